@@ -345,7 +345,7 @@ effects(
     ros_sink=EFFECTS["Scenario", "ros_sink"],
     phy=EFFECTS["Scenario", "phy"],
     airtime=EFFECTS["Scenario", "airtime"],
-    medium=EFFECTS["Scenario", "medium"],
+    medium=Elsewhere("tests/radio/test_slots.py"),
     localhost_only=LOCAL,
     front_end=Elsewhere("tests/radio/test_devices.py"),
     transmit=Elsewhere("tests/radio/test_permission.py"),

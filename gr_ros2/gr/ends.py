@@ -27,7 +27,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import settings_of
-from gr_ros2.link.v1.neighbours import Save
+from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build, refuse_without_effect, robot_of
@@ -106,6 +106,7 @@ class EndpointSetup:
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
     :param mcs_table: the rates of an adaptive rate, see :attr:`gr_ros2.phy.Phy.mcs_table`; () for a fixed rate
     :param access: makes what decides when the robot with an id may send; None from it: whenever there is a credit
+    :param lead_s: s before its burst begins at which a packet is composed that waits for its time
     :param airtime_share: part of the time that this robot may send, above 0..1
     :param close: lets another process start this robot; nothing is stored afterwards
     """
@@ -121,6 +122,7 @@ class EndpointSetup:
     airtime_share: float = 1.0
     close: Callable[[], None] = lambda: None
     access: Callable[[int], Access | None] = lambda _: None
+    lead_s: float = 0.0
 
 
 def make_endpoint(
@@ -194,6 +196,7 @@ def make_endpoint(
         observer=observer,
         mcs_table=start.mcs_table,
         access=start.access(robot_of(source, sink)),
+        lead_s=start.lead_s,
     )
 
 
@@ -206,10 +209,13 @@ def start_of(
     any_length: bool = False,
     mcs_table: Sequence[Mcs] = (),
     airtime_share: float = 1.0,
+    access: Callable[[int], Access | None] = lambda _: None,
+    lead_s: float = 0.0,
 ) -> EndpointSetup:
     """Count this start of a robot in its state file, and read the robot's keys.
 
     :param src_id: id of the robot, -1 for a robot that sends nothing
+    :param access, lead_s: see :class:`EndpointSetup`
     :raises ConfigError: for a key file or a state file that cannot be read or understood
     """
     keys = Keys(read_key_file(config.key), config.seal) if config.key else None
@@ -222,23 +228,27 @@ def start_of(
         any_length=any_length,
         mcs_table=mcs_table,
         airtime_share=airtime_share,
+        access=access,
+        lead_s=lead_s,
     )
     if not config.state and not config.key and src_id < 0:
         return replace(setup, boot=int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS))
-    file = BootFile(_state_file(config, src_id), time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None)
+    file = BootFile(
+        _state_file(config.state, src_id), time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None
+    )
     return replace(setup, boot=file.boot, heard=file.heard, save=file.save, close=file.close)
 
 
-def account_of(config: SourceConfig) -> Path:
+def account_of(state: str, robot_id: int) -> Path:
     """The file of a robot's airtime account, beside its state file.
 
-    :raises ConfigError: when the settings name no robot
+    :param state: its state file, '' = the usual one
     """
-    return _state_file(config, config.src_id()).with_suffix(".airtime")
+    return _state_file(state, robot_id).with_suffix(".airtime")
 
 
-def _state_file(config: SourceConfig | SinkConfig, src_id: int) -> Path:
-    return Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
+def _state_file(state: str, robot_id: int) -> Path:
+    return Path(state).expanduser() if state else state_folder() / f"robot_{robot_id}.json"
 
 
 def state_folder() -> Path:

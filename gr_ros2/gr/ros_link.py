@@ -9,8 +9,9 @@ sent.
 from __future__ import annotations
 
 import random
+import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -21,10 +22,14 @@ from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
+from gr_ros2.link.access import Access
+from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
+from gr_ros2.mac import GUARD_S, access_of
 from gr_ros2.middleware import Middleware
-from gr_ros2.settings.config import SinkConfig, SourceConfig, build
+from gr_ros2.settings.config import SinkConfig, SourceConfig, airtime_from, build
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import MAX_TOPICS, Registry
 
@@ -42,6 +47,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length, mcs_table: see :class:`RosSource`
     :param airtime_share: part of the time that this robot may send, above 0..1
+    :param access, lead_s: see :class:`gr_ros2.gr.ends.EndpointSetup`
     :param observer, clock, seed: see :class:`RosSource`
     :raises ConfigError: for settings that contradict each other
     """
@@ -58,6 +64,8 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         any_length: bool = False,
         mcs_table: Sequence[Mcs] = (),
         airtime_share: float = 1.0,
+        access: Callable[[int], Access | None] = lambda _: None,
+        lead_s: float = 0.0,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
@@ -72,6 +80,8 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
             any_length=any_length,
             mcs_table=mcs_table,
             airtime_share=airtime_share,
+            access=access,
+            lead_s=lead_s,
         )
         rng = random.Random(seed)
         calls = source.version != 0 and (len(rows) < MAX_TOPICS or bool(rows.services))
@@ -102,11 +112,24 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         self._start.close()
 
 
-def make_link(*, half_duplex: bool = False, any_length: bool = False, **values: Any) -> RosLink:
+def make_link(
+    *,
+    half_duplex: bool = False,
+    any_length: bool = False,
+    medium: str = "exclusive",
+    airtime_s: float = 0.0,
+    slot_guard_s: float = GUARD_S,
+    airtime_limit: str | Mapping[str, Any] = "",
+    **values: Any,
+) -> RosLink:
     """Make a link from the settings of both halves in one list, as GRC does.
 
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: see :class:`RosSource`
+    :param airtime_limit: how much the radio may send, as its block says: what the robot says about itself becomes rarer
+    :param medium: see :class:`gr_ros2.settings.config.AnyLink`
+    :param airtime_s: of the longest packet, s; needed unless ``medium`` is exclusive
+    :param slot_guard_s: silence between the packets of two robots, s: the timing error of the radio
     :param values: fields of SourceConfig and of SinkConfig; a field that both have applies to both halves
     :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
@@ -122,4 +145,19 @@ def make_link(*, half_duplex: bool = False, any_length: bool = False, **values: 
     source, sink = halves
     if sink.robot_id == AUTO:  # by it the sink knows the robot's own packets
         sink = replace(sink, robot_id=source.src_id())
-    return RosLink(source.registry, source, sink, half_duplex=half_duplex, any_length=any_length)
+    limits = airtime_from(airtime_limit)
+    limits.check_seal(encrypts=bool(source.key) and source.seal == "encrypt")
+    rule = limits.rule
+    shares = medium != "exclusive"
+    if shares and not (source.version and airtime_s > 0):
+        raise ConfigError(f"medium = {medium!r}: needs version 1, and airtime_s above 0: that of the longest packet")
+    return RosLink(
+        source.registry,
+        source,
+        sink,
+        half_duplex=half_duplex or shares,
+        any_length=any_length,
+        access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=slot_guard_s),
+        lead_s=LEAD_S,
+        airtime_share=1.0 if rule is None else sustained(rule),
+    )

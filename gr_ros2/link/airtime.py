@@ -42,6 +42,7 @@ class AirtimeClock(Generic[T]):
     :ivar refused: packets that were refused, by reason: ``airtime_limit`` or ``transmit_off``
     :ivar used: s of airtime of all packets taken
     :ivar deferred: how often a packet did not leave because somebody else was sending
+    :ivar held: whether the credits given last had been held back by the limit or the switch
     """
 
     def __init__(
@@ -75,6 +76,9 @@ class AirtimeClock(Generic[T]):
         self._transmits = True
         self.refused: Counter[str] = Counter()
         self.used = 0.0
+        self.held = False
+        self._holding = False
+        """Whether the limit or the switch has held back the next credit."""
 
     def offer(self, packet: T, now: float, airtime: float | None = None, leave_at: float | None = None) -> float | None:
         """A packet arrives; it uses a credit if one is open.
@@ -113,6 +117,7 @@ class AirtimeClock(Generic[T]):
         """Let packets pass, or refuse those that wait and all that come."""
         self._transmits = on
         if not on:
+            self._holding = True
             self.refused["transmit_off"] += len(self._queue)
             self._queue.clear()
 
@@ -129,6 +134,8 @@ class AirtimeClock(Generic[T]):
         while self._may_grant(now):
             self._unused += 1
             given += 1
+        if given:
+            self.held, self._holding = self._holding, False
         return given
 
     @property
@@ -172,7 +179,11 @@ class AirtimeClock(Generic[T]):
 
     def _may_grant(self, now: float) -> bool:
         at = self._next_grant(now)
-        return at is not None and at <= now and (self.limit is None or self.limit.reserve(now, self._airtime))
+        if at is None or self.limit is None:
+            return at is not None and at <= now
+        allowed = at <= now and self.limit.reserve(now, self._airtime)
+        self._holding |= not allowed and self._promised_until(now) - self._lead <= now
+        return allowed
 
     def _next_grant(self, now: float) -> float | None:
         """When the next credit may be granted, None if only an arrival or the switch can change that."""

@@ -21,6 +21,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceivedPacket, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
@@ -86,23 +87,9 @@ class MessageSide(Protocol):
         :param definitions: of the type and of those that it is made of, as the codec takes them
         """
 
-    def follow(
-        self,
-        topic_id: int,
-        *,
-        reliable: bool = True,
-        latched: bool = False,
-        depth: int = 0,
-        lifespan_s: float = 0.0,
-        period_s: float = 0.0,
-    ) -> bool:
+    def follow(self, topic_id: int, publishers: PublisherQos) -> bool:
         """Adapt a topic to the QoS of its publishers, where the configuration leaves it open.
 
-        :param reliable: whether all publishers are reliable
-        :param latched: whether all publishers keep messages for late joiners (transient-local)
-        :param depth: depth of their history, 0 for unbounded or unknown
-        :param lifespan_s: s after which a message is useless, 0 without limit
-        :param period_s: s within which they promise a message, 0 for no promise
         :return: whether that changed its queue; ``queue`` returns the new values
         """
 

@@ -16,6 +16,9 @@ _INTERVALS = 15
 """Number of packet intervals whose median estimates the interval of credits."""
 _WINDOW_S = 0.5
 """s over which it is found out whether the computer keeps up."""
+_ENOUGH, _RECENT_S = 3, 10.0
+"""Intervals that must have been measured within so many seconds before a message is dropped because of them. With one,
+the pause of a busy computer stopped the commands of a link for good: what was dropped measured nothing better."""
 
 
 class Pace:
@@ -35,6 +38,8 @@ class Pace:
         self._rough = True
         """Whether no interval of a PHY that was busy without a pause has been measured."""
         self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        self._measured: deque[float] = deque([-inf] * _ENOUGH, maxlen=_ENOUGH)
+        """When the last intervals were measured."""
         self._median = 0.0
         self._free = -inf
         self._ready = inf
@@ -65,6 +70,11 @@ class Pace:
         self._ready = ready
         self._credits = (self._credits or 0) + (0 if self._unpaced else packets)
 
+    def paused(self) -> None:
+        """Sending was held back, by a limit of airtime or its switch: the time since the last packet left is not the
+        interval of the PHY, and a message must not be dropped as if it were."""
+        self._busy_since = inf
+
     @property
     def out_of_credit(self) -> bool:
         """Whether nothing leaves before the next credit, whatever is submitted."""
@@ -83,6 +93,10 @@ class Pace:
         """
         return 1 / self._rate if self._rate else self._median
 
+    def sure_interval(self, now: float) -> float:
+        """The same, but 0 where it was measured too seldom, or too long ago, to drop a message because of it."""
+        return self.interval if self._rate or self._measured[0] > now - _RECENT_S else 0.0
+
     def free(self, now: float) -> float:
         """When the air is free of all packets that have left, as far as it can be estimated; not before ``now``."""
         return max(now, self._free)
@@ -98,6 +112,7 @@ class Pace:
                 self._intervals.clear()
             if self._steady or self._rough:
                 self._intervals.append(now - self._busy_since)
+                self._measured.append(now)
                 self._median = sorted(self._intervals)[len(self._intervals) // 2]
             self._busy_since = inf
             self._credited = now

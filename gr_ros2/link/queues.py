@@ -35,6 +35,28 @@ class Dropped:
     detail: str
 
 
+@dataclass(frozen=True, slots=True)
+class PublisherQos:
+    """The QoS that all publishers of a topic offer.
+
+    :param reliable: whether all are reliable
+    :param latched: whether all keep messages for late joiners (transient-local)
+    :param depth: depth of their history, 0 for unbounded or unknown
+    :param lifespan_s: s after which a message is useless, 0 without limit
+    :param period_s: their deadline: s within which they promise a message, 0 for no promise
+    """
+
+    reliable: bool = True
+    latched: bool = False
+    depth: int = 0
+    lifespan_s: float = 0.0
+    period_s: float = 0.0
+
+
+UNKNOWN_QOS = PublisherQos()
+"""That of a topic of whose publishers nothing is known."""
+
+
 class TopicQueue(deque[Outgoing]):
     """The messages of one topic, in the order in which they are sent.
 
@@ -47,7 +69,7 @@ class TopicQueue(deque[Outgoing]):
         super().__init__()
         self.policy = policy
         self.deadline_s = deadline_s
-        self._in_order = True
+        self._by_age = True
         """Whether no message becomes useless before an earlier one."""
         self._interval = 1 / max_rate if max_rate else 0.0
         self._opens = float("-inf")
@@ -81,7 +103,7 @@ class TopicQueue(deque[Outgoing]):
                 self.remove(victim)
                 dropped.append(Dropped(victim, LedgerRow.QUEUE_BOUND, f"{depth} messages were waiting"))
         message.expires = self._expiry(message)
-        self._in_order = self._in_order and message.lifespan_s >= self.deadline_s
+        self._by_age = self._by_age and message.lifespan_s >= self.deadline_s
         self.append(message)
         return dropped
 
@@ -106,7 +128,7 @@ class TopicQueue(deque[Outgoing]):
             packets = max(-(-message.remaining // payload), 1)
             late = now + packets * interval + lead * bool(interval) > message.expires
             if not late and now < message.expires:
-                if self._in_order:
+                if self._by_age:
                     return  # the following messages are younger, and wait for this one
                 continue
             self.remove(message)
@@ -152,12 +174,7 @@ def qos_class(options: TopicOptions, *, command: bool = False) -> int:
 
 
 def queue_for(
-    options: TopicOptions,
-    depth: int = 0,
-    lifespan_s: float = 0.0,
-    period_s: float = 0.0,
-    *,
-    command: bool = False,
+    options: TopicOptions, publishers: PublisherQos = UNKNOWN_QOS, *, command: bool = False
 ) -> tuple[QueuePolicy, float]:
     """The policy of a topic's queue and its deadline in s (0 = none): the configured ones, otherwise from its
     publishers' QoS.
@@ -167,15 +184,13 @@ def queue_for(
     come faster are thinned out, the newest at each turn, and do not queue up. A lifespan says when a message becomes
     useless.
 
-    :param depth: depth of the publishers' history, 0 for unbounded or unknown
-    :param lifespan_s: s, 0 without limit
-    :param period_s: the publishers' deadline: s within which they promise a message, 0 for no promise
     :param command: whether it is one of commands, which have a deadline of their own
     """
     own_s = COMMAND_DEADLINE_S * command
     if options.queue != AUTO:
         return options.queue, own_s if options.deadline_s == AUTO else options.deadline_s
-    deadline_s = (lifespan_s or own_s) if options.deadline_s == AUTO else options.deadline_s
-    if options.max_rate or options.depth == 1 or (options.depth == AUTO and (depth == 1 or period_s)):
+    deadline_s = (publishers.lifespan_s or own_s) if options.deadline_s == AUTO else options.deadline_s
+    newest = publishers.depth == 1 or publishers.period_s > 0
+    if options.max_rate or options.depth == 1 or (options.depth == AUTO and newest):
         return "latest", deadline_s
     return ("deadline" if deadline_s else "fifo"), deadline_s

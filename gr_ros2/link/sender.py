@@ -19,7 +19,7 @@ from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
-from gr_ros2.link.queues import TopicQueue, qos_class
+from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
 from gr_ros2.link.schedule import PaperScheduler, Plan
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.settings.config import QueuePolicy, SourceConfig, replaced
@@ -166,7 +166,7 @@ class Sender:
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
         """Do nothing: both ends of version 0 code by the same dictionaries."""
 
-    def follow(self, topic_id: int, **qos: Any) -> bool:  # noqa: ARG002
+    def follow(self, topic_id: int, publishers: PublisherQos) -> bool:  # noqa: ARG002
         """Do nothing: version 0 delivers as it comes, and the registry says the rest at both ends."""
         return False
 

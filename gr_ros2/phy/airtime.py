@@ -22,10 +22,12 @@ from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, with_begin
 from gr_ros2.phy.threads import BlockThread
 
+_ONE, _HELD_BACK = pmt.from_long(1), pmt.from_long(0)
+
 
 class AirtimeGate(gr.basic_block):  # type: ignore[misc]
-    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come; it is the time in s at
-    which the air is free for it).
+    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come, for which the
+    air is free since this time in s; an integer for packets that the limit or the switch held back, after a 0).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
@@ -67,6 +69,8 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         self._running = False
         self._looks_at = inf
         """When its thread began with what it does, or looks again at the latest, s."""
+        self.arrived = 0
+        """Packets that have come."""
         self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
@@ -140,6 +144,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             airtime = self._airtime_of(int(pmt.length(pmt.cdr(pdu))), mcs_of(pdu) or 0)
         with self._changed:
             self._clock.offer(pdu, self._now(), airtime, leave_at_of(pdu))
+            self.arrived += 1
             self._changed.notify_all()
 
     def _run(self) -> None:
@@ -152,8 +157,11 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             for begins_at, pdu in pdus:
                 self.message_port_pub(PDUS, with_begin(pdu, begins_at))
             self.passed += len(pdus)
+            if credits and self._clock.held:
+                self.message_port_pub(CREDIT, _HELD_BACK)
+            credit = _ONE if self._clock.held else pmt.from_double(free)
             for _ in range(credits):
-                self.message_port_pub(CREDIT, pmt.from_double(free))
+                self.message_port_pub(CREDIT, credit)
 
     def _step(self) -> tuple[list[tuple[float, Any]], int]:
         """What is due; waits until something is due."""

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -206,10 +207,10 @@ class MediumProcess:
         now = self._clock()
         return sum(now - link.heard < GONE_S for link in self._links)
 
-    def run(self, duration_s: float = inf) -> None:
-        """Carry bursts for so many s."""
+    def run(self, duration_s: float = inf, over: threading.Event | None = None) -> None:
+        """Carry bursts for so many s, or until ``over`` is set."""
         self._began = begin = self._clock()
-        while self._clock() - begin < duration_s:
+        while self._clock() - begin < duration_s and not (over is not None and over.is_set()):
             if self.config.time == "real":
                 self._take(STEP_S)
                 self._now = self._clock() - begin

@@ -11,6 +11,7 @@ import logging
 import selectors
 import socket
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -21,7 +22,7 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
-from gr_ros2.phy.pdus import PDUS, octets, pdu_of
+from gr_ros2.phy.pdus import PDUS, AirPacket, octets, pdu_heard
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.radio.framing import Framing
 from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters
@@ -131,11 +132,19 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
     :param called: name of the front end, for the log
     :param connect: opens the connection or raises RadioError; called here and after each interruption
     :param counters: counts what passes and what does not
+    :param airtime: s that a packet of so many bytes takes. A packet began that long before it came here
     :raises RadioError: when the connection cannot be opened
     """
 
-    def __init__(self, called: str, connect: Callable[[], Connection], counters: Counter[str]) -> None:
+    def __init__(
+        self,
+        called: str,
+        connect: Callable[[], Connection],
+        counters: Counter[str],
+        airtime: Callable[[int], float],
+    ) -> None:
         super().__init__(f"gr_ros2_{called}", None, None)
+        self._airtime = airtime
         self._called, self._connect, self._counters = called, connect, counters
         self._connection: Connection | None = connect()
         self._outgoing: deque[bytes] = deque()
@@ -240,7 +249,8 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
     def _receive(self, connection: Connection) -> None:
         for packet in connection.receive():
             self._counters["frames_in"] += 1
-            self.message_port_pub(PDUS, pdu_of(packet))
+            began = time.monotonic() - self._airtime(len(packet))
+            self.message_port_pub(PDUS, pdu_heard(AirPacket(packet, at=began)))
 
 
 class PacketFrontEnd(FrontEnd):
@@ -256,7 +266,7 @@ class PacketFrontEnd(FrontEnd):
     def __init__(self, phy: Phy, **options: Any) -> None:
         super().__init__(phy, **options)
         self._counters: Counter[str] = Counter()
-        self._port = PacketPort(self.name, self._connect, self._counters)
+        self._port = PacketPort(self.name, self._connect, self._counters, self.phy.airtime)
 
     @abstractmethod
     def _connect(self) -> Connection:

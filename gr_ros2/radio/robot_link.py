@@ -8,6 +8,7 @@ that was opened. If opening fails half-way, everything is released too.
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -21,8 +22,11 @@ from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.ends import account_of, own_settings
+from gr_ros2.link.access import Access
+from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import AirtimeLimit, sustained
 from gr_ros2.link.observe import LinkObserver, Observers
+from gr_ros2.mac import access_of
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.phy import configured
@@ -32,6 +36,7 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.findings import about, introduce, peers, ping
 from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.switch import TransmitSwitch
 from gr_ros2.radio.waiting import shortcut
@@ -45,27 +50,6 @@ _STOP_S, _RETRY_S = 10.0, 1.0
 STALLED_S = 10.0
 """s after which a thread that sends counts as stuck: longer than a busy computer makes it wait."""
 _log = logging.getLogger(__name__)
-
-
-def permitted(config: LinkConfig, front_end: type[FrontEnd]) -> bool:
-    """Whether a link may send.
-
-    :raises ConfigError: for a radio that would send without a word of permission, or without a key
-    """
-    if config.transmit is False or not front_end.has_radio:
-        return config.transmit is not False
-    on_air = f"front_end {front_end.name} sends {front_end.on_air(config.front_end_options)}"
-    if config.transmit is not True:
-        raise ConfigError(
-            f"{on_air}: say once that it may, with --transmit or transmit: true in the file (docs/how-to/radios.md, "
-            "Before you send); --listen-only only receives"
-        )
-    if not config.key and not config.open:
-        raise ConfigError(
-            f"{on_air}, and there is no key: anybody could read, forge and replay its packets; set key (gr-ros2 key "
-            "new FILE), or --open, open: true in the file"
-        )
-    return True
 
 
 class RobotLink(Flowgraph):
@@ -117,7 +101,9 @@ class RobotLink(Flowgraph):
         rate = config.phy.sample_rate
         self.phy = configured(config.phy, config.packet_len, 0.0 if rate == AUTO else rate)
         self._front_end_class: type[FrontEnd] = FRONT_ENDS.load(config.front_end_name)
-        self.sends = permitted(config, self._front_end_class)
+        self.sends = permitted(
+            config.transmit, self._front_end_class, config.front_end_options, guarded=bool(config.key) or config.open
+        )
         """Whether it may send at all."""
         self._open_radio()
         self._stack.callback(self._close_radio)
@@ -149,7 +135,7 @@ class RobotLink(Flowgraph):
 
         :raises RadioError: when it cannot be opened
         """
-        self.front_end = self._front_end_class(self.phy, **self.config.front_end_options)
+        self.front_end = self._front_end_class(self.phy, transmits=self.sends, **self.config.front_end_options)
         try:
             self.radio = Radio(
                 self.phy,
@@ -173,6 +159,8 @@ class RobotLink(Flowgraph):
         if self.sends:  # without credit, nothing leaves
             self.msg_connect(sends, "pdus", self.radio, "pdus")
             self.msg_connect(self.radio, "credit", sends, "credit")
+            if self._shares:
+                self.front_end.follow(self._at_rest)
         self.msg_connect(self.radio, "pdus", receives, "pdus")
 
     def _lose(self, error: RadioError) -> None:
@@ -202,7 +190,8 @@ class RobotLink(Flowgraph):
             self._retry_at = self._clock() + _RETRY_S
             return
         self._retry_at = inf
-        self.radio.gate.transmit(on=transmits)
+        if not transmits:
+            self.radio.transmit(on=False)
         self._connect_radio()
         super().start()
         _log.warning("link %s: front end %s is back", self.config.name, self.front_end.name)
@@ -211,15 +200,18 @@ class RobotLink(Flowgraph):
     def _limit(self) -> AirtimeLimit | None:
         """What limits the airtime, with what earlier starts of this robot have sent."""
         rule = self.config.airtime.rule
-        if rule is None:
+        if rule is None or not self.sends:
             return None
-        file = AirtimeFile(account_of(self.config.ros_source))
+        file = AirtimeFile(account_of(self.config.ros_source.state, self.config.ros_source.src_id()))
         self._stack.callback(file.close)
         longest, now = self.front_end.airtime(), time.monotonic()
         return AirtimeLimit(rule, longest, now=now, spent=file.spent, save=file.save)
 
     def transmit(self, *, on: bool) -> None:
-        """Switch sending off, at once for all packets that have not reached the device, or on again."""
+        """Switch sending off, at once for all packets that have not reached the device, or on again.
+
+        :raises ConfigError: where it only receives
+        """
         self.radio.transmit(on=on)
         _log.warning("link %s: sending is %s", self.config.name, "on" if on else "off")
 
@@ -231,10 +223,12 @@ class RobotLink(Flowgraph):
             self._sink_config(),
             middleware=graphs,
             reports=self.sends,
-            half_duplex=getattr(self.front_end.options, "half_duplex", False),
+            half_duplex=self._shares or getattr(self.front_end.options, "half_duplex", False),
             any_length=self.phy.any_length,
             mcs_table=self.phy.mcs_table,
             airtime_share=1.0 if self.config.airtime.rule is None else sustained(self.config.airtime.rule),
+            access=self._access() if self.sends else lambda _: None,
+            lead_s=LEAD_S + (self.front_end.ahead() or 0.0),
             observer=observer,
             clock=self._clock,
         )
@@ -244,8 +238,32 @@ class RobotLink(Flowgraph):
         """What sends and receives; where the front end loops back, what receives."""
         self._blocks = both, both
 
+    @property
+    def _shares(self) -> bool:
+        """Whether other robots send on its channel."""
+        return self.config.medium != "exclusive"
+
+    def _access(self) -> Callable[[int], Access | None]:
+        """What decides when it sends. The guard between two robots is what its front end may be late by."""
+        airtime_s, seed = self.front_end.airtime(), secrets.randbits(32)
+        return access_of(self.config.medium, airtime_s, seed, guard_s=self.front_end.timing_error_s)
+
+    def _at_rest(self) -> int | None:
+        """As :meth:`Radio.at_rest`; None also while a packet is composed or has to be."""
+        if self.source.composed != self.radio.gate.arrived or self.source.due(self._clock()):
+            return None
+        return self.radio.at_rest()
+
     def _two_blocks(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
-        """A robot that receives its own packets has two endpoints: one sends and one receives."""
+        """A robot that receives its own packets has two endpoints: one sends and one receives.
+
+        :raises ConfigError: it should share its channel with others
+        """
+        if self._shares:
+            raise ConfigError(
+                f"medium = {self.config.medium!r}: front_end {self.front_end.name} reaches no other robot; leave it "
+                "out, or set another front_end"
+            )
         common: dict[str, Any] = {"observer": observer, "clock": self._clock}
         source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
         carried: dict[str, Any] = {"any_length": self.phy.any_length, "mcs_table": self.phy.mcs_table}
@@ -264,7 +282,7 @@ class RobotLink(Flowgraph):
     @property
     def registry(self) -> Registry:
         """The topics that are sent; it grows if they are looked for on the ROS graph."""
-        return self.source.registry
+        return self.source.subscriptions.registry
 
     def _graphs(self, middleware: Middleware | None) -> tuple[Middleware, Middleware]:
         """The participants of source and sink: one for both if they are on the same graph."""

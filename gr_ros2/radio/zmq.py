@@ -60,6 +60,8 @@ _MOST_STEP_S = 1.0
 """s by which one word of a medium process moves the clock at most."""
 _ANSWER_S = 0.5
 """s after which a time is not answered; the medium process sends it again."""
+_LOCKED_S = 0.001
+"""``timing_error_s`` in lock step, where the medium process tells when a burst began and begins it when asked."""
 MAX_SENDERS = 256
 """Largest number of senders whose burst numbers are followed. Beyond it, the one heard longest ago is forgotten."""
 _MAX_PORT = 65535
@@ -159,9 +161,14 @@ class ZmqFrontEnd(FrontEnd):
         self._counters: Counter[str] = Counter()
         self._passed: Callable[[], int | None] = lambda: None
         self._medium_clock = MediumClock() if self.options.medium_process == "lockstep" else None
+        self._sink: _BurstPublisher | None = None
+        if self._medium_clock is not None:
+            self.timing_error_s = _LOCKED_S
         try:
-            publisher = self._socket(zmq.PUB)
-            open_socket(publisher.bind, "bind", self.options.bind)
+            if self.transmits or self._medium_clock is not None:  # in lock step, who only listens answers too
+                publisher = self._socket(zmq.PUB)
+                open_socket(publisher.bind, "bind", self.options.bind)
+                self._sink = _BurstPublisher(publisher, phy, self._counters, self._medium_clock)
             subscriber = self._socket(zmq.SUB)
             subscriber.subscribe(b"")
             for address in self.options.connect:
@@ -170,7 +177,6 @@ class ZmqFrontEnd(FrontEnd):
             self._let_go()
             raise
         self._sockets.remove(subscriber)  # its thread closes it
-        self._sink = _BurstPublisher(publisher, phy, self._counters, self._medium_clock)
         told = None if self._medium_clock is None else self._told
         arrivals = _Arrivals(subscriber, phy.sample_rate, self.options.burst_queue, self._counters, told)
         self._source = _BurstSubscriber(arrivals, self._medium_clock)
@@ -196,10 +202,11 @@ class ZmqFrontEnd(FrontEnd):
     def _told(self, medium: int, at: float) -> None:
         """The medium process has told the time: answer when all has been sent that begins before."""
         assert self._medium_clock is not None
+        assert self._sink is not None
         self._medium_clock.tick(medium, at)
         limit = time.monotonic() + _ANSWER_S
         while self._passed() != self._counters["bursts_out"]:
-            if time.monotonic() > limit:
+            if time.monotonic() > limit or self._sink.closed:
                 return
             time.sleep(_LOOK_S)
         self._sink.answer(at)
@@ -216,7 +223,8 @@ class ZmqFrontEnd(FrontEnd):
         return FrontEndCounters({name: self._counters[name] for name in ("bursts_out", "bursts_in")}, lost)
 
     def close(self) -> None:
-        self._sink.close()
+        if self._sink is not None:
+            self._sink.close()
         self._let_go()
 
     def _socket(self, kind: int) -> Any:
@@ -300,6 +308,11 @@ class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         with self._sending:
             if not self._socket.closed:  # by close(), while arrivals were about to answer
                 self._socket.send(header + samples, zmq.NOBLOCK)
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is sent any more."""
+        return bool(self._socket.closed)
 
     def close(self) -> None:
         """Send nothing from now on. Idempotent."""

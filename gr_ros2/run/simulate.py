@@ -368,7 +368,10 @@ class Robot:
         """Take the messages that have come by ``now``, and send what may leave."""
         if self._clock is not None:
             self._clock.due(now)
-            self.endpoint.pace.credit(self._clock.grants(now))
+            credits = self._clock.grants(now)
+            if credits and self._clock.held:
+                self.endpoint.pace.paused()
+            self.endpoint.pace.credit(credits)
         while self._coming is not None and self._coming.t <= now:
             self.endpoint.messages.submit(self._coming.topic_id, self._coming.payload, now)
             if not self._until:

@@ -183,3 +183,39 @@ def test_a_limit_counts_a_packet_that_waited_when_it_leaves() -> None:
     assert now == 5.0
     assert limit.spent(now + 1.0 + rule.window_s - 0.1) == 1.0
     assert limit.spent(now + 1.0 + 2 * rule.window_s) == 0.0
+
+
+def test_credits_that_the_switch_or_the_limit_held_back_are_known() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(1.0, lead=0.0)
+    assert clock.grants(0.0) == 1
+    assert not clock.held
+    clock.switch(on=False)
+    assert clock.grants(5.0) == 0
+    clock.switch(on=True)
+    clock.offer("first", 9.0)
+    clock.due(10.0)
+    assert clock.grants(10.0) == 1
+    assert clock.held
+    clock.offer("second", 10.0)
+    clock.due(11.0)
+    assert clock.grants(11.0) == 1
+    assert not clock.held
+
+    both: AirtimeClock[str] = AirtimeClock(0.0)
+    both.switch(on=False)
+    both.switch(on=True)
+    assert both.grants(1.0) == 2
+    assert both.held
+
+    limited: AirtimeClock[str] = AirtimeClock(1.0, lead=0.0, limit=AirtimeLimit(AirtimeRule(0.01, window_s=200.0), 1.0))
+    held = []
+    now = 0.0
+    while len(held) < 5:
+        if limited.grants(now):
+            held.append(limited.held)
+            limited.offer("a packet", now)
+        again = limited.next_timeout(now)
+        assert again is not None
+        limited.due(again)
+        now = max(again, now + 1e-6)
+    assert held == [False, True, True, True, True]

@@ -54,6 +54,36 @@ def test_the_first_interval_after_a_pause_counts_only_until_there_is_a_better_on
     assert pace.interval == pytest.approx(0.1)
 
 
+def test_a_pause_of_sending_is_not_the_interval_of_the_phy() -> None:
+    """Otherwise a message with a deadline is dropped as too slow for it, and so no packet shows that it is not."""
+    pace = Pace(AUTO)
+    pace.credit()
+    assert pace.may_leave(0.0)
+    pace.left(0.0, waiting=True)
+    pace.paused()
+    pace.credit()
+    assert pace.may_leave(60.0)
+    assert pace.interval == 0.0
+    pace.left(60.0, waiting=True)
+    pace.credit()
+    assert pace.may_leave(60.1)
+    assert pace.interval == pytest.approx(0.1)
+
+
+def test_messages_are_dropped_for_an_interval_only_if_it_was_measured_lately_and_more_than_once() -> None:
+    pace = Pace(AUTO)
+    pace.use_credit()
+    assert pace.sure_interval(0.0) == 0.0
+    pace.credit()
+    for at, least in ((0.0, 0.0), (0.5, 0.0), (0.6, 0.0), (0.7, 0.1), (0.8, 0.1)):
+        assert pace.may_leave(at)
+        assert pace.sure_interval(at) == pytest.approx(least)
+        pace.left(at, waiting=True)
+        pace.credit()
+    assert pace.sure_interval(60.0) == 0.0
+    assert Pace(4.0).sure_interval(60.0) == 0.25
+
+
 def test_the_air_is_free_when_all_that_left_is_over() -> None:
     pace = Pace(AUTO)
     pace.use_credit()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SentPacket
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.queues import STANDING_S, TopicQueue, queue_for
+from gr_ros2.link.queues import STANDING_S, PublisherQos, TopicQueue, queue_for
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.settings.config import TopicOptions, build
 from gr_ros2.settings.registry import Registry, Topic
@@ -172,7 +172,7 @@ def test_a_queue_follows_its_publishers_where_it_is_not_configured(
 ) -> None:
     source = robot(**options).end
     before = source.messages.queue(0)
-    assert source.messages.follow(0, depth=depth, lifespan_s=lifespan_s, period_s=period_s) == (
+    assert source.messages.follow(0, PublisherQos(depth=depth, lifespan_s=lifespan_s, period_s=period_s)) == (
         source.messages.queue(0) != before
     )
     assert source.messages.queue(0) == queue
@@ -181,12 +181,12 @@ def test_a_queue_follows_its_publishers_where_it_is_not_configured(
 def test_a_lifespan_found_late_holds_for_what_waits() -> None:
     source = robot()
     source.end.messages.submit(0, b"old", 0.0)
-    source.end.messages.follow(0, lifespan_s=0.1)
+    source.end.messages.follow(0, PublisherQos(lifespan_s=0.1))
     source.end.messages.submit(0, b"young", 0.09)
     assert leave(source, 0.15) == [b"young"]
     assert refused(source.end) == {"stale": 1}
     source.end.messages.submit(0, b"for ever again", 0.2)
-    source.end.messages.follow(0)
+    source.end.messages.follow(0, PublisherQos())
     assert source.end.messages.queue(0) == ("fifo", 0.0)
     assert leave(source, 9.0) == [b"for ever again"]
 
@@ -261,9 +261,9 @@ def test_a_capped_message_says_when_it_may_go() -> None:
     source.end.messages.submit(0, b"a", 0.0)
     source.end.messages.submit(0, b"b", 0.0)
     assert leave(source, 0.0) == [b"a"]
-    assert source.end.messages.next_timeout(0.0) == pytest.approx(0.1)
+    assert source.end.messages.packing.next_timeout(0.0) == pytest.approx(0.1)
     assert leave(source, 0.1) == [b"b"]
-    assert source.end.messages.next_timeout(0.1) is None
+    assert source.end.messages.packing.next_timeout(0.1) is None
 
 
 @given(

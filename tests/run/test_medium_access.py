@@ -10,11 +10,9 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import Delivered
-from gr_ros2.radio.config import LinkConfig
 from gr_ros2.run.load import make_phys
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import Simulation
-from gr_ros2.settings.config import build
 from gr_ros2.state.keys import new_key_file
 
 BOTH_WAYS = ("sim.odom_rate=35", "packet_len=96", "phy.sample_rate=300000")
@@ -72,8 +70,3 @@ def test_what_cannot_be_is_refused_in_one_line(overrides: list[str], said: str) 
     with pytest.raises(ConfigError, match=said) as refused:
         load_scenario("two-robots-half-duplex", overrides)
     assert "\n" not in str(refused.value)
-
-
-def test_a_link_over_a_front_end_has_no_slots_yet() -> None:
-    with pytest.raises(ConfigError, match="medium = 'slots'"):
-        build(LinkConfig, {"registry": "odom.csv", "medium": "slots", "front_end": {"name": "udp"}})

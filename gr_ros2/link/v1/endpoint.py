@@ -25,11 +25,11 @@ from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
-from gr_ros2.link.v1.neighbours import Save
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.pings import Pings
 from gr_ros2.link.v1.receiving import ReceivingSide
 from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.link.v1.writer import PacketWriter, room_of
@@ -56,6 +56,7 @@ class EndpointV1:
     :param observer: called with every SenderEvent, in order
     :param mcs_table: the rates of an adaptive rate, see :mod:`gr_ros2.link.rate`; () for a fixed rate
     :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
+    :param lead_s: s before its departure at which a packet is composed
     :ivar answers: whether what it receives can change what it sends
     :ivar window: the packets that are worth repairing
     :ivar neighbours: the robots that are heard
@@ -77,8 +78,9 @@ class EndpointV1:
         observer: Callable[[SenderEvent], None] | None = None,
         mcs_table: Sequence[Mcs] = (),
         access: Access | None = None,
+        lead_s: float = 0.0,
     ) -> None:
-        self._access = access
+        self._access, self._lead = access, lead_s
         self.settings = settings
         self.boot = boot
         self.keys = keys = keys if keys is not None else Keys()
@@ -118,7 +120,7 @@ class EndpointV1:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self._now = max(self._now, now)
         self._hold.submitted(topic_id, now)
-        return self._sending.behind(now)
+        return self._access is None and self._sending.behind(now)  # with medium access, messages wait for their slot
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
@@ -128,7 +130,7 @@ class EndpointV1:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self._sending.mode != "off" and self.window.unconfirmed(self._now)
+        mending = self._sending.repairs.mode != "off" and self.window.packets.unconfirmed(self._now)
         return self.messages.idle and not mending
 
     @property
@@ -199,16 +201,18 @@ class EndpointV1:
         sent = self._sending.packet(now)
         if sent is None and self._writer.block:
             sent = self._writer.control([], "report", now)  # who sends nothing in a slot loses it
-        if sent is not None:
-            self.pace.left(now, waiting=True)
+        if sent is None:
+            return None
+        self.pace.left(now, waiting=True)
         return sent
 
     def _may_begin(self, access: Access, now: float) -> bool:
-        """Whether the channel lets a packet begin; takes the block that it carries."""
-        if now < access.departure(now) - _EARLY_S:
+        """Whether a packet is to be composed now; says when it begins, and takes the block that it carries."""
+        begins = access.departure(now)
+        if now < begins - self._lead - _EARLY_S:
             return False
         block = access.block()
-        self._writer.block = block or b""
+        self._writer.block, self._writer.leave_at = block or b"", max(begins, now)
         return block is not None
 
     def next_departure(self, *, credited: bool = False) -> float | None:
@@ -216,13 +220,13 @@ class EndpointV1:
         if (self.pace.out_of_credit and not credited) or not self.answers:
             return None
         if self._access is not None:
-            return max(self._access.departure(self._now), self.pace.slot)
+            return max(self._access.departure(self._now) - self._lead, self.pace.slot)
         return self._sending.next_departure(self._now)
 
     def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
         """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         self._now = max(self._now, now)
-        self._sending.received()
+        self._sending.repairs.received()
         return self._receiving.receive(arrival, now)
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:

@@ -143,16 +143,19 @@ class Hellos:
         free = room - HELLO_LEN
         lone = self.lone and not self._starting
         self._pause = min(2 * self._pause, max(LONE_S, self._period)) if lone else self._period
-        marks, heard = self._messages.marks(now), neighbours.heard(window.newest)
+        marks, heard = self._messages.kept.marks(now), neighbours.heard(window.packets.newest)
         proofs, self._heard = _in_turn(heard, self._heard, max(free // HEARD_LEN - bool(marks), 1))
         if free < HEARD_LEN:
             self._apart, proofs = [*proofs], []
         free -= len(proofs) * HEARD_LEN
         named, self._mark = _in_turn(marks, self._mark, free // MARK_LEN)
         self.due = now if self._apart else self._next(now, wants=wants)
-        reported = window.reported and self._settings.repair != "off"
+        reported = bool(window.peers) and self._settings.repair != "off"
         capabilities = self._capabilities | reported * REPORTED | wants * WANTS_PROOF
-        return [Hello(self._boot, window.newest >> 16, capabilities, self._messages.digest, tuple(named)), *proofs]
+        return [
+            Hello(self._boot, window.packets.newest >> 16, capabilities, self._messages.kept.digest, tuple(named)),
+            *proofs,
+        ]
 
     def _next(self, now: float, *, wants: bool) -> float:
         """When the next hello is due, s."""

@@ -25,9 +25,10 @@ from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready
+from gr_ros2.link.v1.peers import MAP
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
-from gr_ros2.link.v1.repair import MAP, SPAN
 from gr_ros2.link.v1.reports import Reporter
+from gr_ros2.link.v1.sent_packets import SPAN
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire.control import Control

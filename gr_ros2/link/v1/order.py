@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.gap_contents import GapContents
-from gr_ros2.link.v1.repair import MAP
+from gr_ros2.link.v1.peers import MAP
 
 _VOID = 1024
 """Packets noted as left out of repairs before the notes about old ones are dropped."""

@@ -27,9 +27,10 @@ from gr_ros2.link.rate import RateController
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
-from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
+from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.settings.config import NOBODY
@@ -106,7 +107,7 @@ class ReceivingSide:
             gone.inbox.order.told = False
             self._report_all(gone.inbox.handle_timeout(now))
             self._events.append(Gone(gone.src_id, gone.boot))
-        self._messages.reported = self._window.reported
+        self._messages.reported = bool(self._window.peers)
         events, self._events = self._events, []
         return events
 
@@ -171,7 +172,7 @@ class ReceivingSide:
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
         sending = self._sending
         sending.heard_at = now
-        sending.urged = sending.urged or (repair is not None and not repair.mask) or sending.requests.lacking
+        sending.urged = sending.urged or (repair is not None and not repair.mask) or sending.reports.requests.lacking
         if opened.met:
             self._meet(opened, now)
         self._sender, inbox = neighbour, neighbour.inbox
@@ -193,7 +194,7 @@ class ReceivingSide:
         packet = PacketV1(header, tuple(entries), repair, b"", neighbour.encrypts and not repair.clear)
         self._arrived(arrival, neighbour, number, repair.row, packet)
         if repair.clear:
-            neighbour.echo = arrival.data[-ECHO_LEN:], self._window.newest
+            neighbour.echo = arrival.data[-ECHO_LEN:], self._window.packets.newest
             if neighbour.hello.capabilities & WANTS_PROOF:
                 sending.hellos.answer(now)
         proved = self.neighbours.proved(neighbour, number, entries)
@@ -224,7 +225,7 @@ class ReceivingSide:
         self._forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears:
-            self._window.meet(neighbour.src_id, now)
+            self._window.peers.meet(neighbour.src_id, now)
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)
             self._messages.reported = True
@@ -238,27 +239,27 @@ class ReceivingSide:
             self._reported(self._sender.src_id, entry)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
             for topic_id in entry.topic_ids:
-                self._messages.ask(topic_id, self._now)
+                self._messages.kept.ask(topic_id, self._now)
 
     def _reported(self, sender: int, report: Report) -> None:
         """A robot says which packets it has."""
         if report.src_id != self._settings.src_id or report.boot != self._boot & 0xFFFF:
             return
-        newest = self._window.newest
+        newest = self._window.packets.newest
         number = newest - ((newest - report.number) & 0xFFFF)
         if number < 0:
             raise EntryKindError(f"a report of packet {report.number}, which was never sent")
         loss, now = report.loss / 128, self._now
-        self._window.report(sender, number, report.arrived, settled=report.settled, loss=loss, now=now)
-        self._sending.reported()
+        self._window.peers.report(sender, number, report.arrived, settled=report.settled, loss=loss, now=now)
+        self._sending.repairs.reported()
         self._messages.reported = True
         if self._rate is not None and report.snr_db is not None:
             self._rate.report(sender, report.snr_db, loss, now)
 
     def _forget(self, src_id: int) -> None:
         """A receiver is gone, or has started again."""
-        self._window.forget(src_id)
-        if not self._window.reported:
+        self._window.peers.forget(src_id)
+        if not self._window.peers:
             self._sending.hellos.hurry(self._now)
         if self._rate is not None:
             self._rate.forget(src_id)

@@ -14,7 +14,7 @@ from math import inf
 
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.order import Order
-from gr_ros2.link.v1.repair import MAP, PROMPT
+from gr_ros2.link.v1.peers import MAP, PROMPT
 from gr_ros2.link.v1.snr import SnrFilter
 from gr_ros2.wire.control import REPORT_LEN, Report, reportable
 

@@ -11,11 +11,14 @@ from collections.abc import Callable, Sequence
 from gr_ros2.link.events import AirKind, PacketId, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.rate import RateController
 from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v1.combining import Repair
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.gf256 import combine
 from gr_ros2.link.v1.hold import Hold
-from gr_ros2.link.v1.repair import Lifetime, Repair, RepairWindow, Sent
+from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Checksum, Keys
+from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.wire.v1 import (
     BROADCAST,
@@ -47,6 +50,7 @@ class PacketWriter:
     :param observer: called with every packet
     :param shares: packets carry blocks for medium access
     :ivar block: that of the next packet
+    :ivar leave_at: s, when its burst has to begin; None for as soon as possible
     :ivar room: bytes of the longest body
     :ivar sealed: whether packets are sealed
     """
@@ -65,6 +69,7 @@ class PacketWriter:
         shares: bool = False,
     ) -> None:
         self.block = b""
+        self.leave_at: float | None = None
         self._shares = shares
         self._src_id, self._boot, self._dst_id = settings.src_id, boot, settings.dst_id
         self._packet_len = settings.packet_len
@@ -89,26 +94,26 @@ class PacketWriter:
         :param lifetimes: of the messages in it; () for a packet that is not worth repairing
         :param parts: what it carries of messages that are sent for the first time
         """
-        number = self._window.newest + 1
+        number = self._window.packets.newest + 1
         body = write_body(entries, self.room)
         header = self._header(qos, number)
         clear = write_header(header)
         data = self._trailer.close(clear, self._padded(body, clear), number, SOURCE_ROW)
         self._window.sent(number, body, data, lifetimes, now)
         if lifetimes:
-            self._hold.left(now, self._window.loss)
+            self._hold.left(now, self._window.peers.loss)
         packet = PacketV1(header, tuple(entries), encrypted=self._encrypts)
         return self._leave(data, packet, (number, SOURCE_ROW), "new", now, parts=parts)
 
     def control(self, entries: Sequence[EntryV1], kind: AirKind, now: float, *, clear: bool = False) -> SentPacket:
         """Write a packet of entries that are not messages; it stands at the newest number."""
         window = self._window
-        row = window.take_row(window.newest)
+        row = window.packets.take_row(window.packets.newest)
         if row is None:
             return self.source([], window.exhausted(now), 0, (), now)
         body = write_body(entries, self.room)
-        fields = RepairHeader(row, oldest=not window.unconfirmed(now), clear=clear)
-        return self._repair_packet(fields, window.newest, body, entries, kind=kind, now=now)
+        fields = RepairHeader(row, oldest=not window.packets.unconfirmed(now), clear=clear)
+        return self._repair_packet(fields, window.packets.newest, body, entries, kind=kind, now=now)
 
     def repair(self, chosen: Sent | Repair, now: float) -> SentPacket:
         """Write a combination of packets, or a packet again as it was."""
@@ -116,7 +121,7 @@ class PacketWriter:
             number, mask, row, oldest, combined = chosen
             return self._repair_packet(RepairHeader(row, mask, oldest), number, combined, (), kind="repair", now=now)
         if self._shares:  # with another block it is another packet, and needs a nonce of its own
-            again = self._window.take_row(chosen.number)
+            again = self._window.packets.take_row(chosen.number)
             if again is None:
                 return self.control([], "repair", now)
             body = combine([(chosen.number, chosen.body)], again)
@@ -156,7 +161,9 @@ class PacketWriter:
             mcs = self._rate.sent(None if self._dst_id == BROADCAST else self._dst_id, now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
-        sent = SentPacket(data, packet, PacketId(self._src_id, self._boot, *place), parts, now, kind, mcs)
+        sent = SentPacket(
+            data, packet, PacketId(self._src_id, self._boot, *place), parts, now, kind, mcs, self.leave_at
+        )
         if self._observer is not None:
             self._observer(sent)
         return sent

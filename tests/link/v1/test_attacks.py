@@ -171,18 +171,19 @@ def test_nothing_is_confirmed_that_never_arrived() -> None:
     air.lost = lambda sender, _: sender is one
     one.end.messages.submit(0, b"not heard", air.now)
     air.run(0.2)
-    newest = one.end.window.newest
+    newest = one.end.window.packets.newest
     forged = Report(1, one.boot & 0xFFFF, newest & 0xFFFF, (1 << 64) - 1, True, 0)
-    clear = write_header(Header(3, True, 2, two.end.window.newest & 0xFFFF)) + write_repair_header(RepairHeader(100))
+    other = two.end.window.packets.newest
+    clear = write_header(Header(3, True, 2, other & 0xFFFF)) + write_repair_header(RepairHeader(100))
     body = write_body([forged], body_room(64, sealed=True)).ljust(64 - 14, b"\0")
     for trailer in (Seal(OTHER, 2, two.boot, encrypt=True), Seal(KEY, 1, one.boot, encrypt=True)):
-        one.receive(trailer.close(clear, body, two.end.window.newest, 100), air.now)
+        one.receive(trailer.close(clear, body, other, 100), air.now)
     recorded = of(air, two)
-    one_before = one.end.window.unconfirmed(air.now)
+    one_before = one.end.window.packets.unconfirmed(air.now)
     for data in recorded:
         one.receive(data, air.now)
     assert one_before
-    assert one.end.window.unconfirmed(air.now)
+    assert one.end.window.packets.unconfirmed(air.now)
     air.lost = lambda *_: False
     air.run(1.0)
     assert b"not heard" in two.delivered()
@@ -197,7 +198,7 @@ def test_a_report_of_an_earlier_start_confirms_nothing() -> None:
     air.run(0.06)
     for data in recorded:
         one.receive(data, air.now)
-    assert one.end.window.unconfirmed(air.now)
+    assert one.end.window.packets.unconfirmed(air.now)
 
 
 def test_no_link_is_silenced_for_longer_than_the_attack_lasts() -> None:
@@ -280,8 +281,8 @@ SLOT = 0.001
 def test_a_message_of_the_attackers_own_is_not_taken_in_the_clear() -> None:
     one, two, air = pair()
     body = write_body([Part(0, b"mine")], body_room(64))
-    clear = write_header(Header(0, False, 1, one.end.window.newest + 1 & 0xFFFF))
-    packet = Keys().own(1, one.boot).close(clear, body, one.end.window.newest + 1, SOURCE_ROW)
+    clear = write_header(Header(0, False, 1, one.end.window.packets.newest + 1 & 0xFFFF))
+    packet = Keys().own(1, one.boot).close(clear, body, one.end.window.packets.newest + 1, SOURCE_ROW)
     assert not any(isinstance(event, Delivered) for event in two.receive(packet, air.now))
     assert two.end.received.rejected["not_sealed"] == 1
 

@@ -53,7 +53,7 @@ def test_a_sealed_robot_that_comes_back_after_millions_of_packets() -> None:
     one, two = Robot(1, registry(), mode="encrypt"), Robot(2, registry(), mode="encrypt")
     air = Air(one, two)
     air.run(1.0)
-    one.end.window.newest = 5_000_000  # as if it had sent them out of range
+    one.end.window.packets.newest = 5_000_000  # as if it had sent them out of range
     most = 0
     receive = two.receive
 
@@ -125,7 +125,7 @@ def test_a_report_costs_no_more_the_more_was_sent(mode: SealMode) -> None:
     air = Air(one, two)
     air.run(1.0)
     window = one.end.window
-    for number in range(window.newest + 1, 20_000):
+    for number in range(window.packets.newest + 1, 20_000):
         window.sent(number, b"", b"", (), 1.0)
-    lines = [work(lambda: window.report(2, 19_990, 0, settled=True, loss=0.1, now=air.now))[0] for _ in range(2)]
+    lines = [work(lambda: window.peers.report(2, 19_990, 0, settled=True, loss=0.1, now=air.now))[0] for _ in range(2)]
     assert lines[1] < MOST_LINES

@@ -6,6 +6,7 @@ import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
 from gr_ros2.settings.config import SourceConfig, TopicOptions, build
 from gr_ros2.settings.registry import Registry, Topic
@@ -81,9 +82,9 @@ def test_what_a_user_names_is_a_command_and_with_no_name_nothing_is() -> None:
 
 def test_a_lifespan_of_the_publishers_goes_before_the_default() -> None:
     end = robot().end.messages
-    end.follow(0, lifespan_s=2.0)
+    end.follow(0, PublisherQos(lifespan_s=2.0))
     assert end.queue(0) == ("deadline", 2.0)
-    end.follow(0, depth=1)
+    end.follow(0, PublisherQos(depth=1))
     assert end.queue(0) == ("latest", COMMAND_DEADLINE_S)
 
 

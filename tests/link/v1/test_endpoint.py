@@ -9,6 +9,7 @@ import pytest
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.receiving import GIVE_UP_S
 from gr_ros2.link.v1.sealing import SealMode
@@ -221,7 +222,7 @@ def test_an_earlier_map_never_comes_after_a_later_one(hears: bool) -> None:
     one, two = Robot(1, topics, **settings), Robot(2, hears=hears)
     air = Air(one, two, loss=0.2)
     for number in range(3):
-        one.end.messages.follow(1, reliable=True, latched=True, depth=10)
+        one.end.messages.follow(1, PublisherQos(latched=True, depth=10))
         one.end.messages.submit(1, text(number, 300), air.now)
         air.run(20.0)
     assert two.delivered() == [text(number, 300) for number in range(3)]
@@ -243,7 +244,7 @@ def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_kee
     air.run(2.0)
     for number in range(MAX_TOPICS):
         one.end.messages.add([(f"topic_{number}", "std_msgs/msg/String", TopicOptions())])
-        one.end.messages.follow(number, reliable=True, latched=number == 7)
+        one.end.messages.follow(number, PublisherQos(latched=number == 7))
     with pytest.raises(ConfigError, match="241 topics; a link carries at most 240"):
         one.end.messages.add([("one_more", "std_msgs/msg/String", TopicOptions())])
     sent = [text(number) for number in range(MAX_TOPICS)]
@@ -406,7 +407,7 @@ def test_packet_numbers_come_round() -> None:
     assert here == sorted(set(here))
     assert here[-1] == count - 1
     assert len(here) > 0.8 * count
-    assert one.end.window.newest > 65_536
+    assert one.end.window.packets.newest > 65_536
 
 
 def test_a_packet_for_another_robot_is_not_ours() -> None:
@@ -522,7 +523,7 @@ def test_a_robot_without_topics_announces_nothing_until_it_offers_something_and_
     one, two = Robot(1, Registry.empty().with_calls()), Robot(2)
     air = Air(one, two)
     air.run(2.0)
-    assert one.end.messages.digest == 0
+    assert one.end.messages.kept.digest == 0
     one.end.messages.offer(0, offered=True)
     air.run(1.0)
     assert [row.name for row in two.end.topics_of(1).values()] == ["_calls"]

@@ -98,11 +98,11 @@ def test_reports_that_are_lost_for_a_minute() -> None:
     traffic.run(60.0)
     gone = [event for event in one.events if isinstance(event, Gone)]
     assert [event.src_id for event in gone] == [2]
-    assert not one.end.window.reported
+    assert not one.end.window.peers
     first = traffic.count
     air.lost = usual
     traffic.recovers()
-    assert one.end.window.reported
+    assert one.end.window.peers
     assert [event.src_id for event in one.events if isinstance(event, Met)] == [2, 2]
     air.run(2.0)
     assert len(traffic.here()) >= 0.998 * traffic.count

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.link.events import Delivered
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.link.v1.air import Air, Robot
@@ -13,7 +14,7 @@ STRING = "std_msgs/msg/String"
 
 
 def best_effort(robot: Robot) -> Robot:
-    robot.end.messages.follow(0, reliable=False, depth=1)
+    robot.end.messages.follow(0, PublisherQos(reliable=False, depth=1))
     return robot
 
 

@@ -11,7 +11,7 @@ import pytest
 from bench.hostile import GROWTH, Kind, attack
 from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered
-from gr_ros2.link.v1.repair import GROUP
+from gr_ros2.link.v1.lifetime import GROUP
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, write_body
@@ -87,7 +87,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float, m
             sent[topic][payload] = serial
             one.end.messages.submit(topic, payload, now)
             serial += 1
-        newest = one.end.window.newest
+        newest = one.end.window.packets.newest
         if (newest < SHORT and rng.random() < 1 / SHORT) or newest > LONG:
             happened["sender restarted"] += 1
             happened["came round"] += newest > LONG

@@ -9,9 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gr_ros2.link.v1.combining import Repair
 from gr_ros2.link.v1.decoder import RepairDecoder, window_numbers
 from gr_ros2.link.v1.gf256 import combine
-from gr_ros2.link.v1.repair import AHEAD, Lifetime, Repair, RepairMode, RepairWindow, Sent
+from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.link.v1.repair import RepairMode, RepairWindow
+from gr_ros2.link.v1.sent_packets import Sent
+from gr_ros2.link.v1.thrift import AHEAD
 from gr_ros2.wire.v1 import MAX_WINDOW, ROWS
 
 ROOM = 24
@@ -181,49 +185,49 @@ def test_short_messages_are_repaired_beside_a_long_one() -> None:
 
 def test_a_row_is_used_once_per_number() -> None:
     sender = window(count=1)
-    rows = [sender.take_row(1) for _ in range(ROWS)]
+    rows = [sender.packets.take_row(1) for _ in range(ROWS)]
     assert sorted(row for row in rows if row is not None) == list(range(ROWS))
-    assert sender.take_row(1) is None
+    assert sender.packets.take_row(1) is None
     assert sender.next(0.0) is None  # no repair can stand there any more
-    assert sender.take_row(2) is not None
+    assert sender.packets.take_row(2) is not None
 
 
 def test_a_packet_that_one_receiver_lacks_goes_again_as_it_was() -> None:
     sender = window(count=5)
-    sender.report(9, 5, 0b10110, settled=True, loss=0.2, now=0.1)
+    sender.peers.report(9, 5, 0b10110, settled=True, loss=0.2, now=0.1)
     again = [sender.next(0.1), sender.next(0.1)]
     assert [sent.data for sent in again if isinstance(sent, Sent)] == [b"packet 5", b"packet 2"]
     assert isinstance(sender.next(0.1), Repair)  # both may have been lost again
-    sender.report(9, 5, 0b11111, settled=True, loss=0.2, now=0.2)
+    sender.peers.report(9, 5, 0b11111, settled=True, loss=0.2, now=0.2)
     assert sender.next(0.3) is None
 
 
 def test_two_receivers_are_served_by_combinations() -> None:
     sender = window(count=4)
-    sender.meet(8, 0.0)
-    sender.meet(9, 0.0)
-    sender.report(8, 4, 0b1110, settled=True, loss=0.1, now=0.1)
-    sender.report(9, 4, 0b1011, settled=True, loss=0.1, now=0.1)
+    sender.peers.meet(8, 0.0)
+    sender.peers.meet(9, 0.0)
+    sender.peers.report(8, 4, 0b1110, settled=True, loss=0.1, now=0.1)
+    sender.peers.report(9, 4, 0b1011, settled=True, loss=0.1, now=0.1)
     repair = sender.next(0.2)
     assert isinstance(repair, Repair)
     assert {4, 2} <= set(window_numbers(repair.number, repair.mask))
-    sender.report(8, 4, 0b1111, settled=True, loss=0.1, now=0.3)
+    sender.peers.report(8, 4, 0b1111, settled=True, loss=0.1, now=0.3)
     assert sender.next(0.3) is not None
-    sender.forget(9)
+    sender.peers.forget(9)
     assert sender.next(0.4) is None
 
 
 def test_a_report_of_what_was_never_sent_confirms_nothing() -> None:
     sender = window(count=3)
-    sender.report(9, 4, (1 << 64) - 1, settled=True, loss=0.0, now=0.1)
-    assert sender.unconfirmed(0.1)
-    assert not sender.reported
+    sender.peers.report(9, 4, (1 << 64) - 1, settled=True, loss=0.0, now=0.1)
+    assert sender.packets.unconfirmed(0.1)
+    assert not sender.peers
 
 
 def test_a_thrifty_sender_is_silent_without_losses_and_without_doubt() -> None:
     sender = window("thrifty", 5)
     assert sender.next(0.06) is None
-    sender.report(9, 4, 0b1111, settled=True, loss=0.0, now=0.06)
+    sender.peers.report(9, 4, 0b1111, settled=True, loss=0.0, now=0.06)
     assert sender.next(0.07) is None
     assert sender.next(9.0) is not None  # no report for long: the last packet may be lost
     assert sender.next(9.0) is None
@@ -235,7 +239,7 @@ def prompt(count: int, delay: float = 0.01) -> RepairWindow:
     for number in range(1, count + 1):
         at = number / 10
         sender.sent(number, body(number), b"packet %d" % number, (Lifetime(),), at)
-        sender.report(9, number, (1 << 64) - 1, settled=True, loss=0.2, now=at + delay)
+        sender.peers.report(9, number, (1 << 64) - 1, settled=True, loss=0.2, now=at + delay)
     return sender
 
 
@@ -244,17 +248,17 @@ def test_a_report_that_does_not_come_is_noticed_when_it_is_overdue() -> None:
     sender.sent(5, body(5), b"packet 5", (Lifetime(),), 0.5)
     assert isinstance(sender.next(0.5), Repair), "ahead of any report"
     assert sender.next(0.5) is None
-    overdue = sender.next_doubt(0.5)
+    overdue = sender.thrift.next_doubt(0.5)
     assert overdue == pytest.approx(0.51)
     assert sender.next(0.509) is None
     repair = sender.next(overdue + 1e-6)
     assert isinstance(repair, Repair)
     assert window_numbers(repair.number, repair.mask) == [5]
     assert sender.next(overdue + 2e-6) is None  # until the repair is overdue too
-    again = sender.next_doubt(overdue + 2e-6)
+    again = sender.thrift.next_doubt(overdue + 2e-6)
     assert again == pytest.approx(0.52, abs=1e-4)
     assert sender.next(again + 1e-6) is not None
-    sender.report(9, 5, (1 << 64) - 1, settled=True, loss=0.2, now=0.53)
+    sender.peers.report(9, 5, (1 << 64) - 1, settled=True, loss=0.2, now=0.53)
     assert sender.next(0.53) is None
 
 
@@ -266,7 +270,7 @@ def test_repairs_that_no_report_calls_for_are_few(loss: float) -> None:
         sender.sent(number, body(number), b"packet %d" % number, (Lifetime(),), at)
         while sender.next(at) is not None:
             ahead += 1
-        sender.report(9, number, (1 << 64) - 1, settled=True, loss=loss, now=at + 0.01)
+        sender.peers.report(9, number, (1 << 64) - 1, settled=True, loss=loss, now=at + 0.01)
     most = AHEAD * loss / (1 - loss) ** 3 * count
     assert 0.9 * most <= ahead <= most + 2
 
@@ -281,9 +285,9 @@ def test_the_delay_of_a_report_is_not_measured_on_what_was_repaired() -> None:
     sender = prompt(4)
     sender.sent(5, body(5), b"packet 5", (Lifetime(),), 0.5)
     assert sender.next(0.52) is not None
-    sender.report(9, 5, (1 << 64) - 1, settled=True, loss=0.2, now=0.7)
+    sender.peers.report(9, 5, (1 << 64) - 1, settled=True, loss=0.2, now=0.7)
     sender.sent(6, body(6), b"packet 6", (Lifetime(),), 0.8)
-    assert sender.next_doubt(0.8) < 0.82
+    assert sender.thrift.next_doubt(0.8) < 0.82
 
 
 def test_a_receiver_that_waits_for_what_is_over_is_told_so_by_a_repair() -> None:
@@ -292,16 +296,16 @@ def test_a_receiver_that_waits_for_what_is_over_is_told_so_by_a_repair() -> None
     sender.sent(1, b"gone", b"packet 1", (gone,), 0.0)
     sender.sent(2, b"here", b"packet 2", (Lifetime(),), 0.1)
     gone.end()
-    sender.report(9, 2, (1 << 64) - 1 ^ 0b11, settled=False, loss=0.0, now=0.1)
-    sender.report(9, 2, (1 << 64) - 1 ^ 0b10, settled=False, loss=0.0, now=0.2)
+    sender.peers.report(9, 2, (1 << 64) - 1 ^ 0b11, settled=False, loss=0.0, now=0.1)
+    sender.peers.report(9, 2, (1 << 64) - 1 ^ 0b10, settled=False, loss=0.0, now=0.2)
     assert sender.next(0.2) is None  # all that is alive has arrived: there is nothing to combine
     sender.sent(3, b"new", b"packet 3", (Lifetime(),), 0.3)
-    assert sender.over(0.3) == 1
+    assert sender.peers.over(0.3) == 1
     repair = sender.tell(1, 0.3)
     assert isinstance(repair, Repair)
-    assert sender.over(0.3) == -1
+    assert sender.peers.over(0.3) == -1
     assert (window_numbers(repair.number, repair.mask), repair.oldest) == ([3], True)
-    sender.report(9, 3, (1 << 64) - 1, settled=True, loss=0.0, now=0.4)
+    sender.peers.report(9, 3, (1 << 64) - 1, settled=True, loss=0.0, now=0.4)
     assert sender.next(0.4) is None
 
 

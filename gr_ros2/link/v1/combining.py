@@ -1,0 +1,155 @@
+"""Which packets a repair combines.
+
+A combination is of the newest live packets, up to ``GROUP``. If more packets are alive, it is taken from windows of 127
+numbers, which move over all of them and overlap. With one live packet this is repetition, which is age-optimal. Windows
+that overlap even out the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on
+average, and after 1.36 times as many in separate groups of 64.
+
+Invariant: no two repairs of the same packets have the same coefficients.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import NamedTuple
+
+from gr_ros2.link.v1.gf256 import combine
+from gr_ros2.link.v1.lifetime import GROUP
+from gr_ros2.link.v1.sent_packets import Sent, SentPackets
+from gr_ros2.wire.v1 import MAX_WINDOW
+
+TURN = 3
+"""While a long message is alive, one repair in this many is for short messages."""
+_GOLDEN = (5**0.5 - 1) / 2
+
+
+class Repair(NamedTuple):
+    """A combination to be sent.
+
+    :param number: the newest number of its window
+    :param mask: bit i says that packet ``number - i`` is part of it
+    :param row: row of its coefficients
+    :param oldest: no packet older than the window is alive
+    """
+
+    number: int
+    mask: int
+    row: int
+    oldest: bool
+    combined: bytes
+
+
+class Combining:
+    """The choice of what is combined. A window is the packets to combine, newest first.
+
+    :param room: bytes of the longest body
+    """
+
+    def __init__(self, packets: SentPackets, room: int) -> None:
+        self._packets = packets
+        self._room = room
+        self._turn = 0
+        self._place = 0.0
+
+    def window(self, now: float) -> list[Sent]:
+        """The next window."""
+        found: list[Sent] = []
+        everybody = self._packets.everybody
+        before = -1
+        for record in reversed(self._packets.records.values()):
+            if record.number <= before:
+                break
+            if everybody and record.confirmed & everybody == everybody:
+                continue
+            for lifetime in record.lifetimes:  # ``alive``, whose call would take half of this loop's time
+                if now < lifetime.expires:
+                    break
+            else:
+                continue
+            if not found:
+                before = record.number - MAX_WINDOW
+            found.append(record)
+            if len(found) == GROUP:
+                break
+        if not self._packets.many(now):
+            return found
+        # A long message must not delay the repair of short ones, and short ones must not prevent that of a long one.
+        self._turn += 1
+        counts = Counter(lifetime for record in found for lifetime in record.lifetimes)
+        longest = max(counts, key=lambda lifetime: counts[lifetime])
+        short = [record for record in found if record.lifetimes != (longest,)]
+        if short and self._turn % TURN == 0:
+            return short
+        return self.in_turn(now)
+
+    def newest(self, now: float) -> list[Sent]:
+        """The window of the newest numbers."""
+        packets = self._packets
+        return list(packets.live(max(packets.oldest, packets.newest - MAX_WINDOW + 1), packets.newest, now))[::-1]
+
+    def around(self, number: int, now: float) -> list[Sent]:
+        """The window around a number; only the oldest packet if all are newer."""
+        packets = self._packets
+        if number < packets.oldest:
+            return list(packets.live(packets.oldest, packets.oldest, now))
+        half = MAX_WINDOW // 2
+        first, last = max(number - half, packets.oldest), min(number + half, packets.newest)
+        return list(packets.live(first, last, now))[::-1]
+
+    def in_turn(self, now: float) -> list[Sent]:
+        """The next of the windows over all live packets.
+
+        The positions of the windows follow the golden section, which spreads any number of them evenly. Windows that
+        would reach beyond the ends are moved to the ends, so that the packets there are in as many windows as others.
+        """
+        packets = self._packets
+        self._place = (self._place + _GOLDEN) % 1
+        span = packets.newest - packets.oldest + 1
+        first = packets.oldest + min(max(int(self._place * span) - MAX_WINDOW // 2, 0), max(span - MAX_WINDOW, 0))
+        found = list(packets.live(first, min(first + MAX_WINDOW - 1, packets.newest), now))
+        if not found:  # no live packet there: continue at the next live one
+            for record in packets.live(first, packets.newest, now):
+                last = min(record.number + MAX_WINDOW - 1, packets.newest)
+                found = list(packets.live(record.number, last, now))
+                break
+        return found[::-1]
+
+    def combine(self, window: list[Sent], proven: int) -> tuple[Repair, list[Sent]] | None:
+        """The combination of a window, and the packets that it combines: all in its span if a mask does not fit beside
+        the bodies. None if none can be sent.
+
+        :param proven: it must stand at a later number
+        """
+        window = self._anchored(window, proven)
+        if not window:
+            return None
+        packets = self._packets
+        newest, first = window[0].number, window[-1].number
+        size = newest - first + 1
+        if len(window) < size:
+            longest = max(len(record.body) for record in window)
+            if longest + (size + 7) // 8 > self._room:
+                window = [packets.records[number] for number in range(newest, first - 1, -1)]
+        full = len(window) == size
+        mask = (1 << size) - 1 if full else sum(1 << newest - record.number for record in window)
+        row = packets.take_row(newest)
+        assert row is not None
+        combined = combine([(record.number, record.body) for record in window], row)
+        return Repair(newest, mask, row, first == packets.oldest, combined), window
+
+    def _anchored(self, window: list[Sent], proven: int) -> list[Sent]:
+        """The window, changed so that a repair can stand at its newest packet.
+
+        A later packet is added, or the newest ones are left out.
+        """
+        packets = self._packets
+        newest = window[0].number
+        if not packets.full(newest) and newest > proven:
+            return window
+        for number in range(max(newest, proven) + 1, min(packets.newest, window[-1].number + MAX_WINDOW - 1) + 1):
+            record = packets.records.get(number)
+            if record is not None and not packets.full(number):
+                return [record, *window]
+        while window and packets.full(window[0].number):
+            window = window[1:]
+        return window if window and window[0].number > proven else []

@@ -1,0 +1,194 @@
+"""What of the waiting messages goes into the next packet.
+
+*Order.* Messages of class latency go first, then default, then bulk. Within a class, messages of more than ``LONG``
+packets go last. Of the others the message with the largest value per byte sent goes first, ``weight * g^2 / c`` (see
+``freshness``). Every ``TURN``-th packet begins with the topic
+whose last turn is longest ago, so that no topic starves.
+
+*Fragments.* A message that fits goes whole. A fragment that is not the last one fills its packet. Its size follows from
+the free bytes of the packet; it is not fixed beforehand.
+
+Invariant: the messages of a topic begin one after the other, each after the one before has left whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
+from math import inf
+
+from gr_ros2.link.events import SentEntry
+from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v1.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
+from gr_ros2.link.v1.key import Key
+from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.link.v1.sent_topics import SentTopics
+from gr_ros2.wire import QOS_LATENCY
+from gr_ros2.wire.v1 import EntryV1, Part, fit
+
+SHARE = 2
+"""A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
+lost with any of them. With smaller fragments (3), the scans of ``six-topics-paced`` are 3 % younger without loss, and
+16 % older at 20 % loss. A message of class latency uses any space that is free from ``MIN_FRAGMENT`` bytes on."""
+MIN_FRAGMENT = 16
+LONG = 64
+"""A message of more packets goes after all others of its class, into the room that these leave. Odometry at 35 Hz
+beside 1 MB is then 1.05 times as old as without it; by value alone 1.4 times, because the last 60 kB go before it."""
+ENTRY = 3
+"""Bytes that an entry takes beside its payload, at least."""
+
+
+@dataclass(slots=True, eq=False)
+class Message(Outgoing):
+    """A message to be sent. ``begin``: packet in which it began; ``place``: its place among the entries there."""
+
+    lifetime: Lifetime = field(default_factory=Lifetime)
+    begin: int = 0
+    place: int = 0
+    coded: bool = False
+
+
+@dataclass(slots=True)
+class Filling:
+    """The content of a source packet."""
+
+    parts: list[EntryV1]
+    sent: tuple[SentEntry, ...]
+    lifetimes: tuple[Lifetime, ...]
+    qos: int
+    used: int
+    since: float
+    """When the first of its messages that no ``max_rate`` holds back was submitted, s; infinite if there is none."""
+
+
+class Packing:
+    """The choice of what goes into a packet.
+
+    :param boot: boot number of this start, for keys
+    :param room: bytes of the longest body
+    :param left: called with a message that has left whole, before its lifetime may end with the next one
+    :ivar turns: whose turn it is
+    """
+
+    def __init__(
+        self, topics: SentTopics, stats: SenderStats, left: Callable[[Message, float], None], *, boot: int, room: int
+    ) -> None:
+        self.turns = Turns()
+        self._topics, self._stats, self._left = topics, stats, left
+        self._boot = boot
+        self._room = room
+        self._open: dict[int, Sequence[Outgoing]] = {}
+        """Messages that may continue or start now, by topic."""
+        self._holder = -1
+
+    def fill(self, number: int, room: int, now: float) -> Filling | None:
+        """Take what goes into the next source packet.
+
+        :param number: number of that packet
+        :param room: bytes that its body may have
+        :return: None if nothing may be sent
+        """
+        heap = self._heap(now)
+        if not heap:
+            return None
+        picks: list[tuple[Message, int]] = []
+        used = 0
+        while heap and used < room:
+            _, _, topic_id, position = heappop(heap)
+            queue = self._open[topic_id]
+            message = queue[position]
+            assert isinstance(message, Message)
+            remaining = message.remaining
+            taken, size = fit(room - used, remaining, number - message.begin, message.offset)
+            if taken < 0 or not (taken == remaining or _may_cut(message, taken, used, room)):
+                continue
+            picks.append((message, taken))
+            used += size
+            if taken == remaining and position + 1 < len(queue):
+                following = queue[position + 1]
+                worth = value(following, message.submitted, ENTRY)
+                heappush(heap, (self._rank(following), -worth, topic_id, position + 1))
+        if not picks:
+            return None
+        return self._take(picks, number, used, now)
+
+    def next_timeout(self, now: float) -> float | None:
+        """When ``fill`` may have something; None if nothing waits."""
+        times = [
+            opens if (opens := topic.queue.opens(now)) < inf else now for topic in self._topics.values() if topic.queue
+        ]
+        return min(times) if times else None
+
+    @property
+    def urgent(self) -> bool:
+        """Whether a message of class latency waits. The table of topics does not count: it follows a hello."""
+        return any(topic.queue and topic.queue[0].qos == QOS_LATENCY for topic in self._topics.named())
+
+    def _rank(self, message: Outgoing) -> float:
+        return RANK[message.qos] + 0.5 * self._long(message)
+
+    def _long(self, message: Outgoing) -> bool:
+        return len(message.payload) > LONG * self._room
+
+    def _heap(self, now: float) -> list[tuple[float, float, int, int]]:
+        """Topics that may send, the most urgent and most valuable first."""
+        self._open = {}
+        for topic_id, topic in self._topics.items():
+            if topic.queue and (ready := topic.queue.open(now)):
+                self._open[topic_id] = ready
+        heap: list[tuple[float, float, int, int]] = []
+        if not self._open:
+            return heap
+        holder = self._holder = self.turns.holder(self._open)
+        for topic_id, ready in self._open.items():
+            head, before = ready[0], self._topics[topic_id].newest
+            worth = value(head, before if before > -inf else head.submitted - FIRST_AGE_S, ENTRY)
+            rank = self._rank(head)
+            heap.append((-1 if rank and topic_id == holder else rank, -worth, topic_id, 0))
+        heapify(heap)
+        return heap
+
+    def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
+        parts: list[EntryV1] = []
+        sent: list[SentEntry] = []
+        lifetimes: list[Lifetime] = []
+        stats, qos = self._stats, picks[0][0].qos
+        for place, (message, taken) in enumerate(picks):
+            topic_id, offset, lifetime = message.topic_id, message.offset, message.lifetime
+            topic = self._topics[topic_id]
+            if not message.index:
+                message.begin, message.place = number, place
+                lifetime.expires = message.expires
+                lifetime.in_order, lifetime.long = topic.in_order, self._long(message)
+                topic.queue.started(now)
+            lifetime.awaited = len(topic.queue) > 1
+            payload = message.take(taken)
+            last, begin = message.offset == len(message.payload), message.begin
+            parts.append(Part(topic_id, payload, number - begin if offset else 0, offset, last, message.coded))
+            key = Key(self._boot, begin, message.place)
+            total = message.index if last else 0
+            sent.append(SentEntry(message.serial, topic_id, key, message.index - 1, total, message.repeat))
+            lifetimes.append(lifetime)
+            if RANK[message.qos] < RANK[qos]:
+                qos = message.qos
+            stats.payload_bytes += taken
+            if last:
+                topic.queue.popleft()
+                topic.newest = max(topic.newest, message.submitted)
+                stats.sent[topic_id] += not message.repeat
+                self._left(message, now)
+        self.turns.sent(self._holder)
+        stats.entries += len(picks)
+        free = (message.submitted for message, _ in picks if not self._topics[message.topic_id].topic.options.max_rate)
+        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, min(free, default=inf))
+
+
+def _may_cut(message: Message, taken: int, used: int, room: int) -> bool:
+    """Whether a fragment of this many bytes is worth its header."""
+    if not used:
+        return True
+    if taken < (MIN_FRAGMENT if message.qos == 1 else room // SHARE):
+        return False
+    return message.started or message.qos == 1 or message.remaining > LARGE * room

@@ -1,0 +1,260 @@
+"""What the reports of other robots tell: which packets each of them has, lacks, or waits for in vain.
+
+Invariant: what is told about a packet that was never sent changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from math import inf
+
+from gr_ros2.link.v1.sent_packets import Sent, SentPackets
+from gr_ros2.link.v1.unreported import Unreported
+
+START = 64
+"""If a robot is first heard within this number of packets of its start, its packets count from its start on."""
+MAP = 64
+"""Number of packets that a report covers."""
+PROMPT = 1 / 64
+"""Share of packets lost from which on a peer reports every packet at once, if that takes no slot from anything. The
+sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
+_DELAYS = 16
+_TIMES = 512
+_INTERVAL_S = 0.1
+"""s between two reports of a peer, until its reports tell. With 0, a sender repairs packets before the first report can
+come: three of 141 on ``paper-ofdm-paced`` without losses."""
+_SOON = 2
+"""Mean times between two new packets within which a report must come to be waited for."""
+
+
+@dataclass(slots=True, eq=False)
+class Peer:
+    """What is known from the reports of one peer."""
+
+    bit: int
+    heard: float
+    loss: float = 0.0
+    newest: int = -1
+    proven: int = 0
+    """It may take packets up to this number for replays. A combination that stands at a later one brings them back."""
+    settled: int = 0
+    """It needs no packet before this number."""
+    interval: float = _INTERVAL_S
+    """Mean time in s between its reports."""
+    prompt: bool = False
+    """Whether it reports every packet, so soon that it is better to wait for a report than to expect losses."""
+    waits: int = -1
+    """The oldest packet that the last report misses and that the sender does not repair any more; -1 for none."""
+    waits_since: float = inf
+    """Time in s since which reports miss such packets."""
+    delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+    answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
+    """Times in s from the departure of packets that were sent once to the report that covers them."""
+    lost: set[int] = field(default_factory=set)
+
+    @property
+    def delay(self) -> float:
+        """Shortest time in s from a packet's departure to the report that covers it."""
+        return min(self.delays) if self.delays else 0.0
+
+    @property
+    def answer(self) -> float:
+        """Time in s after which a report about a packet is to be expected."""
+        return max(self.answers) if self.prompt else self.delay + self.interval
+
+    @property
+    def patience(self) -> float:
+        """Time in s after which a packet that no report covers counts as lost, with ``doubt``."""
+        return self.answer if self.prompt else 2 * self.answer
+
+    @property
+    def doubt(self) -> float:
+        """Probability that a packet is lost if its report does not come: it or the report was lost."""
+        return 1 / (2 - self.loss) if self.prompt else max(self.loss, 0.5)
+
+
+class Peers:
+    """The robots that report what they have of one sender's packets.
+
+    :param packets: the packets that they confirm
+    :param unreported: what holds while there are none
+    :ivar all: the peers, by robot id
+    :ivar loss: share of packets that the peer with the most losses loses, as far as it is known or expected
+    :ivar proven: some peer may take packets up to this number for replays
+    :ivar in_vain: whether a peer waits for a packet in vain
+    :ivar once: the newest packets that were neither sent again nor combined: what a report says arrived when it was
+        sent
+    """
+
+    def __init__(self, packets: SentPackets, unreported: Unreported) -> None:
+        self.all: dict[int, Peer] = {}
+        self.loss = unreported.loss
+        self.proven = 0
+        self.in_vain = False
+        self.once: set[int] = set()
+        self._packets, self._unreported = packets, unreported
+        self._resend: list[int] = []
+        """Negated numbers of the packets that the only peer lacks."""
+        self._urgent: list[tuple[bool, int]] = []
+        """The packets that some peer lacks and for which later messages wait: whether all in it are long, and its
+        number."""
+        self._times: dict[int, float] = {}
+        """When the newest packets left, s."""
+        self._period = 0.0
+        """Mean time between two of them, s."""
+
+    def __bool__(self) -> bool:
+        """Whether any peer reports."""
+        return bool(self.all)
+
+    def sent(self, number: int, now: float) -> None:
+        """A source packet leaves, after ``SentPackets.newest``."""
+        before = self._times.get(self._packets.newest)
+        if before is not None:
+            self._period += (now - before - self._period) / 8
+        self._times[number] = now
+        self._times.pop(number - _TIMES, None)
+        self.once.add(number)
+        self.once.discard(number - _TIMES)
+
+    def meet(self, src_id: int, now: float) -> Peer:
+        """A peer that reports is known; from now on, a packet is confirmed only after this one confirmed it too."""
+        self._unreported.over()
+        peer = self.all.get(src_id)
+        if peer is None:
+            free = next(bit for bit in range(256) if not self._packets.everybody >> bit & 1)
+            peer = self.all[src_id] = Peer(1 << free, now)
+            self._packets.everybody |= peer.bit
+            self._note()
+        return peer
+
+    def forget(self, src_id: int) -> None:
+        """A peer is gone."""
+        peer = self.all.pop(src_id, None)
+        if peer is not None:
+            self._note()
+            self._packets.forget(peer.bit)
+
+    def prove(self, src_id: int, number: int) -> None:
+        """A peer is told that packets above a number were sealed after it had started."""
+        peer = self.all.get(src_id)
+        if peer is not None and peer.newest < 0:  # a report shows that it knows
+            peer.proven = number
+            if number <= START:
+                records = self._packets.records
+                peer.lost.update(older for older, record in records.items() if older <= number and record.lifetimes)
+            self._note()
+
+    def report(self, src_id: int, number: int, arrived: int, *, settled: bool, loss: float, now: float) -> None:
+        """A peer says what it has.
+
+        :param number: newest number that the report covers
+        :param arrived: bit i says that the peer has ``number - i``
+        :param settled: the peer needs no packet older than those 64
+        :param loss: recent share of packets that it lost
+        """
+        if number > self._packets.newest:
+            return
+        peer = self.meet(src_id, now)
+        self._note_times(peer, number, loss, now)
+        records, bit, delay = self._packets.records, peer.bit, peer.delay
+        peer.waits = -1
+        for back in range(MAP):
+            record = records.get(number - back)
+            if arrived >> back & 1:
+                if record is not None:
+                    record.confirmed |= bit
+                    peer.lost.discard(record.number)
+            elif record is None or not record.alive(now):
+                if number > back:
+                    peer.waits = number - back
+            elif record.confirmed & bit:
+                continue
+            elif now - record.at >= delay and record.number not in peer.lost:
+                peer.lost.add(record.number)
+                heappush(self._resend, -record.number)
+                if any(lifetime.in_order for lifetime in record.lifetimes):
+                    heappush(self._urgent, (all(lifetime.long for lifetime in record.lifetimes), record.number))
+        peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
+        self._note()
+        if settled:
+            for older in range(max(self._packets.oldest, peer.settled), number - MAP + 1):
+                record = records.get(older)
+                if record is not None:
+                    record.confirmed |= bit
+                    peer.lost.discard(older)
+            peer.settled = max(peer.settled, number - MAP + 1)
+        self._packets.retire(now)
+
+    @property
+    def urges(self) -> bool:
+        """Whether ``urgent`` may have something."""
+        return bool(self._urgent)
+
+    def urgent(self, now: float) -> Sent | None:
+        """The oldest packet that a report names as lost and for which later messages wait; packets of long messages go
+        after others. It is returned once."""
+        while self._urgent:
+            _, number = heappop(self._urgent)
+            record = self._packets.records.get(number)
+            lacking = [peer for peer in self.all.values() if number in peer.lost]
+            if record is None or not lacking or not record.alive(now):
+                continue
+            for peer in lacking:
+                peer.lost.discard(number)
+            return record
+        return None
+
+    def lost(self, now: float) -> Sent | None:
+        """The newest live packet that the only peer lacks and that has not been sent again since."""
+        if not self._resend or len(self.all) != 1:
+            return None
+        (peer,) = self.all.values()
+        while self._resend:
+            number = -heappop(self._resend)
+            record = self._packets.records.get(number)
+            if number in peer.lost and number > peer.proven:
+                peer.lost.discard(number)
+                if record is not None and not record.confirmed & peer.bit and record.alive(now):
+                    return record
+        return None
+
+    def lack(self, packets: list[Sent]) -> bool:
+        """Whether a report names one of these packets as lost."""
+        return any(record.number in peer.lost for peer in self.all.values() if peer.lost for record in packets)
+
+    def over(self, now: float, patience_s: float = 0.0) -> int:
+        """The oldest packet that a peer has waited for longer than so many s in vain: it is not repaired any more.
+        -1 for none."""
+        if not self.in_vain:
+            return -1
+        waits = [p.waits for p in self.all.values() if p.waits >= 0 and p.waits_since + patience_s <= now]
+        return min(waits, default=-1)
+
+    def told(self) -> None:
+        """The peers are told that what they wait for is not repaired any more."""
+        for peer in self.all.values():
+            peer.waits, peer.waits_since = -1, inf
+        self.in_vain = False
+
+    def _note(self) -> None:
+        """Take together what is known of the peers; every new packet asks for that."""
+        peers = self.all.values()
+        self.proven = max((peer.proven for peer in peers), default=0)
+        self.in_vain = any(peer.waits >= 0 for peer in peers)
+        self.loss = max((peer.loss for peer in peers), default=self._unreported.loss)
+
+    def _note_times(self, peer: Peer, number: int, loss: float, now: float) -> None:
+        """Note how often and how soon a peer reports."""
+        peer.interval += (now - peer.heard - peer.interval) / 8
+        peer.heard, peer.loss = now, loss
+        sent_at = self._times.get(number)
+        if sent_at is not None and number >= peer.newest:
+            peer.delays.append(now - sent_at)
+            if loss >= PROMPT and number > peer.newest and number in self.once:
+                peer.answers.append(now - sent_at)
+        peer.newest = max(peer.newest, number)
+        soon = bool(peer.answers) and max(peer.answers) <= _SOON * self._period
+        peer.prompt = loss >= PROMPT and soon

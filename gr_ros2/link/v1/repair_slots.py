@@ -1,0 +1,110 @@
+"""When repairs leave: before new messages, in a slot that nothing else needs, or later because a message is due.
+
+Which repair it is says ``repair``.
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+from gr_ros2.link.events import SentPacket
+from gr_ros2.link.pace import Pace
+from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.hold import Hold
+from gr_ros2.link.v1.repair import RepairMode, RepairWindow
+from gr_ros2.link.v1.writer import PacketWriter
+from gr_ros2.settings.fields import AUTO
+
+PATIENCE_S = 0.2
+"""s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
+_POLL_S, _CALM_POLL_S = 0.02, 0.1
+"""s after which a thrifty sender that is in doubt checks again; the second one while no receiver loses packets."""
+
+
+class RepairSlots:
+    """The slots of one sender that carry repairs."""
+
+    def __init__(
+        self, settings: Settings, pace: Pace, window: RepairWindow, *, writer: PacketWriter, hold: Hold
+    ) -> None:
+        self._setting = settings.repair
+        self._pace, self._window, self._writer, self._hold = pace, window, writer, hold
+        self._repair_at = -inf
+        """Time in s up to which repairs wait, because a new message is about to come."""
+        self._calm_since = inf
+        """Time in s at which no repair was wanted, if no report has come since; otherwise infinite."""
+        self._calm_number = 0
+        """The newest packet then."""
+
+    @property
+    def mode(self) -> RepairMode:
+        """What idle slots carry."""
+        mode, reported = self._setting, bool(self._window.peers)
+        if not self._pace.known:  # nothing limits how many packets leave: repair only what reports call for
+            return "thrifty" if mode != "off" and reported else "off"
+        if mode != AUTO:
+            return mode
+        return "thrifty" if reported else "idle"
+
+    def received(self) -> None:
+        """Something has been received: what waits to be repaired is looked at again."""
+        self._repair_at = -inf
+
+    def reported(self) -> None:
+        """A report has come."""
+        self._calm_since = inf
+
+    def first(self, now: float) -> SentPacket | None:
+        """What goes before new messages: what a receiver lacks or waits for in vain, so that later messages wait."""
+        self._window.mode = self.mode
+        again = self._window.urgent(now)
+        if again is not None:
+            return self._writer.repair(again, now)
+        over = self._window.peers.over(now, PATIENCE_S)
+        return self._tell(over, now) if over >= 0 else None
+
+    def spare(self, now: float) -> SentPacket | None:
+        """What a slot carries that nothing else needs."""
+        self._window.mode = self.mode
+        over = self._window.peers.over(now)
+        return self._repair(now) if over < 0 else self._tell(over, now)
+
+    def next(self, now: float) -> float:
+        """When ``spare`` may have something, s; inf for never."""
+        if self.mode == "off" or not self._window.packets.unconfirmed(now):
+            return inf
+        return max(self._repair_at, now if self.mode == "idle" else self._next_look(now))
+
+    def _tell(self, number: int, now: float) -> SentPacket | None:
+        """Say that a packet is not repaired any more."""
+        repair = self._window.tell(number, now)
+        if repair is not None:
+            return self._writer.repair(repair, now)
+        return None if self._window.packets.unconfirmed(now) else self._writer.control([], "repair", now)
+
+    def _repair(self, now: float) -> SentPacket | None:
+        self._repair_at = -inf
+        chosen = self._window.next(now, self._held)
+        held = self._repair_at > now
+        self._calm_since = now if chosen is None and not held else inf
+        self._calm_number = self._window.packets.newest
+        if chosen is not None:
+            self._hold.repaired(waiting=held)
+            return self._writer.repair(chosen, now)
+        lifetimes = () if held else self._window.exhausted(now)
+        return self._writer.source([], lifetimes, 0, (), now) if lifetimes else None
+
+    def _next_look(self, now: float) -> float:
+        """When a thrifty sender may want to repair something."""
+        window = self._window
+        if not window.peers.loss:
+            return min(now + _CALM_POLL_S, window.thrift.next_doubt(now))
+        if self._calm_since == inf or window.packets.newest != self._calm_number:
+            return now
+        return min(now + _POLL_S, window.thrift.next_doubt(self._calm_since))
+
+    def _held(self, now: float) -> bool:
+        """Whether a repair that could leave now waits for a new message."""
+        airtime = self._pace.interval
+        self._repair_at = self._hold.until(now, self._pace.free(now) + airtime, airtime)
+        return self._repair_at > now

@@ -1,0 +1,144 @@
+"""The topics that a robot sends, and the table in which it announces them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from math import inf
+
+from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
+from gr_ros2.link.v1.lifetime import Lifetimes
+from gr_ros2.settings.commands import is_command
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import CALLS_TYPE, Topic
+from gr_ros2.wire.table import AnnouncedTopic
+from gr_ros2.wire.v1 import TABLE_TOPIC
+
+
+@dataclass(slots=True, eq=False)
+class SentTopic:
+    """One topic, or the table of topics.
+
+    :param qos: QoS class of its messages
+    :param latched: whether its newest messages are kept for robots that join late, however old they are
+    :param hidden: whether the table leaves it out: a service whose server is not there
+    :param command: whether its messages are commands
+    :param publishers: the QoS that its publishers offer
+    :param newest: when the newest of its messages that have left was submitted, s
+    :param lifetimes: its messages that have left
+    """
+
+    topic: Topic
+    queue: TopicQueue
+    qos: int
+    weight: float
+    latched: bool
+    hidden: bool = False
+    command: bool = False
+    publishers: PublisherQos = UNKNOWN_QOS
+    newest: float = -inf
+    lifetimes: Lifetimes = field(default_factory=Lifetimes)
+
+    @property
+    def kept(self) -> bool:
+        """Whether its newest messages are kept for robots that lack them."""
+        return self.latched or self.topic.options.keep_s > 0
+
+    @property
+    def is_stream(self) -> bool:
+        """Whether its messages are useless when newer ones have come, should the computer be too slow for all."""
+        return self.topic.is_topic and not self.kept and not self.topic.options.max_rate
+
+    @property
+    def kept_depth(self) -> int:
+        """How many messages late robots and late subscribers get.
+
+        One, unless the topic's options say otherwise: where the graph does not tell the depth of a map's publisher, an
+        earlier map would come out after the newest one.
+        """
+        depth = self.topic.options.depth
+        return 1 if depth == AUTO else depth
+
+    @property
+    def in_order(self) -> bool:
+        """Whether its messages are delivered in order, each after all earlier ones."""
+        wanted = self.topic.options.reliability
+        reliable = self.publishers.reliable if wanted == AUTO else wanted == "reliable"
+        return reliable and self.queue.policy != "latest"
+
+    def follow(self, publishers: PublisherQos) -> None:
+        """Adapt to the QoS of its publishers, where the configuration leaves it open."""
+        topic, self.publishers = self.topic, publishers
+        self.latched = topic.latched or (publishers.latched and topic.options.durability == AUTO)
+        self.queue.change(*queue_for(topic.options, publishers, command=self.command))
+
+    def announced(self, codec: str) -> AnnouncedTopic:
+        """Its row in the table.
+
+        :param codec: what the codec says of it
+        """
+        topic, options = self.topic, self.topic.options
+        depth = self.publishers.depth if options.depth == AUTO else options.depth
+        fresh = self.queue.deadline_s > 0 or topic.type_name == CALLS_TYPE
+        if options.max_age_s != AUTO:
+            fresh = options.max_age_s > 0
+        return AnnouncedTopic(
+            topic.topic_id,
+            topic.name,
+            topic.type_name,
+            self.qos,
+            self.in_order,
+            self.kept,
+            min(self.kept_depth if self.kept else depth, 255),
+            codec,
+            fresh,
+        )
+
+
+class SentTopics(dict[int, SentTopic]):
+    """The topics of one robot by id, with the table of topics if there are any.
+
+    :param codec: codes their messages
+    :param commands: types and names of topics whose messages are commands
+    :ivar deadlines: the queues whose messages may be too late
+    """
+
+    def __init__(self, codec: MessageCodec | None, commands: Sequence[str]) -> None:
+        super().__init__()
+        self._codec, self._commands = codec, commands
+        self.deadlines: list[TopicQueue] = []
+
+    def add(self, topics: Sequence[Topic]) -> None:
+        """Send these topics too."""
+        for topic in topics:
+            options = topic.options
+            command = is_command(topic.name, topic.type_name, self._commands)
+            queue = TopicQueue(*queue_for(options, command=command), options.max_rate)
+            qos, hidden = qos_class(options, command=command), not topic.is_topic
+            self[topic.topic_id] = SentTopic(
+                topic, queue, qos, options.weight, topic.latched, hidden=hidden, command=command
+            )
+        if TABLE_TOPIC not in self:
+            table = Topic(TABLE_TOPIC, "", "")
+            self[TABLE_TOPIC] = SentTopic(
+                table, TopicQueue("latest"), qos_class(table.options), table.options.weight, table.latched
+            )
+        self.find_deadlines()
+
+    def find_deadlines(self) -> None:
+        """Note which queues have a deadline."""
+        self.deadlines = [topic.queue for topic in self.values() if topic.queue.deadline_s]
+
+    def named(self) -> Iterator[SentTopic]:
+        """All topics, without the table of topics."""
+        return (topic for topic_id, topic in self.items() if topic_id != TABLE_TOPIC)
+
+    def table(self) -> list[AnnouncedTopic]:
+        """The rows of the table of topics."""
+        codec = self._codec
+        return [
+            topic.announced("" if codec is None else codec.announcement(topic.topic.topic_id))
+            for topic in self.named()
+            if not topic.hidden
+        ]

@@ -1,0 +1,92 @@
+"""When a repair is worth its slot: more packets are missing, or expected to be missing, than repairs are on their way.
+
+A peer that loses packets reports every packet at once if that takes no slot from anything. The sender then knows when a
+report is overdue: the packet or its report was lost, and a repair is due. From other peers, whose reports are rare or
+take long, it cannot know that so soon: it sends about as many repairs as losses are to be expected, before a report
+names them. Where reports come at once, the sender may also repair before it knows of a loss, as often as ``AHEAD``
+allows: a message that waits for a repair delays all later ones of its topic.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf
+
+from gr_ros2.link.v1.lifetime import GROUP
+from gr_ros2.link.v1.peers import Peers
+from gr_ros2.link.v1.sent_packets import Sent, SentPackets
+from gr_ros2.link.v1.unreported import MOST_LOSS
+
+AHEAD = 1.2
+"""Most repairs per new packet that are sent before a report calls for them, divided by ``loss / (1 - loss)^3``: a
+packet, its repair and the report that would call for another one are all lost with that probability. Without them,
+odometry in order is 9.5 % older (± 2.6 %) at 20 % loss, for 5 % fewer packets."""
+_MOST_AHEAD = 2.0
+_ENOUGH = 0.05
+"""Expected number of lost packets that is too small for a repair. With 0, odometry takes 8 % more packets at 1 % loss
+and is no younger."""
+_UNDER_WAY_S = 1e-3
+"""s for which a repair is under way at least. Without it, a sender with no pace would repair without end where a report
+comes at once."""
+
+
+class Thrift:
+    """The account of what is missing and what is on its way."""
+
+    def __init__(self, packets: SentPackets, peers: Peers) -> None:
+        self._packets, self._peers = packets, peers
+        self._flight: deque[tuple[float, int, int]] = deque()
+        """The time until which a repair may be on its way without a report about it, and its window."""
+        self._ahead = 0.0
+        """Number of repairs that may be sent before a report calls for them."""
+
+    def sent(self) -> None:
+        """A new packet left that is worth repairing."""
+        loss = min(self._peers.loss, MOST_LOSS)
+        self._ahead = min(self._ahead + AHEAD * loss / (1 - loss) ** 3, _MOST_AHEAD)
+
+    def repaired(self) -> None:
+        """A repair leaves, of any kind."""
+        self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
+
+    def combined(self, now: float, first: int, newest: int) -> None:
+        """A combination of these numbers leaves."""
+        wait = max((peer.answer for peer in self._peers.all.values()), default=inf)
+        self._flight.append((now + max(wait, _UNDER_WAY_S), first, newest))
+
+    def worth(self, window: list[Sent], now: float) -> bool:
+        """Whether a combination of a window is worth its slot."""
+        flight = self._flight
+        while flight and (flight[0][0] <= now or flight[0][2] < self._packets.oldest):
+            flight.popleft()
+        first, last = window[-1].number, window[0].number
+        under_way = sum(1 for _, low, high in flight if low <= last and high >= first)
+        if not self._peers:
+            loss = self._peers.loss
+            return len(window) * loss > under_way * (1 - loss) + _ENOUGH
+        for peer in self._peers.all.values():
+            expected = 0.0 if peer.prompt and self._ahead < 1 else peer.loss
+            patience, doubt = peer.patience, peer.doubt
+            need = 0.0
+            for record in window:
+                if not record.confirmed & peer.bit:
+                    if record.number in peer.lost:
+                        need += 1
+                    else:
+                        need += doubt if now - record.at > patience else expected
+            if need > under_way * (1 - peer.loss) + _ENOUGH:
+                return True
+        return False
+
+    def next_doubt(self, now: float) -> float:
+        """When a report about one of the newest packets, or about a repair, is overdue next, s; inf if none is
+        expected."""
+        soonest = next((at for at, _, _ in self._flight if at > now), inf)
+        waits = [(peer.bit, peer.patience) for peer in self._peers.all.values()]
+        for record in reversed(self._packets.records.values()):
+            if record.number <= self._packets.newest - GROUP:
+                break
+            for bit, patience in waits:
+                if not record.confirmed & bit and now < record.at + patience < soonest:
+                    soonest = record.at + patience
+        return soonest

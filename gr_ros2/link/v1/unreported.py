@@ -1,0 +1,71 @@
+"""Repairs while nobody reports: how many are enough for the losses that are expected.
+
+A long message that is delivered in order has its repairs while it is sent, if anything waits for it: no report will
+call for them. A packet is over after as many repairs as the expected losses need, so that a robot that nobody hears
+falls silent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+
+from gr_ros2.link.v1.lifetime import GROUP, Lifetime
+from gr_ros2.link.v1.sent_packets import Sent
+from gr_ros2.wire.v1 import MAX_WINDOW
+
+MOST_LOSS = 0.5
+"""Loss up to which repairs are sent without reports in proportion to it."""
+
+
+class Unreported:
+    """The repairs of one sender that no report calls for.
+
+    :param loss: share of packets that are expected to be lost
+    """
+
+    def __init__(self, loss: float) -> None:
+        self.loss = loss
+        self._owed = 0.0
+        """Number of repairs of long messages that are due."""
+        self._awaited = -1
+        """Up to this number, they go before new packets: other messages wait for what was lost."""
+
+    def sent(self, number: int, lifetimes: tuple[Lifetime, ...]) -> None:
+        """A source packet left, and nobody reports."""
+        ordered = [lifetime for lifetime in lifetimes if lifetime.in_order]
+        if any(lifetime.long for lifetime in ordered):
+            self._owed += self._enough(MAX_WINDOW) / MAX_WINDOW
+        if any(lifetime.awaited or not lifetime.long for lifetime in ordered):
+            self._awaited = number + MAX_WINDOW
+
+    def due(self, newest: int) -> bool:
+        """Whether a repair of a long message goes before new packets."""
+        return self._owed >= 1 and newest <= self._awaited
+
+    @property
+    def behind(self) -> bool:
+        """Whether more are due than one combination names: they began before anything waited."""
+        return self._owed > GROUP
+
+    def over(self) -> None:
+        """Somebody reports, or nothing is left to repair."""
+        self._owed = 0.0
+
+    def repaired(self) -> None:
+        """A combination leaves."""
+        self._owed = max(self._owed - 1, 0.0)
+
+    def cover(self, packets: Sequence[Sent]) -> None:
+        """These packets were combined, and nobody reports: those that were combined often enough are over."""
+        share = 1 / self._enough(len(packets))
+        for record in packets:
+            record.covered += share
+            if record.covered >= 1:
+                record.lifetimes = ()
+
+    def _enough(self, count: int) -> float:
+        """Number of repairs after which so many packets are complete at a peer with the expected loss, all but
+        surely (five standard deviations)."""
+        lost = count * self.loss
+        return (lost + 5 * sqrt(lost) + 3) / (1 - min(self.loss, MOST_LOSS))

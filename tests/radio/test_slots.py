@@ -1,0 +1,140 @@
+"""Links that share one channel through a medium process: slots against sending at once, and who may not have slots."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+pytest.importorskip("zmq", reason="needs pyzmq")
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr.ros_link import make_link
+from gr_ros2.link.access import Access
+from gr_ros2.mac import Aloha, Slots
+from gr_ros2.radio.medium import MediumConfig, MediumProcess
+from gr_ros2.radio.robot_link import RobotLink
+from gr_ros2.settings.config import build
+from tests.middleware.support import message
+from tests.radio.cables import free_ports
+from tests.radio.robots import Robot, config
+from tests.waiting import wait_for
+
+PHY = {"name": "psk", "sample_rate": 2e5}
+PACKET_LEN = 96
+SAID = 40
+
+
+def front_end(folder: Path, number: int) -> dict[str, Any]:
+    addresses = {"bind": f"ipc://{folder}/robot{number}", "connect": [f"ipc://{folder}/medium{number}"]}
+    return {"name": "zmq", "medium_process": "lockstep", **addresses}
+
+
+@contextmanager
+def air(folder: Path, robots: int) -> Iterator[MediumProcess]:
+    """A medium in lock step, in a thread."""
+    addresses = [
+        {"connect": f"ipc://{folder}/robot{n}", "bind": f"ipc://{folder}/medium{n}"} for n in range(1, robots + 1)
+    ]
+    values = {"phy": PHY, "packet_len": PACKET_LEN, "robots": addresses, "channel": {"snr_db": 20.0}}
+    process = MediumProcess(build(MediumConfig, values))
+    over = threading.Event()
+    thread = threading.Thread(target=process.run, kwargs={"over": over}, daemon=True)
+    thread.start()
+    try:
+        yield process
+    finally:
+        over.set()
+        thread.join()
+        process.close()
+
+
+def heard(folder: Path, medium: str, robots: int = 2) -> tuple[list[int], MediumProcess]:
+    """How many of ``SAID`` messages of each robot came out at each other one."""
+    with air(folder, robots) as process, ExitStack() as stack:
+        numbers = range(1, robots + 1)
+        graphs = [
+            stack.enter_context(
+                Robot(
+                    number,
+                    front_end(folder, number),
+                    hears=tuple(n for n in numbers if n != number),
+                    version=1,
+                    medium=medium,
+                    phy=PHY,
+                    packet_len=PACKET_LEN,
+                )
+            )
+            for number in numbers
+        ]
+        clock = graphs[0].link.front_end.clock
+        begin = clock()
+        for number in range(SAID):  # 10 Hz on the clock of the medium
+            wait_for(lambda: clock() >= begin + number / 10, "the next message")  # noqa: B023 - called at once
+            for robot in graphs:
+                robot.publish(message(number, 40))
+        over = clock() + 3.0
+        whole = (robots - 1) * SAID
+        wait_for(lambda: clock() > over or all(len(robot.heard) == whole for robot in graphs), "what is on its way")
+        return [len(robot.heard) for robot in graphs], process
+
+
+def test_in_slots_two_links_lose_nothing_both_ways_and_at_once_most(tmp_path: Path) -> None:
+    whole, process = heard(tmp_path, "slots")
+    assert whole == [SAID, SAID]
+    assert process.counted["overlapping"] <= 0.02 * process.counted["bursts"]
+    (tmp_path / "again").mkdir()
+    at_once, process = heard(tmp_path / "again", "exclusive")
+    assert sum(at_once) < sum(whole)
+    assert process.counted["overlapping"] > 0.3 * process.counted["bursts"]
+
+
+@pytest.fixture
+def accesses(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Access, float]]:
+    """Medium access of the links that are made, and s between two packets."""
+    made: list[tuple[Access, float]] = []
+    for cls in (Slots, Aloha):
+        before: Callable[..., None] = cls.__init__
+
+        def init(self: Any, src_id: int, slot_s: float, *rest: Any, before: Any = before, **more: Any) -> None:
+            before(self, src_id, slot_s, *rest, **more)
+            made.append((self, slot_s))
+
+        monkeypatch.setattr(cls, "__init__", init)
+    return made
+
+
+def test_the_guard_is_what_the_front_end_may_be_late_by(accesses: list[tuple[Access, float]]) -> None:
+    (port,) = free_ports(1, socket.SOCK_DGRAM)
+    options = {"name": "udp", "listen": f"127.0.0.1:{port}", "send_to": ["127.0.0.1:9"]}
+    link = RobotLink(
+        config(1, options, version=1, medium="slots", phy={"name": "modem", "options": {"bit_rate": 9600}})
+    )
+    try:
+        ((access, slot_s),) = accesses
+        assert isinstance(access, Slots)
+        assert slot_s == pytest.approx(link.front_end.airtime() + link.front_end.timing_error_s)
+    finally:
+        link.stop()
+
+
+def test_the_block_of_grc_has_slots_too(accesses: list[tuple[Access, float]]) -> None:
+    values = {"namespace": "/robot_1", "middleware": "memory"}
+    link = make_link(medium="slots", airtime_s=0.02, slot_guard_s=0.003, **values)
+    link.close()
+    ((_, slot_s),) = accesses
+    assert slot_s == pytest.approx(0.023)
+    with pytest.raises(ConfigError, match="medium = 'slots': needs version 1, and airtime_s above 0"):
+        make_link(medium="slots", **values)
+
+
+def test_a_front_end_that_hears_itself_alone_shares_nothing() -> None:
+    with pytest.raises(ConfigError, match="medium = 'slots': front_end sim reaches no other robot") as refused:
+        RobotLink(config(1, {"name": "sim"}, version=1, medium="slots"))
+    assert "\n" not in str(refused.value)
