@@ -58,7 +58,7 @@ def test_the_demo_fades_behind_obstacles_and_shows_it(walked: Path) -> None:
     assert max(levels) - min(levels) > 20
     assert all(team.beliefs.values())
     page = (walked / "demo" / "report.html").read_text("utf-8")
-    assert "The channel while robots enter" in page
+    assert "The channel while the robots enter" in page
 
 
 def test_in_slots_all_arrives_and_otherwise_little(walked: Path) -> None:

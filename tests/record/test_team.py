@@ -20,7 +20,7 @@ class Reader:
 
 
 def record() -> TeamRecord:
-    return TeamRecord((1, 2, 3), lambda size, mcs: AIRTIME_S, {(1, 0): Reader()})
+    return TeamRecord((1, 2, 3), lambda *_: AIRTIME_S, {(1, 0): Reader()})
 
 
 def sent(robot: int, number: int, begin: float, kind: str = "new") -> SentPacket:
@@ -75,7 +75,7 @@ def test_what_is_written_is_read_again_and_a_damaged_file_is_named(tmp_path: Pat
     assert read.beliefs[2, 1][1] == [1.5, 4.0, 0.0, 0.0]
     assert read.snr_db[2, 1] == [[1.0, 20.0]]
     (tmp_path / TEAM_FILE).write_text('{"robots": [1]}')
-    with pytest.raises(ConfigError, match="team.json: is damaged") as refused:
+    with pytest.raises(ConfigError, match=r"team\.json: is damaged") as refused:
         read_team(tmp_path)
     assert "\n" not in str(refused.value)
 
@@ -85,7 +85,7 @@ def test_positions_are_those_of_real_messages() -> None:
 
     reader = position_reader("geometry_msgs/msg/PointStamped")
     assert reader is not None
-    team = TeamRecord((1, 2), lambda size, mcs: AIRTIME_S, {(1, 0): reader})
+    team = TeamRecord((1, 2), lambda *_: AIRTIME_S, {(1, 0): reader})
     team.sender_event(1, Accepted(0, 0, at(1.5, 2.5), 1.0))
     team.sender_event(1, Accepted(1, 0, b"no message", 1.1))
     assert team.view().places == {1: (1.5, 2.5)}
