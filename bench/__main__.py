@@ -42,9 +42,10 @@ BENCHMARKS = {
     "compression": "bench.compression",
     "sweep": "bench.sweep",
     "mac": "bench.mac",
+    "relay": "bench.relay",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
-LONG = ("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac")
+LONG = ("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay")
 """Many minutes: only when named."""
 
 

@@ -17,6 +17,7 @@ import fuzz.control_socket
 import fuzz.endpoint
 import fuzz.mac
 import fuzz.receiver
+import fuzz.relay
 import fuzz.structure
 import fuzz.type_description
 import fuzz.wire
@@ -37,6 +38,7 @@ HARNESSES = {
     "endpoint": (fuzz.endpoint.endpoint, fuzz.endpoint.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
     "mac": (fuzz.mac.mac, fuzz.mac.corpus),
+    "relay": (fuzz.relay.relay, fuzz.relay.corpus),
     "calls": (fuzz.calls.calls, fuzz.calls.corpus),
     "compression": (fuzz.compression.compression, fuzz.compression.corpus),
     "structure": (fuzz.structure.structure, fuzz.structure.corpus),
@@ -53,6 +55,7 @@ COUNTS = {
     "endpoint": 400,
     "receiver": 1_500,
     "mac": 400,
+    "relay": 400,
     "calls": 4_000,
     "compression": 2_000,
     "structure": 1_500,

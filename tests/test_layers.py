@@ -20,7 +20,7 @@ MODULES = [path.relative_to(ROOT).as_posix() for path in sorted(ROOT.rglob("*.py
 LAYERS = (
     {"core"},
     {"wire", "state"},
-    {"settings"},
+    {"settings", "relay"},
     {"link", "calls"},
     {"mac"},
     {"middleware", "compression"},
@@ -39,7 +39,7 @@ LAYERS = (
 
 MAY_PRINT = {"cli", "ros"}
 
-PURE = {"wire", "link", "mac", "calls"}
+PURE = {"wire", "link", "mac", "relay", "calls"}
 PURE_CODECS = {"backports", "cryptography"}
 """Small codecs and ciphers without IO that these may import beside the standard library."""
 
@@ -85,6 +85,7 @@ KNOW_THEIR_VERSION = (
     "link/sequence.py",
     "link/v1/",
     "mac/",
+    "relay/",
     "link/reader.py",
 )
 """The codec of a version and its engines. All others ask a Format; the race compares with version 0 by name."""

@@ -106,8 +106,8 @@ class Slots:
         self._conflicts: dict[int, int] = {}
         """Slot that two robots want -> the one of them that gives it up."""
         self._robots: dict[int, _HeardRobot] = {}
-        self._hidden_at = self._confirmed_at = self._heard_at = self._swept = _NEVER
-        """Slots: a neighbour last named a robot that is not heard here; named this robot; anybody was last heard."""
+        self._named_at = self._hidden_at = self._confirmed_at = self._heard_at = self._swept = _NEVER
+        """Slots: a neighbour last named another robot; one that is not heard here; this robot; anybody was heard."""
         self._entered_at: int | None = None
         """The slot of the first send since the entry; None outside."""
         self._rate = _ENTRY_RATE
@@ -232,7 +232,7 @@ class Slots:
         first, second = [*names, NOBODY, NOBODY][:2]
         ahead = self._mine[0] - slot, self._mine[1] - self._mine[0]
         short = Block(slot % SLOT_NUMBERS, ahead, len(heard), (first, second))
-        if self._hidden_at < oldest and all(robot.heard == len(heard) for robot in heard.values()):
+        if self._named_at < oldest and all(robot.heard == len(heard) for robot in heard.values()):
             return short
         expected = sum(1 << n for n in range(MAP_SLOTS) if slot + 1 + n in self._taken)
         wanted = min((at for at in self._conflicts if slot < at < slot + SLOT_NUMBERS), default=None)
@@ -281,7 +281,10 @@ class Slots:
             self._rate = max(1.0, self._rate - 1)
         elif slot not in robot.ahead:
             robot.named = _NEVER
-            robot.entered = slot
+            # Where all hear all, both announcements were lost. Where somebody is hidden, the slot more that an entry
+            # costs makes room for those who collide unheard.
+            if slot > robot.last + self._lately() or self._hidden_at >= slot - self._memory():
+                robot.entered = slot
         self._heard_at = max(self._heard_at, slot)
         for at in robot.ahead:
             if at not in ahead and self._taken.get(at) == src_id:
@@ -315,7 +318,9 @@ class Slots:
             elif other is not None and other.named == _NEVER:
                 other.named = self._turn(slot)  # one confirmation is enough
             elif name != NOBODY:
-                self._hidden_at = slot
+                self._named_at = slot
+                if other is None:
+                    self._hidden_at = slot
 
     def _mapped(self, slot: int, expected: int, conflict: tuple[int, int]) -> None:
         at = slot + 1
@@ -336,6 +341,6 @@ class Slots:
         self._expected.clear()
         self._conflicts.clear()
         self._robots.clear()
-        self._heard_at = self._confirmed_at = self._hidden_at = _NEVER
+        self._heard_at = self._confirmed_at = self._hidden_at = self._named_at = _NEVER
         self._swept = _NEVER
         self._rate = _ENTRY_RATE

@@ -1,4 +1,4 @@
-"""Many robots on one channel at packet level: each sends its newest message, of one packet, whenever it may.
+"""Many robots on one channel at packet level: each sends a message of one packet whenever it may.
 
 The robots have the engines of ``gr_ros2.mac`` and clocks of their own; nothing else of a robot is simulated. The medium
 is :class:`gr_ros2.medium.packets.PacketMedium` with a PHY that loses nothing unless packets overlap, and the event loop
@@ -11,7 +11,6 @@ import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from struct import Struct
 from typing import Any
 
 import numpy as np
@@ -22,10 +21,9 @@ from gr_ros2.mac import read_block
 from gr_ros2.medium.base import Hearers, Medium, Path, Reception, Surroundings, Transmission
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
+from gr_ros2.relay.traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.run.simulate import EventLoop
 from gr_ros2.settings.config import ChannelConfig
-
-_stamp = Struct(">d")
 
 
 @dataclass
@@ -36,6 +34,7 @@ class SwarmConfig:
     :param latency_s: s from the end of a packet to what its receiver does about it
     :param period_s: s from one message of a robot to the next
     :param loss: share of packets that are lost for other reasons than collisions
+    :param relay: robots send on each other's messages by gain
     :param jitter_s: a burst begins up to so many s late
     :param ppm: clocks differ by up to so many parts per million
     :param present: from when to when in s a robot is there, by its number
@@ -47,6 +46,7 @@ class SwarmConfig:
     latency_s: float = 0.010
     period_s: float = 0.1
     loss: float = 0.0
+    relay: bool = False
     jitter_s: float = 0.0
     ppm: float = 0.0
     seed: int = 1
@@ -111,17 +111,21 @@ class HearingGraph(Surroundings):
         return np.asarray(self._near[sender])
 
 
+Received = Callable[[Reception, int, float], None]
+"""Is told of a packet, who made the message in it, and when, s."""
+
+
 class SwarmRobot:
     """One robot of a swarm, as the event loop sees it."""
 
-    def __init__(
-        self, number: int, access: Access, config: SwarmConfig, until: float, on: Callable[[Reception], None]
-    ) -> None:
+    def __init__(self, number: int, access: Access, config: SwarmConfig, until: float, on: Received) -> None:
         rng = random.Random(f"robot {config.seed} {number}")
         self.number = self.src_id = number
         self.access, self.endpoint = access, self
         self.over = False
-        self.sent = 0
+        self.left: list[tuple[float, bool]] = []
+        """When each of its packets left, and whether it carried another robot's message."""
+        self.traffic: SwarmTraffic = ByGain(number) if config.relay else OwnOnly()
         self._config, self._until, self._on = config, until, on
         self._rng = rng
         self._ppm = 1 + (config.ppm * 1e-6 if number == 0 else rng.uniform(-1, 1) * config.ppm * 1e-6)
@@ -141,9 +145,10 @@ class SwarmRobot:
     def _asleep(self, now: float) -> float | None:
         return next((end for begin, end in self._frozen if begin <= now < end), None)
 
-    def newest(self, at: float) -> float:
-        """When the newest message at a time was made, s."""
-        return self._phase + math.floor((at - self._phase) / self._config.period_s) * self._config.period_s
+    def newest(self, at: float) -> tuple[int, float]:
+        """The number of the newest message at a time, and when it was made, s."""
+        number = math.floor((at - self._phase) / self._config.period_s)
+        return number + 1, self._phase + number * self._config.period_s
 
     def _plan(self, now: float) -> None:
         self.due = max(now, (self.access.departure(self._local(now)) - self._offset) / self._ppm)
@@ -166,8 +171,11 @@ class SwarmRobot:
             block = self.access.block()
             if block is not None:
                 start = now + self._rng.uniform(0, self._config.jitter_s)
-                medium.send(self.number, block + _stamp.pack(self.newest(now)), start, self._config.airtime_s)
-                self.sent += 1
+                number, made = self.newest(now)
+                content = self.traffic.compose(number, made, self._local(now))
+                packet = bytes((len(block),)) + block + content
+                medium.send(self.number, packet, start, self._config.airtime_s)
+                self.left.append((now, self.traffic.relays))
         self._plan(now)
         yield from ()
 
@@ -177,17 +185,17 @@ class SwarmRobot:
             if self._asleep(reception.at) is not None:
                 self._late.append((reception.at, reception))
                 return
-            self._hear(reception)
-            self._on(reception)
+            self._on(reception, *self._hear(reception))
             if not self.over:
                 self._plan(reception.at)
         yield from ()
 
-    def _hear(self, reception: Reception) -> None:
-        data = reception.data
-        block = read_block(data)[0] if len(data) > _stamp.size else None
-        began = reception.sent.start * self._ppm + self._offset
-        self.access.hear(reception.sent.sender, block, began)
+    def _hear(self, reception: Reception) -> tuple[int, float]:
+        data, sender = reception.data, reception.sent.sender
+        end = 1 + data[0]
+        block = read_block(data[1:end])[0] if data[0] else None
+        self.access.hear(sender, block, reception.sent.start * self._ppm + self._offset)
+        return self.traffic.take(sender, block, data[end:], self._local(reception.at))
 
     def expire(self, now: float) -> Iterator[Any]:  # noqa: ARG002
         yield from ()
@@ -237,7 +245,8 @@ class Swarm:
             SwarmRobot(n, make(n, random.Random(f"access {config.seed} {n}")), config, t1, self._received)
             for n in range(count)
         ]
-        self.pairs = {(one, other) for one in range(count) for other in around.reached(one)}
+        reached = fully_meshed(count) if config.relay else [around.reached(one) for one in range(count)]
+        self.pairs = {(one, other) for one in range(count) for other in reached[one]}
         self.heard_at: dict[int, list[float]] = {n: [] for n in range(count)}
         self.first_heard: dict[int, float] = {}
         self.received = 0
@@ -256,20 +265,21 @@ class Swarm:
             self._settle(pair, self.t1)
         return self
 
-    def _received(self, reception: Reception) -> None:
-        sender, receiver = reception.sent.sender, reception.receiver
-        at, made = reception.at, _stamp.unpack(reception.data[-8:])[0]
+    def _received(self, reception: Reception, origin: int, made: float) -> None:
+        sender, receiver, at = reception.sent.sender, reception.receiver, reception.at
         self.first_heard.setdefault(sender, at)
         self.heard_at[sender].append(at)
-        pair = sender, receiver
         if at >= self.t0:
             self.received += 1
+        if origin == receiver:
+            return
+        pair = origin, receiver
         if made <= self._newest.get(pair, -1.0):
             return
         self._settle(pair, at)
         self._newest[pair] = made
         if self.t0 <= at <= self.t1:
-            self.got[sender][receiver] += 1
+            self.got[origin][receiver] += 1
 
     def _settle(self, pair: tuple[int, int], at: float) -> None:
         mark, at = self._marks.get(pair, self.t0), min(at, self.t1)
@@ -281,6 +291,17 @@ class Swarm:
     def lost(self, *reasons: str) -> int:
         """Packets that one robot did not receive from another, after ``t0``, for these reasons."""
         return sum(map(self.medium.lost.total, reasons))
+
+    @property
+    def sent(self) -> int:
+        """Packets that left, from the start on."""
+        return sum(len(robot.left) for robot in self.robots)
+
+    @property
+    def relayed(self) -> float:
+        """Share of the packets after ``t0`` that carried a message of another robot."""
+        relays = [relays for robot in self.robots for at, relays in robot.left if at >= self.t0]
+        return sum(relays) / max(1, len(relays))
 
     @property
     def collided(self) -> float:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
 
-_HELLO, _ASK, _REPORT, _HEARD, _PING, _ABOUT = 0xF8, 0xF9, 0xFA, 0xFB, 0xFC, 0xFD
+_HELLO, _ASK, _REPORT, _HEARD, _PING, _ABOUT, _NEWEST = 0xF8, 0xF9, 0xFA, 0xFB, 0xFC, 0xFD, 0xFE
 
 _heard = Struct(">B4sH")
 _hello = Struct(">QIBI")
@@ -19,6 +19,7 @@ _mark = Struct(">BI")
 _report = Struct(">BHHQB")
 _ping = Struct(">BHBHHQB")
 _about = Struct(">HII")
+_newest = Struct(">BBBH")
 _REPLY, _WANTS_ABOUT = 1, 2
 _UNKNOWN_SNR = 255
 _LEAST_SNR_DB, _MOST_SNR_DB, _SNR_STEPS = -40, 60, 2
@@ -31,6 +32,7 @@ HEARD_LEN = 2 + _heard.size
 PING_LEN = 2 + _ping.size
 ABOUT_LEN = 2 + _about.size
 """Bytes without its text."""
+NEWEST_LEN = 2 + _newest.size
 HELD_STEP_S = 1e-4
 ECHO_LEN = 4
 
@@ -190,7 +192,29 @@ class About(NamedTuple):
         return f"about, packets of {self.packet_len} bytes, phy {self.phy:08x}, key {self.key:08x}, {text!r}"
 
 
-Control = Hello | Ask | Report | Heard | Ping | About
+class Newest(NamedTuple):
+    """The newest message that the sender has of a topic of another robot, where messages are relayed.
+
+    :param origin: the robot whose topic it is
+    :param start: the low 8 bits of that robot's boot number
+    :param topic_id: in that robot's table
+    :param number: of that robot's packet in which the message began, mod 2^16
+    """
+
+    origin: int
+    start: int
+    topic_id: int
+    number: int
+
+    def describe(self) -> str:
+        """The entry in words."""
+        return (
+            f"newest, of robot {self.origin} (boot ends in {self.start:02x}) topic {self.topic_id}, "
+            f"from its packet {self.number}"
+        )
+
+
+Control = Hello | Ask | Report | Heard | Ping | About | Newest
 
 
 def reportable(snr_db: float) -> float:
@@ -223,6 +247,8 @@ def write_control(entry: Control) -> bytes:
             flags = _REPLY * reply | _WANTS_ABOUT * wants_about
             snr = _UNKNOWN_SNR if snr_db is None else _snr_byte(snr_db)
             name, data = _PING, _ping.pack(robot, number, flags, arrived, held, clock_us, snr)
+        elif isinstance(entry, Newest):
+            name, data = _NEWEST, _newest.pack(*entry)
         elif isinstance(entry, About):
             name, data = _ABOUT, _about.pack(*entry[:3]) + entry.text
         else:
@@ -277,16 +303,26 @@ def read_control(body: bytes, position: int, end: int) -> tuple[int, Control | N
         if size < 2:
             raise EntryBoundsError(f"a request of {size} bytes")
         return stop, Ask(body[start], body[start + 1 : stop])
+    return stop, _read_exchange(name, body, start, stop)
+
+
+def _read_exchange(name: int, body: bytes, start: int, stop: int) -> Control | None:
+    """An entry of kinds that robots exchange at any time; None for an unknown kind."""
+    size = stop - start
     if name == _PING:
         if size != _ping.size:
             raise EntryBoundsError(f"a ping of {size} bytes")
         robot, number, flags, arrived, held, clock_us, snr = _ping.unpack_from(body, start)
         reply, wants_about = flags & _REPLY != 0, flags & _WANTS_ABOUT != 0
         snr_db = None if snr == _UNKNOWN_SNR else _snr_db(snr)
-        return stop, Ping(robot, number, reply, wants_about, arrived, held, clock_us, snr_db)
+        return Ping(robot, number, reply, wants_about, arrived, held, clock_us, snr_db)
+    if name == _NEWEST:
+        if size != _newest.size:
+            raise EntryBoundsError(f"a note of the newest message, of {size} bytes")
+        return Newest(*_newest.unpack_from(body, start))
     if name == _ABOUT:
         if size < _about.size:
             raise EntryBoundsError(f"an about of {size} bytes")
         packet_len, phy, key = _about.unpack_from(body, start)
-        return stop, About(packet_len, phy, key, body[start + _about.size : stop])
-    return stop, None
+        return About(packet_len, phy, key, body[start + _about.size : stop])
+    return None

@@ -54,6 +54,10 @@ MAX_WINDOW = 127
 MAX_TOPICS = 240
 TABLE_TOPIC = 240
 """Topic id of the table of topics (``table``), which is sent like any other message."""
+RELAYED_TOPIC = 241
+"""Topic id of messages of other robots (``relayed``) whose newest is worth most."""
+CARRIED_TOPIC = 242
+"""Topic id of messages of other robots that each robot on the way keeps until the next one has them."""
 MAX_MESSAGE = 1 << 24
 """Bytes of the largest message."""
 MAX_BACK = (1 << 21) - 1
@@ -104,7 +108,7 @@ class Header(NamedTuple):
 class Part(NamedTuple):
     """A message, or a fragment of one.
 
-    :param topic_id: 0..239, or 240 for the table of topics
+    :param topic_id: 0..239, 240 for the table of topics, 241 and 242 for messages of other robots
     :param payload: these bytes of the message
     :param back: how many source packets ago the message began
     :param offset: where in the message the payload stands, bytes
@@ -305,7 +309,7 @@ def read_body(body: bytes, room: int) -> list[EntryV1]:
         name = body[position]
         if not name:
             break
-        if name > TABLE_TOPIC + 1:
+        if name > CARRIED_TOPIC + 1:
             position, control = read_control(body, position, end)
             if control is not None:
                 entries.append(control)
@@ -349,8 +353,8 @@ def _write_part(part: Part, room: int) -> bytes:
     topic_id, payload, back, offset, last, coded = part
     size = len(payload)
     kind = (_LAST if last else _MIDDLE) if offset else (_WHOLE if last else _FIRST)
-    if not 0 <= topic_id <= TABLE_TOPIC:
-        raise EncodeError(f"topic id {topic_id} is not in 0..{TABLE_TOPIC}")
+    if not 0 <= topic_id <= CARRIED_TOPIC:
+        raise EncodeError(f"topic id {topic_id} is not in 0..{CARRIED_TOPIC}")
     if not 0 <= offset <= MAX_MESSAGE - size or not 0 <= back <= MAX_BACK or (back and not offset):
         raise EncodeError(f"a fragment {back} packets and {offset} bytes after the begin of its message, {size} long")
     if kind and not size:

@@ -15,7 +15,8 @@ local QOS = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "default (11
 local QOS_V1 = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "a repair packet" }
 local KINDS = { [0] = "source", [1] = "repair", [2] = "control" }
 local PLACES = { [0] = "whole message", [1] = "first fragment", [2] = "middle fragment", [3] = "last fragment" }
-local CONTROLS = { [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard", [0xFC] = "ping", [0xFD] = "about" }
+local CONTROLS = { [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard", [0xFC] = "ping", [0xFD] = "about",
+    [0xFE] = "newest" }
 local BROADCAST, MOST_BLOCK = 255, 12
 local CRC_LEN, HEADER_LEN, ENTRY_HEADER_LEN = 2, 5, 5
 
@@ -101,6 +102,18 @@ local f = {
     about_phy = ProtoField.uint32("gr_ros2.about.phy", "CRC-32 of the settings of the PHY", base.HEX),
     about_key = ProtoField.uint32("gr_ros2.about.key", "Fingerprint of the key", base.HEX),
     about_text = ProtoField.string("gr_ros2.about.text", "Text"),
+    newest_origin = ProtoField.uint8("gr_ros2.newest.origin", "Robot whose topic it is"),
+    newest_start = ProtoField.uint8("gr_ros2.newest.start", "Its boot number, low 8 bits", base.HEX),
+    newest_topic_id = ProtoField.uint8("gr_ros2.newest.topic_id", "Topic id"),
+    newest_number = ProtoField.uint16("gr_ros2.newest.number", "Its packet, low 16 bits"),
+    relayed_origin = ProtoField.uint8("gr_ros2.relayed.origin", "Robot that made the message"),
+    relayed_start = ProtoField.uint16("gr_ros2.relayed.start", "Its boot number, low 16 bits", base.HEX),
+    relayed_number = ProtoField.uint32("gr_ros2.relayed.number", "Its packet in which the message began"),
+    relayed_place = ProtoField.uint8("gr_ros2.relayed.place", "Place there"),
+    relayed_topic_id = ProtoField.uint8("gr_ros2.relayed.topic_id", "Topic id"),
+    relayed_coded = ProtoField.bool("gr_ros2.relayed.coded", "Coded", 8, nil, 0x80),
+    relayed_hops = ProtoField.uint8("gr_ros2.relayed.hops", "Hops", base.DEC, nil, 0x3F),
+    relayed_dst_id = ProtoField.uint8("gr_ros2.relayed.dst_id", "For robot"),
     table_topic_id = ProtoField.uint8("gr_ros2.table.topic_id", "Topic id"),
     table_name = ProtoField.string("gr_ros2.table.name", "Name"),
     table_type = ProtoField.string("gr_ros2.table.type", "Type"),
@@ -313,8 +326,9 @@ end
 
 -- Version 1 -----------------------------------------------------------------------------------------------------------
 
-local TABLE_TOPIC, MAX_MESSAGE, MAX_BACK = 240, 0x1000000, 0x1FFFFF
-local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN, PING_LEN, ABOUT_LEN = 17, 5, 14, 7, 17, 10
+local TABLE_TOPIC, RELAYED_TOPIC, CARRIED_TOPIC, RELAYED_LEN = 240, 241, 242, 10
+local MAX_MESSAGE, MAX_BACK = 0x1000000, 0x1FFFFF
+local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN, PING_LEN, ABOUT_LEN, NEWEST_LEN = 17, 5, 14, 7, 17, 10, 5
 local MAX_SNR = 200 -- 60 dB
 
 -- CRC-32 of IEEE 802.3.
@@ -349,7 +363,7 @@ end
 
 local function name_of(src, id)
     local row = announced[src] and announced[src][id] or topics[id]
-    return row and row.name or (id == TABLE_TOPIC and "table of topics" or "topic " .. id), row
+    return row and row.name or (id == TABLE_TOPIC and "table of topics" or id > TABLE_TOPIC and "relayed" or "topic " .. id), row
 end
 
 local function varint(buffer, at, limit)
@@ -402,6 +416,7 @@ local function dissect_control(buffer, tree, at, limit)
         heard = size == HEARD_LEN,
         ping = size == PING_LEN,
         about = size >= ABOUT_LEN,
+        newest = size == NEWEST_LEN,
     }
     if sizes[name] == false then
         item:add_proto_expert_info(refused.overrun)
@@ -451,6 +466,11 @@ local function dissect_control(buffer, tree, at, limit)
         if size > ABOUT_LEN then
             item:add(f.about_text, buffer(start + 10, size - ABOUT_LEN))
         end
+    elseif name == "newest" then
+        item:add(f.newest_origin, buffer(start, 1))
+        item:add(f.newest_start, buffer(start + 1, 1))
+        item:add(f.newest_topic_id, buffer(start + 2, 1))
+        item:add(f.newest_number, buffer(start + 3, 2))
     end
     return start + size, name
 end
@@ -511,6 +531,23 @@ local function show_table(tree, range, rows)
         item:add(f.table_reliable, range, math.floor(row.flags / 4) % 2 == 1):set_generated()
         item:add(f.table_latched, range, math.floor(row.flags / 8) % 2 == 1):set_generated()
         item:add(f.table_depth, range, row.depth):set_generated()
+    end
+end
+
+-- Whose message it is that stands in a message of another robot.
+local function dissect_relayed(buffer, entry, at, after)
+    if after < at + RELAYED_LEN then
+        return
+    end
+    entry:add(f.relayed_origin, buffer(at, 1))
+    entry:add(f.relayed_start, buffer(at + 1, 2))
+    entry:add(f.relayed_number, buffer(at + 3, 4))
+    entry:add(f.relayed_place, buffer(at + 7, 1))
+    entry:add(f.relayed_topic_id, buffer(at + 8, 1))
+    entry:add(f.relayed_coded, buffer(at + 9, 1))
+    entry:add(f.relayed_hops, buffer(at + 9, 1))
+    if math.floor(buffer(at + 9, 1):uint() / 64) % 2 == 1 and after > at + RELAYED_LEN then
+        entry:add(f.relayed_dst_id, buffer(at + 10, 1))
     end
 end
 
@@ -582,6 +619,9 @@ local function dissect_part(buffer, tree, packet, at, limit)
     if after > at then
         entry:add(f.payload, buffer(at, after - at))
     end
+    if id >= RELAYED_TOPIC and offset == 0 then
+        dissect_relayed(buffer, entry, at, after)
+    end
     if id == TABLE_TOPIC and packet.first_time and after > at then
         packet.frame.rows = keep_fragment(
             packet.src, packet.number - back, offset, place % 3 == 0, buffer(at, after - at):bytes())
@@ -602,7 +642,7 @@ end
 local function dissect_body(buffer, tree, packet, at, limit)
     local summary, last = {}, math.min(limit, packet.filled)
     while at < last and buffer(at, 1):uint() ~= 0 do
-        local control = buffer(at, 1):uint() > TABLE_TOPIC + 1
+        local control = buffer(at, 1):uint() > CARRIED_TOPIC + 1
         local after, text
         if control then
             after, text = dissect_control(buffer, tree, at, last)

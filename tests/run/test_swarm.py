@@ -62,6 +62,21 @@ def test_of_three_in_a_row_the_outer_ones_leave_each_other_the_air() -> None:
     assert swarm.collided <= 0.03
 
 
+def test_by_relaying_every_robot_of_a_line_hears_of_every_other() -> None:
+    line = [{j for j in range(6) if abs(i - j) == 1} for i in range(6)]
+    config = SwarmConfig(loss=0.1, relay=True)
+    swarm = Swarm(slots, HearingGraph(line, config), config, t1=60).run()
+    assert len(swarm.ages) == 30
+    assert swarm.ages[-1] <= 2.0
+    assert swarm.relayed >= 0.3
+
+
+def test_where_all_hear_all_next_to_nothing_is_relayed_and_nothing_gets_older() -> None:
+    relaying, plain = (cell(10, SwarmConfig(loss=0.1, relay=relay), t1=40) for relay in (True, False))
+    assert relaying.relayed <= 0.02
+    assert relaying.age <= 1.02 * plain.age
+
+
 @pytest.mark.parametrize("by", [1.0, -1.0])
 def test_a_clock_that_jumps_disturbs_the_others_for_a_moment_only(by: float) -> None:
     swarm = cell(5, SwarmConfig(jumps=[(25.0, 2, by)]), t0=30, t1=60)

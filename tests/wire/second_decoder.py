@@ -100,7 +100,7 @@ def read_body(body: bytes, room: int) -> list[dict[str, object]]:
     at, end = 0, min(room, len(body))
     while at < end and body[at]:
         kind = body[at]
-        if kind >= 242:
+        if kind >= 244:
             if at + 2 > end or at + 2 + body[at + 1] > end:
                 raise Refused("entry_bounds")
             content = body[at + 2 : at + 2 + body[at + 1]]
@@ -212,7 +212,32 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
         if len(content) < 10:
             raise Refused("entry_bounds")
         return {"about": number(0, 2), "phy": number(2, 6), "key": number(6, 10), "text": content[10:].hex()}
+    if kind == 0xFE:
+        if len(content) != 5:
+            raise Refused("entry_bounds")
+        return {"newest": content[0], "start": content[1], "topic_id": content[2], "number": number(3, 5)}
     return None
+
+
+def read_relayed(content: bytes) -> dict[str, object]:
+    """A message of topic 241 or 242."""
+    if len(content) < 10 or (content[9] & 64 and len(content) < 11):
+        raise Refused("entry_bounds")
+    begin = 11 if content[9] & 64 else 10
+    to = content[10] if begin == 11 else 255
+    if content[8] > 240 or content[0] == 255 or (begin == 11 and to == 255):
+        raise Refused("entry_kind")
+    return {
+        "origin": content[0],
+        "start": int.from_bytes(content[1:3], "big"),
+        "number": int.from_bytes(content[3:7], "big"),
+        "place": content[7],
+        "topic_id": content[8],
+        "hops": content[9] % 64,
+        "payload": content[begin:].hex(),
+        "coded": content[9] >= 128,
+        "dst_id": to,
+    }
 
 
 def read_medium_access(data: bytes) -> dict[str, object]:

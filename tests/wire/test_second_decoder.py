@@ -20,6 +20,7 @@ from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.mac_block import read_block
+from gr_ros2.wire.relayed import read_relayed, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, read_table
 from tests.link.v1.air import KEY, Air, Robot, registry
 from tests.wire import second_decoder as second
@@ -66,6 +67,25 @@ def test_bodies_to_refuse(case: dict[str, Any]) -> None:
         v1.read_body(body, case["room"])
     with pytest.raises(second.Refused) as theirs:
         second.read_body(body, case["room"])
+    assert ours.value.kind == str(theirs.value) == case["error"]
+
+
+@named("relayed")
+def test_messages_of_other_robots(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    ours = read_relayed(data)
+    assert write_relayed(ours) == data
+    fields = {name: value for name, value in case.items() if name != "hex"}
+    assert {**ours._asdict(), "payload": ours.payload.hex()} == second.read_relayed(data) == fields
+
+
+@named("refused_relayed")
+def test_messages_of_other_robots_to_refuse(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    with pytest.raises(WireError) as ours:
+        read_relayed(data)
+    with pytest.raises(second.Refused) as theirs:
+        second.read_relayed(data)
     assert ours.value.kind == str(theirs.value) == case["error"]
 
 

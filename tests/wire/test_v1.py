@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import EncodeError, WireError
 from gr_ros2.wire import v1
-from gr_ros2.wire.control import About, Ask, Heard, Hello, Ping, Report
+from gr_ros2.wire.control import About, Ask, Heard, Hello, Newest, Ping, Report
 from gr_ros2.wire.mac_block import MOST_LEN
 from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 from gr_ros2.wire.v1 import Header, PacketV1, Part, RepairHeader, decode, encode
@@ -31,7 +31,7 @@ def parts(draw: st.DrawFn) -> Part:
     last = draw(st.booleans())
     payload = draw(st.binary(min_size=0 if last and not offset else 1, max_size=40))
     back = draw(st.integers(0, v1.MAX_BACK)) if offset else 0
-    return Part(draw(st.integers(0, v1.TABLE_TOPIC)), payload, back, offset, last, draw(st.booleans()))
+    return Part(draw(st.integers(0, v1.CARRIED_TOPIC)), payload, back, offset, last, draw(st.booleans()))
 
 
 SNRS = st.none() | st.integers(0, 200).map(lambda steps: steps / 2 - 40)
@@ -42,6 +42,7 @@ controls = (
     | st.builds(Heard, U8, st.binary(min_size=4, max_size=4), st.integers(0, 0xFFFF))
     | st.builds(Ping, U8, U16, st.booleans(), st.booleans(), U16, U16, U64, SNRS)
     | st.builds(About, U16, U32, U32, st.binary(max_size=20))
+    | st.builds(Newest, U8, U8, U8, U16)
     | st.builds(Report, U8, U16, U16, U64, st.booleans(), st.integers(0, 127), SNRS)
 )
 entries = st.lists(parts() | controls, max_size=6).map(tuple)

@@ -1,0 +1,54 @@
+"""Relaying: whatever messages of other robots are heard, choosing goes on, and each costs a bounded work."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from fuzz.loop import main, within
+from gr_ros2.core.errors import WireError
+from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.wire.control import Newest
+from gr_ros2.wire.relayed import Relayed, read_relayed, write_relayed
+
+MOST_LINES = 4000
+"""Lines of Python for a message heard, and for a choice among 40 streams for 40 neighbours."""
+_STEP = 20
+"""Bytes that make a packet: sender, time, two robots that it hears, a number told, message."""
+
+
+def relay(data: bytes) -> None:
+    """Take the bytes as packets heard, and choose in between."""
+    gains = Gains(1)
+    now = 0.0
+    for start in range(0, min(len(data), 40 * _STEP), _STEP):
+        src_id, later, *names = (data[start : start + 4] + bytes(4))[:4]
+        now += later / 256
+        try:
+            message = read_relayed(data[start + 6 : start + _STEP])
+        except WireError:
+            continue
+        assert write_relayed(message) == data[start + 6 : start + _STEP]
+        stream = Stream(message.origin, message.start, message.topic_id)
+        told = Newest(message.origin, message.start & 0xFF, message.topic_id, data[start + 4])
+        gains.neighbour(src_id, now, names, 2)
+        within(MOST_LINES, partial(gains.message, src_id, stream, message.number, now))
+        within(MOST_LINES, partial(gains.told, src_id, told))
+        found: list[Stream] = []
+        within(MOST_LINES, lambda at=now, found=found: found.extend([s for s in [gains.best(at)[0]] if s]))
+        for best in found:
+            assert gains.has(best) >= 0
+            gains.sent(best, now)
+        assert len(gains.tells()) <= 2
+
+
+def corpus() -> list[bytes]:
+    """Robots of which each sends on what the one before has said."""
+    heard = b""
+    for n in range(40):
+        message = write_relayed(Relayed(n % 7, 1, n, 0, 0, n % 4, b"odom"))
+        heard += bytes((2 + n % 3, 64, 1, 3, n, 0)) + message
+    return [b"", heard[:_STEP], heard]
+
+
+if __name__ == "__main__":
+    main(relay, corpus())

@@ -1,0 +1,221 @@
+"""Which message of which robot is worth sending next: the one that makes the neighbours' knowledge youngest.
+
+A *stream* is one topic of one start of one robot; the messages of a stream are numbered by their origin. For each
+robot that is heard, and each stream, an engine keeps the newest number that this robot is known or taken to have:
+
+- *Evidence.* It sent the message itself, or its packet told that it has it: every packet tells the newest number of a
+  few streams, in turn.
+- *Belief.* A message that was sent was heard with probability ``BELIEF`` by each robot in range: by the own neighbours
+  when this robot sent it, and by those neighbours that the sender names as heard when another robot sent it.
+
+The gain of sending a stream's newest message is the sum over the neighbours of how much younger it makes them, in s.
+
+Invariants: sans-IO, the caller passes in times; the work for a message heard is bounded by the robots heard, and that
+for a choice by robots times streams; equal calls give equal choices; memory is bounded by ``MOST_STREAMS`` and the ids.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from gr_ros2.wire.control import Newest
+
+HEARD_S = 3.0
+"""s for which a robot that was heard counts as a neighbour."""
+OWN, OTHERS = 0.7, 0.9
+"""Share of the way from what a neighbour was taken to have to a message that it should have heard just now."""
+UNKNOWN_S = 10.0
+"""By how much younger a stream's first message is taken to make a robot."""
+FIRST_PERIOD_S = 0.1
+"""s from one number of a stream to the next, before two are known."""
+ARRIVALS = 16
+"""Numbers of a stream from whose times its period follows."""
+TOLD = 2
+"""Streams of which a packet tells the newest number."""
+MOST_STREAMS = 4096
+_HALF = 1 << 15
+
+
+class Stream(NamedTuple):
+    """One topic of one start of a robot.
+
+    :param start: tells the starts of one robot apart
+    """
+
+    origin: int
+    start: int
+    topic_id: int
+
+
+class _State:
+    """A stream, and who has what of it."""
+
+    __slots__ = ("arrivals", "has", "newest", "period")
+
+    def __init__(self) -> None:
+        self.newest = -1
+        self.period = FIRST_PERIOD_S
+        self.arrivals: deque[tuple[int, float]] = deque(maxlen=ARRIVALS)
+        self.has: dict[int, float] = {}
+        """The newest number that a neighbour is taken to have."""
+
+
+class _Heard:
+    """A robot that is heard."""
+
+    __slots__ = ("at", "named", "packets")
+
+    def __init__(self) -> None:
+        self.at = 0.0
+        self.packets = 0
+        self.named: dict[int, int] = {}
+        """The robots that it hears -> the count of its packets when it last named each."""
+
+
+class Gains:
+    """See the module.
+
+    :param src_id: of this robot
+    """
+
+    def __init__(self, src_id: int) -> None:
+        self.src_id = src_id
+        self._streams: dict[Stream, _State] = {}
+        self._told: dict[tuple[int, int, int], _State] = {}
+        """The same by what an entry ``Newest`` names."""
+        self._heard: dict[int, _Heard] = {}
+        self._turn = 0
+
+    def has(self, stream: Stream) -> int:
+        """The newest number of a stream that is here; -1 for none."""
+        state = self._streams.get(stream)
+        return -1 if state is None else state.newest
+
+    # ---- what is heard
+
+    def neighbour(self, src_id: int, now: float, names: Iterable[int] = (), heard: int = 0) -> None:
+        """A packet of a robot was heard.
+
+        :param names: robots that it says it hears
+        :param heard: how many it hears in all: a name counts for as many packets as it takes to name all twice
+        """
+        robot = self._heard.get(src_id)
+        if robot is None:
+            robot = self._heard[src_id] = _Heard()
+        robot.at = now
+        robot.packets += 1
+        for name in names:
+            robot.named[name] = robot.packets
+        if len(robot.named) > heard:
+            robot.named = {name: at for name, at in robot.named.items() if robot.packets - at <= heard + 2}
+
+    def message(self, via: int, stream: Stream, number: int, now: float) -> bool:
+        """A message was heard.
+
+        :param via: the robot whose packet carried it
+        :return: whether it is newer than what is here
+        """
+        state = self._state(stream)
+        if state is None:
+            return False
+        state.has[via] = max(number, state.has.get(via, number))
+        robot = self._heard.get(via)
+        for name in () if robot is None else robot.named:
+            if name in self._heard and name != self.src_id:
+                self._believe(state, name, number, OTHERS)
+        return stream.origin != self.src_id and self._arrived(state, number, now)
+
+    def told(self, via: int, newest: Newest) -> None:
+        """A robot tells the newest number that it has of a stream. What is not here cannot be relayed to it."""
+        state = self._told.get((newest.origin, newest.start, newest.topic_id))
+        if state is not None:
+            ahead = (newest.number - state.newest + _HALF & 0xFFFF) - _HALF
+            state.has[via] = state.newest + ahead
+
+    # ---- what is sent
+
+    def own(self, topic_id: int, start: int, number: int, now: float) -> None:
+        """This robot has a new message of its own."""
+        state = self._state(Stream(self.src_id, start, topic_id))
+        if state is not None:
+            self._arrived(state, number, now)
+
+    def gain(self, stream: Stream, now: float) -> float:
+        """By how many s sending its newest message makes the neighbours younger, all together."""
+        state = self._streams[stream]
+        return self._gain(stream, state, self._neighbours(now))
+
+    def best(self, now: float, may: Callable[[Stream], bool] = lambda _: True) -> tuple[Stream | None, float]:
+        """The stream that is worth most, and its gain in s; None where nothing is gained.
+
+        :param may: whether a stream is to be considered
+        """
+        neighbours = self._neighbours(now)
+        best: Stream | None = None
+        most = 0.0
+        for stream, state in self._streams.items():
+            gain = self._gain(stream, state, neighbours)
+            if gain > most and may(stream):
+                best, most = stream, gain
+        return best, most
+
+    def sent(self, stream: Stream, now: float) -> None:
+        """The newest message of a stream leaves."""
+        state = self._streams[stream]
+        for robot in self._neighbours(now):
+            if robot != stream.origin:
+                self._believe(state, robot, state.newest, OWN)
+
+    def tells(self, count: int = TOLD) -> list[Newest]:
+        """The newest numbers that are here of other robots' streams, in turn."""
+        streams = [stream for stream in self._streams if stream.origin != self.src_id]
+        count = min(count, len(streams))
+        turn, self._turn = self._turn, self._turn + count
+        told = [streams[(turn + i) % len(streams)] for i in range(count)]
+        return [Newest(s.origin, s.start & 0xFF, s.topic_id, self._streams[s].newest & 0xFFFF) for s in told]
+
+    # ----
+
+    def _state(self, stream: Stream) -> _State | None:
+        state = self._streams.get(stream)
+        if state is None and len(self._streams) < MOST_STREAMS:
+            state = self._streams[stream] = _State()
+            self._told[stream.origin, stream.start & 0xFF, stream.topic_id] = state
+        return state
+
+    def _arrived(self, state: _State, number: int, now: float) -> bool:
+        if number <= state.newest:
+            return False
+        state.newest = number
+        arrivals = state.arrivals
+        arrivals.append((number, now))
+        first, since = arrivals[0]
+        if number > first and now > since:
+            state.period = (now - since) / (number - first)
+        return True
+
+    def _believe(self, state: _State, robot: int, number: int, share: float) -> None:
+        before = state.has.get(robot)
+        if before is None:
+            before = number - UNKNOWN_S / state.period
+        if number > before:
+            state.has[robot] = before + share * (number - before)
+
+    def _neighbours(self, now: float) -> list[int]:
+        return [src_id for src_id, robot in self._heard.items() if now - robot.at < HEARD_S]
+
+    def _gain(self, stream: Stream, state: _State, neighbours: Iterable[int]) -> float:
+        newest, origin, has = state.newest, stream.origin, state.has
+        if newest < 0:
+            return 0.0
+        behind = 0.0
+        for robot in neighbours:
+            if robot != origin:
+                before = has.get(robot)
+                if before is None:
+                    behind += UNKNOWN_S / state.period
+                elif before < newest:
+                    behind += newest - before
+        return behind * state.period

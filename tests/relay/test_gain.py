@@ -1,0 +1,107 @@
+"""Which message is worth sending: what neighbours are known or taken to have, and by how much it makes them younger."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gr_ros2.relay.gain import HEARD_S, OWN, UNKNOWN_S, Gains, Stream
+from gr_ros2.wire.control import Newest
+
+ODOM = Stream(7, 0xCAFE, 0)
+
+
+def hearing(*neighbours: int, period_s: float = 0.1) -> Gains:
+    """Robot 1, which hears these, and has heard robot 7 ten times a second."""
+    gains = Gains(1)
+    for number in range(11):
+        for neighbour in neighbours:
+            gains.neighbour(neighbour, number * period_s)
+        gains.message(neighbours[0], ODOM, number, number * period_s)
+    return gains
+
+
+def test_who_has_sent_a_message_needs_it_no_more() -> None:
+    assert hearing(2).best(1.0) == (None, 0.0)
+    assert hearing(7).best(1.0) == (None, 0.0)
+
+
+def test_a_neighbour_that_has_heard_nothing_of_a_robot_is_worth_most() -> None:
+    gains = hearing(2, 3)
+    assert gains.best(1.0) == (ODOM, pytest.approx(UNKNOWN_S))
+
+
+def test_the_gain_is_the_time_that_a_neighbour_is_behind() -> None:
+    gains = hearing(2, 3)
+    gains.told(3, Newest(7, 0xFE, 0, 4))
+    assert gains.gain(ODOM, 1.0) == pytest.approx(0.6)
+    gains.sent(ODOM, 1.0)
+    assert gains.gain(ODOM, 1.0) == pytest.approx(0.6 * (1 - OWN))
+
+
+def test_what_a_neighbour_tells_stands_against_belief() -> None:
+    gains = hearing(2, 3)
+    gains.sent(ODOM, 1.0)
+    gains.told(3, Newest(7, 0xFE, 0, 10))
+    assert gains.best(1.0) == (None, 0.0)
+    gains.told(3, Newest(7, 0xFE, 0, 0))
+    assert gains.gain(ODOM, 1.0) == pytest.approx(1.0)
+    gains.told(3, Newest(7, 0xFF, 0, 10))  # another start
+    assert gains.gain(ODOM, 1.0) == pytest.approx(1.0)
+
+
+def test_who_is_named_by_the_sender_is_taken_to_have_heard_it() -> None:
+    gains = hearing(2, 3)
+    gains.told(3, Newest(7, 0xFE, 0, 10))
+    gains.neighbour(2, 1.1, [3], 1)
+    gains.message(2, ODOM, 11, 1.1)
+    assert 0 < gains.gain(ODOM, 1.1) < 0.05
+
+
+def test_a_silent_robot_is_no_neighbour_any_more() -> None:
+    assert hearing(2, 3).best(1.0 + HEARD_S) == (None, 0.0)
+
+
+def test_an_older_message_is_not_new_and_another_start_is_another_stream() -> None:
+    gains = hearing(2)
+    assert not gains.message(3, ODOM, 10, 1.1)
+    assert gains.message(3, ODOM._replace(start=1), 0, 1.1)
+    assert not gains.message(2, Stream(1, 0, 0), 5, 1.1)  # its own, sent on
+    assert gains.has(ODOM) == 10
+
+
+def test_own_messages_compete_with_those_of_others() -> None:
+    gains = hearing(2, 3)
+    gains.own(0, 5, 1, 1.0)
+    assert gains.best(1.0) == (Stream(1, 5, 0), pytest.approx(2 * UNKNOWN_S))
+
+
+def test_every_stream_is_told_in_turn() -> None:
+    gains = hearing(2)
+    for origin in (8, 9):
+        gains.message(2, Stream(origin, 0x1234, 3), 70_000, 1.0)
+    gains.own(0, 5, 1, 1.0)
+    told = [newest.origin for _ in range(3) for newest in gains.tells()]
+    assert told == [7, 8, 9, 7, 8, 9]
+    assert gains.tells(3)[1] == Newest(8, 0x34, 3, 70_000 & 0xFFFF)
+
+
+@given(st.lists(st.tuples(st.integers(2, 5), st.integers(0, 9), st.integers(0, 70_000), st.integers(0, 40))))
+def test_the_choice_is_something_that_is_here(packets: list[tuple[int, int, int, int]]) -> None:
+    gains = Gains(1)
+    newest: dict[Stream, int] = {}
+    now = 0.0
+    for via, origin, number, later in packets:
+        now += later / 10
+        stream = Stream(origin, 0, 0)
+        gains.neighbour(via, now, [origin], 3)
+        assert gains.message(via, stream, number, now) == (origin != 1 and number > newest.get(stream, -1))
+        if origin != 1:
+            newest[stream] = max(number, newest.get(stream, -1))
+        best, gain = gains.best(now)
+        assert (best is None) == (gain == 0)
+        if best is not None:
+            assert gains.has(best) == newest[best]
+            gains.sent(best, now)
+            assert gains.gain(best, now) < gain

@@ -1,0 +1,53 @@
+"""A relayed message reads back as it was written, and bytes raise nothing but named errors."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gr_ros2.core.errors import EncodeError, WireError
+from gr_ros2.wire.relayed import MOST_HOPS, Relayed, read_relayed, write_relayed
+
+U8 = st.integers(0, 255)
+ID = st.integers(0, 254)
+MESSAGES = st.builds(
+    Relayed,
+    ID,
+    st.integers(0, 0xFFFF),
+    st.integers(0, 0xFFFF_FFFF),
+    U8,
+    st.integers(0, 240),
+    st.integers(0, MOST_HOPS),
+    st.binary(max_size=40),
+    st.booleans(),
+    U8,
+)
+
+
+@given(MESSAGES)
+def test_round_trip(message: Relayed) -> None:
+    assert read_relayed(write_relayed(message)) == message
+
+
+@given(st.binary(max_size=20))
+def test_any_bytes(data: bytes) -> None:
+    try:
+        message = read_relayed(data)
+    except WireError:
+        return
+    assert write_relayed(message) == data
+
+
+@pytest.mark.parametrize(
+    "change", [{"origin": 255}, {"topic_id": 241}, {"hops": 64}, {"start": 1 << 16}, {"number": -1}, {"place": 256}]
+)
+def test_fields_out_of_range(change: dict[str, int]) -> None:
+    message = Relayed(7, 0xCAFE, 70_000, 1, 3, 2, b"odom")
+    with pytest.raises(EncodeError):
+        write_relayed(message._replace(**change))
+
+
+def test_it_says_whose_message_it_is() -> None:
+    said = Relayed(7, 0xCAFE, 70_000, 1, 3, 2, b"", dst_id=9).describe()
+    assert said == "robot 7's (boot ends in cafe) topic 3 to robot 9, from its packet 70000.1, hop 2"
