@@ -59,7 +59,7 @@ RULES: dict[str, list[Patch]] = {
 }
 CONSTANTS = (
     ("lifetime", "GROUP"), ("lifetime", "WORTH"), ("lifetime", "REPORTED_DEPTH"), ("lifetime", "UNREPORTED_DEPTH"),
-    ("thrift", "AHEAD"), ("thrift", "_ENOUGH"), ("combining", "TURN"),
+    ("thrift", "AHEAD"), ("thrift", "_ENOUGH"), ("thrift", "_MOST_AHEAD"), ("combining", "TURN"),
     ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"), ("freshness", "FIRST_AGE_S"),
     ("freshness", "LARGE"), ("packing", "SHARE"), ("packing", "MIN_FRAGMENT"), ("packing", "LONG"),
     ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
