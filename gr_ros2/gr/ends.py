@@ -233,20 +233,22 @@ def start_of(
     )
     if not config.state and not config.key and src_id < 0:
         return replace(setup, boot=int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS))
-    file = BootFile(_state_file(config, src_id), time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None)
+    file = BootFile(
+        _state_file(config.state, src_id), time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None
+    )
     return replace(setup, boot=file.boot, heard=file.heard, save=file.save, close=file.close)
 
 
-def account_of(config: SourceConfig) -> Path:
+def account_of(state: str, robot_id: int) -> Path:
     """The file of a robot's airtime account, beside its state file.
 
-    :raises ConfigError: when the settings name no robot
+    :param state: its state file, '' = the usual one
     """
-    return _state_file(config, config.src_id()).with_suffix(".airtime")
+    return _state_file(state, robot_id).with_suffix(".airtime")
 
 
-def _state_file(config: SourceConfig | SinkConfig, src_id: int) -> Path:
-    return Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
+def _state_file(state: str, robot_id: int) -> Path:
+    return Path(state).expanduser() if state else state_folder() / f"robot_{robot_id}.json"
 
 
 def state_folder() -> Path:

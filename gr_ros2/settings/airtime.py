@@ -14,6 +14,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.fields import AUTO, Auto
 
 HOUR_S = 3600.0
@@ -91,6 +92,8 @@ class AirtimeConfig(Windowed):
         without one no limit
     :param window_s: s over which ``duty_cycle`` holds; auto = the band's, without one an hour
     :param max_burst_s: most s without a pause of 0.1 s, 0 = no limit; auto = the band's, without one no limit
+    :param listen_before_send: a packet waits while the receiver hears a signal, 6 dB above the noise; for front ends of
+        SDRs with ``half_duplex``
     """
 
     band: str = ""
@@ -103,6 +106,7 @@ class AirtimeConfig(Windowed):
     max_burst_s: Annotated[
         Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Longest time without a pause (s)")
     ] = AUTO
+    listen_before_send: bool = False
 
     @model_validator(mode="after")
     def _within_band(self) -> AirtimeConfig:
@@ -131,6 +135,14 @@ class AirtimeConfig(Windowed):
                 "set less"
             )
         return self
+
+    def check_seal(self, *, encrypts: bool) -> None:
+        """:raises ConfigError: for a robot that encrypts in a band that forbids it"""
+        band = self.of_band
+        if band is not None and band.in_clear and encrypts:
+            raise ConfigError(
+                f"airtime.band = {self.band!r}: forbids encryption ({band.source}); set seal: authenticate"
+            )
 
     @property
     def of_band(self) -> Band | None:

@@ -118,6 +118,29 @@ def test_every_packet_goes_out_as_one_ended_burst_and_comes_back(driver: Path, t
     assert not {"bursts_out", "underflows", "late", "corrupted"} & set(result)
 
 
+def test_a_link_that_only_receives_opens_no_transmitter(driver: Path, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    front_end = {"name": "soapy", "args": f"driver=loopback,log={log}", "frequency": 433e6, "half_duplex": True}
+    code = (
+        "import json\n"
+        "from tests.radio.robots import *\n"
+        f"state = {str(tmp_path / 'state')!r}\n"
+        f"with RobotLink(config(1, {front_end!r}, version=1, transmit=False, state=state)) as link:\n"
+        "    wait_for(lambda: link.front_end._gaps.nitems_read(0), 'samples')\n"
+        "    link.check()\n"
+        "    print(json.dumps(link.stats()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=with_driver(driver), capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert told["packets"]["out"] == 0
+    assert not told["airtime"]["transmits"]
+    lines = log.read_text().splitlines()
+    assert f"rx rate {RATE:f}" in lines
+    assert [line for line in lines if line.startswith("tx") and line != "tx closed"] == []
+
+
 def test_what_a_device_tells_is_counted_by_name(driver: Path) -> None:
     front_end = {"name": "soapy", "args": "driver=loopback,tells=2,loses=3", "frequency": 433e6}
     result = talk(driver, front_end, {"phy": {"name": "psk", "sample_rate": SLOW}})
@@ -137,7 +160,8 @@ from gr_ros2.phy.pdus import AirPacket, packets_of, pdu_to_send
 from gr_ros2.radio.radio import make_radio
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
-radio, probe, top = make_radio("psk", 64, 1e6, "soapy", args=sys.argv[1], frequency=433e6), Probe(), Flowgraph("t", "t")
+radio = make_radio("psk", 64, 1e6, "soapy", args=sys.argv[1], frequency=433e6, transmit=True)
+probe, top = Probe(), Flowgraph("t", "t")
 top.msg_connect(probe, "pdus", radio, "pdus")
 top.msg_connect(radio, "pdus", probe, "pdus")
 got = lambda: [packet for message in probe.messages for packet in packets_of(message)[0]]
@@ -323,6 +347,21 @@ def test_a_radio_has_a_channel_of_its_own(monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr(SoapyFrontEnd, half, lambda _self: None)
     with pytest.raises(ConfigError, match="channel: front_end soapy has a real one"):
         RobotLink(config(1, {"name": "soapy", "frequency": 433e6}, channel={"snr_db": 3}))
+
+
+def test_a_device_listens_where_it_sends_and_does_not_hear_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    for half in ("_open_transmitter", "_open_receiver"):
+        monkeypatch.setattr(SoapyFrontEnd, half, lambda _self: None)
+    phy = PskPhy(64, RATE)
+    listening = SoapyFrontEnd(phy, frequency=433e6, half_duplex=True).busy
+    assert listening is not None
+    assert not listening()
+    assert SoapyFrontEnd(phy, frequency=433e6).busy is None
+    assert SoapyFrontEnd(phy, frequency=433e6, frequency_rx=434e6, half_duplex=True).busy is None
+    with pytest.raises(ConfigError, match=r"airtime\.listen_before_send: front_end soapy measures no power where it"):
+        RobotLink(config(1, {"name": "soapy", "frequency": 433e6}, airtime={"listen_before_send": True}))
+    with pytest.raises(ConfigError, match="medium = 'slots' has times of its own; leave it out"):
+        config(1, {"name": "udp"}, version=1, medium="slots", airtime={"listen_before_send": True})
 
 
 def test_airtime_counts_padding_guard_and_turnaround(monkeypatch: pytest.MonkeyPatch) -> None:
