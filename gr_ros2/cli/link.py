@@ -191,7 +191,7 @@ def _live(running: RobotLink) -> LiveRun:
         sources={source.src_id: source},
         links=(running.radio,),
         ledger=None,
-        received_as=running.sink.name_here,
+        received_as=running.sink.outputs.heard.name_of,
     )
 
 
