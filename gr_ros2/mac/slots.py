@@ -114,6 +114,13 @@ class Slots:
         """v; see the module."""
         self._since: float | None = None
 
+    def unheard(self, now: float) -> bool:
+        """Whether robots are heard, of which none has named this one for so long that none can hear it."""
+        if not self.clock.runs or self._since is None or now < self._since + 3 * HEARD_S:
+            return False
+        slot = self.clock.slot(now)
+        return not self._alone(slot) and self._confirmed_at < slot - 2 * self._memory()
+
     # ---- sending
 
     def departure(self, now: float) -> float:
