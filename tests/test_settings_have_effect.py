@@ -222,6 +222,7 @@ effects(
     cmd_vel_rate=drives(cmd_vel_rate=5.0),
     clock_rate=drives(clock_rate=5.0),
     map_rate=drives(map_rate=3.0),
+    rtcm_rate=drives(rtcm_rate=3.0),
     beams=drives(beams=90),
     scan_range=drives(scan_range=3.0),
     map_cells=drives(map_cells=50),
@@ -298,6 +299,7 @@ effects(
     duty_cycle=run("airtime.duty_cycle=0.1"),
     window_s=run("airtime.window_s=10", "airtime.duty_cycle=0.1"),
     max_burst_s=run("airtime.max_burst_s=0.2"),
+    listen_before_send=Elsewhere("tests/radio/test_radio.py"),
 )
 effects(
     "Reports",

@@ -39,7 +39,7 @@ from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.switch import TransmitSwitch
-from gr_ros2.radio.waiting import shortcut
+from gr_ros2.radio.waiting import foreign, shortcut
 from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import Registry
@@ -145,6 +145,7 @@ class RobotLink(Flowgraph):
                 channel=self.config.channel,
                 record=self.config.record,
                 limit=self._limit,
+                listens=self.config.airtime.listen_before_send and self.sends,
                 instrumented=self._instrumented,
             )
         except BaseException:
@@ -380,10 +381,15 @@ class RobotLink(Flowgraph):
         """What a person should know about this link and its surroundings: one line each, mostly none."""
         now, own = self._clock(), self.config.ros_source.src_id()
         robots = [peer["robot"] for peer in peers(self.end, now)]
+        here, there = self.source.middleware, self.sink.middleware
+        names = {info.topic for graph in {here, there} for info in graph.discover() if info.publishers}
+        services = here.discover_services() if isinstance(here, ServiceGraph) else ()
         full, self._outrun = outrun(self._outrun, self.source.stats()["topics"])
+        sink = self.sink.stats()
         lines = [
-            shortcut(self.source.middleware.discover(), own, robots),
-            same_id(own, {"sink": self.sink.stats()}),
+            shortcut([*names, *services], own, robots),
+            foreign(names, sink["topics"]),
+            same_id(own, {"sink": sink}),
             full if self._shares else None,
         ]
         with self.end.lock:

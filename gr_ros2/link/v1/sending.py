@@ -94,6 +94,7 @@ class SendingSide:
             return first
         filling = packing.fill(self._window.packets.newest + 1, self._writer.room, now)
         if filling is not None:
+            self.pace.waited(filling.since, now)
             reports.add(filling.parts, self._writer.room - filling.used, due, now)
             return self._writer.source(filling.parts, filling.lifetimes, filling.qos, filling.sent, now)
         if now >= hellos.due:  # it let messages go first, and none of them is worth sending any more
@@ -101,6 +102,10 @@ class SendingSide:
         if due:
             return reports.packet(due, now)
         return reports.asks(now) or self.repairs.spare(now) or reports.early(now)
+
+    def behind(self, now: float) -> bool:
+        """Whether messages that wait do so because the computer is too slow."""
+        return self.pace.behind(now) and not self._alone(now)
 
     def next_departure(self, now: float) -> float:
         """When ``packet`` may have something, s; without regard to credits."""
