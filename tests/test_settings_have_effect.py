@@ -328,7 +328,11 @@ effects(
 for part in ("channel", "ros_source", "ros_sink"):
     EFFECTS["Way back", part] = Elsewhere("tests/run/test_scenario.py")
 effects("Scenario", **dict.fromkeys(("robots", "duplex", "gains_db"), Elsewhere("tests/run/test_robots.py")))
-effects("Scenario", medium=Elsewhere("tests/run/test_medium_access.py"))
+effects(
+    "Scenario",
+    medium=Elsewhere("tests/run/test_medium_access.py"),
+    relay=Elsewhere("tests/run/test_relaying.py"),
+)
 effects(
     "Robot",
     ros_source=run("robots=[{ros_source: {repair: 'off'}}, {}]", scenario="two-robots-half-duplex"),

@@ -657,10 +657,12 @@ class AnyLink(OneWay, Agreed, Named):
     :param airtime: how much a robot may send, whatever waits: settings, or the name of a band alone
     :param medium: when a robot sends on a channel that others use too: slots that it derives from the packets heard,
         aloha (at random, as rarely as the robots heard call for), or exclusive = whenever it has something
+    :param relay: gain = a robot sends on the messages of others that make those who hear it youngest; medium: slots
     """
 
     phy: PhyConfig = Field(default_factory=PhyConfig)
     medium: Medium = "exclusive"
+    relay: Literal["off", "gain"] = "off"
     airtime: Airtime = Field(default_factory=AirtimeConfig)
     localhost_only: bool | Auto = AUTO
 
@@ -668,6 +670,8 @@ class AnyLink(OneWay, Agreed, Named):
     def _medium_fits(self) -> AnyLink:
         if self.medium != "exclusive" and not self.version:
             raise ValueError(f"medium = {self.medium!r}: version 0 says nothing about slots; set version: 1")
+        if self.relay != "off" and self.medium != "slots":
+            raise ValueError(f"relay = {self.relay!r}: the packets of slots name who hears whom; set medium: slots")
         if self.medium != "exclusive" and not self.phy.takes_airtime:
             raise ValueError(f"medium = {self.medium!r}: phy direct takes no airtime; choose another")
         return self
