@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from gr_ros2.radio.robot_link import RobotLink
     from gr_ros2.run.observers import LiveRun
 
+_log = logging.getLogger(__name__)
 _SHOW_S = 0.5
 _LOOK_S = 3.0
 """s after which the graph has told most of what is on it."""
@@ -136,7 +138,7 @@ def link(
         running = RobotLink(settings, observer=run_observers, instrumented=True)
         stack.callback(running.stop)
         for number, on in ((signal.SIGUSR1, False), (signal.SIGUSR2, True)):
-            signal.signal(number, lambda *_, on=on: running.transmit(on=on))
+            signal.signal(number, lambda *_, on=on: _switch(running, on))
         try:
             running.start()
             answers |= {STATUS: lambda _: running.stats(), PING: lambda robot: running.ping(int(robot))}
@@ -150,6 +152,13 @@ def link(
         for line in running.incomplete():
             console.print(line, soft_wrap=True)
         return FAILED if running.incomplete() else 0
+
+
+def _switch(running: RobotLink, on: bool) -> None:
+    try:
+        running.transmit(on=on)
+    except ConfigError as error:  # a signal ends no link
+        _log.warning("%s", error)
 
 
 def _in_one_line(values: Mapping[str, Any], overrides: Sequence[str], save: Path | None) -> LinkConfig:
@@ -177,7 +186,7 @@ def _live(running: RobotLink) -> LiveRun:
         duration_s=0.0,
         packet_len=running.config.packet_len,
         registry=running.registry,
-        topics={(source.src_id, topic.topic_id): name for name, topic in source.subscribed.items()},
+        topics={(source.src_id, topic.topic_id): name for name, topic in source.subscriptions.subscribed.items()},
         sources={source.src_id: source},
         links=(running.radio,),
         ledger=None,

@@ -59,7 +59,7 @@ class LiveCalls:
         self._end, self._messages = end.endpoint, end.endpoint.messages
         self._lock, self._work = end.lock, end.work
         self._engine = Calls(source.src_id, self._end.boot)
-        self._row = len(source.registry)
+        self._row = len(source.subscriptions.registry)
         self._source, self._sink = source, sink
         self._clock = source.clock
         self._robots: dict[int, _Robot] = {}
@@ -72,9 +72,9 @@ class LiveCalls:
         self._offered: dict[int, Offer] = {}
         """The services of this robot whose server is there, by id."""
         self._clients: dict[int, ServiceClient] = {}
-        for name, topic in source.services.items():
+        for name, topic in source.subscriptions.services.items():
             self._offer(name, topic)
-        source.offer_with(self._offer_found)
+        source.found.offer_with(self._offer_found)
         sink.share(self)
 
     def takes(self, event: ReceiverEvent) -> bool:

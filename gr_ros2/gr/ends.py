@@ -27,7 +27,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import settings_of
-from gr_ros2.link.v1.neighbours import Save
+from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.middleware import Middleware, join_graph, meet
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build, refuse_without_effect, robot_of
@@ -236,20 +236,22 @@ def start_of(
     )
     if not config.state and not config.key and src_id < 0:
         return replace(setup, boot=int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS))
-    file = BootFile(_state_file(config, src_id), time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None)
+    file = BootFile(
+        _state_file(config.state, src_id), time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None
+    )
     return replace(setup, boot=file.boot, heard=file.heard, save=file.save, close=file.close)
 
 
-def account_of(config: SourceConfig) -> Path:
+def account_of(state: str, robot_id: int) -> Path:
     """The file of a robot's airtime account, beside its state file.
 
-    :raises ConfigError: when the settings name no robot
+    :param state: its state file, '' = the usual one
     """
-    return _state_file(config, config.src_id()).with_suffix(".airtime")
+    return _state_file(state, robot_id).with_suffix(".airtime")
 
 
-def _state_file(config: SourceConfig | SinkConfig, src_id: int) -> Path:
-    return Path(config.state).expanduser() if config.state else state_folder() / f"robot_{src_id}.json"
+def _state_file(state: str, robot_id: int) -> Path:
+    return Path(state).expanduser() if state else state_folder() / f"robot_{robot_id}.json"
 
 
 def state_folder() -> Path:

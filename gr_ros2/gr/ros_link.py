@@ -11,7 +11,7 @@ from __future__ import annotations
 import random
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -24,11 +24,12 @@ from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link.access import Access
 from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
 from gr_ros2.mac import GUARD_S, access_of
 from gr_ros2.middleware import Middleware
-from gr_ros2.settings.config import SinkConfig, SourceConfig, build
+from gr_ros2.settings.config import SinkConfig, SourceConfig, airtime_from, build
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import MAX_TOPICS, Registry
 
@@ -118,12 +119,14 @@ def make_link(
     medium: str = "exclusive",
     airtime_s: float = 0.0,
     slot_guard_s: float = GUARD_S,
+    airtime_limit: str | Mapping[str, Any] = "",
     **values: Any,
 ) -> RosLink:
     """Make a link from the settings of both halves in one list, as GRC does.
 
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: see :class:`RosSource`
+    :param airtime_limit: how much the radio may send, as its block says: what the robot says about itself becomes rarer
     :param medium: see :class:`gr_ros2.settings.config.AnyLink`
     :param airtime_s: of the longest packet, s; needed unless ``medium`` is exclusive
     :param slot_guard_s: silence between the packets of two robots, s: the timing error of the radio
@@ -142,6 +145,9 @@ def make_link(
     source, sink = halves
     if sink.robot_id == AUTO:  # by it the sink knows the robot's own packets
         sink = replace(sink, robot_id=source.src_id())
+    limits = airtime_from(airtime_limit)
+    limits.check_seal(encrypts=bool(source.key) and source.seal == "encrypt")
+    rule = limits.rule
     shares = medium != "exclusive"
     if shares and not (source.version and airtime_s > 0):
         raise ConfigError(f"medium = {medium!r}: needs version 1, and airtime_s above 0: that of the longest packet")
@@ -153,4 +159,5 @@ def make_link(
         any_length=any_length,
         access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=slot_guard_s),
         lead_s=LEAD_S,
+        airtime_share=1.0 if rule is None else sustained(rule),
     )

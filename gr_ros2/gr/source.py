@@ -9,42 +9,33 @@ from __future__ import annotations
 
 import logging
 import random
-import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any
 
 import pmt
 from gnuradio import gr
 
-from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.core.guard import Guard
-from gr_ros2.gr.ends import LOOP_GUARD, EndpointSetup, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
-from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
+from gr_ros2.gr.ends import EndpointSetup, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.found_topics import FoundTopics
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
-from gr_ros2.gr.topic_search import TopicSearch
+from gr_ros2.gr.subscriptions import Subscriptions
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
-from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
-from gr_ros2.middleware.adapt import agreed
-from gr_ros2.middleware.services import OTHER_RMW, ServiceGraph
-from gr_ros2.middleware.type_descriptions import Described
-from gr_ros2.middleware.type_search import TypeSearch
+from gr_ros2.middleware import Middleware
 from gr_ros2.phy.pdus import CREDIT, AirPacket, PduPort
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import SourceConfig, replaced
-from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.registry import MAX_TOPICS, NewTopic, Registry, Topic, normalize_type, options_of
-from gr_ros2.settings.service_rows import ServiceRow, is_service, parts, rows_of
-from gr_ros2.settings.topic_choice import TopicChoice
+from gr_ros2.settings.fields import Auto
+from gr_ros2.settings.registry import Registry
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 32
@@ -95,7 +86,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         rows = read_registry(registry, needed=not self.config.version)
         self.src_id = self.config.src_id()
         """The source id on the wire."""
-        self.registry = rows.with_options(self.config.topic_options)
         self._start = EndpointSetup()
         if end is None:
             start = self._start = start_of(
@@ -107,7 +97,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             )
         end.observer = self._observe
         self._live, self._end = end, end.endpoint
-        self._messages = end.endpoint.messages
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
         self.clock = clock
@@ -116,9 +105,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """MCS of the newest packet."""
         self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
         self._lock, self._work = end.lock, end.work
-        self._room = threading.Condition(self._lock)
         self._running = False
-        self._closed = False
         self._thread = BlockThread()
         self._looked = -inf
         """When the sending thread last began to look for packets, s."""
@@ -127,36 +114,22 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self.composed = self.emitted = 0
         """Number of packets composed, and number of PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
-        static = [topic for topic in self.registry if topic.latched and topic.type_name == TF_TYPE]
-        self._static = {topic.topic_id: StaticTransforms(self._counters) for topic in static}
-        self._subscriptions: dict[int, Subscription] = {}
         self._port = PduPort(self)
         self.message_port_register_in(CREDIT)
         self.set_msg_handler(CREDIT, self._credit)
-        namespace, words = self.config.namespace, self.config.topics
-        chosen = self.registry.chosen(words) if self.registry else []
-        self.subscribed = {topic.on_graph(namespace): topic for topic in chosen if topic.is_topic}
-        """Topics by their absolute names on the ROS graph. The mapping is replaced as a whole when a topic is added."""
-        self.services = {topic.on_graph(namespace): topic for topic in chosen if topic.is_service}
-        """The same for the services that other robots may call."""
-        self.choice = TopicChoice(() if self.registry else words, namespace)
-        """The topics and services that are looked for on the ROS graph."""
-        self.offered: set[str] = set()
-        """Absolute names of the services, actions and nodes that were found and chosen."""
-        self._offer: Callable[[str, Topic], None] | None = None
-        self._left_out: set[str] = set()
-        self.not_offered: set[str] = set()
-        """Services that cannot be called because of the RMW of their nodes. Only the first one is logged."""
-        self._full = False
-        """Whether a topic was not sent because there are too many. Only the first one is logged."""
-        self._search: TopicSearch | None = None
-        self._types: TypeSearch | None = None
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
+        rows = rows.with_options(self.config.topic_options)
+        self.subscriptions = Subscriptions(
+            rows, self.config, self._graph, end, clock=clock, counters=self._counters, log=self._log
+        )
+        """What it sends."""
+        self.found = FoundTopics(self.config, self.middleware, self.subscriptions, self._log)
+        """What it looks for."""
+        self._room = self.subscriptions.room
         try:
-            LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
-            self._subscribe()
+            self.subscriptions.open()
         except GrRos2Error:
             self.close()
             raise
@@ -175,17 +148,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     @property
     def matched(self) -> bool:
         """Whether every subscription has found a publisher."""
-        return not self.unmatched
-
-    @property
-    def unmatched(self) -> list[str]:
-        """Names, on the ROS graph, of the topics without a publisher; the patterns, if no name is known yet."""
-        subscriptions, subscribed = self._subscriptions, self.subscribed
-        unseen = [name for name in self.choice.named if name not in subscribed and name not in self.offered]
-        if self.choice.open and not subscribed and not unseen:
-            return [self.choice.everything]
-        waiting = {name: subscriptions.get(topic.topic_id) for name, topic in subscribed.items()}
-        return unseen + [name for name, end in waiting.items() if end is not None and not end.matched()]
+        return not self.found.unmatched()
 
     def stalled_s(self, now: float) -> float:
         """s for which the sending thread has been at one thing, or asleep beyond the time at which it meant to look
@@ -216,13 +179,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._end.pace.use_credit()
 
-    def offer_with(self, offer: Callable[[str, Topic], None]) -> None:
-        """Look for services too, from the next start on, unless ``services`` of the settings is false.
-
-        :param offer: called with the name of each service on the ROS graph and its row, from a thread of this block
-        """
-        self._offer = offer if self.config.services else None
-
     def start(self) -> bool:
         self._unread = not self._port.find_readers()
         if self._unread:
@@ -231,64 +187,29 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._running = True
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
-        if self.choice:
-            self._search = TopicSearch(self.middleware, self._found, services=self._offer is not None)
-        if self.config.version and self.config.compresses and isinstance(self.middleware, ServiceGraph):
-            self._types = TypeSearch(self.middleware, self._types_in_use, self._learn)
+        self.found.start()
         return True
 
     def stop(self) -> bool:
-        self._stop_search()
+        self.found.stop()
         with self._lock:
             self._running = False
-            self._take_losses()
+            self.subscriptions.take_losses()
             self._work.notify_all()
         self._thread.stop()
         return True
 
     def close(self) -> None:
         """Leave the ROS graph. A callback held back by ``backpressure`` returns without submitting. Idempotent."""
-        self._stop_search()
-        with self._lock:
-            self._closed = True
-            self._room.notify_all()
-        for subscription in self._subscriptions.values():
-            subscription.close()
-        with self._lock:
-            self._take_losses()
-        self._subscriptions.clear()
-        LOOP_GUARD.remove(self)
+        self.found.stop()
+        self.subscriptions.close()
         self._finalizer()
         self._start.close()
 
     def stats(self) -> dict[str, Any]:
         """A snapshot of the counters of packets and messages, per topic and in total."""
         with self._lock:
-            self._take_losses()
-            stats = self._end.sent
-            queued = self._messages.queued()
-            rows: dict[str, list[int]] = {}
-            for topic in self.registry:
-                if topic.is_topic:
-                    rows.setdefault(topic.name, []).append(topic.topic_id)
-            topics = {
-                name: {
-                    "topic_id": topic.topic_id,
-                    "type": topic.type_name,
-                    "types": len(rows[topic.name]),
-                    "submitted": sum(stats.submitted[row] for row in rows[topic.name]),
-                    LedgerRow.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
-                    "sent": sum(stats.sent[row] for row in rows[topic.name]),
-                    "queued": sum(queued[row] for row in rows[topic.name]),
-                    "queue": self._messages.queue(topic.topic_id)[0],
-                    "queue_depth": self._messages.depth(topic.topic_id),
-                    "refused": {
-                        reason: sum(stats.refused[row, reason] for row in rows[topic.name])
-                        for reason in sorted({why for row, why in stats.refused if row in rows[topic.name]})
-                    },
-                }
-                for name, topic in self.subscribed.items()
-            }
+            stats, topics = self._end.sent, self.subscriptions.stats()
             return {
                 "src_id": self.src_id,
                 "packets": stats.packets,
@@ -298,7 +219,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "air": dict(stats.air),
                 **{name: self._counters[name] for name in _COUNTED},
                 "observer_missed": self._guard.missed,
-                "unmatched": self.unmatched,
+                "unmatched": self.found.unmatched(),
                 "topics": topics,
                 "middleware": dict(self.middleware.counters),
             }
@@ -335,193 +256,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self.config = config
             self._work.notify_all()
             self._room.notify_all()
-
-    def _subscribe(self) -> None:
-        for name, topic in self.subscribed.items():
-            self._subscribe_to(name, topic)
-        if self._graph.owned:
-            self.middleware.start()
-
-    def _subscribe_to(self, name: str, topic: Topic) -> None:
-        options = topic.options
-        depth = self.config.subscriber_depth if options.depth == AUTO else options.depth
-        if topic.topic_id in self._static and depth:
-            depth = max(depth, STATIC_DEPTH)
-        reliability = None if options.reliability == AUTO else options.reliability
-        durability = None if options.durability == AUTO else options.durability
-        qos = Qos(reliability, durability, depth)
-        callback = partial(self._take, topic.topic_id)
-        subscription = self.middleware.subscribe(name, topic.type_name, qos, callback)
-        self._subscriptions = {**self._subscriptions, topic.topic_id: subscription}
-        subscription.follow(partial(self._follow, topic))
-
-    def _stop_search(self) -> None:
-        for search in (self._search, self._types):
-            if search is not None:
-                search.close()
-        self._search = self._types = None
-
-    def _types_in_use(self) -> list[tuple[str, str]]:
-        return [(name, topic.type_name) for name, topic in self.subscribed.items()]
-
-    def _learn(self, described: Described) -> None:
-        """Code messages of a type by the definition that a node has given."""
-        with self._lock:
-            self._messages.learn(described.type_name, described.types)
-            self._work.notify()
-
-    def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
-        """Send the topics of the graph that are chosen and not sent yet, or have another type now; likewise the
-        services."""
-        published = {(info.topic, info.type_name) for info in infos if info.publishers}
-        for info in infos:
-            sent = self.subscribed.get(info.topic)
-            if not info.publishers or (sent is not None and (info.topic, sent.type_name) in published):
-                continue
-            row_name = self.choice.row_name(info.topic)
-            if row_name is None or info.topic in self._left_out or LOOP_GUARD.returns(self._graph, info.topic):
-                continue
-            try:
-                self._add(row_name, info)
-            except GrRos2Error as error:
-                self._leave_out(info.topic, f"topic {info.topic} is not sent", error)
-        uncallable = (
-            self.middleware.uncallable() if services and isinstance(self.middleware, ServiceGraph) else frozenset()
-        )
-        for row in rows_of(services):
-            row_name = self.choice.row_name(row.name, hidden=row.of_node)
-            if row_name is None or self._is_offered(row) or f"{row.name} {row.kind}" in self._left_out:
-                continue
-            if not uncallable.isdisjoint(parts(row.name, row.kind)):
-                if not self.not_offered:
-                    self._log.warning("%s (%s) is not offered: its node %s", row.name, row.kind, OTHER_RMW)
-                self.not_offered.add(row.name)
-                continue
-            try:
-                self._add_services(row_name, row)
-            except GrRos2Error as error:
-                self._leave_out(f"{row.name} {row.kind}", f"{row.name} ({row.kind}) is not offered", error)
-
-    def _leave_out(self, key: str, what: str, error: GrRos2Error) -> None:
-        """Say once what cannot be sent; of what finds no room, only the first."""
-        self._left_out.add(key)
-        full = len(self.registry) == MAX_TOPICS
-        level = logging.DEBUG if full and self._full else logging.WARNING
-        self._full = full
-        self._log.log(level, "%s: %s", what, error)
-
-    def _is_offered(self, row: ServiceRow) -> bool:
-        """Whether the services of a row are offered already, or have come by radio."""
-        names = parts(row.name, row.kind)
-        return any(name in self.services or LOOP_GUARD.returns(self._graph, name) for name in names)
-
-    def _add_services(self, row_name: str, row: ServiceRow) -> None:
-        """Offer the services of a row to other robots. The topics of an action are sent.
-
-        :raises ConfigError: for a row that cannot be offered, such as one more than a link carries
-        """
-        assert self._offer is not None
-        rows: dict[str, NewTopic] = {}
-        for name, type_name in parts(row.name, row.kind).items():
-            if not self.choice.leaves_out(name):
-                part = row_name + name.removeprefix(row.name)
-                rows[name] = part, type_name, options_of(part, self.config.topic_options)
-        if not any(is_service(type_name) for _, type_name, _ in rows.values()):
-            raise ConfigError("topics leaves out all its services")
-        with self._lock:
-            self.registry = self._messages.add(list(rows.values()))
-            added = dict(zip(rows, self.registry[-len(rows) :], strict=True))
-            self.services = {**self.services, **{name: topic for name, topic in added.items() if topic.is_service}}
-            topics = {name: topic for name, topic in added.items() if topic.is_topic}
-            self.subscribed = {**self.subscribed, **topics}
-        self.offered.add(row.name)
-        LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
-        self._log.info("%s (%s) of the ROS graph is offered to other robots", row.name, row.kind)
-        for name, topic in added.items():
-            if topic.is_service:
-                self._offer(name, topic)
-            else:
-                self._subscribe_to(name, topic)
-
-    def _add(self, row_name: str, info: TopicInfo) -> None:
-        """Announce a topic of the graph, and subscribe it. It may be sent already, with a type that has no publisher
-        any more; each type of a topic has its own row.
-
-        :raises ConfigError: for a topic that cannot be sent, such as one more than a link carries
-        """
-        options, type_name = options_of(row_name, self.config.topic_options), normalize_type(info.type_name)
-        with self._lock:
-            before = self.subscribed.get(info.topic)
-            rows = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
-            if not rows:
-                self.registry = self._messages.add([(row_name, type_name, options)])
-                rows = [self.registry[-1]]
-            (topic,) = rows
-            subscribed = {**self.subscribed, info.topic: topic}
-            self._adapt(topic, info.publishers)
-            if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
-                self._static[topic.topic_id] = StaticTransforms(self._counters)
-            self.subscribed = subscribed
-            self._work.notify()
-        LOOP_GUARD.add_source(self, self._graph, [*subscribed, *self.services])
-        if before is None:
-            self._log.info("topic %s (%s) of the ROS graph is sent", info.topic, topic.type_name)
-        else:
-            self._log.warning("topic %s is %s now, was %s", info.topic, topic.type_name, before.type_name)
-            self._unsubscribe(before)
-        self._subscribe_to(info.topic, topic)
-
-    def _unsubscribe(self, topic: Topic) -> None:
-        """Take no further messages of a row, and keep none for robots that join late."""
-        subscriptions = dict(self._subscriptions)
-        subscriptions.pop(topic.topic_id).close()
-        with self._lock:
-            self._take_losses()
-            self._subscriptions = subscriptions
-            self._messages.forget_kept(topic.topic_id)
-
-    def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
-        """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
-        qos = agreed(offers)
-        publishers = PublisherQos(
-            reliable=qos.reliability != "best_effort",
-            latched=all(offer.durability == "transient_local" for offer in offers),
-            depth=qos.depth,
-            lifespan_s=qos.lifespan_s,
-            period_s=qos.deadline_s,
-        )
-        return self._messages.follow(topic.topic_id, publishers)
-
-    def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
-        """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
-        with self._lock:
-            changed = self._adapt(topic, offers)
-            policy, deadline_s = self._messages.queue(topic.topic_id)
-        if changed:
-            limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
-            self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
-
-    def _take(self, topic_id: int, payload: bytes) -> None:
-        """Accept a message of the ROS graph, in a thread of the middleware."""
-        with self._lock:
-            while self.config.backpressure and not self._closed and not self._messages.room(topic_id):
-                self._room.wait()
-            if self._closed:
-                self._counters["held_back_at_close"] += 1
-                return
-            subscription = self._subscriptions.get(topic_id)
-            if subscription is not None and subscription.lost:
-                self._messages.missed(topic_id, subscription.lost)
-            # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
-            static = self._static.get(topic_id)
-            whole = None if static is None else static.union(payload)
-            self._messages.submit(topic_id, whole or payload, self.clock())
-            self._live.wake()
-
-    def _take_losses(self) -> None:
-        """Count the messages that the ROS graph lost before they arrived here. Called with the lock held."""
-        for topic_id, subscription in self._subscriptions.items():
-            self._messages.missed(topic_id, subscription.lost)
 
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
@@ -561,7 +295,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _emit(self, packets: list[SentPacket]) -> None:
         if self.config.debug:
             for sent in packets:
-                self._log.debug("tx %s", describe(sent, self.registry))
+                self._log.debug("tx %s", describe(sent, self.subscriptions.registry))
         adaptive = bool(self._end.mcs_table)
         on_air = [AirPacket(sent.data, sent.mcs if adaptive else None, leave_at=sent.leave_at) for sent in packets]
         if self._port.bundles:
@@ -578,7 +312,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _observe(self, event: SenderEvent) -> None:
         if isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
             self._said.add((event.topic_id, event.reason))
-            name = self.registry[event.topic_id].name if event.topic_id < len(self.registry) else "of calls"
+            registry = self.subscriptions.registry
+            name = registry[event.topic_id].name if event.topic_id < len(registry) else "of calls"
             level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:

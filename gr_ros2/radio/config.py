@@ -17,6 +17,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.radio.permission import check_band
 from gr_ros2.settings.config import AnyLink, DiagnosticsConfig, Text, build
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import SHARED_KEYS, read_settings, with_shared
@@ -68,20 +69,7 @@ class LinkConfig(AnyLink):
         if self.phy.sample_rate == AUTO and PHY.load(self.phy.name).has_samples:
             raise ValueError("phy.sample_rate = auto: a link needs one; set it to what the radio can do, samples/s")
         self.ros_source.src_id()
-        band, frequency = self.airtime.of_band, self.front_end.get("frequency")
-        if band is not None and band.in_clear and not self.front_end.get("callsign"):
-            raise ValueError(
-                f"airtime.band = {self.airtime.band!r}: a station says its callsign in clear ({band.source}), which "
-                "front_end kiss alone does, in each packet; set front_end.name to kiss, and front_end.callsign"
-            )
-        if band is not None and band.highest_hz and isinstance(frequency, int | float):
-            half = 0.0 if self.phy.sample_rate == AUTO else self.phy.sample_rate / 2
-            if not band.lowest_hz <= frequency - half < frequency + half <= band.highest_hz:
-                raise ValueError(
-                    f"front_end.frequency = {frequency:g}: with phy.sample_rate = {2 * half:g} not within the "
-                    f"{band.lowest_hz / 1e6:g} to {band.highest_hz / 1e6:g} MHz of airtime.band = "
-                    f"{self.airtime.band!r}; set another frequency or band"
-                )
+        check_band(self.airtime, self.front_end, 0.0 if self.phy.sample_rate == AUTO else self.phy.sample_rate)
         return self
 
     @property

@@ -109,7 +109,7 @@ class DeviceFrontEnd(FrontEnd):
         scale = chosen.level / sqrt(phy.burst_power())
         self._shaper = BurstShaper(self.layout, scale, phy.sample_rate, tagged=phy.any_length)
         self._blanker: Blanker | None = None
-        if chosen.half_duplex:
+        if chosen.half_duplex and self.transmits:
             self._blanker = Blanker(self._shaper.sent, chosen.turnaround_s, phy.sample_rate)
         self._gaps, self._energy = GapCounter(), EnergyCounter()
         self._given, self._taken = _Progress(), _Progress()
@@ -118,7 +118,8 @@ class DeviceFrontEnd(FrontEnd):
         self._offset: float | None = None
         self._offset_at = 0.0
         with self.one_line():
-            self._transmitting = self._open_transmitter()
+            if self.transmits:
+                self._transmitting = self._open_transmitter()
             try:
                 self._receiving = self._open_receiver()
                 self._follow_clock()
@@ -179,35 +180,36 @@ class DeviceFrontEnd(FrontEnd):
 
     @property
     def sink(self) -> Any:
-        return self._shaper
+        return self._shaper if self.transmits else None
 
     @property
     def source(self) -> Any:
         return self._blanker or self._receiving
 
     def wire(self, graph: Any) -> None:
-        graph.connect(self._shaper, self._transmitting)
+        if self.transmits:
+            graph.connect(self._shaper, self._transmitting)
         graph.connect(self._receiving, self._gaps)
         if self._blanker is not None:
             graph.connect(self._receiving, self._blanker)
         graph.connect(self.source, self._energy)
 
-    def _silence(self) -> float:
-        """How long nothing is sent after each burst, s."""
-        return float(self.options.guard_s + (self.options.turnaround_s if self.options.half_duplex else 0.0))
-
-    def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
-        samples = self.phy.on_mcs(mcs).airtime_samples(packet_len)
-        return self.layout.total_of(samples) / self.phy.sample_rate + self._silence()
+    @classmethod
+    def airtime_with(cls, phy: Phy, chosen: Any, packet_len: int | None = None, mcs: int = 0) -> float:
+        samples = phy.on_mcs(mcs).airtime_samples(packet_len)
+        burst = BurstLayout(samples, chosen.lead, chosen.tail, chosen.multiple)
+        return burst.total / phy.sample_rate + _silence(chosen)
 
     def ahead(self) -> float:
-        return 0.0 if self._silence() else _LEAD_S
+        return 0.0 if _silence(self.options) else _LEAD_S
 
     def check(self, now: float) -> None:
         if self._offset is not None and now - self._offset_at > _FOLLOWED_S:
             self._follow_clock()
         if self._given.still_s(self._gaps.nitems_read(0), now) > SILENT_S:
             raise self._dead("no samples")
+        if self._transmitting is None:
+            return
         taken = self._transmitting.nitems_read(0)
         waiting = taken < self._shaper.nitems_written(0)
         if self._taken.still_s(taken if waiting else None, now) > SILENT_S + self.layout.total / self.phy.sample_rate:
@@ -310,6 +312,11 @@ class DeviceFrontEnd(FrontEnd):
                 f"front_end {self.name}: args = {self.options.args!r}: {reason}; is the device plugged in, and free? "
                 f"{self.find_with} lists devices, args look like {self.example_args}"
             ) from error
+
+
+def _silence(chosen: DeviceOptions) -> float:
+    """How long nothing is sent after each burst, s."""
+    return chosen.guard_s + (chosen.turnaround_s if chosen.half_duplex else 0.0)
 
 
 class _Progress:

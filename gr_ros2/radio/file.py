@@ -73,7 +73,7 @@ class FileFrontEnd(FrontEnd):
                     f"instead of {phy.sample_rate:g}"
                 )
             self._replay = _Replay(samples, phy, self.options)
-        if self.options.write:
+        if self.options.write and self.transmits:
             about = SigmfRecording(phy.sample_rate, None, f"sent with phy {phy.name}, {phy.packet_len} B packets")
             bursts = BurstCutter(phy.airtime_samples(), phy.any_length)
             self._recorder = SigmfRecorder(Path(self.options.write), about, bursts, lossless=True)

@@ -60,6 +60,7 @@ class FrontEnd(ABC):
     """The connection of one robot to the air.
 
     :param phy: PHY whose samples it carries, at its sample rate
+    :param transmits: whether it may send; if not, no transmitter is opened
     :param options: fields of ``Options``
     :raises ConfigError: for an option that is unknown or out of range, or a PHY without samples
     :raises RadioError: when the device, address or file cannot be opened
@@ -85,7 +86,7 @@ class FrontEnd(ABC):
     refuses: ClassVar[frozenset[str]] = frozenset()
     """Options of its base class that it does not support. GRC does not offer them."""
 
-    def __init__(self, phy: Phy, **options: Any) -> None:
+    def __init__(self, phy: Phy, *, transmits: bool = True, **options: Any) -> None:
         self.options: Any = build(self.Options, options, f"front_end {self.name}")
         if not self.carries(type(phy)):
             raise ConfigError(
@@ -97,7 +98,7 @@ class FrontEnd(ABC):
             )
         if not self.any_length:
             phy.pad_all()
-        self.phy = phy
+        self.phy, self.transmits = phy, transmits
 
     @classmethod
     def carries(cls, phy: type[Phy]) -> bool:
@@ -148,7 +149,15 @@ class FrontEnd(ABC):
         :param packet_len: length of the packet, bytes; None: that of the longest
         :param mcs: with an adaptive rate, the MCS that it is sent with
         """
-        return self.phy.airtime(packet_len, mcs) + float(self.options.guard_s)
+        return self.airtime_with(self.phy, self.options, packet_len, mcs)
+
+    @classmethod
+    def airtime_with(cls, phy: Phy, chosen: Any, packet_len: int | None = None, mcs: int = 0) -> float:
+        """What :meth:`airtime` says where a front end has these options, without one that is open.
+
+        :param chosen: an object of ``Options``
+        """
+        return phy.airtime(packet_len, mcs) + float(chosen.guard_s)
 
     def ahead(self) -> float | None:
         """How long before the begin of its airtime a packet must arrive, s. None if samples take no time to pass: a

@@ -81,7 +81,8 @@ class PlutoFrontEnd(DeviceFrontEnd):
     def _power_dbm(cls, gain_db: float, level: float) -> float | None:
         return _FULL_POWER_DBM + gain_db + 20 * log10(level)
 
-    def _open_transmitter(self) -> Any:
+    def _check_asked(self) -> None:
+        """:raises RadioError: for what no Pluto has"""
         rate, options = self.phy.sample_rate, self.options
         if not SLOWEST <= rate <= FASTEST:
             raise RadioError(
@@ -89,6 +90,10 @@ class PlutoFrontEnd(DeviceFrontEnd):
             )
         if any(getattr(options, name) != AUTO for name in self.refuses):
             raise RadioError("front_end pluto: a Pluto has one port to send and one to receive; leave antennas out")
+
+    def _open_transmitter(self) -> Any:
+        self._check_asked()
+        rate, options = self.phy.sample_rate, self.options
         block = iio.fmcomms2_sink_fc32(self.device_args, _CHANNELS, self.layout.total, False)
         block.set_filter_params(*_AUTOMATIC_FILTER)
         block.set_samplerate(int(rate))
@@ -99,6 +104,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
         return block
 
     def _open_receiver(self) -> Any:
+        self._check_asked()
         rate, options = self.phy.sample_rate, self.options
         size = max(1024, int(rate * 0.005)) if options.buffer_rx == AUTO else options.buffer_rx
         block = iio.fmcomms2_source_fc32(self.device_args, _CHANNELS, size)

@@ -6,13 +6,16 @@ direction waits for the other. Received samples can be impaired only if the chan
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr.ends import account_of
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.airtime import AirtimeGate
@@ -21,8 +24,11 @@ from gr_ros2.phy.flowgraph import HierBlock
 from gr_ros2.phy.path import PacketPath
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.permission import check_band, permitted
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording
-from gr_ros2.settings.config import ChannelConfig, build
+from gr_ros2.settings.config import ChannelConfig, airtime_from, build
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.state.airtime import AirtimeFile
 
 
 class Radio(PacketPath, HierBlock):
@@ -56,6 +62,8 @@ class Radio(PacketPath, HierBlock):
             register("pdus")
         self.message_port_register_hier_out("credit")
         self.phy, self.front_end = phy, front_end
+        self.closing = ExitStack()
+        """What :meth:`close` closes besides."""
         self.channel = ChannelConfig() if channel is None else channel
         phy.check_channel(self.channel)
         if front_end.has_radio and self.channel != ChannelConfig():
@@ -76,6 +84,8 @@ class Radio(PacketPath, HierBlock):
             timed=front_end.clock_offset is not None,
             clock=front_end.clock,
         )
+        if not front_end.transmits:
+            self.gate.transmit(on=False)
         front_end.follow(self.at_rest)
         self.msg_connect(self, "pdus", self._gate, "pdus")
         self.msg_connect(self._gate, "credit", self, "credit")
@@ -129,6 +139,19 @@ class Radio(PacketPath, HierBlock):
         if self._recorder is not None:
             self._recorder.close()
         self.front_end.close()
+        self.closing.close()
+
+    def transmit(self, *, on: bool) -> None:
+        """Switch sending off, at once for all packets that have not reached the device, or on again.
+
+        :raises ConfigError: where it only receives
+        """
+        if on and not self.front_end.transmits:
+            raise ConfigError(
+                f"front_end {self.front_end.name}: it only receives, and has no open transmitter; start it again with "
+                "--transmit, or transmit: true"
+            )
+        super().transmit(on=on)
 
     def recorded(self) -> dict[str, int]:
         """Numbers of samples. ``unrecorded``: not in the recording, for example because the disk is full. Empty if
@@ -168,6 +191,10 @@ def make_radio(
     *,
     channel: Mapping[str, Any] | None = None,
     record: str = "",
+    transmit: bool | Auto = AUTO,
+    airtime_limit: str | Mapping[str, Any] = "",
+    robot_id: int | Auto = AUTO,
+    state: str = "",
     **options: Any,
 ) -> Radio:
     """Make a radio from the names of its parts, as GRC does.
@@ -180,15 +207,35 @@ def make_radio(
     :param channel: settings of :class:`gr_ros2.settings.config.ChannelConfig`, for front ends without a radio. If they
         are given, even empty, they can be changed while the radio runs
     :param record: SigMF recording to write of all samples received, '' = none
+    :param transmit: whether it may send: auto = yes, where no radio is connected; a radio needs True
+    :param airtime_limit: how much it may send: name of a band, or settings of
+        :class:`gr_ros2.settings.airtime.AirtimeConfig`; '' = no limit
+    :param robot_id: with ``airtime_limit``: the robot whose account this is, as for its link
+    :param state: with ``airtime_limit``: that robot's state file, beside which the account is; '' = the usual one
     :param options: settings of the front end
-    :raises ConfigError: for an unknown name or setting, or a value out of range
+    :raises ConfigError: for an unknown name or setting, or a value out of range; for a radio that nobody has allowed
+        to send
     :raises RadioError: when the front end cannot be opened, or the recording cannot be written
     """
     modem: Phy = PHY.load(phy)(packet_len, sample_rate, **(phy_options or {}))
     impairments = build(ChannelConfig, channel or {}, "channel")
-    opened: FrontEnd = FRONT_ENDS.load(front_end)(modem, **options)
-    try:
-        return Radio(modem, opened, channel=impairments, record=record, changeable=channel is not None)
-    except BaseException:
-        opened.close()
-        raise
+    limits = airtime_from(airtime_limit)
+    kind: type[FrontEnd] = FRONT_ENDS.load(front_end)
+    sends = permitted(transmit, kind, options)
+    check_band(limits, options, modem.sample_rate if modem.has_samples else 0.0)
+    with ExitStack() as undo:
+        opened = kind(modem, transmits=sends, **options)
+        undo.callback(opened.close)
+        limit = None
+        if limits.rule is not None and sends:
+            if robot_id == AUTO:
+                raise ConfigError("airtime_limit: whose account is it? set robot_id to that of the robot's link")
+            file = AirtimeFile(account_of(state, robot_id))
+            undo.callback(file.close)
+            longest, now = opened.airtime(), time.monotonic()
+            limit = AirtimeLimit(limits.rule, longest, now=now, spent=file.spent, save=file.save)
+        radio = Radio(modem, opened, channel=impairments, record=record, limit=limit, changeable=channel is not None)
+        if limit is not None:
+            radio.closing.callback(file.close)
+        undo.pop_all()
+        return radio

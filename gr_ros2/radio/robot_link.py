@@ -36,6 +36,7 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.findings import about, introduce, peers, ping
 from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.switch import TransmitSwitch
 from gr_ros2.radio.waiting import shortcut
@@ -49,27 +50,6 @@ _STOP_S, _RETRY_S = 10.0, 1.0
 STALLED_S = 10.0
 """s after which a thread that sends counts as stuck: longer than a busy computer makes it wait."""
 _log = logging.getLogger(__name__)
-
-
-def permitted(config: LinkConfig, front_end: type[FrontEnd]) -> bool:
-    """Whether a link may send.
-
-    :raises ConfigError: for a radio that would send without a word of permission, or without a key
-    """
-    if config.transmit is False or not front_end.has_radio:
-        return config.transmit is not False
-    on_air = f"front_end {front_end.name} sends {front_end.on_air(config.front_end_options)}"
-    if config.transmit is not True:
-        raise ConfigError(
-            f"{on_air}: say once that it may, with --transmit or transmit: true in the file (docs/how-to/radios.md, "
-            "Before you send); --listen-only only receives"
-        )
-    if not config.key and not config.open:
-        raise ConfigError(
-            f"{on_air}, and there is no key: anybody could read, forge and replay its packets; set key (gr-ros2 key "
-            "new FILE), or --open, open: true in the file"
-        )
-    return True
 
 
 class RobotLink(Flowgraph):
@@ -121,7 +101,9 @@ class RobotLink(Flowgraph):
         rate = config.phy.sample_rate
         self.phy = configured(config.phy, config.packet_len, 0.0 if rate == AUTO else rate)
         self._front_end_class: type[FrontEnd] = FRONT_ENDS.load(config.front_end_name)
-        self.sends = permitted(config, self._front_end_class)
+        self.sends = permitted(
+            config.transmit, self._front_end_class, config.front_end_options, guarded=bool(config.key) or config.open
+        )
         """Whether it may send at all."""
         self._open_radio()
         self._stack.callback(self._close_radio)
@@ -153,7 +135,7 @@ class RobotLink(Flowgraph):
 
         :raises RadioError: when it cannot be opened
         """
-        self.front_end = self._front_end_class(self.phy, **self.config.front_end_options)
+        self.front_end = self._front_end_class(self.phy, transmits=self.sends, **self.config.front_end_options)
         try:
             self.radio = Radio(
                 self.phy,
@@ -207,7 +189,8 @@ class RobotLink(Flowgraph):
             self._retry_at = self._clock() + _RETRY_S
             return
         self._retry_at = inf
-        self.radio.gate.transmit(on=transmits)
+        if not transmits:
+            self.radio.transmit(on=False)
         self._connect_radio()
         super().start()
         _log.warning("link %s: front end %s is back", self.config.name, self.front_end.name)
@@ -216,15 +199,18 @@ class RobotLink(Flowgraph):
     def _limit(self) -> AirtimeLimit | None:
         """What limits the airtime, with what earlier starts of this robot have sent."""
         rule = self.config.airtime.rule
-        if rule is None:
+        if rule is None or not self.sends:
             return None
-        file = AirtimeFile(account_of(self.config.ros_source))
+        file = AirtimeFile(account_of(self.config.ros_source.state, self.config.ros_source.src_id()))
         self._stack.callback(file.close)
         longest, now = self.front_end.airtime(), time.monotonic()
         return AirtimeLimit(rule, longest, now=now, spent=file.spent, save=file.save)
 
     def transmit(self, *, on: bool) -> None:
-        """Switch sending off, at once for all packets that have not reached the device, or on again."""
+        """Switch sending off, at once for all packets that have not reached the device, or on again.
+
+        :raises ConfigError: where it only receives
+        """
         self.radio.transmit(on=on)
         _log.warning("link %s: sending is %s", self.config.name, "on" if on else "off")
 
@@ -295,7 +281,7 @@ class RobotLink(Flowgraph):
     @property
     def registry(self) -> Registry:
         """The topics that are sent; it grows if they are looked for on the ROS graph."""
-        return self.source.registry
+        return self.source.subscriptions.registry
 
     def _graphs(self, middleware: Middleware | None) -> tuple[Middleware, Middleware]:
         """The participants of source and sink: one for both if they are on the same graph."""

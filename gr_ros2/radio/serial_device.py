@@ -66,8 +66,13 @@ class StreamFrontEnd(PacketFrontEnd):
         super().__init__(phy, **options)
 
     def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
-        share = 1.0 if packet_len is None else self._rng.random()
-        return super().airtime(packet_len, mcs) + share * float(self.options.backoff_s)
+        drawn = 0.0 if packet_len is None else self._rng.random() * float(self.options.backoff_s)
+        return super().airtime(packet_len, mcs) + drawn
+
+    @classmethod
+    def airtime_with(cls, phy: Phy, chosen: Any, packet_len: int | None = None, mcs: int = 0) -> float:
+        longest = float(chosen.backoff_s) if packet_len is None else 0.0
+        return super().airtime_with(phy, chosen, packet_len, mcs) + longest
 
 
 def open_stream(front_end: str, device: str, baud: int, framing: Framing) -> StreamConnection:

@@ -66,7 +66,7 @@ class SoapyFrontEnd(DeviceFrontEnd):
         return at
 
     def check(self, now: float) -> None:
-        if trouble := self._transmitting.trouble:
+        if self._transmitting is not None and (trouble := self._transmitting.trouble):
             raise RadioError(
                 f"front_end soapy: args = {self.options.args!r}: the device does not begin to send ({trouble}); "
                 "is another program using it?"

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from struct import pack
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.services import ServiceGraph
 
 SWITCH_TYPE = "std_srvs/srv/SetBool"
@@ -17,7 +18,7 @@ _CDR = b"\0\1\0\0"
 class TransmitSwitch:
     """The server.
 
-    :param transmit: switches sending
+    :param transmit: switches sending, or raises ConfigError where it cannot
     :raises MiddlewareError: when the service cannot be offered
     """
 
@@ -31,8 +32,10 @@ class TransmitSwitch:
 
     def _request(self, client: Hashable, payload: bytes) -> None:
         on = len(payload) > len(_CDR) and payload[len(_CDR)] != 0
-        self._transmit(on)
-        self._server.reply(client, _CDR + pack("<B3xI", 1, 1 + len(_TOLD[on])) + _TOLD[on] + b"\0")
-
-
-_TOLD = {True: b"sending is on", False: b"sending is off"}
+        done, told = True, f"sending is {'on' if on else 'off'}"
+        try:
+            self._transmit(on)
+        except ConfigError as error:
+            done, told = False, str(error)
+        text = told.encode()
+        self._server.reply(client, _CDR + pack("<B3xI", done, 1 + len(text)) + text + b"\0")

@@ -50,7 +50,8 @@ class UhdFrontEnd(DeviceFrontEnd):
 
     def wire(self, graph: Any) -> None:
         super().wire(graph)
-        graph.msg_connect(self._transmitting, "async_msgs", self._events, "async_msgs")
+        if self.transmits:
+            graph.msg_connect(self._transmitting, "async_msgs", self._events, "async_msgs")
 
     def _device_counters(self) -> dict[str, int]:
         return dict(self._events.counted)

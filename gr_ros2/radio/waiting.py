@@ -59,7 +59,7 @@ class Waiting:
 
         :raises MiddlewareError: when the graph cannot be asked
         """
-        missing = self._source.unmatched
+        missing = self._source.found.unmatched()
         line = waiting_line(missing, self._types(), self._others()) if missing else self._sent()
         if line == self._last:
             return None
@@ -68,19 +68,20 @@ class Waiting:
 
     def _others(self) -> list[TopicInfo]:
         """What is on the graph, except for what will be sent at once."""
-        infos, choice = self._source.middleware.discover(), self._source.choice
+        infos, choice = self._source.middleware.discover(), self._source.found.choice
         return [info for info in infos if choice.row_name(info.topic) is None]
 
     def _sent(self) -> str:
         """That every topic has a publisher; with the topics and services, where the user did not name them."""
-        if not self._source.choice.open:
+        if not self._source.found.choice.open:
             return ALL_THERE
-        topics = [name for name, topic in self._source.subscribed.items() if not topic.action]
-        offered = f"; services and actions: {_listed(sorted(self._source.offered))}" if self._source.offered else ""
+        topics = [name for name, topic in self._source.subscriptions.subscribed.items() if not topic.action]
+        found = self._source.found.offered
+        offered = f"; services and actions: {_listed(sorted(found))}" if found else ""
         return f"{ALL_THERE}: {_listed(topics)}{offered}"
 
     def _types(self) -> dict[str, str]:
-        return {name: topic.type_name for name, topic in self._source.subscribed.items()}
+        return {name: topic.type_name for name, topic in self._source.subscriptions.subscribed.items()}
 
 
 def waiting_line(missing: Sequence[str], types: dict[str, str], found: Sequence[TopicInfo]) -> str:

@@ -161,11 +161,14 @@ class ZmqFrontEnd(FrontEnd):
         self._counters: Counter[str] = Counter()
         self._passed: Callable[[], int | None] = lambda: None
         self._medium_clock = MediumClock() if self.options.medium_process == "lockstep" else None
+        self._sink: _BurstPublisher | None = None
         if self._medium_clock is not None:
             self.timing_error_s = _LOCKED_S
         try:
-            publisher = self._socket(zmq.PUB)
-            open_socket(publisher.bind, "bind", self.options.bind)
+            if self.transmits or self._medium_clock is not None:  # in lock step, who only listens answers too
+                publisher = self._socket(zmq.PUB)
+                open_socket(publisher.bind, "bind", self.options.bind)
+                self._sink = _BurstPublisher(publisher, phy, self._counters, self._medium_clock)
             subscriber = self._socket(zmq.SUB)
             subscriber.subscribe(b"")
             for address in self.options.connect:
@@ -174,7 +177,6 @@ class ZmqFrontEnd(FrontEnd):
             self._let_go()
             raise
         self._sockets.remove(subscriber)  # its thread closes it
-        self._sink = _BurstPublisher(publisher, phy, self._counters, self._medium_clock)
         told = None if self._medium_clock is None else self._told
         arrivals = _Arrivals(subscriber, phy.sample_rate, self.options.burst_queue, self._counters, told)
         self._source = _BurstSubscriber(arrivals, self._medium_clock)
@@ -200,6 +202,7 @@ class ZmqFrontEnd(FrontEnd):
     def _told(self, medium: int, at: float) -> None:
         """The medium process has told the time: answer when all has been sent that begins before."""
         assert self._medium_clock is not None
+        assert self._sink is not None
         self._medium_clock.tick(medium, at)
         limit = time.monotonic() + _ANSWER_S
         while self._passed() != self._counters["bursts_out"]:
@@ -220,7 +223,8 @@ class ZmqFrontEnd(FrontEnd):
         return FrontEndCounters({name: self._counters[name] for name in ("bursts_out", "bursts_in")}, lost)
 
     def close(self) -> None:
-        self._sink.close()
+        if self._sink is not None:
+            self._sink.close()
         self._let_go()
 
     def _socket(self, kind: int) -> Any:

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.fields import AUTO, Auto
 
 HOUR_S = 3600.0
@@ -131,6 +132,14 @@ class AirtimeConfig(Windowed):
                 "set less"
             )
         return self
+
+    def check_seal(self, *, encrypts: bool) -> None:
+        """:raises ConfigError: for a robot that encrypts in a band that forbids it"""
+        band = self.of_band
+        if band is not None and band.in_clear and encrypts:
+            raise ConfigError(
+                f"airtime.band = {self.band!r}: forbids encryption ({band.source}); set seal: authenticate"
+            )
 
     @property
     def of_band(self) -> Band | None:

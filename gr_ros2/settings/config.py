@@ -684,11 +684,7 @@ class AnyLink(OneWay, Agreed, Named):
             )
         if self.airtime.rule is not None and not self.phy.takes_airtime:
             raise ValueError("airtime: phy direct takes no airtime, so there is nothing to limit; leave it out")
-        band = self.airtime.of_band
-        if band is not None and band.in_clear and self.key and self.seal == "encrypt":
-            raise ValueError(
-                f"airtime.band = {self.airtime.band!r}: forbids encryption ({band.source}); set seal: authenticate"
-            )
+        self.airtime.check_seal(encrypts=bool(self.key) and self.seal == "encrypt")
         return self
 
 
@@ -756,6 +752,14 @@ def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:
         return TypeAdapter(cls).validate_python(dict(values))
     except ValidationError as error:
         raise ConfigError(explain(cls, error.errors(), where)) from error
+
+
+def airtime_from(given: str | Mapping[str, Any]) -> AirtimeConfig:
+    """How much a robot may send, from the name of a band ('' = no limit) or from settings.
+
+    :raises ConfigError: naming key, value and what is allowed
+    """
+    return build(AirtimeConfig, {"band": given} if isinstance(given, str) else given, "airtime")
 
 
 def replaced(config: _T, **changes: Any) -> _T:

@@ -57,7 +57,7 @@ class Pair:
             self.graph.close()
 
     def sends(self, topic: str, type_name: str) -> bool:
-        found = self.source.subscribed.get(topic)
+        found = self.source.subscriptions.subscribed.get(topic)
         return found is not None and found.type_name == type_name
 
 
@@ -91,7 +91,7 @@ def test_a_publisher_that_comes_back_with_another_type_is_carried_again(
         stats = {"source": pair.source.stats(), "sink": pair.sink.stats()}
         assert stats["source"]["topics"]["/count"]["submitted"] == 120
         assert stats["sink"]["topics"]["/rx_robot_1/count"]["delivered"] == 120
-        assert len(pair.source.registry) == 2
+        assert len(pair.source.subscriptions.registry) == 2
         rest = {"packets": {"in": 1, "out": 1, "refused": 0, "damaged": 0}, "airtime": {"transmits": True}}
         rest["uptime_s"] = 1.0
         line = status_line({**stats, **rest, "phy": {"snr_db": None}, "front_end": {"lost": {}}})

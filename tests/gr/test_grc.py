@@ -110,7 +110,14 @@ def test_ros_link_has_the_settings_of_both_halves_and_hands_them_over() -> None:
     offered = [parameter["id"] for parameter in loaded["parameters"]]
     wanted = {item.name for _, config in halves.values() for item in fields(config)}
     assert len(offered) == len(set(offered))
-    assert set(offered) == wanted | {"half_duplex", "any_length", "medium", "airtime_s", "slot_guard_s"}
+    assert set(offered) == wanted | {
+        "half_duplex",
+        "any_length",
+        "medium",
+        "airtime_limit",
+        "airtime_s",
+        "slot_guard_s",
+    }
     values = {parameter["id"]: parameter["default"] for parameter in loaded["parameters"]}
     assert (values["version"], values["compression"], values["repair"]) == ("1", '"auto"', '"auto"')
     for name in offered:
@@ -194,7 +201,8 @@ def test_a_radio_offers_what_it_can_do(name: str) -> None:
     refused = FRONT_ENDS.load(name).refuses
     channel = set() if FRONT_ENDS.load(name).has_radio else {"snr_db", "frequency_offset", "packet_loss"}
     sampled = set() if FRONT_ENDS.load(name).carries_packets else {"sample_rate", "record"}
-    made = {"phy", "phy_options", "packet_len"} | sampled
+    made = {"phy", "phy_options", "packet_len", "airtime_limit", "robot_id", "state"} | sampled
+    made |= {"transmit"} if FRONT_ENDS.load(name).has_radio else set()
     assert set(offered) == settings - refused | channel | made
     assert offered.get("record", "file_save") == "file_save"
     for setting in offered:
@@ -207,7 +215,7 @@ def test_a_radio_offers_what_it_can_do(name: str) -> None:
 def test_what_a_radio_does_not_offer_it_refuses() -> None:
     for setting in ("antenna_tx", "antenna_rx"):
         with pytest.raises(RadioError, match="leave antennas out"):
-            make_radio("psk", 220, 1e6, "pluto", frequency=433e6, **{setting: "A"})
+            make_radio("psk", 220, 1e6, "pluto", frequency=433e6, transmit=True, **{setting: "A"})
 
 
 def test_options_are_the_tables() -> None:
@@ -307,11 +315,17 @@ def in_memory(path: Path, folder: Path) -> Any:
 @pytest.mark.parametrize("name", ON_THE_AIR)
 def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: Path) -> None:
     copy = tmp_path / f"{name}.grc"
-    copy.write_text(example(f"{name}.grc").read_text().replace("'\"dds\"'", "'\"memory\"'"))
-    program = Path(str(compiled(copy, tmp_path).__file__))
-    done = subprocess.run([sys.executable, program], capture_output=True, text=True, check=False)
-    assert done.returncode != 0
-    assert f"RadioError: front_end {name.removesuffix('_radio')}: args = " in done.stderr.splitlines()[-1]
+    text = example(f"{name}.grc").read_text().replace("'\"dds\"'", "'\"memory\"'")
+    front_end = name.removesuffix("_radio")
+    for word, said in (
+        ("'\"auto\"'", f"ConfigError: front_end {front_end} sends at "),
+        ("'True'", f"RadioError: front_end {front_end}: args = "),
+    ):
+        copy.write_text(text.replace("transmit: '\"auto\"'", f"transmit: {word}"))
+        program = Path(str(compiled(copy, tmp_path).__file__))
+        done = subprocess.run([sys.executable, program], capture_output=True, text=True, check=False)
+        assert done.returncode != 0
+        assert said in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.slow

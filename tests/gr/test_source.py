@@ -98,7 +98,7 @@ def test_queues_follow_the_qos_of_the_publishers(middleware: str, monkeypatch: p
         topic_options={"/tf": {"queue": "fifo"}},
     )
     with MIDDLEWARE.load(middleware)(domain_id=domain) as robot:
-        for name, topic in source.subscribed.items():
+        for name, topic in source.subscriptions.subscribed.items():
             robot.advertise(name, topic.type_name, Qos(depth=1, lifespan_s=0.05))
 
         def queues() -> list[str]:
@@ -159,7 +159,7 @@ def test_what_the_graph_loses_last_is_told_when_the_source_stops(rig: Rig) -> No
     events: list[SenderEvent] = []
     source = rig.make(observer=Hears(events.append))
     rig.start()
-    subscription = source._subscriptions[0]
+    subscription = source.subscriptions._subscriptions[0]
     source.middleware.count_lost(subscription, "/robot_1/odom", "lost", 3)
     rig.top.stop()
     rig.top.wait()
@@ -170,9 +170,9 @@ def test_what_the_graph_loses_last_is_told_when_the_source_stops(rig: Rig) -> No
 
 
 def test_all_topics_or_a_subset(rig: Rig) -> None:
-    assert set(rig.make().subscribed) == {"/robot_1/odom", "/tf"}
+    assert set(rig.make().subscriptions.subscribed) == {"/robot_1/odom", "/tf"}
     rig.source.close()
-    assert set(rig.make(topics=["/odom"]).subscribed) == {"/robot_1/odom"}
+    assert set(rig.make(topics=["/odom"]).subscriptions.subscribed) == {"/robot_1/odom"}
 
 
 def test_messages_before_the_start_are_kept(rig: Rig) -> None:

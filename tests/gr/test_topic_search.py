@@ -63,22 +63,22 @@ def test_types_and_qos_are_those_of_the_graph(
         Running(tmp_path, topics=topics, middleware=middleware, domain_id=domain) as running,
     ):
         waiting = Waiting(running.source)
-        assert running.source.unmatched == ["/robot_1/odom", "/elsewhere"]
+        assert running.source.found.unmatched() == ["/robot_1/odom", "/elsewhere"]
         assert "no publisher on /robot_1/odom, /elsewhere yet" in str(waiting.look())
         wheels = robot.advertise("/robot_1/wheels", unknown, Qos("best_effort", "volatile", 1))
         robot.advertise("/robot_1/odom", ODOM, Qos("reliable", "volatile", 5))
         robot.advertise("/robot_1/camera", STRING, Qos("reliable", "volatile", 5))
         robot.subscribe("/robot_1/only_wanted", STRING, Qos("reliable", "volatile", 5), lambda _: None)
         robot.advertise("/elsewhere", STRING, Qos("reliable", "transient_local", 1)).publish(message(1, 20))
-        wait_for(lambda: not running.source.unmatched, "all topics that are named")
-        wait_for(lambda: "/robot_1/wheels" in running.source.subscribed, "a topic that nobody named")
+        wait_for(lambda: not running.source.found.unmatched(), "all topics that are named")
+        wait_for(lambda: "/robot_1/wheels" in running.source.subscriptions.subscribed, "a topic that nobody named")
 
         def crosses() -> bool:
             wheels.publish(message(2, 20))
             return bool(running.submitted["/robot_1/wheels"]) and bool(running.submitted["/elsewhere"])
 
         wait_for(crosses, "messages to be taken")
-        rows = {topic.name: topic.type_name for topic in running.source.registry}
+        rows = {topic.name: topic.type_name for topic in running.source.subscriptions.registry}
         assert rows == {"odom": ODOM, "wheels": unknown, "/elsewhere": STRING}
         queues = {name: topic["queue"] for name, topic in running.source.stats()["topics"].items()}
         assert queues["/robot_1/wheels"] == ("fifo" if middleware == "rclpy" else "latest")  # rclpy tells no depth
@@ -105,20 +105,20 @@ def test_what_cannot_be_sent_is_said_once(tmp_path: Path, caplog: pytest.LogCapt
         assert waiting.look() == "no publisher on /scan yet; nothing else is published on the graph"
         robot.advertise("/robot_1/odom", ODOM, Qos())
         robot.advertise("/robot_1/scan", STRING, Qos())
-        wait_for(lambda: "/robot_1/scan" in running.source.subscribed, "a topic that can be sent")
+        wait_for(lambda: "/robot_1/scan" in running.source.subscriptions.subscribed, "a topic that can be sent")
         robot.advertise("/scan", STRING, Qos())  # would come out under the same name as the other one
         wait_for(lambda: "topic /scan is not sent" in caplog.text, "a topic that cannot")
         for number in range(300):
             robot.advertise(f"/robot_1/topic_{number}", STRING, Qos())
         wait_for(lambda: "241 topics" in caplog.text, "too many")
         robot.advertise("/robot_1/one_more", STRING, Qos())
-        wait_for(lambda: "/robot_1/one_more" in running.source._left_out, "one more")
+        wait_for(lambda: "/robot_1/one_more" in running.source.found.left_out, "one more")
     for name, why in (("/robot_1/odom", "no_such_field"), ("/scan", "duplicate topic '/scan'")):
         (line,) = [line for line in caplog.messages if line.startswith(f"topic {name} is not sent: ")]
         assert why in line
     assert caplog.text.count("241 topics; a link carries at most 240") == 1
-    assert len(running.source.registry) == 240
-    assert running.source.registry.named("scan").options.codec == "none"
+    assert len(running.source.subscriptions.registry) == 240
+    assert running.source.subscriptions.registry.named("scan").options.codec == "none"
 
 
 def test_a_source_that_sends_nothing_yet_says_what_it_looks_for(tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_a_source_that_sends_nothing_yet_says_what_it_looks_for(tmp_path: Path) 
         robot.advertise("/robot_2/odom", ODOM, Qos())
         assert waiting.look() == "no publisher on /robot_1/* yet; seen on the graph: /robot_2/odom"
         robot.advertise("/robot_1/odom", ODOM, Qos())
-        wait_for(lambda: running.source.subscribed, "the topic")
+        wait_for(lambda: running.source.subscriptions.subscribed, "the topic")
         wait_for(lambda: waiting.look() == "every topic has a publisher: /robot_1/odom", "the line")
 
 
@@ -156,10 +156,10 @@ def test_of_services_that_cannot_be_called_one_line_says_what_to_set(
     offered: list[str] = []
     with OfFastDds(domain_id=free_domains(1)[0]) as graph:
         running = Running(tmp_path, topics=["auto"], middleware=graph)
-        running.source.offer_with(lambda name, _: offered.append(name))
+        running.source.found.offer_with(lambda name, _: offered.append(name))
         with running:
-            wait_for(lambda: len(running.source.not_offered) == 2, "both services to be found")
-    assert not offered and not running.source.offered
+            wait_for(lambda: len(running.source.found.not_offered) == 2, "both services to be found")
+    assert not offered and not running.source.found.offered
     (line,) = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
     assert line.startswith("/robot_1/add (std_srvs/srv/Trigger) is not offered: its node has another RMW")
     assert "--middleware rclpy" in line

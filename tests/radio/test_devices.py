@@ -118,6 +118,29 @@ def test_every_packet_goes_out_as_one_ended_burst_and_comes_back(driver: Path, t
     assert not {"bursts_out", "underflows", "late", "corrupted"} & set(result)
 
 
+def test_a_link_that_only_receives_opens_no_transmitter(driver: Path, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    front_end = {"name": "soapy", "args": f"driver=loopback,log={log}", "frequency": 433e6, "half_duplex": True}
+    code = (
+        "import json\n"
+        "from tests.radio.robots import *\n"
+        f"state = {str(tmp_path / 'state')!r}\n"
+        f"with RobotLink(config(1, {front_end!r}, version=1, transmit=False, state=state)) as link:\n"
+        "    wait_for(lambda: link.front_end._gaps.nitems_read(0), 'samples')\n"
+        "    link.check()\n"
+        "    print(json.dumps(link.stats()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=with_driver(driver), capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert told["packets"]["out"] == 0
+    assert not told["airtime"]["transmits"]
+    lines = log.read_text().splitlines()
+    assert f"rx rate {RATE:f}" in lines
+    assert [line for line in lines if line.startswith("tx") and line != "tx closed"] == []
+
+
 def test_what_a_device_tells_is_counted_by_name(driver: Path) -> None:
     front_end = {"name": "soapy", "args": "driver=loopback,tells=2,loses=3", "frequency": 433e6}
     result = talk(driver, front_end, {"phy": {"name": "psk", "sample_rate": SLOW}})
@@ -137,7 +160,8 @@ from gr_ros2.phy.pdus import AirPacket, packets_of, pdu_to_send
 from gr_ros2.radio.radio import make_radio
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
-radio, probe, top = make_radio("psk", 64, 1e6, "soapy", args=sys.argv[1], frequency=433e6), Probe(), Flowgraph("t", "t")
+radio = make_radio("psk", 64, 1e6, "soapy", args=sys.argv[1], frequency=433e6, transmit=True)
+probe, top = Probe(), Flowgraph("t", "t")
 top.msg_connect(probe, "pdus", radio, "pdus")
 top.msg_connect(radio, "pdus", probe, "pdus")
 got = lambda: [packet for message in probe.messages for packet in packets_of(message)[0]]

@@ -65,7 +65,7 @@ def test_auto_offers_services_and_actions_of_the_namespace(
                 [f"{prefix}/add", *services_of(f"{prefix}/count"), *services_of(f"{prefix}/quiet")],
             )
             wait_for(lambda: found(robots, number) == wanted, "all services")  # noqa: B023 - called at once
-        assert {name for name in robots.links[2].source.subscribed if "quiet" in name} == {QUIET}
+        assert {name for name in robots.links[2].source.subscriptions.subscribed if "quiet" in name} == {QUIET}
         caller.call(1)
         wait_for(lambda: caller.got == {1: [1001]}, "the reply")
         client.ask("send_goal", GOAL, struct.pack("<i", 40))
@@ -117,8 +117,10 @@ def test_services_can_be_left_to_the_robot(tmp_path: Path) -> None:
         Adder(robots.graphs[1], FAR)
         robots.graphs[1].advertise("/robot_2/later", STRING, Qos())
         source = robots.links[2].source
-        wait_for(lambda: "/robot_2/later" in source.subscribed, "a topic that was made after it to be found")
-        assert not source.offered
+        wait_for(
+            lambda: "/robot_2/later" in source.subscriptions.subscribed, "a topic that was made after it to be found"
+        )
+        assert not source.found.offered
         assert not offered(robots, 2)
 
 
@@ -129,9 +131,9 @@ def test_what_finds_no_room_is_left_out_as_a_whole(tmp_path: Path, caplog: pytes
         source = robots.links[2].source
         for number in range(235):  # with the row of calls, four numbers are left
             robots.graphs[1].advertise(f"/robot_2/topic_{number}", STRING, Qos())
-        wait_for(lambda: len(source.subscribed) == 235, "the topics to be found")
+        wait_for(lambda: len(source.subscriptions.subscribed) == 235, "the topics to be found")
         FibonacciServer(robots.graphs[1], "/robot_2/count")
         wait_for(lambda: "/robot_2/count (example_interfaces/action/Fibonacci) is not offered" in caplog.text, "a word")
         Adder(robots.graphs[1], FAR)
         wait_for(lambda: offered(robots, 2) == [FAR], "a service that fits")
-        assert not [name for name in source.subscribed if "_action" in name]
+        assert not [name for name in source.subscriptions.subscribed if "_action" in name]

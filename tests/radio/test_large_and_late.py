@@ -108,7 +108,7 @@ def test_a_message_of_almost_16_MB_crosses_and_memory_stays_bounded(tmp_path: Pa
     ):
         far.subscribe("/rx_robot_1/cloud", CUSTOM, QOS, heard.append)
         cloud = near.advertise("/robot_1/cloud", CUSTOM, QOS)
-        wait_for(lambda: "/robot_1/cloud" in one.link.source.subscribed, "the topic")
+        wait_for(lambda: "/robot_1/cloud" in one.link.source.subscriptions.subscribed, "the topic")
         wait_for(lambda: two.link.stats()["packets"]["in"], "a packet of the other robot")
         cloud.publish(sent)
         held = [0]

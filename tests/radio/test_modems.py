@@ -134,7 +134,7 @@ def test_two_tnc_that_hear_each_other(tmp_path: Path) -> None:
 )
 def test_a_wrong_setting_is_one_line(front_end: str, options: dict[str, Any], said: str) -> None:
     with pytest.raises((ConfigError, RadioError), match=said) as caught:
-        make_radio("modem", 64, front_end=front_end, **options)
+        make_radio("modem", 64, front_end=front_end, transmit=True, **options)
     assert "\n" not in str(caught.value)
 
 

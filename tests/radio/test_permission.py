@@ -11,7 +11,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio import FRONT_ENDS
-from gr_ros2.radio.robot_link import permitted
+from gr_ros2.radio.permission import permitted
+from gr_ros2.radio.radio import make_radio
 from gr_ros2.state.keys import new_key_file
 from tests.radio.cables import SerialCable
 from tests.radio.robots import Robot, config
@@ -24,7 +25,8 @@ MODEM = {"name": "modem", "options": {"bit_rate": 1e6}}
 
 def may_send(front_end: dict[str, Any], **values: Any) -> bool:
     link = config(1, front_end, **{"version": 1, "phy": MODEM, **values})
-    return permitted(link, FRONT_ENDS.load(link.front_end_name))
+    front_end_class = FRONT_ENDS.load(link.front_end_name)
+    return permitted(link.transmit, front_end_class, link.front_end_options, guarded=bool(link.key) or link.open)
 
 
 @pytest.mark.parametrize(
@@ -71,3 +73,65 @@ def test_a_link_that_only_receives_hears_and_sends_nothing(tmp_path: Path) -> No
             assert two.link.stats()["packets"]["out"] == 0
             assert two.link.source.stats()["topics"] == {}
             assert one.link.stats()["peers"] == []
+
+
+def test_who_only_receives_binds_no_address_over_zeromq_and_switches_nothing_on(tmp_path: Path) -> None:
+    ends = [f"ipc://{tmp_path}/{name}" for name in "ab"]
+    common = {"version": 1, "phy": {"name": "psk", "sample_rate": 1e6}}
+    one = {"name": "zmq", "bind": ends[0], "connect": [ends[1]]}
+    two = {"name": "zmq", "bind": ends[1], "connect": [ends[0]]}
+    with (
+        Robot(1, one, state=str(tmp_path / "1"), **common) as first,
+        Robot(2, two, hears=(1,), state=str(tmp_path / "2"), transmit=False, **common) as second,
+        Robot(3, two, hears=(1,), state=str(tmp_path / "3"), transmit=False, **common) as third,
+    ):
+        said: list[bytes] = []
+        wait_for(lambda: second.link.stats()["peers"] and third.link.stats()["peers"], "a hello")
+        said += first.say(1)
+        wait_for(lambda: second.heard == third.heard == said, "the message at both")
+        assert first.counters()["bursts_in"] == 0
+        with pytest.raises(ConfigError, match="front_end zmq: it only receives, and has no open transmitter"):
+            second.link.transmit(on=True)
+        second.link.transmit(on=False)
+        assert not (tmp_path / "b").exists()
+
+
+def test_a_radio_of_grc_asks_too(tmp_path: Path) -> None:
+    with SerialCable(tmp_path) as cable:
+        modem = {"phy": "modem", "packet_len": 64, "front_end": "serial", "device": str(cable.ends[0])}
+        with pytest.raises(ConfigError, match=r"serial sends .*: say once that it may, .* in the block of GRC"):
+            make_radio(**modem)
+        for word in (True, False):
+            radio = make_radio(**modem, transmit=word)
+            assert radio.transmits is word
+            radio.close()
+
+
+def test_a_band_holds_in_grc_as_in_a_link(tmp_path: Path) -> None:
+    modem: dict[str, Any] = {"phy": "modem", "packet_len": 64, "phy_options": {"bit_rate": 9600}, "front_end": "serial"}
+    with pytest.raises(ConfigError, match=r"not within the 868 to 868\.6 MHz"):
+        make_radio("psk", 64, 1e6, "uhd", frequency=433.2e6, transmit=True, airtime_limit="eu868", robot_id=1)
+    with pytest.raises(ConfigError, match="a station says its callsign in clear"):
+        make_radio(**modem, device="/dev/ttyUSB0", transmit=True, airtime_limit="amateur", robot_id=1)
+    with pytest.raises(ConfigError, match="whose account is it"):
+        make_radio("psk", 64, 1e6, "zmq", airtime_limit="eu868", **zmq_ends(tmp_path))
+    limited: dict[str, Any] = {
+        "airtime_limit": {"duty_cycle": 0.1, "window_s": 100},
+        "robot_id": 1,
+        "state": str(tmp_path / "robot.json"),
+    }
+    radio = make_radio("psk", 64, 1e6, "zmq", **limited, **zmq_ends(tmp_path))
+    limit = radio.gate._clock.limit
+    assert limit is not None
+    assert limit.budget == pytest.approx(10)
+    assert limit.reserve(0.0, 0.1)
+    with pytest.raises(ConfigError, match="another link of this robot uses it"):
+        make_radio("psk", 64, 1e6, "zmq", **limited, bind=f"ipc://{tmp_path}/c", connect=(f"ipc://{tmp_path}/b",))
+    radio.close()
+    again = make_radio("psk", 64, 1e6, "zmq", **limited, **zmq_ends(tmp_path))
+    assert again.gate.account()["spent_s"] > 0, "what was reserved counts after a restart"
+    again.close()
+
+
+def zmq_ends(folder: Path) -> dict[str, Any]:
+    return {"bind": f"ipc://{folder}/a", "connect": (f"ipc://{folder}/b",)}

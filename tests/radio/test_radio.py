@@ -152,4 +152,4 @@ def test_names_and_settings_that_are_wrong() -> None:
     with pytest.raises(ConfigError, match="channel: snr_db = 101"):
         make_radio("psk", 64, 1e6, "sim", channel={"snr_db": 101})
     with pytest.raises((RadioError, BackendMissingError), match="uhd"):
-        make_radio("psk", 64, 1e6, "uhd", args="type=none", frequency=433e6)
+        make_radio("psk", 64, 1e6, "uhd", args="type=none", frequency=433e6, transmit=True)

@@ -42,6 +42,22 @@ def test_a_ros_service_switches_sending_off_and_on() -> None:
         client.close()
 
 
+def test_who_only_receives_says_that_it_cannot_send() -> None:
+    with Robot(1, SIM, hears=(1,), version=1, transmit=False) as robot, MemoryMiddleware(domain_id=domain(1)) as graph:
+        replies: list[bytes] = []
+        there: list[bool] = []
+        client: ServiceClient = graph.client(
+            "/gr_ros2_link_1/transmit", SWITCH_TYPE, lambda _, reply: replies.append(reply), there.append
+        )
+        wait_for(lambda: there == [True], "the service")
+        client.call(0, b"\0\1\0\0\1")
+        wait_for(lambda: replies, "an answer")
+        assert replies[0][4] == 0
+        assert b"it only receives, and has no open transmitter" in replies[0]
+        assert not robot.link.radio.transmits
+        client.close()
+
+
 def test_the_state_of_a_link_is_a_latched_topic() -> None:
     quick: dict[str, Any] = {"period_s": 0.05, "silence_warn_s": 0.3, "silence_error_s": 0.6}
     with Robot(1, SIM, hears=(1,), diagnostics=quick) as robot:

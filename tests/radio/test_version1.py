@@ -98,21 +98,21 @@ def test_topics_are_taken_from_the_graph_and_what_was_received_is_not_sent_back(
 
         wait_for(lambda: arrives("early"), "a topic of the graph")
         added = near.advertise("/added", CUSTOM, QOS)
-        wait_for(lambda: "/added" in one.link.source.subscribed, "a topic that comes later")
+        wait_for(lambda: "/added" in one.link.source.subscriptions.subscribed, "a topic that comes later")
         added.close()
-        wait_for(lambda: "/added" in one.link.source.unmatched, "its publisher to go")
-        wait_for(lambda: "/robot_2/chat" in two.link.source.subscribed, "what robot 2 itself has")
+        wait_for(lambda: "/added" in one.link.source.found.unmatched(), "its publisher to go")
+        wait_for(lambda: "/robot_2/chat" in two.link.source.subscriptions.subscribed, "what robot 2 itself has")
         answer = two.say(5)
         wait_for(lambda: arrives("later") and republished(near, "/rx_robot_2/robot_2/chat"), "both directions")
         assert answer
-        assert set(one.link.source.subscribed) == {
+        assert set(one.link.source.subscriptions.subscribed) == {
             *("/robot_1/chat", "/robot_1/kept", "/robot_1/early", "/robot_1/later", "/added")
         }
-        assert set(two.link.source.subscribed) == {"/robot_2/chat"}
+        assert set(two.link.source.subscriptions.subscribed) == {"/robot_2/chat"}
         assert not arrived["secret/key"]
         assert not arrived["_hidden"]
         names = [topic.name for topic in one.link.registry if topic.is_topic]
-        assert [f"/{name}" for name in names] == list(one.link.source.subscribed)
+        assert [f"/{name}" for name in names] == list(one.link.source.subscriptions.subscribed)
 
 
 def republished(graph: MemoryMiddleware, topic: str) -> list[Qos]:

@@ -38,5 +38,5 @@ def test_sealed_messages_cross_three_hops(tmp_path: Path) -> None:
 
 
 def test_relaying_needs_slots() -> None:
-    with pytest.raises(ConfigError, match="relay = 'gain': the packets of slots .* set medium: slots"):
+    with pytest.raises(ConfigError, match="relay = 'gain': the packets of slots name who hears whom"):
         load_scenario("line", ["medium=exclusive"])

@@ -26,11 +26,11 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.inbox import Inbox
-from gr_ros2.link.v1.neighbours import Save
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.pings import Pings
 from gr_ros2.link.v1.receiving import ReceivingSide
 from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.link.v1.writer import PacketWriter, room_of

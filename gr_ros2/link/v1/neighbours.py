@@ -3,19 +3,13 @@
 A robot's packets can be opened once a hello has told its boot number. Packets that arrive shortly before the hello are
 kept until then.
 
-*Proof.* Where packets are sealed and two robots hear each other, a packet of messages is used only if it was sealed
-after this robot started. The other robot proves it: it echoes the end of a hello of this start, and says at which
-number it was then (*heard*). So what was recorded before is refused, whether this robot heard it or not. Echoes also
-tell how long ago a packet was sealed at most (``Neighbour.sealed_after``). Packets that arrive before the first proof
-are kept until then.
+*Replays.* Where packets are sealed and two robots hear each other, a packet of messages is used only if it was sealed
+after this robot started, which the other robot proves (``proofs``). Packets that arrive before the first proof are kept
+until then. Of a robot that can prove nothing, a number is stored below which nothing is accepted (``replays``).
 
-A robot that cannot hear this one can prove nothing. Of such a robot, a packet number is stored below which nothing is
-accepted, before a packet above it is used. So after a restart of this robot, every packet that it heard before is
-refused, but not what it never heard.
-
-The newest boot number of every robot is stored. An older start of a robot is accepted only with a proof; where packets
-are not sealed, any other start is accepted a second after the last one. A robot whose boot number is stored was heard
-before this robot restarted, so its packets count from the first hello on, and no message comes out twice.
+An older start of a robot is accepted only with a proof; where packets are not sealed, any other start is accepted a
+second after the last one. A robot whose boot number is stored was heard before this robot restarted, so its packets
+count from the first hello on, and no message comes out twice.
 
 Invariants: no body is given out that was not opened; no control packet is given out twice; work per packet is bounded;
 where packets are sealed, nothing is given out that was sealed before this start and could be a replay.
@@ -31,8 +25,6 @@ from math import inf
 from gr_ros2.core.errors import (
     CrcError,
     EntryKindError,
-    GrRos2Error,
-    NotStoredError,
     ReplayedError,
     SameIdError,
     SourcesError,
@@ -43,8 +35,10 @@ from gr_ros2.core.errors import (
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.peers import START
+from gr_ros2.link.v1.proofs import OwnHellos, Proofs
+from gr_ros2.link.v1.replays import Floor, Floors, Save
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
-from gr_ros2.wire.control import CAN_HEAR, ECHO_LEN, ENCRYPTS, Heard, Hello
+from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, Heard, Hello
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
     TAG_LEN,
@@ -54,12 +48,6 @@ from gr_ros2.wire.v1 import (
     read_body,
     read_repair_header,
 )
-
-Save = Callable[[int, int, int], None]
-"""Stores robot id, boot number and the packet number below which nothing more is accepted. Stores before it returns.
-
-:raises GrRos2Error: it cannot be stored
-"""
 
 _HALF = 1 << 15
 _EARLY = 64
@@ -71,15 +59,8 @@ _STARTS = 256
 """Starts that have ended of which is known how far they were heard."""
 _ROWS_KEPT = 512
 """Packet numbers, counted back from the newest, for which it is known which rows were used."""
-_ECHOES = 64
-"""Hellos of this robot that can be echoed, and proofs kept of each other robot."""
 _MOST = 1 << 48
 """Number of packets that a start of a robot can have."""
-_RESERVE = 16
-_MOST_RESERVED = 1 << 14
-_SAVING_S = 0.25
-_RETRY_S = 10.0
-"""s after which a state file that could not be written is tried again where nothing waits for it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -94,24 +75,14 @@ class Neighbour:
     hello_number: int
     """The packet number at which its newest hello stands."""
     heard: float
-    floor: int = 0
-    """Stored packet number below which nothing is accepted after a restart of this robot."""
+    floor: Floor
+    proofs: Proofs
     gone: bool = False
     """Whether it has been silent for long."""
-    reserve: int = _RESERVE
-    saved: float = 0.0
-    failed: bool = False
-    """Whether storing failed the last time."""
     rows: dict[int, int] = field(default_factory=dict)
     """Rows of repair packets that carried entries, as bits, by packet number."""
     asked: dict[int, float] = field(default_factory=dict)
     """When each topic was requested."""
-    proofs: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=_ECHOES))
-    """(number, time in s): packets above this number were sealed after this time."""
-    proven: int | None = None
-    """Packets above this number were sealed after this robot started; None as long as nothing proves it."""
-    not_before: float = -inf
-    """Hellos of this robot up to this time in s prove nothing: an earlier start of the other robot heard them."""
     echo: tuple[bytes, int] | None = None
     """The end of its newest hello, and the number that this robot had reached then."""
 
@@ -141,16 +112,6 @@ class Neighbour:
             self.rows = {number: used for number, used in self.rows.items() if number > oldest}
         return True
 
-    def prove(self, number: int, at: float) -> None:
-        """Note that its packets above a number were sealed after a time, s."""
-        self.proven = number if self.proven is None else min(self.proven, number)
-        if not self.proofs or (number >= self.proofs[-1][0] and at > self.proofs[-1][1]):
-            self.proofs.append((number, at))
-
-    def sealed_after(self, number: int) -> float:
-        """Time in s after which a packet was sealed; -inf if nothing proves it."""
-        return next((at for since, at in reversed(self.proofs) if since < number), -inf)
-
 
 @dataclass(slots=True)
 class Opened:
@@ -178,6 +139,7 @@ class Neighbours:
     :param heard: what ``save`` has stored, by robot id: boot number and packet number
     :param dropped: counts packets that are kept (``early``), packets that may have been sealed before this robot
         started (``unproven``), and failures of ``save`` (``state_not_written``)
+    :ivar own_hellos: what others can prove to have heard
     :param inbox: makes the inbox of a start of a robot: (src_id, boot, first packet that may be needed, bytes of its
         longest body)
     """
@@ -198,8 +160,8 @@ class Neighbours:
         self._settings = settings
         self._keys = keys
         self._provable = keys.sealed and settings.hears
-        self._stored = dict(heard)
-        self._save = save
+        self.floors = Floors(heard, save, dropped)
+        self.own_hellos = OwnHellos(own[0])
         self._make_inbox = inbox
         self._known: dict[int, Neighbour] = {}
         self._early: dict[int, deque[bytes]] = {}
@@ -207,8 +169,6 @@ class Neighbours:
         """When the present start of each robot was heard for the first time."""
         self._ended: dict[tuple[int, int], int] = {}
         """By id and boot number of a start that was replaced: the first packet of it that was not heard."""
-        self._hellos: dict[bytes, float] = {}
-        """When the newest hellos of this robot left, by their ends."""
 
     def __iter__(self) -> Iterator[Neighbour]:
         return iter(self._known.values())
@@ -260,11 +220,11 @@ class Neighbours:
             raise
         control = repair is not None and not repair.mask
         if not control and self.proves(neighbour.hello):
-            if neighbour.proven is None:
+            if neighbour.proofs.proven is None:
                 self._keep(header.src_id, data)
                 self.dropped["early"] += 1
                 return None
-            if number <= neighbour.proven:
+            if number <= neighbour.proofs.proven:
                 self.dropped["unproven"] += 1
                 return None
         new = neighbour.new(number, row)
@@ -280,20 +240,15 @@ class Neighbours:
     @property
     def unproven(self) -> bool:
         """Whether a robot is heard whose messages cannot be taken before it has proven that it hears this start."""
-        return any(n.proven is None and not n.gone and self.proves(n.hello) for n in self._known.values())
+        return any(n.proofs.proven is None and not n.gone and self.proves(n.hello) for n in self._known.values())
 
     def proved(self, neighbour: Neighbour, number: int, entries: Sequence[EntryV1]) -> bool:
         """Take the proofs among the entries of a control packet; returns whether they are the first of its sender."""
-        before = neighbour.proven
-        for since, at in self._proofs(number, entries, neighbour.not_before):
-            neighbour.prove(since, at)
-        return before is None and neighbour.proven is not None
-
-    def said_hello(self, data: bytes, now: float) -> None:
-        """A hello of this robot leaves: from now on, other robots can prove that they have heard it."""
-        self._hellos[data[-ECHO_LEN:]] = now
-        if len(self._hellos) > _ECHOES:
-            del self._hellos[next(iter(self._hellos))]
+        proofs = neighbour.proofs
+        before = proofs.proven
+        for since, at in self.own_hellos.proofs(number, entries, proofs.not_before):
+            proofs.take(since, at)
+        return before is None and proofs.proven is not None
 
     def heard(self, newest: int) -> list[Heard]:
         """What proves to other robots that they were heard.
@@ -329,13 +284,8 @@ class Neighbours:
     def settle(self, now: float) -> None:
         """Store the exact packet number reached by robots that are quiet."""
         for neighbour in self._known.values():
-            exact = neighbour.inbox.newest + 1
-            quiet = now - max(neighbour.heard, neighbour.saved) > 2 * _SAVING_S
-            if neighbour.failed and now - neighbour.saved > _RETRY_S:
-                self._store(neighbour, exact if self._counts_on_store(neighbour.hello) else 0, now)
-            elif self._counts_on_store(neighbour.hello) and neighbour.floor > exact and quiet:
-                neighbour.reserve = _RESERVE
-                self._store(neighbour, exact, now)
+            counts, exact = self._counts_on_store(neighbour.hello), neighbour.inbox.newest + 1
+            self.floors.settle(neighbour.floor, exact, neighbour.heard, now, counts=counts)
 
     def _read_hello(
         self, data: bytes, header: Header, repair: RepairHeader
@@ -363,10 +313,10 @@ class Neighbours:
                 if number >= neighbour.hello_number:
                     neighbour.hello, neighbour.hello_number = hello, number
                 return Opened(neighbour, header, number, repair, b"", entries, self._heard(neighbour, number, now))
-        boot, floor = self._stored.get(src_id, (-1, 0))
+        boot, floor = self.floors.of(src_id)
         before = self._met_at.get(src_id, -inf)
-        proofs = self._proofs(number, entries, before) if sealed else ()
-        refused = hello.boot < boot and not proofs
+        proven = sealed and self.own_hellos.proofs(number, entries, before)
+        refused = hello.boot < boot and not proven
         if not sealed:
             refused = neighbour is not None and now < before + _CHANGE_S
         if refused:
@@ -387,29 +337,15 @@ class Neighbours:
                 del self._ended[next(iter(self._ended))]
         first = max(first, self._ended.pop((src_id, hello.boot), 0))
         room = header.room(self._settings.packet_len)
-        met = Neighbour(
-            src_id, hello.boot, trailer, self._make_inbox(src_id, hello.boot, first, room), hello, number, now
-        )
+        inbox, proofs = self._make_inbox(src_id, hello.boot, first, room), Proofs(before)
+        met = Neighbour(src_id, hello.boot, trailer, inbox, hello, number, now, Floor(src_id, hello.boot), proofs)
         if self.proves(hello):
-            met.inbox.sealed_after = met.sealed_after
-        met.not_before, self._met_at[src_id] = before, now
+            inbox.sealed_after = proofs.sealed_after
+        self._met_at[src_id] = now
         met.new(number, repair.row)
         self._known[src_id] = met
-        self._store(met, max(first, number + 1) if stores else 0, now)
+        self.floors.store(met.floor, max(first, number + 1) if stores else 0, now)
         return Opened(met, header, number, repair, b"", entries, True, neighbour)
-
-    def _proofs(self, number: int, entries: Sequence[EntryV1], before: float) -> list[tuple[int, float]]:
-        """What entries prove: packets of their sender above a number were sealed after a time in s.
-
-        :param number: at which the entries stand
-        :param before: hellos up to this time in s prove nothing: another start of the sender may have echoed them
-        """
-        own, hellos = self._own[0], self._hellos
-        found = [entry for entry in entries if isinstance(entry, Heard) and entry.src_id == own]
-        proofs = [
-            (number - (number - entry.since & 0xFFFF), hellos[entry.echo]) for entry in found if entry.echo in hellos
-        ]
-        return [(since, at) for since, at in proofs if since >= 0 and at > before]
 
     def _trailer(self, src_id: int, hello: Hello, clear: bytes, rest: bytes, place: tuple[int, int]) -> Trailer:
         encrypt = hello.capabilities & ENCRYPTS != 0
@@ -428,7 +364,8 @@ class Neighbours:
         """A new packet of a known robot arrived; returns whether the robot was taken for gone."""
         neighbour.heard = now
         back, neighbour.gone = neighbour.gone, False
-        self._guard(neighbour, number, now)
+        if self._counts_on_store(neighbour.hello):
+            self.floors.guard(neighbour.floor, number, now)
         return back
 
     def _room_for(self, src_id: int) -> Neighbour | None:
@@ -447,34 +384,4 @@ class Neighbours:
 
     def _counts_on_store(self, hello: Hello) -> bool:
         """Whether only the stored packet number keeps replays of a robot out."""
-        return self._save is not None and self._keys.sealed and not self.proves(hello)
-
-    def _guard(self, neighbour: Neighbour, number: int, now: float) -> None:
-        """Store that a robot has reached this number, before the packet is used.
-
-        :raises NotStoredError: it cannot be stored
-        """
-        if self._save is None or number < neighbour.floor or not self._counts_on_store(neighbour.hello):
-            return
-        soon = now - neighbour.saved < _SAVING_S
-        if soon and not neighbour.failed:
-            neighbour.reserve = min(2 * neighbour.reserve, _MOST_RESERVED)
-        if (soon and neighbour.failed) or not self._store(neighbour, number + neighbour.reserve, now):
-            raise NotStoredError(
-                f"packet {number} of robot {neighbour.src_id} is not used, because the state file cannot be written: "
-                "after a restart it could be replayed"
-            )
-
-    def _store(self, neighbour: Neighbour, floor: int, now: float) -> bool:
-        """Store the number below which nothing is accepted; returns whether that worked."""
-        neighbour.saved, neighbour.failed = now, False
-        if self._save is not None:
-            try:
-                self._save(neighbour.src_id, neighbour.boot, floor)
-            except GrRos2Error:
-                self.dropped["state_not_written"] += 1
-                neighbour.failed = True
-                return False
-        neighbour.floor = floor
-        self._stored[neighbour.src_id] = (neighbour.boot, floor)
-        return True
+        return self.floors.stores and self._keys.sealed and not self.proves(hello)

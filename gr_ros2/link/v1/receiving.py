@@ -27,10 +27,11 @@ from gr_ros2.link.rate import RateController
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
-from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened, Save
+from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.settings.config import NOBODY

@@ -179,7 +179,7 @@ class SendingSide:
             kept.ask(TABLE_TOPIC, now)  # no report says whether it has arrived
         entries = self.hellos.entries(self._writer.room, now)
         sent = self._writer.control(entries, "hello", now, clear=isinstance(entries[0], Hello))
-        self._neighbours.said_hello(sent.data, now)
+        self._neighbours.own_hellos.said(sent.data, now)
         for entry in entries:
             if isinstance(entry, Heard):
                 window.peers.prove(entry.src_id, self._neighbours.since(entry.src_id))

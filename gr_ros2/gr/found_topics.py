@@ -1,0 +1,138 @@
+"""What a ROS Source finds on its ROS graph: topics and services that no registry names, and types of what it sends.
+
+Invariant: what cannot be sent or offered is said once.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+
+from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.gr.subscriptions import Subscriptions
+from gr_ros2.gr.topic_search import TopicSearch
+from gr_ros2.middleware import Middleware, TopicInfo
+from gr_ros2.middleware.services import OTHER_RMW, ServiceGraph
+from gr_ros2.middleware.type_search import TypeSearch
+from gr_ros2.settings.config import SourceConfig
+from gr_ros2.settings.registry import MAX_TOPICS, NewTopic, Topic, options_of
+from gr_ros2.settings.service_rows import ServiceRow, is_service, parts, rows_of
+from gr_ros2.settings.topic_choice import TopicChoice
+
+
+class FoundTopics:
+    """The search of one source.
+
+    :param subscriptions: takes what is found
+    :ivar choice: the topics and services that are looked for
+    :ivar offered: absolute names of the services, actions and nodes that were found and chosen
+    :ivar left_out: what cannot be sent or offered
+    :ivar not_offered: services that cannot be called because of the RMW of their nodes; only the first one is logged
+    """
+
+    def __init__(
+        self, config: SourceConfig, middleware: Middleware, subscriptions: Subscriptions, log: logging.Logger
+    ) -> None:
+        self.choice = TopicChoice(() if subscriptions.registry else config.topics, config.namespace)
+        self.offered: set[str] = set()
+        self.left_out: set[str] = set()
+        self.not_offered: set[str] = set()
+        self._config, self._middleware, self._subscriptions, self._log = config, middleware, subscriptions, log
+        self._offer: Callable[[str, Topic], None] | None = None
+        self._full = False
+        """Whether a topic was not sent because there are too many. Only the first one is logged."""
+        self._searches: list[TopicSearch | TypeSearch] = []
+
+    def offer_with(self, offer: Callable[[str, Topic], None]) -> None:
+        """Look for services too, from the next start on, unless ``services`` of the settings is false.
+
+        :param offer: called with the name of each service on the ROS graph and its row, from a thread of the search
+        """
+        self._offer = offer if self._config.services else None
+
+    def start(self) -> None:
+        """Look periodically."""
+        if self.choice:
+            self._searches.append(TopicSearch(self._middleware, self._found, services=self._offer is not None))
+        if self._config.version and self._config.compresses and isinstance(self._middleware, ServiceGraph):
+            subscriptions = self._subscriptions
+            self._searches.append(TypeSearch(self._middleware, subscriptions.types, subscriptions.learn))
+
+    def stop(self) -> None:
+        """Look no more. Idempotent."""
+        for search in self._searches:
+            search.close()
+        self._searches.clear()
+
+    def unmatched(self) -> list[str]:
+        """Names, on the ROS graph, of the topics without a publisher; the patterns, if no name is known yet."""
+        subscribed, choice = self._subscriptions.subscribed, self.choice
+        unseen = [name for name in choice.named if name not in subscribed and name not in self.offered]
+        if choice.open and not subscribed and not unseen:
+            return [choice.everything]
+        return unseen + self._subscriptions.unmatched()
+
+    def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
+        """Send the topics of the graph that are chosen and not sent yet, or have another type now; likewise the
+        services."""
+        published = {(info.topic, info.type_name) for info in infos if info.publishers}
+        for info in infos:
+            sent = self._subscriptions.subscribed.get(info.topic)
+            if not info.publishers or (sent is not None and (info.topic, sent.type_name) in published):
+                continue
+            row_name = self.choice.row_name(info.topic)
+            if row_name is None or info.topic in self.left_out or self._subscriptions.returns([info.topic]):
+                continue
+            try:
+                self._subscriptions.add(row_name, info)
+            except GrRos2Error as error:
+                self._leave_out(info.topic, f"topic {info.topic} is not sent", error)
+        uncallable = (
+            self._middleware.uncallable() if services and isinstance(self._middleware, ServiceGraph) else frozenset()
+        )
+        for row in rows_of(services):
+            row_name = self.choice.row_name(row.name, hidden=row.of_node)
+            if row_name is None or self._is_offered(row) or f"{row.name} {row.kind}" in self.left_out:
+                continue
+            if not uncallable.isdisjoint(parts(row.name, row.kind)):
+                if not self.not_offered:
+                    self._log.warning("%s (%s) is not offered: its node %s", row.name, row.kind, OTHER_RMW)
+                self.not_offered.add(row.name)
+                continue
+            try:
+                self._add_services(row_name, row)
+            except GrRos2Error as error:
+                self._leave_out(f"{row.name} {row.kind}", f"{row.name} ({row.kind}) is not offered", error)
+
+    def _leave_out(self, key: str, what: str, error: GrRos2Error) -> None:
+        """Say once what cannot be sent; of what finds no room, only the first."""
+        self.left_out.add(key)
+        full = len(self._subscriptions.registry) == MAX_TOPICS
+        level = logging.DEBUG if full and self._full else logging.WARNING
+        self._full = full
+        self._log.log(level, "%s: %s", what, error)
+
+    def _is_offered(self, row: ServiceRow) -> bool:
+        """Whether the services of a row are offered already, or have come by radio."""
+        names = parts(row.name, row.kind)
+        services = self._subscriptions.services
+        return any(name in services for name in names) or self._subscriptions.returns(names)
+
+    def _add_services(self, row_name: str, row: ServiceRow) -> None:
+        """Offer the services of a row to other robots. The topics of an action are sent.
+
+        :raises ConfigError: for a row that cannot be offered, such as one more than a link carries
+        """
+        assert self._offer is not None
+        rows: dict[str, NewTopic] = {}
+        for name, type_name in parts(row.name, row.kind).items():
+            if not self.choice.leaves_out(name):
+                part = row_name + name.removeprefix(row.name)
+                rows[name] = part, type_name, options_of(part, self._config.topic_options)
+        if not any(is_service(type_name) for _, type_name, _ in rows.values()):
+            raise ConfigError("topics leaves out all its services")
+        services = self._subscriptions.add_services(rows)
+        self.offered.add(row.name)
+        self._log.info("%s (%s) of the ROS graph is offered to other robots", row.name, row.kind)
+        for name, topic in services.items():
+            self._offer(name, topic)

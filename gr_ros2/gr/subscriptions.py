@@ -1,0 +1,252 @@
+"""What a ROS Source takes from its ROS graph: the topics, with the QoS of their publishers.
+
+Invariants: a callback of the middleware blocks only with ``backpressure``. Each type of a topic has a row of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd
+from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.queues import PublisherQos
+from gr_ros2.middleware import Qos, Subscription, TopicInfo
+from gr_ros2.middleware.adapt import agreed
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.settings.config import SourceConfig
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import NewTopic, Registry, Topic, normalize_type, options_of
+
+
+class Subscriptions:
+    """The topics that a source sends, and the services that it offers.
+
+    :param registry: what it sends and offers, from which ``config.topics`` chooses
+    :param live: endpoint that takes the messages
+    :param clock: s, monotonic
+    :param counters: counts ``held_back_at_close``, and what static transforms count
+    :ivar registry: all rows so far
+    :ivar room: notified when a message that is held back may be submitted; uses the lock of ``live``
+    :ivar subscribed: topics by their absolute names on the ROS graph. The mapping is replaced as a whole when a topic
+        is added
+    :ivar services: the same for the services that other robots may call
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        config: SourceConfig,
+        graph: Graph,
+        live: LiveEnd,
+        *,
+        clock: Callable[[], float],
+        counters: Counter[str],
+        log: logging.Logger,
+    ) -> None:
+        self.registry = registry
+        self.room = threading.Condition(live.lock)
+        self._config, self._graph, self._live = config, graph, live
+        self._messages = live.endpoint.messages
+        self._clock, self._counters, self._log = clock, counters, log
+        self._closed = False
+        static = [topic for topic in registry if topic.latched and topic.type_name == TF_TYPE]
+        self._static = {topic.topic_id: StaticTransforms(counters) for topic in static}
+        self._subscriptions: dict[int, Subscription] = {}
+        chosen = registry.chosen(config.topics) if registry else []
+        self.subscribed = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_topic}
+        self.services = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_service}
+
+    def open(self) -> None:
+        """Subscribe to all topics.
+
+        :raises GrRos2Error: when a topic cannot be subscribed
+        """
+        self._guard_loops()
+        for name, topic in self.subscribed.items():
+            self._subscribe(name, topic)
+        if self._graph.owned:
+            self._graph.middleware.start()
+
+    def close(self) -> None:
+        """Take no further messages. Idempotent."""
+        with self._live.lock:
+            self._closed = True
+            self.room.notify_all()
+        for subscription in self._subscriptions.values():
+            subscription.close()
+        with self._live.lock:
+            self.take_losses()
+        self._subscriptions.clear()
+        LOOP_GUARD.remove(self)
+
+    def unmatched(self) -> list[str]:
+        """Names, on the ROS graph, of the topics without a publisher."""
+        subscriptions = self._subscriptions
+        waiting = {name: subscriptions.get(topic.topic_id) for name, topic in self.subscribed.items()}
+        return [name for name, end in waiting.items() if end is not None and not end.matched()]
+
+    def take_losses(self) -> None:
+        """Count the messages that the ROS graph lost before they arrived here. Called with the lock held."""
+        for topic_id, subscription in self._subscriptions.items():
+            self._messages.missed(topic_id, subscription.lost)
+
+    def stats(self) -> dict[str, dict[str, Any]]:
+        """The counters of each topic, by its name on the ROS graph. Called with the lock held."""
+        self.take_losses()
+        stats, queued = self._live.endpoint.sent, self._messages.queued()
+        rows: dict[str, list[int]] = {}
+        for topic in self.registry:
+            if topic.is_topic:
+                rows.setdefault(topic.name, []).append(topic.topic_id)
+        return {
+            name: {
+                "topic_id": topic.topic_id,
+                "type": topic.type_name,
+                "types": len(rows[topic.name]),
+                "submitted": sum(stats.submitted[row] for row in rows[topic.name]),
+                LedgerRow.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
+                "sent": sum(stats.sent[row] for row in rows[topic.name]),
+                "queued": sum(queued[row] for row in rows[topic.name]),
+                "queue": self._messages.queue(topic.topic_id)[0],
+                "queue_depth": self._messages.depth(topic.topic_id),
+                "refused": {
+                    reason: sum(stats.refused[row, reason] for row in rows[topic.name])
+                    for reason in sorted({why for row, why in stats.refused if row in rows[topic.name]})
+                },
+            }
+            for name, topic in self.subscribed.items()
+        }
+
+    def types(self) -> list[tuple[str, str]]:
+        """Name on the ROS graph and type of each topic."""
+        return [(name, topic.type_name) for name, topic in self.subscribed.items()]
+
+    def learn(self, described: Described) -> None:
+        """Code messages of a type by the definition that a node has given."""
+        with self._live.lock:
+            self._messages.learn(described.type_name, described.types)
+            self._live.work.notify()
+
+    def add_services(self, rows: Mapping[str, NewTopic]) -> dict[str, Topic]:
+        """Announce services, and the topics of actions.
+
+        :param rows: by names on the ROS graph
+        :return: the services among them, by names on the ROS graph
+        :raises ConfigError: for more than a link carries
+        """
+        with self._live.lock:
+            self.registry = self._messages.add(list(rows.values()))
+            added = dict(zip(rows, self.registry[-len(rows) :], strict=True))
+            services = {name: topic for name, topic in added.items() if topic.is_service}
+            topics = {name: topic for name, topic in added.items() if topic.is_topic}
+            self.services = {**self.services, **services}
+            self.subscribed = {**self.subscribed, **topics}
+        self._guard_loops()
+        for name, topic in topics.items():
+            self._subscribe(name, topic)
+        return services
+
+    def add(self, row_name: str, info: TopicInfo) -> None:
+        """Announce a topic of the graph, and subscribe it. It may be sent already, with a type that has no publisher
+        any more.
+
+        :raises ConfigError: for a topic that cannot be sent, such as one more than a link carries
+        """
+        options, type_name = options_of(row_name, self._config.topic_options), normalize_type(info.type_name)
+        with self._live.lock:
+            before = self.subscribed.get(info.topic)
+            rows = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
+            if not rows:
+                self.registry = self._messages.add([(row_name, type_name, options)])
+                rows = [self.registry[-1]]
+            (topic,) = rows
+            self._adapt(topic, info.publishers)
+            if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
+                self._static[topic.topic_id] = StaticTransforms(self._counters)
+            self.subscribed = {**self.subscribed, info.topic: topic}
+            self._live.work.notify()
+        self._guard_loops()
+        if before is None:
+            self._log.info("topic %s (%s) of the ROS graph is sent", info.topic, topic.type_name)
+        else:
+            self._log.warning("topic %s is %s now, was %s", info.topic, topic.type_name, before.type_name)
+            self._unsubscribe(before)
+        self._subscribe(info.topic, topic)
+
+    def returns(self, names: Iterable[str]) -> bool:
+        """Whether a topic or service of the ROS graph has come by radio."""
+        return any(LOOP_GUARD.returns(self._graph, name) for name in names)
+
+    def _guard_loops(self) -> None:
+        LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
+
+    def _subscribe(self, name: str, topic: Topic) -> None:
+        options = topic.options
+        depth = self._config.subscriber_depth if options.depth == AUTO else options.depth
+        if topic.topic_id in self._static and depth:
+            depth = max(depth, STATIC_DEPTH)
+        reliability = None if options.reliability == AUTO else options.reliability
+        durability = None if options.durability == AUTO else options.durability
+        qos = Qos(reliability, durability, depth)
+        callback = partial(self._take, topic.topic_id)
+        subscription = self._graph.middleware.subscribe(name, topic.type_name, qos, callback)
+        self._subscriptions = {**self._subscriptions, topic.topic_id: subscription}
+        subscription.follow(partial(self._follow, topic))
+
+    def _unsubscribe(self, topic: Topic) -> None:
+        """Take no further messages of a row, and keep none for robots that join late."""
+        subscriptions = dict(self._subscriptions)
+        subscriptions.pop(topic.topic_id).close()
+        with self._live.lock:
+            self.take_losses()
+            self._subscriptions = subscriptions
+            self._messages.forget_kept(topic.topic_id)
+
+    def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
+        """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
+        qos = agreed(offers)
+        publishers = PublisherQos(
+            reliable=qos.reliability != "best_effort",
+            latched=all(offer.durability == "transient_local" for offer in offers),
+            depth=qos.depth,
+            lifespan_s=qos.lifespan_s,
+            period_s=qos.deadline_s,
+        )
+        return self._messages.follow(topic.topic_id, publishers)
+
+    def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
+        """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
+        with self._live.lock:
+            changed = self._adapt(topic, offers)
+            policy, deadline_s = self._messages.queue(topic.topic_id)
+        if changed:
+            limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
+            self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
+
+    def _take(self, topic_id: int, payload: bytes) -> None:
+        """Accept a message of the ROS graph, in a thread of the middleware."""
+        with self._live.lock:
+            while self._config.backpressure and not self._closed and not self._messages.room(topic_id):
+                self.room.wait()
+            if self._closed:
+                self._counters["held_back_at_close"] += 1
+                return
+            subscription = self._subscriptions.get(topic_id)
+            if subscription is not None and subscription.lost:
+                self._messages.missed(topic_id, subscription.lost)
+            # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
+            static = self._static.get(topic_id)
+            whole = None if static is None else static.union(payload)
+            self._messages.submit(topic_id, whole or payload, self._clock())
+            self._live.wake()
+
+    def _take_losses(self) -> None:
+        """Count the messages that the ROS graph lost before they arrived here. Called with the lock held."""
+        for topic_id, subscription in self._subscriptions.items():
+            self._messages.missed(topic_id, subscription.lost)
