@@ -39,6 +39,7 @@ BENCHMARKS = {
     "beside": "bench.phys",
     "stop": "bench.stop",
     "reopen": "bench.reopen",
+    "slow_computer": "bench.slow_computer",
     "compression": "bench.compression",
     "sweep": "bench.sweep",
     "mac": "bench.mac",

@@ -27,7 +27,8 @@ MOST_S = 2.0
 """A device is tried again every second; then a repair has to cross."""
 _DOMAINS = (93, 94)
 _TYPE, _QOS = "std_msgs/msg/UInt32", Qos("reliable", "volatile", 0)
-_PATIENCE_S = 60.0
+_PATIENCE_S = 10.0
+"""s after which a message counts as lost: the whole takes less than 2 minutes, whatever happens."""
 
 
 def reopen() -> list[Row]:
@@ -41,7 +42,7 @@ def reopen() -> list[Row]:
         publisher = graphs[0].advertise("/robot_1/count", _TYPE, _QOS)
         graphs[1].subscribe("/rx_robot_1/count", _TYPE, _QOS, heard.append)
 
-        def wait(done: Callable[[], bool]) -> float:
+        def wait(done: Callable[[], object]) -> float:
             begin = time.monotonic()
             while not done() and time.monotonic() < begin + _PATIENCE_S:
                 time.sleep(0.002)
@@ -51,15 +52,16 @@ def reopen() -> list[Row]:
         for number in range(TIMES + 1):
             if number:
                 cable.pull()
-            publisher.publish(b"\0\1\0\0" + number.to_bytes(4, "little"))
+            payload = b"\0\1\0\0" + number.to_bytes(4, "little")
+            publisher.publish(payload)
             if number:
                 time.sleep(AWAY_S)
                 cable.plug()
-            took.append(wait(lambda: len(heard) == number + 1))  # noqa: B023 - called at once
+            took.append(wait(lambda: payload in heard))  # noqa: B023 - called at once
     never = f"the first message, without an interruption: {took[0]:.2f} s; the longest: {max(took[1:]):.2f} s"
     return [
         Row("serial line gone for 2 s: until data flows again", median(took[1:]), "s", "≤", MOST_S, "{:.2f}", never),
-        Row("messages published meanwhile that did not arrive", TIMES + 1 - len(heard), "", "=", 0),
+        Row("messages published meanwhile that did not arrive", TIMES + 1 - len(set(heard)), "", "=", 0),
     ]
 
 

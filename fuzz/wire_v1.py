@@ -7,7 +7,7 @@ import random
 from fuzz.loop import main
 from gr_ros2.core.errors import WireError
 from gr_ros2.wire import v1
-from gr_ros2.wire.control import Ask, Hello, Report
+from gr_ros2.wire.control import About, Ask, Heard, Hello, Ping, Report
 from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 from gr_ros2.wire.v1 import BROADCAST, Header, PacketV1, Part, RepairHeader, decode, encode
 
@@ -50,6 +50,15 @@ def corpus() -> list[bytes]:
     control = (hello, Ask(1, b"\xf0\1"), Report(1, 2, 3, 1 << 63, True, 12))
     found.append(
         encode(PacketV1(Header(3, False, 2, 7), control, RepairHeader(5, clear=True)), 80, BOOT)[: -v1.CRC_LEN]
+    )
+    trials = (
+        Ping(1, 2, wants_about=True),
+        Ping(1, 2, True, False, 3, 4, 5, -1.5),
+        About(220, 1, 2, b"x"),
+        Heard(1, bytes(4), 9),
+    )
+    found.append(
+        encode(PacketV1(Header(3, False, 2, 7), trials, RepairHeader(5, clear=True)), 120, BOOT)[: -v1.CRC_LEN]
     )
     for mask in (1, 0xFF, 0x101, (1 << 127) - 3):
         repair = v1.read_repair_header(v1.write_repair_header(RepairHeader(9, mask, True)), 0, 20)

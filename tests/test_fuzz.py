@@ -29,6 +29,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import fuzz.framing
 import fuzz.kernels
 import fuzz.medium
+import fuzz.pings
 import fuzz.wifi
 
 ROOT = Path(__file__).parents[1]
@@ -47,6 +48,7 @@ HARNESSES = {
     "framing": (fuzz.framing.framing, fuzz.framing.corpus),
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
     "medium": (fuzz.medium.medium, fuzz.medium.corpus),
+    "pings": (fuzz.pings.pings, fuzz.pings.corpus),
     "wifi": (fuzz.wifi.wifi, fuzz.wifi.corpus),
 }
 COUNTS = {
@@ -64,6 +66,7 @@ COUNTS = {
     "dashboard": 300,
     "framing": 1_000,
     "kernels": 400,
+    "pings": 400,
     "wifi": 200,
 }
 if find_spec("bokeh") is not None:

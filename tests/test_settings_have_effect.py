@@ -298,6 +298,7 @@ effects(
     duty_cycle=run("airtime.duty_cycle=0.1"),
     window_s=run("airtime.window_s=10", "airtime.duty_cycle=0.1"),
     max_burst_s=run("airtime.max_burst_s=0.2"),
+    listen_before_send=Elsewhere("tests/radio/test_radio.py"),
 )
 effects(
     "Reports",

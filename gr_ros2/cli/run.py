@@ -61,9 +61,17 @@ def run(scenario: str, **options: Any) -> int:
 
 @click.command()
 @click.option("--wire", type=click.Choice(["0", "1"]), default="1", help="Of the wire format; 0 repairs nothing.")
+@click.option("--robots", type=click.IntRange(2, 6), help="So many robots that all send, on one channel, in slots.")
 @_with_options
-def demo(wire: str, overrides: tuple[str, ...], **options: Any) -> int:
-    """Two simulated robots: the topics of one cross an OFDM link that loses packets, and come out at the other."""
+def demo(wire: str, robots: int | None, overrides: tuple[str, ...], **options: Any) -> int:
+    """Two simulated robots: the topics of one cross an OFDM link that loses packets, and come out at the other.
+
+    With --robots, that many drive apart among obstacles and tell each other where they are on one channel.
+    """
+    if robots is not None:
+        if wire == "0":
+            raise click.UsageError("--robots: version 0 says nothing about slots; leave --wire out")
+        return _run("demo-team", overrides=(f"robots={robots}", *overrides), **options)
     older = () if wire == "1" else ("version=0", "reports=null")
     return _run("demo", overrides=(*older, *overrides), **options)
 

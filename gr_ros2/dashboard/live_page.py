@@ -36,9 +36,19 @@ from bokeh.plotting import figure
 from jinja2 import Environment, FileSystemLoader
 
 from gr_ros2.dashboard.monitor import RadioView, RunMonitor
-from gr_ros2.dashboard.tables import alarms_html, colour, heard_html, packets_html, paths_html, tiles_html, topics_html
+from gr_ros2.dashboard.tables import (
+    alarms_html,
+    colour,
+    heard_html,
+    packets_html,
+    paths_html,
+    team_html,
+    tiles_html,
+    topics_html,
+)
 from gr_ros2.dashboard.views import Snapshot
-from gr_ros2.report.colours import AIR_COLOURS
+from gr_ros2.record.team import STRIP_S, TeamView
+from gr_ros2.report.colours import AIR_COLOURS, OUTCOME_COLOURS
 from gr_ros2.settings.config import ChannelConfig
 
 AHEAD = 3
@@ -80,7 +90,7 @@ class LivePage:
         style = InlineStyleSheet(css=(_TEMPLATES / "parts.css").read_text("utf-8"))
         self._html = {
             name: Div(name=name, stylesheets=[style], sizing_mode="stretch_width", disable_math=True)
-            for name in ("tiles", "alarms", "topics", "heard", "paths", "packets", "note")
+            for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "packets", "note")
         }
         self._sources = {
             name: ColumnDataSource({key: [] for key in columns.split()})
@@ -96,6 +106,9 @@ class LivePage:
                 "spectrum": "khz db",
                 "air": "t new repair report hello",
                 "snr": "t db",
+                "strip": "left right robot colour",
+                "places": "x y colour",
+                "beliefs": "x y colour",
             }.items()
         }
         self._html["tiles"].tags = [self._counter]  # it has no place on the page, but must be in the document
@@ -135,10 +148,13 @@ class LivePage:
         self._html["alarms"].text = alarms_html(snapshot)
         self._html["topics"].text = topics_html(snapshot)
         self._html["heard"].text = heard_html(snapshot)
+        self._html["team"].text = team_html(snapshot)
         self._html["paths"].text = paths_html(snapshot)
         self._html["packets"].text = packets_html(snapshot)
         self._draw_series(snapshot)
         self._draw_paths(snapshot)
+        if snapshot.team is not None:
+            self._draw_team(snapshot.team)
         self._draw_radio(radio)
         self._show_channel(radio)
         self._counter.empty = " ".join(_empty_cards(snapshot, radio))
@@ -199,6 +215,30 @@ class LivePage:
             "colour": [colour(path.colour) for path in paths],
             "t": [_small(path.error_t) for path in paths],
             "m": [_small(path.errors_m) for path in paths],
+        }
+
+    def _draw_team(self, team: TeamView) -> None:
+        """The newest slots of the channel, and for each robot where the others believe it is, with a line to it."""
+        sends = [send for send in team.sends if send.t > team.now - STRIP_S]
+        self._sources["strip"].data = {
+            "left": [send.t - team.now for send in sends],
+            "right": [send.t + send.airtime_s - team.now for send in sends],
+            "robot": [float(send.robot) for send in sends],
+            "colour": [OUTCOME_COLOURS[send.outcome(len(team.robots))] for send in sends],
+        }
+        inks = {robot: colour(number) for number, robot in enumerate(team.robots)}
+        self._sources["places"].data = {
+            "x": [place[0] for place in team.places.values()],
+            "y": [place[1] for place in team.places.values()],
+            "colour": [inks[robot] for robot in team.places],
+        }
+        known = [
+            (team.places[of], believed, inks[of]) for (_, of), believed in team.beliefs.items() if of in team.places
+        ]
+        self._sources["beliefs"].data = {
+            "x": [[there[0], believed[0]] for there, believed, _ in known],
+            "y": [[there[1], believed[1]] for there, believed, _ in known],
+            "colour": [ink for *_, ink in known],
         }
 
     def _draw_radio(self, radio: RadioView) -> None:
@@ -291,7 +331,12 @@ class LivePage:
         air.legend.label_text_font_size, air.legend.label_text_color = "10px", _SOFT
         snr = _plot("snr", "", "time [s]", "SNR [dB]")
         snr.line("t", "db", source=sources["snr"], color=_SENT, line_width=1.8)
-        plots = [map_, error, constellation, spectrum, latency, air, snr]
+        strip = _plot("strip", "", "time [s]", "robot", x_range=Range1d(-STRIP_S, 0))
+        strip.hbar("robot", left="left", right="right", height=0.8, color="colour", source=sources["strip"])
+        beliefs = _plot("beliefs", "", "x [m]", "y [m]", match_aspect=True)
+        beliefs.multi_line("x", "y", source=sources["beliefs"], color="colour", line_width=3)
+        beliefs.scatter("x", "y", source=sources["places"], color="colour", line_color="white", size=13)
+        plots = [map_, error, constellation, spectrum, latency, air, snr, strip, beliefs]
         series: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
             ("pdr", "pdr", "share", {"y_range": Range1d(0, 1.1)}),
             ("goodput", "goodput", "kB/s", {}),
@@ -312,7 +357,7 @@ class LivePage:
         )
         document = self.document
         document.title = "gr-ros2 · live"
-        texts = [self._html[name] for name in ("tiles", "alarms", "topics", "heard", "paths", "packets")]
+        texts = [self._html[name] for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "packets")]
         with document.models.freeze():  # otherwise the document walks through all models for every root
             for root in (*plots, channel, self._pause, *texts):
                 document.add_root(root)
@@ -346,6 +391,7 @@ def _empty_cards(snapshot: Snapshot, radio: RadioView) -> Iterator[str]:
         "constellation": radio.symbols is not None,
         "spectrum": radio.spectrum_db is not None,
         "air": snapshot.air is not None and bool(snapshot.air.busy),
+        **dict.fromkeys(("strip", "beliefs", "team"), snapshot.team is not None),
         "snr": snapshot.air is not None and bool(np.isfinite(snapshot.air.snr_db).any()),
     }
     if snapshot.phase != "waiting":

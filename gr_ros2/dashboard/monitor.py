@@ -7,7 +7,7 @@ all viewers see it. A setting that the link refuses changes nothing, and the rea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 
 import numpy as np
@@ -133,7 +133,8 @@ class RunMonitor:
         now, links = run.clock(), run.links
         snr_db = links[0].snr_db if links else None
         late_s = max((_late_s(link.gate_lateness(), now) for link in links), default=0.0)
-        self.snapshot = state.tick(now, queued, snr_db=snr_db, late_s=late_s)
+        snapshot = state.tick(now, queued, snr_db=snr_db, late_s=late_s)
+        self.snapshot = snapshot if run.team is None else replace(snapshot, team=run.team.view())
         if not links:
             return
         spectrum = self._spectrum

@@ -14,6 +14,7 @@ from gr_ros2.dashboard.packets import NO_COLOUR
 from gr_ros2.dashboard.views import PacketView, Snapshot, SpanView, TopicView
 from gr_ros2.link.events import AirKind
 from gr_ros2.link.ledger_rows import LedgerRow, row_order
+from gr_ros2.record.team import PairView
 from gr_ros2.report.colours import COLOURS, row_colour
 from gr_ros2.wire import BROADCAST
 
@@ -80,6 +81,27 @@ def heard_html(snapshot: Snapshot) -> str:
         '<table class="heard"><thead><tr><th scope="col" class="name">robot</th><th scope="col">heard [s ago]</th>'
         f'<th scope="col">packets</th></tr></thead><tbody>{rows}</tbody></table>'
     )
+
+
+def team_html(snapshot: Snapshot) -> str:
+    """Who hears whom: share of the packets of the last seconds, and SNR."""
+    team = snapshot.team
+    if team is None:
+        return ""
+    head = "".join(f'<th scope="col">of robot {other}</th>' for other in team.robots)
+    rows = ""
+    for one in team.robots:
+        cells = "".join(
+            f'<td data-pair="{one} {other}">{_hears(team.pairs.get((one, other)))}</td>' for other in team.robots
+        )
+        rows += f'<tr><th scope="row" class="name">robot {one} hears</th>{cells}</tr>'
+    return f'<table class="heard"><thead><tr><th scope="col"></th>{head}</tr></thead><tbody>{rows}</tbody></table>'
+
+
+def _hears(pair: PairView | None) -> str:
+    if pair is None or pair.share is None:
+        return "–"
+    return f"{pair.share:.0%}" + ("" if pair.snr_db is None else f", {pair.snr_db:.0f} dB")
 
 
 def _repair_tiles(snapshot: Snapshot) -> list[str]:

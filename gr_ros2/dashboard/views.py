@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 from gr_ros2.dashboard.windows import Floats, Point
 from gr_ros2.record.metrics import Latency
+from gr_ros2.record.team import TeamView
 
 
 @dataclass(frozen=True)
@@ -178,6 +179,7 @@ class Snapshot:
     alarms: tuple[str, ...] = ()
     heard: tuple[RobotView, ...] = ()
     air: AirView | None = None
+    team: TeamView | None = None
 
     def in_row(self, row: str) -> int:
         """Messages in a row of the ledger, over all topics."""

@@ -47,7 +47,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
     optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave;
-    0 says that sending was held back, so that the time since the last packet is not the pace of the PHY.
+    0 says that sending was held back, so that the time since the last packet is not the pace of the PHY. A real number
+    is the time in s, of this block's clock, since when the air is free for the packet: messages that wait all the same
+    wait for the computer.
 
     The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` leaves the
     graph, and so does the end of the process. A middleware that is passed in open must be started and closed by the
@@ -259,10 +261,12 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     def _credit(self, message: Any) -> None:
         packets = pmt.to_long(message) if pmt.is_integer(message) else 1
+        # Whoever waits for room in a queue wants nothing dropped.
+        ready = pmt.to_double(message) if pmt.is_real(message) and not self.config.backpressure else inf
         with self._lock:
             if packets <= 0:
                 self._end.pace.paused()
-            self._end.pace.credit(max(0, packets))
+            self._end.pace.credit(max(0, packets), ready)
             self._live.wake()
 
     def _pump(self) -> None:

@@ -6,12 +6,14 @@ credit is granted no earlier than ``lead`` before the channel is free of all que
 promised packet is an unused credit, counted as a longest packet), and only while there are fewer than ``OUTSTANDING``
 of them. There is no IO and no clock: ``now`` is seconds, monotonic. With a limit (:mod:`gr_ros2.link.airtime_limit`)
 a credit is granted only when the limit lets a longest packet begin, and a packet that comes without one and would
-have to wait for the limit is refused. While sending is switched off, nothing passes and no credit is granted.
+have to wait for the limit is refused. While sending is switched off, nothing passes and no credit is granted. With
+``listens``, one packet at a time is queued or promised, and it waits until nobody else sends.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from gr_ros2.core.errors import ConfigError
@@ -34,9 +36,12 @@ class AirtimeClock(Generic[T]):
         a packet leaves when its airtime is over, because the following stages take no time
     :param limit: what limits the airtime; None = nothing
     :param timed: the device itself waits for the time that a packet asks for, which then leaves ``lead`` before it
+    :param listens: called when a packet is about to leave; returns s after which to listen again because somebody else
+        sends, 0 if the channel is clear. None: nobody listens
     :raises ConfigError: for a negative airtime, lead or ahead
     :ivar refused: packets that were refused, by reason: ``airtime_limit`` or ``transmit_off``
     :ivar used: s of airtime of all packets taken
+    :ivar deferred: how often a packet did not leave because somebody else was sending
     :ivar held: whether the credits given last had been held back by the limit or the switch
     """
 
@@ -48,6 +53,7 @@ class AirtimeClock(Generic[T]):
         limit: AirtimeLimit | None = None,
         *,
         timed: bool = False,
+        listens: Callable[[], float] | None = None,
     ) -> None:
         if not airtime >= 0:
             raise ConfigError(f"airtime = {airtime} s: must be 0 or more")
@@ -59,6 +65,9 @@ class AirtimeClock(Generic[T]):
         self._lead = lead
         self._ahead = ahead
         self._timed = timed
+        self._listens = listens
+        self._most = OUTSTANDING if listens is None else 1
+        self.deferred = 0
         self._free = float("-inf")
         self._queue: deque[tuple[float, float, T]] = deque()
         """When each packet leaves, when its airtime begins, and the packet."""
@@ -115,7 +124,7 @@ class AirtimeClock(Generic[T]):
     def due(self, now: float) -> list[tuple[float, T]]:
         """The packets that may leave, in order of arrival, each with the time at which its airtime begins."""
         over: list[tuple[float, T]] = []
-        while self._queue and self._queue[0][0] <= now:
+        while self._queue and self._queue[0][0] <= now and self._is_clear(now):
             over.append(self._queue.popleft()[1:])
         return over
 
@@ -128,6 +137,11 @@ class AirtimeClock(Generic[T]):
         if given:
             self.held, self._holding = self._holding, False
         return given
+
+    @property
+    def free(self) -> float:
+        """When the channel is free of all packets that have come and of all but one that were promised, s."""
+        return self._free + max(self._unused - 1, 0) * self._airtime
 
     def next_timeout(self, now: float) -> float | None:
         """When ``due`` or ``grants`` next has something, None if only an arrival can change that."""
@@ -151,6 +165,18 @@ class AirtimeClock(Generic[T]):
     def _outstanding(self) -> int:
         return len(self._queue) + self._unused
 
+    def _is_clear(self, now: float) -> bool:
+        """Whether the first packet may leave; if not, all packets are put off."""
+        wait = 0.0 if self._listens is None else self._listens()
+        if wait > 0:
+            self.deferred += 1
+            later = now + wait - self._queue[0][0]
+            self._queue = deque((leaves + later, begin + later, packet) for leaves, begin, packet in self._queue)
+            self._free += later
+            if self.limit is not None:
+                self.limit.put_off(later)
+        return wait <= 0
+
     def _may_grant(self, now: float) -> bool:
         at = self._next_grant(now)
         if at is None or self.limit is None:
@@ -161,7 +187,7 @@ class AirtimeClock(Generic[T]):
 
     def _next_grant(self, now: float) -> float | None:
         """When the next credit may be granted, None if only an arrival or the switch can change that."""
-        if self._outstanding >= OUTSTANDING or not self._transmits:
+        if self._outstanding >= self._most or not self._transmits:
             return None
         begin = self._promised_until(now)
         if self.limit is None:

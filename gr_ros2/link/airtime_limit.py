@@ -149,6 +149,13 @@ class AirtimeLimit:
         self._bins.append((until, airtime))
         self._sum += airtime
 
+    def put_off(self, later: float) -> None:
+        """The newest packet begins so many s later. What shares its bin counts longer, never too short."""
+        self._over += later
+        if self._bins:
+            until, spent = self._bins.pop()
+            self._bins.append((until + later, spent))
+
     def _fits(self, end: float, airtime: float) -> float:
         """When a packet may end, not before ``end``."""
         left = self._sum

@@ -23,6 +23,7 @@ class LedgerRow(str, Enum):
     LOST_ON_GRAPH = "lost_on_graph", "source", "#5b5b9a", "lost by the ROS graph of the source before the link had them"
     TOO_LARGE = "too_large", "source", "#c9a08a", "too large for the packet length"
     QUEUE_BOUND = "queue_bound", "source", "#f0a330", "dropped at the bound of the source's queue"
+    OVERLOAD = "overload", "source", "#b0612c", "dropped at the source because the computer did not keep up"
     SUPERSEDED = "superseded", "source", "#88ccee", "replaced by a newer one before the first packet"
     STALE = "stale", "source", "#e7cf4f", "dropped at the source after their deadline"
     CANNOT_COMPLETE = "cannot_complete", "source", "#661100", "not begun, since they would have missed their deadline"

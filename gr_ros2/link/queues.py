@@ -2,8 +2,9 @@
 
 Invariants: a message that is being sent is first in its queue, and no newer message replaces it; every dropped message
 is returned with its ledger row. Rows: ``superseded`` (latest: a newer one came), ``queue_bound`` (fifo: the oldest,
-when full), ``stale`` (its deadline passed), ``cannot_complete`` (not started: even alone on the link it would be late),
-``abandoned`` (started, and it would be late).
+when full), ``overload`` (fifo: the oldest, while the computer is too slow), ``stale`` (its deadline passed),
+``cannot_complete`` (not started: even alone on the link it would be late), ``abandoned`` (started, and it would be
+late).
 """
 
 from __future__ import annotations
@@ -19,6 +20,10 @@ from gr_ros2.settings.commands import COMMAND_DEADLINE_S
 from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire import QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
+
+STANDING_S = 0.5
+"""s for which a message of a stream waits at most while the computer is too slow. At a third of the processor time that
+the demo needs (``python -m bench slow_computer``), its IMU was 1.9 s old where only the queue's bound dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +106,14 @@ class TopicQueue(deque[Outgoing]):
         self._by_age = self._by_age and message.lifespan_s >= self.deadline_s
         self.append(message)
         return dropped
+
+    def shed(self, now: float) -> Iterator[Dropped]:
+        """A message has come while the computer is too slow: drop those before it that have waited for too long."""
+        if self.policy != "fifo":
+            return
+        for message in [waiting for waiting in self if now - waiting.submitted > STANDING_S and not waiting.started]:
+            self.remove(message)
+            yield Dropped(message, LedgerRow.OVERLOAD, f"it waited for {STANDING_S:g} s and newer ones came")
 
     def expire(self, now: float, interval: float, lead: float, payload: int) -> Iterator[Dropped]:
         """Drop the messages that cannot be delivered in time, even if they had the link to themselves.

@@ -26,15 +26,15 @@ _ONE, _HELD_BACK = pmt.from_long(1), pmt.from_long(0)
 
 
 class AirtimeGate(gr.basic_block):  # type: ignore[misc]
-    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come; 0: the limit or the
-    switch held the next one back).
+    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come, for which the
+    air is free since this time in s; an integer for packets that the limit or the switch held back, after a 0).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
     :param lead: s before the channel is free at which a credit is given
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
-    :param timed: see :class:`AirtimeClock`
+    :param timed, listens: see :class:`AirtimeClock`
     :param clock: s, monotonic
     :param times: store when each packet passed; off by default, since a link that runs without end would store too many
     :ivar lateness: delays of packets after the time at which they should pass
@@ -51,12 +51,13 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         ahead: float | None = None,
         limit: AirtimeLimit | None = None,
         timed: bool = False,
+        listens: Callable[[], float] | None = None,
         times: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
-        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead, limit, timed=timed)
+        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead, limit, timed=timed, listens=listens)
         self._now = clock
         self._left = 0
         """Packets that have passed or are about to."""
@@ -104,6 +105,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         with self._changed:
             clock, limit = self._clock, self._clock.limit
             told = {"transmits": clock.transmits, "sent_s": clock.used, "refused": dict(clock.refused)}
+            told["deferred"] = clock.deferred
             if limit is None:
                 return told
             now = self._now()
@@ -151,13 +153,15 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 if not self._running:
                     return
                 pdus, credits = self._step()
+                free = self._clock.free
             for begins_at, pdu in pdus:
                 self.message_port_pub(PDUS, with_begin(pdu, begins_at))
             self.passed += len(pdus)
             if credits and self._clock.held:
                 self.message_port_pub(CREDIT, _HELD_BACK)
+            credit = _ONE if self._clock.held else pmt.from_double(free)
             for _ in range(credits):
-                self.message_port_pub(CREDIT, _ONE)
+                self.message_port_pub(CREDIT, credit)
 
     def _step(self) -> tuple[list[tuple[float, Any]], int]:
         """What is due; waits until something is due."""

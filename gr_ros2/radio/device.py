@@ -111,7 +111,7 @@ class DeviceFrontEnd(FrontEnd):
         self._blanker: Blanker | None = None
         if chosen.half_duplex and self.transmits:
             self._blanker = Blanker(self._shaper.sent, chosen.turnaround_s, phy.sample_rate)
-        self._gaps, self._energy = GapCounter(), EnergyCounter()
+        self._gaps, self._energy = GapCounter(), EnergyCounter(phy.sample_rate)
         self._given, self._taken = _Progress(), _Progress()
         self._transmitting: Any = None
         self._receiving: Any = None
@@ -193,6 +193,11 @@ class DeviceFrontEnd(FrontEnd):
         if self._blanker is not None:
             graph.connect(self._receiving, self._blanker)
         graph.connect(self.source, self._energy)
+
+    @property
+    def busy(self) -> Callable[[], bool] | None:
+        alone = self._blanker is not None and self.options.receive_frequency == self.options.frequency
+        return self._energy.is_above if alone else None
 
     @classmethod
     def airtime_with(cls, phy: Phy, chosen: Any, packet_len: int | None = None, mcs: int = 0) -> float:

@@ -143,6 +143,12 @@ class FrontEnd(ABC):
         """Strength of the newest packet received, dBm; None if the device does not tell it."""
         return None
 
+    @property
+    def busy(self) -> Callable[[], bool] | None:
+        """Returns whether somebody else sends now; None where the receiver measures no power at the frequency at which
+        this robot sends, or hears itself."""
+        return None
+
     def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
         """Time from the start of one packet to the earliest start of the next, s.
 

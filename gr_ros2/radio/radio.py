@@ -6,6 +6,7 @@ direction waits for the other. Received samples can be impaired only if the chan
 
 from __future__ import annotations
 
+import random
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -30,6 +31,9 @@ from gr_ros2.settings.config import ChannelConfig, airtime_from, build
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.state.airtime import AirtimeFile
 
+_LEAST_WAIT_S = 0.001
+"""s after which a channel that was not clear is listened to again, at least."""
+
 
 class Radio(PacketPath, HierBlock):
     """Message ports `pdus` in, `pdus` out and `credit` out (one message: one more packet may come).
@@ -39,6 +43,7 @@ class Radio(PacketPath, HierBlock):
     :param channel: impairments of what is received, for front ends without a radio
     :param record: SigMF recording to write of all samples received, '' = none
     :param limit: what limits the airtime; None = nothing
+    :param listens: whether each packet waits until nobody else is heard
     :param changeable: add a channel that can be changed while running, if the front end has no radio
     :param instrumented: add parts for a dashboard: a channel that can be changed, and taps for spectrum and
         constellation
@@ -54,6 +59,7 @@ class Radio(PacketPath, HierBlock):
         channel: ChannelConfig | None = None,
         record: str = "",
         limit: AirtimeLimit | None = None,
+        listens: bool = False,
         changeable: bool = False,
         instrumented: bool = False,
     ) -> None:
@@ -82,6 +88,7 @@ class Radio(PacketPath, HierBlock):
             ahead=front_end.ahead(),
             limit=limit,
             timed=front_end.clock_offset is not None,
+            listens=_Listener(front_end) if listens else None,
             clock=front_end.clock,
         )
         if not front_end.transmits:
@@ -182,6 +189,26 @@ class Radio(PacketPath, HierBlock):
         return f"front_end {self.front_end.name}"
 
 
+class _Listener:
+    """s after which to listen again; 0 if the channel is clear. Of two robots that wait for the end of a third one's
+    packet, one begins first: the time is random, up to that of a packet.
+
+    :raises ConfigError: for a front end that cannot listen
+    """
+
+    def __init__(self, front_end: FrontEnd) -> None:
+        if front_end.busy is None:
+            raise ConfigError(
+                f"airtime.listen_before_send: front_end {front_end.name} measures no power where it sends, with these "
+                "settings; take a front end of an SDR with half_duplex: true and one frequency, or leave it out"
+            )
+        self._busy, self._rng = front_end.busy, random.Random()
+        self._most = max(front_end.airtime(), 2 * _LEAST_WAIT_S)
+
+    def __call__(self) -> float:
+        return self._rng.uniform(_LEAST_WAIT_S, self._most) if self._busy() else 0.0
+
+
 def make_radio(
     phy: str,
     packet_len: int,
@@ -234,7 +261,15 @@ def make_radio(
             undo.callback(file.close)
             longest, now = opened.airtime(), time.monotonic()
             limit = AirtimeLimit(limits.rule, longest, now=now, spent=file.spent, save=file.save)
-        radio = Radio(modem, opened, channel=impairments, record=record, limit=limit, changeable=channel is not None)
+        radio = Radio(
+            modem,
+            opened,
+            channel=impairments,
+            record=record,
+            limit=limit,
+            listens=limits.listen_before_send and sends,
+            changeable=channel is not None,
+        )
         if limit is not None:
             radio.closing.callback(file.close)
         undo.pop_all()

@@ -143,6 +143,7 @@ class RobotLink(Flowgraph):
                 channel=self.config.channel,
                 record=self.config.record,
                 limit=self._limit,
+                listens=self.config.airtime.listen_before_send and self.sends,
                 instrumented=self._instrumented,
             )
         except BaseException:

@@ -17,6 +17,9 @@ sixteen colours."""
 AIR_COLOURS = {"new": "#2a9d5c", "repair": "#56b4e9", "report": "#e69f00", "hello": "#9db8d9"}
 """Colours of what packets are for."""
 
+OUTCOME_COLOURS = {"heard by all": "#0072b2", "not by all": "#e69f00", "overlapped": "#d62728", "relayed": "#009e73"}
+"""Colours of what became of a packet on a shared channel, see :meth:`gr_ros2.record.team.Send.outcome`."""
+
 
 def row_colour(row: str) -> str:
     """The colour of a ledger row. A row that this version does not know also has a fixed colour."""

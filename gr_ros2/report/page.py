@@ -28,11 +28,13 @@ from gr_ros2.core.files import write_text, write_whole
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.repetitions import run_folders
 from gr_ros2.record.result import Result, air_uses, read_result, topic_numbers
+from gr_ros2.record.team import Team, read_team
 from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv
 from gr_ros2.report.explain import explanation
 from gr_ros2.report.figures import air_figure, latency_figure, ledger_figure, path_figure, save_figure
 from gr_ros2.report.snr_map import map_of
 from gr_ros2.report.table import PAPER, Grid, air_grid, ledger_grid, notes, paper_grid, paper_results, summary_grid
+from gr_ros2.report.team_figures import belief_figure, hearing_figure, strip_figure
 from gr_ros2.report.timelines import Deliveries, age_figure, airtime_figure, delivery_figure, packets_figure
 
 REPORT_FILE = "report.html"
@@ -243,6 +245,8 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
     if (world := map_of(result)) is not None:
         caption = "SNR over the world for a receiver that stands still; white: obstacles; lines: where the robots drove"
         pictures.append(save(world, out, f"{prefix}snr-map", caption))
+    if (team := read_team(run.directory)) is not None:
+        pictures += _draw_team(team, out, prefix)
     pictures.append(save(latency_figure(latencies([run])), out, f"{prefix}latency", _LATENCY))
     pictures.append(
         save(
@@ -292,6 +296,19 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
         )
     )
     return pictures
+
+
+def _draw_team(team: Team, out: Path, prefix: str) -> list[Picture]:
+    """What robots on one channel saw."""
+    drawn = {
+        "slots": (
+            strip_figure(team),
+            "The channel while the robots enter, and at the end: who sent, and what became of it",
+        ),
+        "hearing": (hearing_figure(team), "SNR with which each robot hears the others"),
+        "beliefs": (belief_figure(team), "Where each robot drove, and where the others believed it to be"),
+    }
+    return [save(figure, out, f"{prefix}{name}", caption, name == "slots") for name, (figure, caption) in drawn.items()]
 
 
 def write_summary(runs: Sequence[Run], out: Path) -> list[Path]:

@@ -21,6 +21,7 @@ from gr_ros2.link.observe import LinkObserver, Observers, name_of
 from gr_ros2.phy import Phy
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.result import Result
+from gr_ros2.record.team import TeamRecord
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.settings.registry import Registry
 
@@ -74,6 +75,7 @@ class LiveRun:
     :param links: every direction's flowgraph
     :param ledger: the state of every message sent so far; None where only one end of the link is in this process
     :param clock: s, the clock of the run's events
+    :param team: robots that share a channel, None where none do
     :param received_as: absolute name under which a topic of a sender, by its name in a registry, comes out here; ''
         where the names of ``topics`` are shown
     """
@@ -87,6 +89,7 @@ class LiveRun:
     links: Sequence[LiveLink]
     ledger: Ledger | None
     clock: Callable[[], float] = time.monotonic
+    team: TeamRecord | None = None
     received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
 
 

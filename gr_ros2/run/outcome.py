@@ -11,6 +11,7 @@ from typing import Any
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
+from gr_ros2.record.team import TeamRecord
 from gr_ros2.record.trace import Trace
 
 DELIVERED_BAG = "delivered"
@@ -35,10 +36,11 @@ class Progress:
 
 @dataclass
 class Outcome:
-    """The result, and the trace of every message."""
+    """The result, the trace of every message, and where robots share a channel what all of them saw."""
 
     result: Result
     trace: Trace
+    team: TeamRecord | None = None
 
 
 def phy_numbers(phy: Phy, channels: int, recorder: Recorder) -> dict[str, Any]:

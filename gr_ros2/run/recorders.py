@@ -10,8 +10,11 @@ from typing import Any
 
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.observe import LinkObserver, Observers
+from gr_ros2.phy import Phy
+from gr_ros2.record.positions import position_reader
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import ReceiverResult
+from gr_ros2.record.team import TeamRecord
 from gr_ros2.run.load import source_names
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.settings.registry import Registry
@@ -33,6 +36,22 @@ def make_recorder(
         {way.ros_source.src_id(): source_names(way, registry).values() for way in ways},
         on_delivery=on_delivery,
     )
+
+
+def make_team(registry: Registry, ways: Sequence[Scenario], phy: Phy) -> TeamRecord | None:
+    """What follows the robots of a scenario that share a channel; None where they do not.
+
+    :param ways: one scenario per direction
+    """
+    if ways[0].duplex != "half":
+        return None
+    readers = {
+        (way.ros_source.src_id(), topic_id): reader
+        for way in ways
+        for topic_id in source_names(way, registry).values()
+        if (reader := position_reader(registry[topic_id].type_name)) is not None
+    }
+    return TeamRecord([way.ros_source.src_id() for way in ways], phy.airtime, readers)
 
 
 class Ear:

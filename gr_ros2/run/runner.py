@@ -132,6 +132,8 @@ def run_scenario(
         run_observers.run_ended(None if outcome is None else outcome.result)
     if out is not None:
         write_trace(outcome.trace, out)
+        if outcome.team is not None:
+            outcome.team.write(out)
         write_whole(out / REGISTRY_FILE, scenario.registry, copyfile)
         write_result(outcome.result, out / RESULT_FILE)
     return outcome

@@ -157,6 +157,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError(f"medium = {self.medium!r}: each robot has a channel of its own; set duplex: half")
         if self.airtime.rule is not None and self.time == "unthrottled":
             raise ValueError("airtime: packets take no airtime with time = 'unthrottled'; set time to real, or packets")
+        if self.airtime.listen_before_send:
+            raise ValueError("airtime.listen_before_send: no receiver of a run measures power; leave it to live links")
         self._check_robots()
         self._check_positions()
         return self

@@ -21,14 +21,15 @@ from gr_ros2.link import ReceiverEvent
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
+from gr_ros2.record.team import TeamRecord
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import make_phys, recording, source_names
 from gr_ros2.run.observers import LiveRun, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
-from gr_ros2.run.recorders import Ear, FurtherRecorders, make_recorder
+from gr_ros2.run.recorders import Ear, FurtherRecorders, make_recorder, make_team
 from gr_ros2.run.robots import ears_of, recorder_of
 from gr_ros2.run.scenario import Scenario, dump
-from gr_ros2.run.simulate import Simulation, pass_on
+from gr_ros2.run.simulate import Simulation, TimedEvent, pass_on
 from gr_ros2.settings.registry import Registry
 
 _REPORT_S = 0.05
@@ -82,12 +83,15 @@ def run_simulated(
         link_observers.add(further)
         link_observers.add(run_observers)
         clock = _EventClock()
-        run_observers.run_started(_live_run(scenario, registry, recorder, clock))
+        team = make_team(registry, ways, phys[0])
+        run_observers.run_started(_live_run(scenario, registry, recorder, clock, team))
         reported, progress = 0.0, Guard("progress")
         for timed_event in run.events():
             clock.now, robot, event = timed_event
             number = recorder_of(scenario, robot.number) if isinstance(event, ReceiverEvent) else 0
             pass_on(further.at(number) if number else link_observers, timed_event)
+            if team is not None:
+                _follow(team, timed_event)
             recorded.check()
             further.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
@@ -114,7 +118,15 @@ def run_simulated(
         counters={**there, **back, "listener": {} if bag is None else dict(bag.written)},
     )
     published_as = {name: other for way in ways for name, other in _published_as(way, registry).items()}
-    return Outcome(result, recorder.trace(0.0, played, published_as))
+    return Outcome(result, recorder.trace(0.0, played, published_as), team)
+
+
+def _follow(team: TeamRecord, timed_event: TimedEvent) -> None:
+    now, robot, event = timed_event
+    if isinstance(event, ReceiverEvent):
+        team.receiver_event(robot.src_id, event, now)
+    else:
+        team.sender_event(robot.src_id, event)
 
 
 class _EventClock:
@@ -170,7 +182,9 @@ def _published_as(way: Scenario, registry: Registry) -> dict[str, str]:
     return {name: rows[topic_id].republished(format_, src_id) for name, topic_id in source_names(way, registry).items()}
 
 
-def _live_run(scenario: Scenario, registry: Registry, recorder: Recorder, clock: Callable[[], float]) -> LiveRun:
+def _live_run(
+    scenario: Scenario, registry: Registry, recorder: Recorder, clock: Callable[[], float], team: TeamRecord | None
+) -> LiveRun:
     topics = {
         (way.ros_source.src_id(), topic_id): name
         for way in scenario.directions()
@@ -186,4 +200,5 @@ def _live_run(scenario: Scenario, registry: Registry, recorder: Recorder, clock:
         links=(),
         ledger=recorder.ledger,
         clock=clock,
+        team=team,
     )

@@ -92,6 +92,8 @@ class AirtimeConfig(Windowed):
         without one no limit
     :param window_s: s over which ``duty_cycle`` holds; auto = the band's, without one an hour
     :param max_burst_s: most s without a pause of 0.1 s, 0 = no limit; auto = the band's, without one no limit
+    :param listen_before_send: a packet waits while the receiver hears a signal, 6 dB above the noise; for front ends of
+        SDRs with ``half_duplex``
     """
 
     band: str = ""
@@ -104,6 +106,7 @@ class AirtimeConfig(Windowed):
     max_burst_s: Annotated[
         Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Longest time without a pause (s)")
     ] = AUTO
+    listen_before_send: bool = False
 
     @model_validator(mode="after")
     def _within_band(self) -> AirtimeConfig:

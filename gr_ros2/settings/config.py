@@ -682,6 +682,8 @@ class AnyLink(OneWay, Agreed, Named):
             raise ValueError(
                 "ros_source.packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out"
             )
+        if self.airtime.listen_before_send and self.medium != "exclusive":
+            raise ValueError(f"airtime.listen_before_send: medium = {self.medium!r} has times of its own; leave it out")
         if self.airtime.rule is not None and not self.phy.takes_airtime:
             raise ValueError("airtime: phy direct takes no airtime, so there is nothing to limit; leave it out")
         self.airtime.check_seal(encrypts=bool(self.key) and self.seal == "encrypt")

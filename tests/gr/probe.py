@@ -44,6 +44,7 @@ class Probe(gr.basic_block):
         self.times: list[float] = []
         self.handled = self.emitted = 0
         self.credits = 0
+        self.granted: list[Any] = []
         self.uses_credit = False
 
     def use_credit(self) -> None:
@@ -66,4 +67,5 @@ class Probe(gr.basic_block):
         self.handled += 1
 
     def _count(self, message: Any) -> None:
-        self.credits += pmt.to_long(message)
+        self.granted.append(message)
+        self.credits += pmt.to_long(message) if pmt.is_integer(message) else 1

@@ -153,6 +153,38 @@ def test_a_packet_that_asks_for_a_time_begins_then_and_later_ones_behind_it() ->
     assert clock.due(15.0) == [(12.0, "slot"), (13.0, "next"), (15.0, "missed")]
 
 
+def test_a_packet_waits_while_somebody_else_sends() -> None:
+    heard = [0.3, 0.2, 0.0, 0.0]
+    clock: AirtimeClock[str] = AirtimeClock(1.0, ahead=0.0, listens=lambda: heard.pop(0))
+    assert clock.grants(0.0) == 1, "one at a time: what waits behind a packet could not be listened for"
+    clock.offer("a", 0.0)
+    assert clock.grants(0.0) == 0
+    assert clock.due(0.0) == []
+    assert clock.next_timeout(0.0) == pytest.approx(0.3)
+    assert clock.due(0.31) == []
+    assert clock.next_timeout(0.31) == pytest.approx(0.51)
+    assert packets(clock.due(0.51)) == ["a"]
+    assert clock.deferred == 2
+    assert clock.grants(1.4) == 0, "its airtime began at 0.51"
+    assert clock.grants(1.51) == 1
+    clock.offer("b", 1.6)
+    assert packets(clock.due(1.6)) == ["b"]
+
+
+def test_a_limit_counts_a_packet_that_waited_when_it_leaves() -> None:
+    heard = [1.0] * 5 + [0.0]
+    rule = AirtimeRule(duty_cycle=0.1, window_s=20.0)
+    limit = AirtimeLimit(rule, 1.0)
+    clock: AirtimeClock[str] = AirtimeClock(1.0, ahead=0.0, limit=limit, listens=lambda: heard.pop(0))
+    clock.offer("a", 0.0)
+    now = 0.0
+    while not clock.due(now):
+        now += 1.0
+    assert now == 5.0
+    assert limit.spent(now + 1.0 + rule.window_s - 0.1) == 1.0
+    assert limit.spent(now + 1.0 + 2 * rule.window_s) == 0.0
+
+
 def test_credits_that_the_switch_or_the_limit_held_back_are_known() -> None:
     clock: AirtimeClock[str] = AirtimeClock(1.0, lead=0.0)
     assert clock.grants(0.0) == 1

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SentPacket
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.queues import PublisherQos, TopicQueue, queue_for
+from gr_ros2.link.queues import STANDING_S, PublisherQos, TopicQueue, queue_for
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.settings.config import TopicOptions, build
 from gr_ros2.settings.registry import Registry, Topic
@@ -51,6 +51,90 @@ def test_latest_sends_the_newest_and_finishes_what_it_began() -> None:
         source.end.messages.submit(0, letter * 20, 0.1)
     assert b"".join([*begun, *leave(source, 0.1)]) == b"a" * 100 + b"d" * 20
     assert refused(source.end) == {"superseded": 2}
+
+
+def overloaded(source: Robot, airtime: float, seconds: float = 8.0) -> dict[int, list[float]]:
+    """50 messages/s of each topic, and a packet of one message every 50 ms; for each topic, the ages of what leaves.
+
+    :param airtime: s that a packet takes, at most 50 ms; the rest is spent by the computer
+    """
+    ages: dict[int, list[float]] = {}
+    free = now = 0.0
+    for tick in range(round(seconds * 100)):
+        now = tick / 100
+        if tick % 2 == 0:
+            for topic_id in source.topics or ():
+                source.end.messages.submit(topic_id.topic_id, tick.to_bytes(4, "big").ljust(45, b"."), now)
+        if tick % 5 == 0:
+            source.end.pace.credit(1, ready=free)
+            sent = source.end.next_packet(now)
+            free = now + airtime
+            for part in () if sent is None else sent.packet.entries:
+                if isinstance(part, Part) and part.topic_id != TABLE_TOPIC:
+                    ages.setdefault(part.topic_id, []).append(now - int.from_bytes(part.payload[:4], "big") / 100)
+    return ages
+
+
+def test_a_computer_that_is_too_slow_drops_the_oldest_and_starves_no_topic() -> None:
+    source = robot(3, queue="fifo")
+    ages = overloaded(source, airtime=0.005)
+    assert set(refused(source.end)) == {"overload"}
+    for late in ages.values():
+        assert max(late) < 1.5  # the queue of two topics while the third has its turn, at the beginning
+        assert max(late[len(late) // 2 :]) < STANDING_S + 0.05 * (3 + 1)
+    counts = [len(late) for late in ages.values()]
+    assert len(counts) == 3
+    assert min(counts) > 0.5 * max(counts)
+
+
+def test_an_air_that_is_too_slow_drops_at_the_bound_of_the_queue() -> None:
+    source = robot(3, queue="fifo")
+    ages = overloaded(source, airtime=0.05)
+    assert set(refused(source.end)) == {"queue_bound"}
+    assert max(max(late) for late in ages.values()) > 1.9
+
+
+def test_a_burst_after_which_nothing_comes_leaves_whole_however_slow_the_computer_is() -> None:
+    source = robot(queue="fifo")
+    overloaded(source, airtime=0.005, seconds=3.0)
+    assert source.end.pace.behind(3.0)
+    leave(source, 4.0)
+    before = source.end.sent.refused.copy()
+    left = 0
+    for number in range(50):
+        source.end.messages.submit(0, b"%d" % number, 20.0)
+    for turn in range(200):
+        source.end.pace.credit(1, ready=0.0)
+        sent = source.end.next_packet(20.0 + turn / 20)
+        left += 0 if sent is None else sum(isinstance(part, Part) for part in sent.packet.entries)
+    assert left >= 50
+    assert source.end.sent.refused == before
+
+
+def test_a_sending_thread_that_does_not_run_is_a_computer_that_is_too_slow() -> None:
+    source = robot(queue="fifo")
+    leave(source, 0.0)
+    source.end.pace.credit(1, ready=0.0)
+    for tick in range(200):
+        source.end.messages.submit(0, bytes(45), 1.0 + tick / 50)
+    assert set(refused(source.end)) == {"overload"}
+    assert source.end.messages.queued() == {0: 26}
+
+
+def test_a_robot_that_nobody_hears_is_not_too_slow() -> None:
+    rows = [Topic(0, "t", "std_msgs/msg/String", TopicOptions(queue="fifo"))]
+    source = Robot(1, Registry(rows), hears=True, beacon_s=1.0)
+    leave(source, 0.0)
+    source.end.pace.credit(1, ready=0.0)
+    for tick in range(200):
+        source.end.messages.submit(0, bytes(45), 5.0 + tick / 50)
+    assert set(refused(source.end)) == {"queue_bound"}
+
+
+def test_messages_that_max_rate_holds_back_do_not_wait_for_the_computer() -> None:
+    source = robot(queue="fifo", max_rate=5.0)
+    overloaded(source, airtime=0.005)
+    assert set(refused(source.end)) == {"queue_bound"}
 
 
 def test_latest_holds_a_recording_back_while_one_waits() -> None:

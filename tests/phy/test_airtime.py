@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from math import inf
 
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+import pmt
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.airtime import AirtimeGate
@@ -53,6 +56,19 @@ def test_one_credit_first_then_one_per_packet(top: Flowgraph) -> None:
         probe.post(bytes(1))
     wait_for(lambda: probe.handled == 5, "every packet")
     wait_for(lambda: probe.credits == 6, "the last credit")
+
+
+def test_a_credit_says_since_when_the_air_is_free(top: Flowgraph) -> None:
+    """A source that has messages all the same knows that it is the computer that they wait for."""
+    gate = AirtimeGate(0.02)
+    probe = wire(top, gate)
+    wait_for(lambda: probe.credits == 1, "a credit")
+    begin = time.monotonic()
+    probe.post(b"x")
+    wait_for(lambda: probe.credits == 2, "the next credit")
+    first, second = (pmt.to_double(message) for message in probe.granted)
+    assert first == -inf
+    assert second >= begin + 0.02
 
 
 def test_without_airtime_packets_pass_at_once_and_credits_go_on(top: Flowgraph) -> None:

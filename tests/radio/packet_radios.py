@@ -16,6 +16,7 @@ import threading
 import time
 import tty
 from collections import deque
+from contextlib import suppress
 from math import ceil
 from pathlib import Path
 from types import TracebackType
@@ -69,9 +70,10 @@ class Radio:
         raise NotImplementedError
 
     def receive(self, packet: bytes) -> None:
-        """A packet has arrived."""
+        """A packet has arrived. What the computer does not read in time is lost, as at any UART."""
         self.heard += 1
-        os.write(self.master, packet)
+        with suppress(BlockingIOError):
+            os.write(self.master, packet)
 
     def close(self) -> None:
         os.close(self.master)
@@ -149,6 +151,12 @@ class Tnc(Radio):
             return None
         frame = self._waiting.popleft()
         return _FEND + frame + _FEND, self.txdelay_s + 8 * len(frame) / self.bit_rate
+
+
+class SlowTnc(Tnc):
+    """The same at 1,200 bits/s, with the TXDELAY and the slots of the KISS paper."""
+
+    txdelay_s, bit_rate, slot_s = 0.3, 1200, 0.1
 
 
 class Channel:

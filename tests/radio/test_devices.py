@@ -349,6 +349,21 @@ def test_a_radio_has_a_channel_of_its_own(monkeypatch: pytest.MonkeyPatch) -> No
         RobotLink(config(1, {"name": "soapy", "frequency": 433e6}, channel={"snr_db": 3}))
 
 
+def test_a_device_listens_where_it_sends_and_does_not_hear_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    for half in ("_open_transmitter", "_open_receiver"):
+        monkeypatch.setattr(SoapyFrontEnd, half, lambda _self: None)
+    phy = PskPhy(64, RATE)
+    listening = SoapyFrontEnd(phy, frequency=433e6, half_duplex=True).busy
+    assert listening is not None
+    assert not listening()
+    assert SoapyFrontEnd(phy, frequency=433e6).busy is None
+    assert SoapyFrontEnd(phy, frequency=433e6, frequency_rx=434e6, half_duplex=True).busy is None
+    with pytest.raises(ConfigError, match=r"airtime\.listen_before_send: front_end soapy measures no power where it"):
+        RobotLink(config(1, {"name": "soapy", "frequency": 433e6}, airtime={"listen_before_send": True}))
+    with pytest.raises(ConfigError, match="medium = 'slots' has times of its own; leave it out"):
+        config(1, {"name": "udp"}, version=1, medium="slots", airtime={"listen_before_send": True})
+
+
 def test_airtime_counts_padding_guard_and_turnaround(monkeypatch: pytest.MonkeyPatch) -> None:
     for half in ("_open_transmitter", "_open_receiver"):
         monkeypatch.setattr(SoapyFrontEnd, half, lambda _self: None)

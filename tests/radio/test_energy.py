@@ -15,7 +15,7 @@ from gr_ros2.radio.energy import EnergyCounter
 
 def counted(samples: NDArray[np.complex64]) -> int:
     """How many signals a flowgraph counts in them."""
-    graph, counter = gr.top_block(), EnergyCounter()
+    graph, counter = gr.top_block(), EnergyCounter(1e6)
     graph.connect(blocks.vector_source_c(samples), counter)
     graph.run()
     return counter.bursts
@@ -50,3 +50,22 @@ def test_silence_and_samples_that_are_no_numbers_do_no_harm() -> None:
     samples = np.zeros(100_000, np.complex64)
     samples[50_000:60_000] = np.nan
     assert counted(samples) == 0
+
+
+def test_the_newest_samples_say_whether_somebody_sends() -> None:
+    samples = noise(200_000, 1e-6)
+    samples[150_000:] += noise(50_000, 1e-4, 2)
+    graph, counter = gr.top_block(), EnergyCounter(1e6)
+    graph.connect(blocks.vector_source_c(samples), counter)
+    graph.run()
+    assert counter.is_above()
+
+
+def test_a_carrier_counts_as_noise_after_a_while() -> None:
+    """Otherwise whoever listens before sending would be silent for ever."""
+    samples = np.concatenate([noise(20_000, 1e-6), noise(400_000, 1e-4, 2)])
+    for sample_rate, above in ((1e6, True), (1e4, False)):
+        graph, counter = gr.top_block(), EnergyCounter(sample_rate)
+        graph.connect(blocks.vector_source_c(samples), counter)
+        graph.run()
+        assert counter.is_above() == above

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -153,3 +154,32 @@ def test_names_and_settings_that_are_wrong() -> None:
         make_radio("psk", 64, 1e6, "sim", channel={"snr_db": 101})
     with pytest.raises((RadioError, BackendMissingError), match="uhd"):
         make_radio("psk", 64, 1e6, "uhd", args="type=none", frequency=433e6, transmit=True)
+
+
+class _Ears(SimFrontEnd):
+    """A front end that can be told that somebody else sends."""
+
+    loud = True
+
+    @property
+    def busy(self) -> Callable[[], bool]:
+        return lambda: self.loud
+
+
+def test_a_radio_that_listens_sends_nothing_while_somebody_else_does() -> None:
+    phy = PskPhy(64, 1e6)
+    front_end = _Ears(phy)
+    radio = Radio(phy, front_end, listens=True)
+    with Running(radio) as running:
+        wait_for(lambda: running.source.credits == 1, "the credit")
+        running.source.post(PACKETS[0])
+        wait_for(lambda: radio.gate.account()["deferred"] > 3, "a packet that waits")
+        assert running.sink.packets == []
+        front_end.loud = False
+        wait_for(lambda: running.sink.packets == PACKETS[:1], "the packet")
+
+
+def test_a_front_end_that_measures_no_power_cannot_listen() -> None:
+    phy = PskPhy(64, 1e6)
+    with pytest.raises(ConfigError, match="listen_before_send: front_end sim measures no power where it sends"):
+        Radio(phy, SimFrontEnd(phy), listens=True)

@@ -128,10 +128,11 @@ class EndpointV1:
         self._receiving.tell(self._sending, messages, window, rate)
         self.pace, self.pings = self._sending.pace, self._sending.pings
 
-    def submitted(self, topic_id: int, now: float) -> None:
+    def submitted(self, topic_id: int, now: float) -> bool:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self._now = max(self._now, now)
         self._hold.submitted(topic_id, now)
+        return self._access is None and self._sending.behind(now)  # with medium access, messages wait for their slot
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""

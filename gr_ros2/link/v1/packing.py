@@ -59,6 +59,8 @@ class Filling:
     lifetimes: tuple[Lifetime, ...]
     qos: int
     used: int
+    since: float
+    """When the first of its messages that no ``max_rate`` holds back was submitted, s; infinite if there is none."""
 
 
 class Packing:
@@ -179,7 +181,8 @@ class Packing:
                 self._left(message, now)
         self.turns.sent(self._holder)
         stats.entries += len(picks)
-        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used)
+        free = (message.submitted for message, _ in picks if not self._topics[message.topic_id].topic.options.max_rate)
+        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, min(free, default=inf))
 
 
 def _may_cut(message: Message, taken: int, used: int, room: int) -> bool:

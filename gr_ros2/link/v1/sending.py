@@ -103,6 +103,7 @@ class SendingSide:
             room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
         filling = packing.fill(self._window.packets.newest + 1, room, now)
         if filling is not None:
+            self.pace.waited(filling.since, now)
             reports.add(filling.parts, room - filling.used, due, now)
             if self._relaying is not None:
                 filling.parts += self._relaying.gains.tells()
@@ -112,6 +113,10 @@ class SendingSide:
         if due:
             return reports.packet(due, now)
         return reports.asks(now) or self.repairs.spare(now) or reports.early(now)
+
+    def behind(self, now: float) -> bool:
+        """Whether messages that wait do so because the computer is too slow."""
+        return self.pace.behind(now) and not self._alone(now)
 
     def next_departure(self, now: float) -> float:
         """When ``packet`` may have something, s; without regard to credits."""

@@ -46,6 +46,11 @@ class SentTopic:
         return self.latched or self.topic.options.keep_s > 0
 
     @property
+    def is_stream(self) -> bool:
+        """Whether its messages are useless when newer ones have come, should the computer be too slow for all."""
+        return self.topic.is_topic and not self.kept and not self.topic.options.max_rate
+
+    @property
     def kept_depth(self) -> int:
         """How many messages late robots and late subscribers get.
 

@@ -115,7 +115,7 @@ def test_reports_become_rare_while_nothing_is_lost_and_frequent_again_after_a_lo
 
 
 @pytest.mark.parametrize("half_duplex", [False, True])
-def test_while_packets_get_lost_every_one_is_reported_where_that_takes_no_slot_from_packets(half_duplex: bool) -> None:
+def test_while_packets_get_lost_more_is_reported_where_that_takes_no_slot_from_packets(half_duplex: bool) -> None:
     one, two = Robot(1, registry()), Robot(2, half_duplex=half_duplex)
     air = Air(one, two, loss=0.2)
     for number in range(200):
@@ -124,8 +124,8 @@ def test_while_packets_get_lost_every_one_is_reported_where_that_takes_no_slot_f
     air.run(3.0)
     assert len(two.delivered()) == 200
     reports, arrived = two.end.sent.air["report"], two.end.received.packets
-    assert (reports > 0.85 * arrived) != half_duplex
-    assert (reports < 0.75 * arrived) == half_duplex
+    assert (reports > 0.55 * arrived) != half_duplex
+    assert (reports < 0.4 * arrived) == half_duplex
 
 
 def test_a_topic_where_only_the_newest_matters_drops_what_is_overtaken() -> None:
