@@ -350,6 +350,7 @@ effects(
     phy=EFFECTS["Scenario", "phy"],
     airtime=EFFECTS["Scenario", "airtime"],
     medium=Elsewhere("tests/radio/test_slots.py"),
+    relay=Elsewhere("tests/radio/test_slots.py"),
     localhost_only=LOCAL,
     front_end=Elsewhere("tests/radio/test_devices.py"),
     transmit=Elsewhere("tests/radio/test_permission.py"),

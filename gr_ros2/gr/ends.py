@@ -214,11 +214,12 @@ def start_of(
     airtime_share: float = 1.0,
     access: Callable[[int], Access | None] = lambda _: None,
     lead_s: float = 0.0,
+    relay: bool = False,
 ) -> EndpointSetup:
     """Count this start of a robot in its state file, and read the robot's keys.
 
     :param src_id: id of the robot, -1 for a robot that sends nothing
-    :param access, lead_s: see :class:`EndpointSetup`
+    :param access, lead_s, relay: see :class:`EndpointSetup`
     :raises ConfigError: for a key file or a state file that cannot be read or understood
     """
     keys = Keys(read_key_file(config.key), config.seal) if config.key else None
@@ -233,6 +234,7 @@ def start_of(
         airtime_share=airtime_share,
         access=access,
         lead_s=lead_s,
+        relay=relay,
     )
     if not config.state and not config.key and src_id < 0:
         return replace(setup, boot=int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS))
