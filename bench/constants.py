@@ -4,6 +4,9 @@ halved and doubled, one at a time, over the same messages and losses.
 A *promise* is a figure of which less is better, of one seed. A change is shown where its mean over the seeds is at
 least ``SHOWN`` and the 95 % interval of the paired differences (Student's t) leaves out zero. A rule that shows no such
 gain on any promise does not earn its place.
+
+``gr-ros2 ablate`` does not run over them: its variants differ in settings, which any user can repeat with ``--set``.
+These are no settings.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from math import exp, isfinite, log, sqrt
 from statistics import mean, stdev
 from typing import Any
 
-from bench import repair, repair_backlog, saturated
+from bench import rate, repair, repair_backlog, saturated
 from bench.rows import Row
 
 SEEDS = range(1, 7)
@@ -30,11 +33,15 @@ _T = 2.571
 """97.5 % quantile of Student's t with 5 degrees of freedom."""
 
 Patch = tuple[str, str, Any]
-"""Module of ``gr_ros2.link.v1``, name in it (a dot leads into a class), and its value."""
+"""Module of ``gr_ros2.link.v1``, or ``rate``; name in it (a dot leads into a class), and its value."""
+
+
+def _module(name: str) -> Any:
+    return import_module(f"gr_ros2.link.{name}" if name == "rate" else f"gr_ros2.link.v1.{name}")
 
 
 def _scaled(module: str, name: str, *factors: float) -> Iterator[tuple[str, list[Patch]]]:
-    value = getattr(import_module(f"gr_ros2.link.v1.{module}"), name)
+    value = getattr(_module(module), name)
     for factor in factors or (0.5, 2.0):
         new = type(value)(value * factor)
         yield f"{name} = {new:.4g}, not {value:.4g}", [(module, name, new)]
@@ -55,7 +62,15 @@ CONSTANTS = (
     ("thrift", "AHEAD"), ("thrift", "_ENOUGH"), ("thrift", "_MOST_AHEAD"), ("combining", "TURN"),
     ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"), ("freshness", "FIRST_AGE_S"),
     ("freshness", "LARGE"), ("packing", "SHARE"), ("packing", "MIN_FRAGMENT"), ("packing", "LONG"),
+    ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
+    ("reports", "_CALM"), ("reports", "_SLOWER"), ("hold", "OVERLAP"), ("hold", "WAITED"), ("hold", "_STEADY"),
 )  # fmt: skip
+RATE = (
+    "GAIN_UP", "GAIN_DOWN", "SETTLED", "_HASTY", "_MOST_PATIENCE", "MOST_SILENT_S", "_GAPS", "_UNANSWERED",
+    "_FADING_SILENT_S", "_FADING_UNANSWERED", "_LOOK_BACK_S", "_REPORT_S", "_ERROR_DB", "_CHANGE_DB",
+    "_DRIFT_SMOOTHING", "_MOST_DRIFT_DB_S", "_CALM_DB_S", "_CORRECTION_DB_S", "_MOST_CORRECTION_DB", "_FADE_S",
+)  # fmt: skip
+"""Constants of the adaptive rate, whose promises are its own."""
 
 
 def _six(seed: int) -> float:
@@ -66,6 +81,16 @@ def _six(seed: int) -> float:
 def _paced(name: str, seed: int, *, back: bool) -> float:
     ages = saturated.paced(name, 0.2, back=back, seed=seed, best_effort=())
     return exp(mean(log(age) for age in ages.values()))
+
+
+def rate_promises(seed: int) -> dict[str, float]:
+    """The same of the adaptive rate where it fades: s per message delivered, at a load that it cannot carry."""
+    fading = {"doppler_hz": rate.DOPPLER_HZ, "seed": seed}
+    rates, load = tuple(rate.RATES), rate.FASTEST
+    return {
+        f"fading, {mean_db:g} dB": 1 / rate.carried(rates, {"snr_db": mean_db, **fading}, load, 4.0)[0]
+        for mean_db in rate.MEANS_DB
+    }
 
 
 def promises(seed: int) -> dict[str, float]:
@@ -80,6 +105,7 @@ def promises(seed: int) -> dict[str, float]:
 
     add("odometry, reports", loss=0.2, back=0.2)
     add("odometry, one way", loss=0.2)
+    add("odometry, late reports", loss=0.2, back=0.2, delay=8)
     add("odometry, bursts", loss=0.2, back=0.2, burst=3.0)
     add("odometry, 5 %", loss=0.05, back=0.05)
     add("busy", hz=55.0, loss=0.1, back=0.1)
@@ -102,7 +128,7 @@ def patched(patches: Sequence[Patch]) -> Iterator[None]:
     """The engine with other constants or without rules, wherever they are imported."""
     before: list[tuple[Any, str, Any]] = []
     for module, name, value in patches:
-        place = import_module(f"gr_ros2.link.v1.{module}")
+        place = _module(module)
         first, _, rest = name.partition(".")
         if rest:
             holders = [getattr(place, first)]
@@ -124,13 +150,18 @@ def patched(patches: Sequence[Patch]) -> Iterator[None]:
 def _measure(job: tuple[str, int]) -> tuple[str, int, dict[str, float]]:
     name, seed = job
     with patched(variants()[name]):
-        return name, seed, promises(seed)
+        return name, seed, {**promises(seed), **rate_promises(seed)} if not name else _promises(name)(seed)
+
+
+def _promises(name: str) -> Callable[[int], dict[str, float]]:
+    return rate_promises if any(module == "rate" for module, _, _ in variants()[name]) else promises
 
 
 @cache
 def variants() -> dict[str, list[Patch]]:
     """What is changed, by name; the first changes nothing."""
-    scaled = [item for module, name in CONSTANTS for item in _scaled(module, name)]
+    every = (*CONSTANTS, *(("rate", name) for name in RATE))
+    scaled = [item for module, name in every for item in _scaled(module, name)]
     return {"": [], **RULES, **dict(scaled)}
 
 
@@ -152,7 +183,7 @@ def constants(chosen: Callable[[str], bool] = lambda _: True) -> list[Row]:
     rows = []
     for name in names[1:]:
         notes, worst = [], 0.0
-        for promise in found[""][SEEDS[0]]:
+        for promise in found[name][SEEDS[0]]:
             change, half = changes(*([found[n][seed][promise] for seed in SEEDS] for n in ("", name)))
             if abs(change) >= SHOWN and abs(change) > half:
                 notes.append(f"{promise} {change:+.1%}")

@@ -47,7 +47,12 @@ def carried(rates: tuple[str, ...], channel: dict[str, float], load: float, seco
             "time": "packets",
             "version": 1,
             "packet_len": PACKET_LEN,
-            "ros_source": {"robot_id": 1, "queue_depth": 1000, "topic_options": {"odom": {"queue": "fifo"}}},
+            "ros_source": {
+                "robot_id": 1,
+                "compression": False,
+                "queue_depth": 1000,
+                "topic_options": {"odom": {"queue": "fifo"}},
+            },
             "phy": {"name": "ofdm", "sample_rate": 1e6, "options": {"rate": "adaptive", "rates": rates}},
             "channel": channel,
             "ros_sink": {"hold_s": HOLD_S if not channel.get("doppler_hz") else 1.0},

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import random
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import inf
@@ -96,6 +96,7 @@ def run(
     once: bool = False,
     tail: float = 3.0,
     options: TopicOptions | None = None,
+    delay: int = 0,
 ) -> Outcome:
     """One sender and some receivers.
 
@@ -103,6 +104,7 @@ def run(
     :param back: loss of the way back; None: there is none
     :param once: one message only
     :param tail: s after the last message
+    :param delay: slots that reports take beside their own
     """
     registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options or TopicOptions())])
     events: list[SenderEvent] = []
@@ -133,6 +135,7 @@ def run(
     latest = [-1] * receivers
     slot, n, now = 1 / RATE, 0, 0.0
     outcome = Outcome([], inf, inf, inf, 0.0)
+    under_way: deque[tuple[int, bytes]] = deque()
     complete = 0
     index = 0
     while now < times[-1] + tail:
@@ -159,7 +162,9 @@ def run(
                     end.pace.credit()
                 answer = end.next_packet(now)
                 if answer is not None and not next(backward[number]):
-                    sender.receive(ReceivedPacket(answer.data), now + slot)
+                    under_way.append((index + delay, answer.data))
+        while under_way and under_way[0][0] <= index:
+            sender.receive(ReceivedPacket(under_way.popleft()[1]), now + slot)
         sender.handle_timeout(now)
         if complete == count * receivers and outcome.done == inf:
             outcome.done, outcome.sent_until = now + slot, sum(sender.sent.air.values())

@@ -100,7 +100,7 @@ class LiveCalls:
         self._change(src_id, services=services)
         feedback = [topic.topic_id for topic in topics if topic.is_topic and "/_action/" in topic.name]
         if feedback and services:
-            self._sink.announce(src_id, feedback)
+            self._sink.outputs.announce(src_id, feedback)
 
     def stats(self) -> dict[str, Any]:
         """A snapshot: counters of :class:`gr_ros2.calls.Calls` and of this class, and the calls that wait."""

@@ -7,12 +7,14 @@ Negative values, caused by clocks that disagree, are kept and counted. A window 
 from __future__ import annotations
 
 import struct
+import time
 from collections import deque
 from itertools import islice
 from typing import NamedTuple
 
 from rosbags.typesys.store import Typestore
 
+from gr_ros2.middleware import Middleware, Qos, Subscription
 from gr_ros2.middleware.type_definitions import typestores
 
 WINDOW = 10_000
@@ -24,6 +26,7 @@ CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 _TIME = (struct.Struct(">iI"), struct.Struct("<iI"))
 _CDR_HEAD = 4
 _LITTLE_ENDIAN = 1
+_CLOCK_DEPTH = 1
 
 
 def has_header(type_name: str, *learned: Typestore) -> bool:
@@ -92,3 +95,45 @@ class LatencyWindow:
             return LatencySummary(None, None, None, None, 0, 0)
         p50, p95, p99 = (values[-(-len(values) * percent // 100) - 1] for percent in (50, 95, 99))
         return LatencySummary(p50, p95, p99, values[-1], self._count, self._negative)
+
+
+class Latencies:
+    """Measures the latencies of messages by their stamps.
+
+    :param middleware: where ``/clock`` is, if stamps are of simulated time
+    """
+
+    def __init__(self, middleware: Middleware, *, sim_time: bool) -> None:
+        self.sim_time: float | None = None
+        """The newest time of ``/clock``, s."""
+        self._simulated = sim_time
+        self._stamped: dict[str, bool] = {}
+        self._clock: Subscription | None = None
+        if sim_time:
+            qos = Qos("best_effort", "volatile", _CLOCK_DEPTH)
+            self._clock = middleware.subscribe("/clock", CLOCK_TYPE, qos, self._set)
+
+    def close(self) -> None:
+        """Hear no clock any more. Idempotent."""
+        if self._clock is not None:
+            self._clock.close()
+            self._clock = None
+
+    def learn(self, type_name: str, store: Typestore) -> None:
+        """Take the definition of a type that was not known."""
+        self._stamped[type_name] = has_header(type_name, store)
+
+    def has(self, type_name: str) -> bool:
+        """Whether messages of a type begin with a header."""
+        stamped = self._stamped.get(type_name)
+        if stamped is None:
+            stamped = self._stamped[type_name] = has_header(type_name)
+        return stamped
+
+    def of(self, payload: bytes) -> float | None:
+        """The latency of a message that is published now, s; None if it has no stamp, or there is no clock yet."""
+        now, stamp = self.sim_time if self._simulated else time.time(), leading_time(payload)
+        return None if now is None or stamp is None else now - stamp
+
+    def _set(self, payload: bytes) -> None:
+        self.sim_time = leading_time(payload)

@@ -8,42 +8,36 @@ delivered only after it was published. Everything else is counted by name.
 
 from __future__ import annotations
 
-import threading
+import logging
 import time
 import weakref
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Protocol
 
 from gnuradio import gr
 
-from gr_ros2.core.errors import ConfigError, DescriptionError, GrRos2Error, SealError
+from gr_ros2.core.errors import GrRos2Error, SealError
 from gr_ros2.core.guard import Guard
-from gr_ros2.core.names import topic_fault
-from gr_ros2.gr.early import CHECK_S, EarlyMessages
+from gr_ros2.gr.early import CHECK_S
 from gr_ros2.gr.ends import LOOP_GUARD, EndpointSetup, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
-from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
-from gr_ros2.gr.latency import CLOCK_TYPE, RECENT, LatencyWindow, has_header, leading_time
+from gr_ros2.gr.failures import Failures
+from gr_ros2.gr.latency import RECENT
+from gr_ros2.gr.outputs import Outputs
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.link import Delivered, Received, ReceivedPacket, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription
+from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
-from gr_ros2.middleware.type_definitions import known
-from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import PDUS, AirPacket, PduPort, packets_of
 from gr_ros2.phy.threads import BlockThread
-from gr_ros2.settings.config import SinkConfig, TopicOptions, replaced, robot_of
-from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Registry, Topic, announced, check_outputs
+from gr_ros2.settings.config import SinkConfig, replaced, robot_of
+from gr_ros2.settings.registry import Registry, Topic, check_outputs
 
 _SHORTEST_WAIT_S = 1e-3
-_CLOCK_DEPTH = 1
 _COUNTED = (
     *("not_a_pair", "not_u8", LedgerRow.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
@@ -58,30 +52,6 @@ class Services(Protocol):
 
     def learn(self, src_id: int, topics: Sequence[Topic]) -> None:
         """Take over the topics and services that a robot announces now."""
-
-
-@dataclass(slots=True, eq=False)
-class _Output:
-    """A topic of one sender, as this block publishes it.
-
-    :param stamped: whether its messages begin with a header
-    :param name: absolute name on the graph, of the newest publisher
-    :param publisher: None until the first message, and after the topic has changed
-    :param early: what waits for the subscribers of a new publisher; None where nothing does
-    :param opening: held while ``early`` is used
-    :param published: number of messages
-    :param delivered_at: time of the newest one, s
-    """
-
-    topic: Topic
-    stamped: bool
-    name: str = ""
-    publisher: Publisher | None = None
-    early: EarlyMessages | None = None
-    opening: threading.RLock = field(default_factory=threading.RLock)
-    published: int = 0
-    delivered_at: float | None = None
-    latency: LatencyWindow | None = None
 
 
 class RosSink(gr.basic_block):  # type: ignore[misc]
@@ -130,32 +100,18 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 )
             end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
         self.live, self._end = end, end.endpoint
-        self._announced: dict[tuple[int, int], Topic] = {}
-        """Topics that senders have announced, by source id and topic id."""
         self._calls: Services | None = None
         self._observer = observer
         self._guard = Guard("observer of ros2_sink")
         self._clock = clock
         self._log = debug_logger("gr_ros2.gr.sink", self.config.debug)
         self._lock = end.lock
-        self._timer_due = threading.Condition(self._lock)
         self._timer_idle = False
         self._running = False
         self._thread = BlockThread()
-        self._counters: Counter[str] = Counter()
-        self._prefix = FramePrefix(self.config.frame_prefix, self._counters)
-        self._transforms: MergedTransforms | None = None
-        # Publishers are kept when a robot has gone. Late subscribers still get its map, and a robot that comes back
-        # needs no new discovery. There are at most as many as source ids times topics of the registry.
-        self._outputs: dict[tuple[int, int], _Output] = {}
-        self._opening: set[_Output] = set()
-        """The outputs in which something may wait for subscribers."""
-        self._stamped: dict[str, bool] = {}
-        """Whether messages of a type begin with a header."""
+        self._failures = Failures(self._log, self._lock)
         self._types: TypeSearch | None = None
         self._said: set[str] = set()
-        self._sim_time: float | None = None
-        self._clock_subscription: Subscription | None = None
         self._heard: dict[int, float] = {}
         """When a packet of each robot was taken last, s."""
         self.handled = 0
@@ -167,13 +123,22 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self._finalizer = weakref.finalize(self, self._graph.close)
         try:
             LOOP_GUARD.add_sink(self, self._graph, self.config, self.registry)
-            if self.config.merge_tf:
-                self._transforms = MergedTransforms(self.config.merged_topics, self.middleware, self._counters)
-            if self.config.use_sim_time:
-                qos = Qos("best_effort", "volatile", _CLOCK_DEPTH)
-                self._clock_subscription = self.middleware.subscribe("/clock", CLOCK_TYPE, qos, self._set_sim_time)
+            self.outputs = Outputs(
+                self,
+                self.registry,
+                self.config,
+                self._graph,
+                end,
+                tell=self._tell,
+                clock=clock,
+                failures=self._failures,
+                log=self._log,
+            )
+            """What it publishes."""
         except GrRos2Error:
-            self.close()
+            LOOP_GUARD.remove(self)
+            self._finalizer()
+            self._start.close()
             raise
 
     @property
@@ -193,47 +158,29 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     @property
     def matched(self) -> bool:
         """Whether every publisher has found a subscription."""
-        return all(publisher.matched() for publisher in self._publishers())
-
-    def announce(self, src_id: int, topic_ids: Iterable[int]) -> None:
-        """Create the publishers of an expected sender now, so that subscribers find them before its first message.
-
-        :raises MiddlewareError: when a topic cannot be announced
-        """
-        for topic_id in topic_ids:
-            key = (src_id, topic_id)
-            output = self._output(key)
-            if output.publisher is None:
-                self._advertise(key, output)
+        return all(publisher.matched() for publisher in self.outputs.publishers())
 
     def start(self) -> bool:
         with self._lock:
-            self._running = True
+            self._running = self.outputs.running = True
         self._thread.start(self._watch_timeouts, "gr-ros2-sink")
         if isinstance(self.middleware, ServiceGraph):
-            self._types = TypeSearch(self.middleware, self._unknown_types, self._define)
+            self._types = TypeSearch(self.middleware, self.outputs.types, self.outputs.define)
         return True
 
     def stop(self) -> bool:
         self._stop_search()
         with self._lock:
-            self._running = False
-            self._timer_due.notify_all()
+            self._running = self.outputs.running = False
+            self.outputs.due.notify_all()
         self._thread.stop()
-        self._release(self._opening)
+        self.outputs.release(self.outputs.opening)
         return True
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
         self._stop_search()
-        self._release(self._opening)
-        if self._clock_subscription is not None:
-            self._clock_subscription.close()
-            self._clock_subscription = None
-        if self._transforms is not None:
-            self._transforms.close()
-        for publisher in self._publishers():
-            publisher.close()
+        self.outputs.close()
         LOOP_GUARD.remove(self)
         self._finalizer()
         self._start.close()
@@ -241,17 +188,13 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     def stats(self) -> dict[str, Any]:
         """A snapshot. ``packet_loss_est`` and ``message_loss_est`` are estimates from gaps in numbers."""
         with self._lock:
-            stats = self._end.received
-            keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
-            topics = {key: self._topic_stats(key) for key in keys if self._is_topic(key)}
-            outputs = {key: self._outputs[key] for key in topics if key in self._outputs}
-            windows = {key: window.copy() for key, output in outputs.items() if (window := output.latency) is not None}
+            stats, topics, windows = self._end.received, self.outputs.stats(), self.outputs.windows()
             counted = {
                 "packets": stats.packets,
                 "handled": self.handled,
                 "rejected": dict(stats.rejected),
                 "dropped": dict(stats.dropped),
-                **{name: self._counters[name] for name in _COUNTED},
+                **{name: self._failures.counters[name] for name in _COUNTED},
                 "observer_missed": self._guard.missed,
                 "repeats": stats.repeats,
                 "repaired": stats.repaired.total(),
@@ -264,12 +207,13 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "middleware": dict(self.middleware.counters),
             }
         # There may be thousands of latencies. They are sorted without the lock, because the next packet waits for it.
-        for key, window in windows.items():
+        for key in topics.keys() & windows.keys():
+            window = windows[key]
             summaries = {"latency_s": window.summary(), "recent_latency_s": window.summary(RECENT)}
             topics[key] |= {name: summary._asdict() for name, summary in summaries.items()}
         named: dict[str, dict[str, Any]] = {}
         for key, topic in topics.items():  # of a topic that has changed its type, the newest row has the figures
-            name = self._name(key)
+            name = self.outputs.heard.name(key)
             if name in named:
                 topic["delivered"] += named[name]["delivered"]
             named[name] = topic
@@ -286,115 +230,16 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._types.close()
             self._types = None
 
-    def _unknown_types(self) -> list[tuple[str, str]]:
-        """The topics published whose types ROS does not ship."""
-        outputs = [(key, output) for key, output in list(self._outputs.items()) if output.publisher is not None]
-        types = [(self._name(key), output.topic.type_name) for key, output in outputs]
-        return [(name, type_name) for name, type_name in types if not known(type_name)]
-
-    def _define(self, described: Described) -> None:
-        """Take a definition that a subscriber has given, for frame names and latencies."""
-        try:
-            store = described.store()
-        except DescriptionError as error:
-            self._log.info("ros2_sink: %s", error)
-            return
-        self._prefix.learn(described.type_name, store)
-        stamped = self._stamped[described.type_name] = has_header(described.type_name, store)
-        for output in list(self._outputs.values()):
-            if output.topic.type_name == described.type_name:
-                output.stamped = stamped
-
-    def name_here(self, src_id: int, name: str) -> str:
-        """Absolute name under which a sender's topic comes out, by its name in a registry."""
-        options = self.config.topic_options.get(name, TopicOptions())
-        return Topic(0, name, "", options).republished(self.config.namespace_format, src_id)
-
-    def _name(self, key: tuple[int, int]) -> str:
-        return self._topic(key).republished(self.config.namespace_format, key[0])
-
-    def _topic(self, key: tuple[int, int]) -> Topic:
-        """The topic that a sender's topic id means, from its announcement or from the registry.
-
-        :raises ConfigError: when the topic id is in neither of them
-        """
-        topic = self._announced.get(key)
-        if topic is not None:
-            return topic
-        if key[1] < len(self.registry):
-            return self.registry[key[1]]
-        raise ConfigError(f"topic id {key[1]} of robot {key[0]} is neither announced nor in the registry")
-
-    def _is_topic(self, key: tuple[int, int]) -> bool:
-        """Whether a sender's topic id means a topic: neither its table, nor its calls, nor something unknown."""
-        topic = self._announced.get(key)
-        return key[1] < len(self.registry) if topic is None else topic.is_topic
-
-    def _learn(self, event: Announced) -> None:
-        """Take over the topics that a sender announces. A publisher whose topic has a new name or type is closed."""
-        topics = []
-        for row in event.rows:
-            key = (event.src_id, row.topic_id)
-            try:
-                topic = announced(row, self.config.topic_options)
-                name = topic.republished(self.config.namespace_format, event.src_id)
-                if topic.is_topic:
-                    LOOP_GUARD.add_output(self, self._graph, key, name)
-                if fault := topic_fault(name):
-                    raise ConfigError(f"topic {name!r}: {fault}")
-            except ConfigError as error:
-                self._tell_first("bad_announcement", f"a topic of robot {event.src_id} cannot be published", error)
-                continue
-            topics.append(topic)
-            self._announced[key] = topic
-            if key in self._outputs:
-                self._change(self._outputs[key], topic)
-        if self._calls is not None:
-            self._calls.learn(event.src_id, topics)
-
-    def _topic_stats(self, key: tuple[int, int]) -> dict[str, Any]:
-        stats = self._end.received
-        output = self._outputs.get(key)
-        window = None if output is None else output.latency
-        delivered_at = None if output is None else output.delivered_at
-        latency = 0.0 if window is None else window.newest or 0.0
-        return {
-            "src_id": key[0],
-            "topic_id": key[1],
-            "type": self._topic(key).type_name,
-            "delivered": 0 if output is None else output.published,
-            "lost": {reason: count for (*whose, reason), count in stats.lost.items() if tuple(whose) == key},
-            "latency_s": None,
-            "recent_latency_s": None,
-            "age_s": None if delivered_at is None else self._clock() - delivered_at + latency,
-        }
-
     def _handle(self, message: Any) -> None:
         packets, problem = packets_of(message)
         try:
             if problem:
-                self._refuse(problem)
+                self._failures.note(problem, f"ros2_sink: a message that is no PDU of bytes ({problem}) was dropped")
             else:
                 self._take(packets)
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
-            self._failed(error)
+            self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
         self.handled += max(len(packets), 1)
-
-    def _failed(self, error: Exception) -> None:
-        """Count an unexpected error, and log the first one."""
-        with self._lock:
-            self._counters["handler_failed"] += 1
-            first = self._counters["handler_failed"] == 1
-        if first:
-            self._log.error("ros2_sink: %s", error, exc_info=error)
-
-    def _refuse(self, problem: str) -> None:
-        """Count a message that is not a packet, and log the first one."""
-        with self._lock:
-            self._counters[problem] += 1
-            first = self._counters[problem] == 1
-        if first:
-            self._log.warning("ros2_sink: a message that is no PDU of bytes (%s) was dropped", problem)
 
     def _take(self, packets: Iterable[AirPacket]) -> None:
         events: list[ReceiverEvent] = []
@@ -402,7 +247,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             for packet in packets:
                 events += self._end.receive(ReceivedPacket(packet.data, packet.at, packet.snr_db), self._clock())
             if self._timer_idle and self._end.next_timeout() is not None:
-                self._timer_due.notify_all()
+                self.outputs.due.notify_all()
             if self._end.answers:
                 self.live.wake()
         self._settle(events)
@@ -417,78 +262,22 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 if isinstance(event, Received):
                     self._heard[event.packet.src_id] = self._clock()
                 elif isinstance(event, Announced):
-                    self._learn(event)
+                    topics = self.outputs.take(event)
+                    if calls is not None:
+                        calls.learn(event.src_id, topics)
                 elif isinstance(event, Rejected):
                     self._warn(event)
                 taken = calls is not None and calls.takes(event)
                 if isinstance(event, Delivered) and not taken:
-                    self._deliver(event)
+                    self.outputs.deliver(event)
                 else:
                     self._tell(event)
             except Exception as error:  # noqa: BLE001 - an exception would lose the next events and the thread
-                self._failed(error)
+                self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
 
     def _tell(self, event: ReceiverEvent) -> None:
         if self._observer is not None:
             self._guard(self._observer.receiver_event, event, self._clock())
-
-    def _deliver(self, event: Delivered) -> None:
-        """Publish a message, now or when the subscribers of its publisher have found it."""
-        output = self._outputs.get((event.src_id, event.topic_id))
-        if output is None or output.publisher is None or output.early is not None:
-            output = self._opened(event)
-        if output is None or output.early is None:
-            self._tell(self._publish(event))
-            return
-        with output.opening:
-            if output.early is not None:
-                output.early.add(event)
-            else:
-                self._tell(self._publish(event))
-
-    def _opened(self, event: Delivered) -> _Output | None:
-        """The output of a message, with a publisher; None if it cannot have one, which publishing then says."""
-        key = (event.src_id, event.topic_id)
-        try:
-            output = self._output(key)
-            if output.publisher is None:
-                self._advertise(key, output)
-        except Exception:  # noqa: BLE001 - publishing fails for the same reason, and counts it
-            return None
-        return output
-
-    def _release(self, outputs: Iterable[_Output]) -> None:
-        """Publish what waits for subscribers."""
-        for output in list(outputs):
-            with output.opening:
-                if output.early is not None:
-                    for event in output.early.waiting:
-                        self._tell(self._publish(event))
-                output.early = None
-            with self._lock:
-                self._opening.discard(output)
-
-    def _publish(self, event: Delivered) -> ReceiverEvent:
-        key = (event.src_id, event.topic_id)
-        try:
-            output = self._outputs.get(key) or self._output(key)
-            topic = output.topic
-            payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
-            publisher = output.publisher or self._advertise(key, output)
-            publisher.publish(payload)
-        except Exception as error:  # noqa: BLE001 - whatever the reason, nobody got the message
-            named = f"topic id {key[1]} of robot {key[0]}"
-            self._tell_first(LedgerRow.PUBLISH_FAILED.value, f"a message of {named} was not published", error)
-            with self._lock:
-                return self._end.unpublished(event)
-        with self._lock:
-            output.published += 1
-            output.delivered_at = self._clock()
-            if output.stamped:
-                self._measure(output, event.payload)
-        if self._transforms is not None and topic.type_name == TF_TYPE:
-            self._merge(self._transforms, payload, static=topic.latched)
-        return event
 
     def _warn(self, event: Rejected) -> None:
         """Log each refusal that concerns keys, once for each reason."""
@@ -496,105 +285,20 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._said.add(event.error.kind)
             self._log.warning("ros2_sink: a packet was refused (%s): %s", event.error.kind, event.error)
 
-    def _merge(self, transforms: MergedTransforms, payload: bytes, *, static: bool) -> None:
-        try:
-            transforms.add(payload, static=static)
-        except Exception as error:  # noqa: BLE001 - the message itself was published and counts as delivered
-            self._tell_first("tf_failed", "transforms were not merged", error)
-
-    def _tell_first(self, counter: str, what: str, error: Exception) -> None:
-        """Count a failure and log the first one, with a traceback if the error is not one of this project."""
-        with self._lock:
-            self._counters[counter] += 1
-            first = self._counters[counter] == 1
-        if first:
-            trace = None if isinstance(error, GrRos2Error) else error
-            self._log.warning("ros2_sink: %s: %s", what, error, exc_info=trace)
-
-    def _output(self, key: tuple[int, int]) -> _Output:
-        """A sender's topic, which may be published from now on.
-
-        :raises ConfigError: when the topic id is neither announced nor in the registry
-        """
-        output = self._outputs.get(key)
-        if output is None:
-            topic = self._topic(key)
-            output = self._outputs[key] = _Output(topic, self._is_stamped(topic.type_name))
-        return output
-
-    def _change(self, output: _Output, topic: Topic) -> None:
-        """A topic id means this topic now. A publisher of another name or type is closed."""
-        before = output.topic
-        if (before.name, before.type_name) != (topic.name, topic.type_name):
-            self._release([output])
-            output.stamped = self._is_stamped(topic.type_name)
-            if output.publisher is not None:
-                output.publisher.close()
-                output.publisher = None
-        output.topic = topic
-
-    def _is_stamped(self, type_name: str) -> bool:
-        stamped = self._stamped.get(type_name)
-        if stamped is None:
-            stamped = self._stamped[type_name] = has_header(type_name)
-        return stamped
-
-    def _publishers(self) -> list[Publisher]:
-        return [publisher for output in list(self._outputs.values()) if (publisher := output.publisher) is not None]
-
-    def _advertise(self, key: tuple[int, int], output: _Output) -> Publisher:
-        topic = output.topic
-        depth = topic.options.depth
-        if depth == AUTO:
-            depth = 1 if topic.latched else self.config.publisher_depth
-        asked = topic.options.reliability
-        qos = Qos(None if asked == AUTO else asked, "transient_local" if topic.latched else "volatile", depth)
-        name = self._name(key)
-        for (src_id, _), other in list(self._outputs.items()):
-            if src_id == key[0] and other is not output and other.publisher is not None and other.name == name:
-                self._release([other])  # the same topic with its type before
-                other.publisher.close()
-                other.publisher = None
-        output.name = name
-        publisher = output.publisher = self.middleware.advertise(name, topic.type_name, qos)
-        if self._running and self.middleware.settling_s and not topic.latched:
-            output.early = EarlyMessages(publisher, self.middleware.settling_s, self._clock())
-            with self._lock:
-                self._opening.add(output)
-                self._timer_due.notify_all()
-        return publisher
-
-    def _measure(self, output: _Output, payload: bytes) -> None:
-        """Note the latency of a message; the caller holds the lock."""
-        now = self._sim_time if self.config.use_sim_time else time.time()
-        stamp = leading_time(payload)
-        if now is not None and stamp is not None:
-            if output.latency is None:
-                self._forget_the_gone()
-                output.latency = LatencyWindow()
-            output.latency.add(now - stamp)
-
-    def _forget_the_gone(self) -> None:
-        """Free the latencies of senders that the receiver no longer knows: 0.3 MB per topic."""
-        for (src_id, _), output in list(self._outputs.items()):
-            if not self._end.knows(src_id):
-                output.latency = None
-
-    def _set_sim_time(self, payload: bytes) -> None:
-        self._sim_time = leading_time(payload)
-
     def _watch_timeouts(self) -> None:
+        outputs = self.outputs
         while True:
-            self._release([o for o in list(self._opening) if o.early is None or o.early.over(self._clock())])
+            opening = list(outputs.opening)
+            outputs.release([o for o in opening if o.early is None or o.early.over(self._clock())])
             with self._lock:
                 if not self._running:
                     return
                 events = self._end.handle_timeout(self._clock())
                 if not events:
                     at = self._end.next_timeout()
-                    if self._opening:
+                    if outputs.opening:
                         at = min(self._clock() + CHECK_S, inf if at is None else at)
                     self._timer_idle = at is None
-                    self._timer_due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
+                    outputs.due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
                     self._timer_idle = False
             self._settle(events)

@@ -131,7 +131,7 @@ class RaceRosLink:
                 for block in ends[-1]:
                     stack.callback(block.close)
             (self._source, _), (_, self._sink) = ends
-            self._sink.announce(SOURCE_ID, [0])
+            self._sink.outputs.announce(SOURCE_ID, [0])
             self._links: list[LoopbackLink] = []
             for direction, (source, _) in enumerate(ends):
                 phy, sink = radio.with_frames_of(packet_len), ends[1 - direction][1]

@@ -161,7 +161,7 @@ class Direction:
     def _sink(self, config: SinkConfig, end: LiveEnd | None, observer: LinkObserver, stack: ExitStack) -> RosSink:
         sink = RosSink(self.registry, middleware=self.output, observer=observer, end=end, **own_settings(config))
         stack.callback(sink.close)
-        sink.announce(self.src_id, self.topics.values())
+        sink.outputs.announce(self.src_id, self.topics.values())
         return sink
 
     def _input_graph(self) -> Middleware:

@@ -301,14 +301,14 @@ def test_two_robots_on_one_graph_of_a_real_dds(monkeypatch: pytest.MonkeyPatch) 
     (domain,) = free_domains(1)
     odometry = encode("nav_msgs/msg/Odometry", message("nav_msgs/msg/Odometry", "odom", 1))
     sink = RosSink(REGISTRY, version=0, domain_id=domain, frame_prefix=PREFIX, merge_tf="/tf")
-    sink.announce(1, [0])
+    sink.outputs.announce(1, [0])
     try:
         with DdsMiddleware(domain_id=domain) as listener:
             moving: list[bytes] = []
             odometries: list[bytes] = []
             listener.subscribe("/tf", TF_TYPE, Qos(depth=0), moving.append)
             listener.subscribe("/rx_robot_1/odom", "nav_msgs/Odometry", Qos(depth=0), odometries.append)
-            wait_for(lambda: sink._transforms._moving_publisher.matched() and sink.matched)
+            wait_for(lambda: sink.outputs._transforms._moving_publisher.matched() and sink.matched)
             for robot in (1, 2):
                 messages = (0, odometry), (2, transforms("imu")), (2, transforms("laser")), (1, transforms("wheel"))
                 for data in packets(robot, *messages):

@@ -366,7 +366,7 @@ def test_latency_by_simulated_clock(rig: Rig) -> None:
     rig.start()
     clock = rig.listener.advertise("/clock", "rosgraph_msgs/Clock", Qos())
     clock.publish(b"\0\1\0\0" + struct.pack("<iI", 100, 500_000_000))
-    wait_for(lambda: sink._sim_time == 100.5)
+    wait_for(lambda: sink.outputs._latencies.sim_time == 100.5)
     for data in packets((0, stamped(100.0))):
         rig.probe.post(data)
     wait_for(lambda: sink.stats()["topics"])

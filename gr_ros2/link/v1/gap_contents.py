@@ -38,6 +38,8 @@ class GapContents:
         """A packet is known now: look at the gaps before and after it."""
         known = self._decoder
         for step, end in ((-1, known.floor), (1, known.newest)):
+            if number == end:  # nothing is known beyond it
+                continue
             other = number + step
             while other != end and other not in known and abs(other - number) < MAP:
                 other += step

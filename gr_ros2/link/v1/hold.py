@@ -25,8 +25,6 @@ from math import inf
 
 OVERLAP = 1 / 4
 """Part of a packet's airtime by which a repair may delay a message."""
-HEADROOM = 1.5
-"""Number of repairs that are owed, divided by the number of packets that are expected to be lost."""
 WAITED = 1 / 16
 """Number of repairs owed per wait, independent of the losses."""
 _MOST_LOSS = 0.5
@@ -112,7 +110,7 @@ class Hold:
         :param loss: share of packets lost, as far as it is known or expected
         """
         loss = min(loss, _MOST_LOSS)
-        self._owed = min(self._owed + HEADROOM * loss / (1 - loss), 2.0)
+        self._owed = min(self._owed + loss / (1 - loss), 2.0)
         if self._would_end < inf:
             self._ended(self._would_end - now)
 

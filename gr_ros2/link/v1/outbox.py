@@ -54,6 +54,7 @@ class Outbox:
     :param boot: boot number of this start, for keys
     :param room: bytes of the longest body
     :ivar topics: what it sends
+    :ivar sent: the same, with what waits
     :ivar kept: what it keeps for robots that join late
     :ivar packing: what goes into the next packet
     :ivar reported: whether receivers report, so that it is known when a message is over
@@ -79,18 +80,18 @@ class Outbox:
         self._codec = codec
         self._observer = observer
         self._serial = 0
-        self._sent = SentTopics(codec, settings.commands)
-        self.kept = KeptMessages(self._sent, room, self.stats, self._admit)
-        self.packing = Packing(self._sent, self.stats, self._left, boot=boot, room=room)
+        self.sent = SentTopics(codec, settings.commands)
+        self.kept = KeptMessages(self.sent, room, self.stats, self._admit)
+        self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room)
         self.relayed: SentTopic | None = None
         """The queue of messages of other robots, where they are relayed."""
         self.relayed_left: Callable[[float], None] = lambda _: None
         """Called when one of them has left whole."""
         if settings.relay:
-            self.relayed = self._sent.relay()
+            self.relayed = self.sent.relay()
             self.packing.turns.join(RELAYED_TOPIC)
         if topics:
-            self._sent.add(topics)
+            self.sent.add(topics)
             self._tabulate()
 
     def add(self, rows: Sequence[NewTopic]) -> Registry:
@@ -102,7 +103,7 @@ class Outbox:
             for topic in topics:
                 self._codec.add(topic)
         self.topics = together
-        self._sent.add(topics)
+        self.sent.add(topics)
         self._tabulate()
         self._owner.topics_changed(added=True)
         return together
@@ -117,15 +118,15 @@ class Outbox:
 
     def offer(self, topic_id: int, *, offered: bool) -> None:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
-        self._sent[topic_id].hidden = not offered
+        self.sent[topic_id].hidden = not offered
         if self._tabulate():
             self._owner.topics_changed(asked=True)
 
     def follow(self, topic_id: int, publishers: PublisherQos) -> bool:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         before = self.queue(topic_id)
-        self._sent[topic_id].follow(publishers)
-        self._sent.find_deadlines()
+        self.sent[topic_id].follow(publishers)
+        self.sent.find_deadlines()
         if self._tabulate():
             self._owner.topics_changed()
         return self.queue(topic_id) != before
@@ -140,7 +141,7 @@ class Outbox:
 
     def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
-        topic = self._sent.get(topic_id)
+        topic = self.sent.get(topic_id)
         if topic is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         if self._owner.submitted(topic_id, now) and topic.is_stream:
@@ -169,26 +170,26 @@ class Outbox:
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
-        queue = self._sent[topic_id].queue
+        queue = self.sent[topic_id].queue
         return queue.policy, queue.deadline_s
 
     def depth(self, topic_id: int) -> int:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
-        depth = self._sent[topic_id].topic.options.queue_depth
+        depth = self.sent[topic_id].topic.options.queue_depth
         return self._settings.queue_depth if depth == AUTO else depth
 
     def room(self, topic_id: int) -> bool:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
-        return self._sent[topic_id].queue.room(self.depth(topic_id))
+        return self.sent[topic_id].queue.room(self.depth(topic_id))
 
     def queued(self) -> dict[int, int]:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
-        return {topic.topic.topic_id: len(topic.queue) for topic in self._sent.named()}
+        return {topic.topic.topic_id: len(topic.queue) for topic in self.sent.named()}
 
     @property
     def idle(self) -> bool:
         """Whether nothing waits."""
-        return not any(topic.queue for topic_id, topic in self._sent.items() if topic_id != RELAYED_TOPIC)
+        return not any(topic.queue for topic_id, topic in self.sent.items() if topic_id != RELAYED_TOPIC)
 
     def reconfigure(self, settings: Settings) -> None:
         """Use other settings from now on."""
@@ -199,13 +200,13 @@ class Outbox:
 
         :param interval: s from one packet to the next, 0 if unknown
         """
-        for queue in self._sent.deadlines:
+        for queue in self.sent.deadlines:
             if queue:
                 self._drop(list(queue.expire(now, interval, LEAD_S, self._room - ENTRY)))
 
     def _tabulate(self) -> bool:
         """Make the table of topics; returns whether it has changed."""
-        return self.kept.tabulate(self._sent.table())
+        return self.kept.tabulate(self.sent.table())
 
     def _admit(self, topic: SentTopic, message: Message) -> None:
         if dropped := topic.queue.admit(message, self.depth(message.topic_id)):
@@ -213,7 +214,7 @@ class Outbox:
 
     def _left(self, message: Message, now: float) -> None:
         """A message has left whole."""
-        topic = self._sent[message.topic_id]
+        topic = self.sent[message.topic_id]
         topic.lifetimes.left(
             message.lifetime,
             message.index,

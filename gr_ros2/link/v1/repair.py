@@ -107,7 +107,7 @@ class RepairWindow:
     @property
     def pressing(self) -> bool:
         """Whether ``urgent`` or ``Peers.over`` may have something."""
-        return self.peers.urges or self.peers.in_vain or self._unreported.due(self.packets.newest)
+        return bool(self.peers.urges) or self.peers.in_vain or self._unreported.due(self.packets.newest)
 
     def tell(self, number: int, now: float) -> Repair | None:
         """A repair from which peers learn that a packet is not repaired any more; None if there is none."""

@@ -22,6 +22,10 @@ AHEAD = 1.2
 packet, its repair and the report that would call for another one are all lost with that probability. Without them,
 odometry in order is 9.5 % older (± 2.6 %) at 20 % loss, for 5 % fewer packets."""
 _MOST_AHEAD = 2.0
+"""Bound of what is saved up for that, and of what is owed. It is no gain where losses are steady: without it, odometry
+is 3.9 % younger (± 3.4 %) at 20 % loss both ways, for 2 % more packets. But a sender that nobody has heard for ten
+minutes would then repair ahead 10,000 times.
+"""
 _ENOUGH = 0.05
 """Expected number of lost packets that is too small for a repair. With 0, odometry takes 8 % more packets at 1 % loss
 and is no younger."""

@@ -1,0 +1,315 @@
+"""The topics of other robots as a ROS Sink publishes them.
+
+Invariants: messages are published in the order in which they become complete. A message counts as delivered only after
+it was published. Publishers are kept when a robot has gone: late subscribers still get its map, and a robot that comes
+back needs no new discovery. There are at most as many as source ids times topics.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from gr_ros2.core.errors import ConfigError, DescriptionError, GrRos2Error
+from gr_ros2.core.names import topic_fault
+from gr_ros2.gr.early import EarlyMessages
+from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd
+from gr_ros2.gr.failures import Failures
+from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
+from gr_ros2.gr.heard_topics import HeardTopics, Key
+from gr_ros2.gr.latency import Latencies, LatencyWindow
+from gr_ros2.link import Delivered, ReceiverEvent
+from gr_ros2.link.events import Announced
+from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.middleware import Publisher, Qos
+from gr_ros2.middleware.type_definitions import known
+from gr_ros2.middleware.type_descriptions import Described
+from gr_ros2.settings.config import SinkConfig
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Registry, Topic, announced
+
+
+@dataclass(slots=True, eq=False)
+class Output:
+    """A topic of one sender, as this block publishes it.
+
+    :param name: absolute name on the graph, of the newest publisher
+    :param publisher: None until the first message, and after the topic has changed
+    :param early: what waits for the subscribers of a new publisher; None where nothing does
+    :param opening: held while ``early`` is used
+    :param published: number of messages
+    :param delivered_at: time of the newest one, s
+    """
+
+    topic: Topic
+    name: str = ""
+    publisher: Publisher | None = None
+    early: EarlyMessages | None = None
+    opening: threading.RLock = field(default_factory=threading.RLock)
+    published: int = 0
+    delivered_at: float | None = None
+    latency: LatencyWindow | None = None
+
+
+class Outputs:
+    """What one sink publishes.
+
+    :param owner: the block, for the loop guard
+    :param tell: called with what became of each message
+    :param clock: s, monotonic
+    :ivar heard: what topic ids mean
+    :ivar opening: the outputs in which something may wait for subscribers
+    :ivar running: whether messages may wait, because somebody looks at ``opening``
+    :ivar due: notified when something waits; uses the lock of ``live``
+    """
+
+    def __init__(
+        self,
+        owner: Any,
+        registry: Registry,
+        config: SinkConfig,
+        graph: Graph,
+        live: LiveEnd,
+        *,
+        tell: Callable[[ReceiverEvent], None],
+        clock: Callable[[], float],
+        failures: Failures,
+        log: logging.Logger,
+    ) -> None:
+        self.heard = HeardTopics(registry, config)
+        self.opening: set[Output] = set()
+        self.running = False
+        self.due = threading.Condition(live.lock)
+        self._owner, self._config, self._graph, self._end = owner, config, graph, live.endpoint
+        self._lock = live.lock
+        self._tell, self._clock, self._failures, self._log = tell, clock, failures, log
+        self._outputs: dict[Key, Output] = {}
+        self._prefix = FramePrefix(config.frame_prefix, failures.counters)
+        self._transforms: MergedTransforms | None = None
+        if config.merge_tf:
+            self._transforms = MergedTransforms(config.merged_topics, graph.middleware, failures.counters)
+        try:
+            self._latencies = Latencies(graph.middleware, sim_time=config.use_sim_time)
+        except GrRos2Error:
+            if self._transforms is not None:
+                self._transforms.close()
+            raise
+
+    def close(self) -> None:
+        """Publish what waits, and leave the graph. Idempotent."""
+        self.release(self.opening)
+        self._latencies.close()
+        if self._transforms is not None:
+            self._transforms.close()
+        for publisher in self.publishers():
+            publisher.close()
+
+    def announce(self, src_id: int, topic_ids: Iterable[int]) -> None:
+        """Create the publishers of an expected sender now, so that subscribers find them before its first message.
+
+        :raises MiddlewareError: when a topic cannot be announced
+        """
+        for topic_id in topic_ids:
+            key = (src_id, topic_id)
+            output = self._output(key)
+            if output.publisher is None:
+                self._advertise(key, output)
+
+    def take(self, event: Announced) -> list[Topic]:
+        """Take over the topics that a sender announces; returns those that can be published. A publisher whose topic
+        has a new name or type is closed."""
+        topics = []
+        for row in event.rows:
+            key = (event.src_id, row.topic_id)
+            try:
+                topic = announced(row, self._config.topic_options)
+                name = topic.republished(self._config.namespace_format, event.src_id)
+                if topic.is_topic:
+                    LOOP_GUARD.add_output(self._owner, self._graph, key, name)
+                if fault := topic_fault(name):
+                    raise ConfigError(f"topic {name!r}: {fault}")
+            except ConfigError as error:
+                self._failures.note(
+                    "bad_announcement", f"ros2_sink: a topic of robot {event.src_id} cannot be published", error
+                )
+                continue
+            topics.append(topic)
+            self.heard.announce(key, topic)
+            if key in self._outputs:
+                self._change(self._outputs[key], topic)
+        return topics
+
+    def types(self) -> list[tuple[str, str]]:
+        """Name on the graph and type of each topic that is published and whose type ROS does not ship."""
+        outputs = [(key, output) for key, output in list(self._outputs.items()) if output.publisher is not None]
+        types = [(self.heard.name(key), output.topic.type_name) for key, output in outputs]
+        return [(name, type_name) for name, type_name in types if not known(type_name)]
+
+    def define(self, described: Described) -> None:
+        """Take a definition that a subscriber has given, for frame names and latencies."""
+        try:
+            store = described.store()
+        except DescriptionError as error:
+            self._log.info("ros2_sink: %s", error)
+            return
+        self._prefix.learn(described.type_name, store)
+        self._latencies.learn(described.type_name, store)
+
+    def stats(self) -> dict[Key, dict[str, Any]]:
+        """The counters of each topic, without its latencies. Called with the lock held."""
+        stats = self._end.received
+        keys = dict.fromkeys([*stats.delivered, *((src, tid) for src, tid, _ in stats.lost)])
+        return {key: self._topic_stats(key) for key in keys if self.heard.is_topic(key)}
+
+    def windows(self) -> dict[Key, LatencyWindow]:
+        """Copies of the latencies. Called with the lock held."""
+        found = {key: output.latency for key, output in list(self._outputs.items())}
+        return {key: window.copy() for key, window in found.items() if window is not None}
+
+    def _topic_stats(self, key: Key) -> dict[str, Any]:
+        topic = self.heard.topic(key)
+        output = self._outputs.get(key) or Output(topic)
+        latency = (output.latency.newest or 0.0) if output.latency is not None else 0.0
+        at = output.delivered_at
+        lost = self._end.received.lost
+        return {
+            "src_id": key[0],
+            "topic_id": key[1],
+            "type": topic.type_name,
+            "delivered": output.published,
+            "lost": {reason: count for (*whose, reason), count in lost.items() if tuple(whose) == key},
+            "latency_s": None,
+            "recent_latency_s": None,
+            "age_s": None if at is None else self._clock() - at + latency,
+        }
+
+    def deliver(self, event: Delivered) -> None:
+        """Publish a message, now or when the subscribers of its publisher have found it."""
+        output = self._outputs.get((event.src_id, event.topic_id))
+        if output is None or output.publisher is None or output.early is not None:
+            output = self._opened(event)
+        if output is None or output.early is None:
+            self._tell(self._publish(event))
+            return
+        with output.opening:
+            if output.early is not None:
+                output.early.add(event)
+            else:
+                self._tell(self._publish(event))
+
+    def _opened(self, event: Delivered) -> Output | None:
+        """The output of a message, with a publisher; None if it cannot have one, which publishing then says."""
+        key = (event.src_id, event.topic_id)
+        try:
+            output = self._output(key)
+            if output.publisher is None:
+                self._advertise(key, output)
+        except Exception:  # noqa: BLE001 - publishing fails for the same reason, and counts it
+            return None
+        return output
+
+    def release(self, outputs: Iterable[Output]) -> None:
+        """Publish what waits for subscribers."""
+        for output in list(outputs):
+            with output.opening:
+                if output.early is not None:
+                    for event in output.early.waiting:
+                        self._tell(self._publish(event))
+                output.early = None
+            with self._lock:
+                self.opening.discard(output)
+
+    def _publish(self, event: Delivered) -> ReceiverEvent:
+        key = (event.src_id, event.topic_id)
+        try:
+            output = self._outputs.get(key) or self._output(key)
+            topic = output.topic
+            payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
+            publisher = output.publisher or self._advertise(key, output)
+            publisher.publish(payload)
+        except Exception as error:  # noqa: BLE001 - whatever the reason, nobody got the message
+            named = f"topic id {key[1]} of robot {key[0]}"
+            self._failures.note(
+                LedgerRow.PUBLISH_FAILED.value, f"ros2_sink: a message of {named} was not published", error
+            )
+            with self._lock:
+                return self._end.unpublished(event)
+        with self._lock:
+            output.published += 1
+            output.delivered_at = self._clock()
+            if self._latencies.has(topic.type_name):
+                self._measure(output, event.payload)
+        if self._transforms is not None and topic.type_name == TF_TYPE:
+            self._merge(self._transforms, payload, static=topic.latched)
+        return event
+
+    def _merge(self, transforms: MergedTransforms, payload: bytes, *, static: bool) -> None:
+        try:
+            transforms.add(payload, static=static)
+        except Exception as error:  # noqa: BLE001 - the message itself was published and counts as delivered
+            self._failures.note("tf_failed", "ros2_sink: transforms were not merged", error)
+
+    def _output(self, key: Key) -> Output:
+        """A sender's topic, which may be published from now on.
+
+        :raises ConfigError: when the topic id is neither announced nor in the registry
+        """
+        output = self._outputs.get(key)
+        if output is None:
+            topic = self.heard.topic(key)
+            output = self._outputs[key] = Output(topic)
+        return output
+
+    def _change(self, output: Output, topic: Topic) -> None:
+        """A topic id means this topic now. A publisher of another name or type is closed."""
+        before = output.topic
+        if (before.name, before.type_name) != (topic.name, topic.type_name):
+            self.release([output])
+            if output.publisher is not None:
+                output.publisher.close()
+                output.publisher = None
+        output.topic = topic
+
+    def publishers(self) -> list[Publisher]:
+        """All that are open."""
+        return [publisher for output in list(self._outputs.values()) if (publisher := output.publisher) is not None]
+
+    def _advertise(self, key: Key, output: Output) -> Publisher:
+        topic = output.topic
+        depth = topic.options.depth
+        if depth == AUTO:
+            depth = 1 if topic.latched else self._config.publisher_depth
+        asked = topic.options.reliability
+        qos = Qos(None if asked == AUTO else asked, "transient_local" if topic.latched else "volatile", depth)
+        name = self.heard.name(key)
+        for (src_id, _), other in list(self._outputs.items()):
+            if src_id == key[0] and other is not output and other.publisher is not None and other.name == name:
+                self.release([other])  # the same topic with its type before
+                other.publisher.close()
+                other.publisher = None
+        output.name = name
+        publisher = output.publisher = self._graph.middleware.advertise(name, topic.type_name, qos)
+        if self.running and self._graph.middleware.settling_s and not topic.latched:
+            output.early = EarlyMessages(publisher, self._graph.middleware.settling_s, self._clock())
+            with self._lock:
+                self.opening.add(output)
+                self.due.notify_all()
+        return publisher
+
+    def _measure(self, output: Output, payload: bytes) -> None:
+        """Note the latency of a message; the caller holds the lock."""
+        latency = self._latencies.of(payload)
+        if latency is not None:
+            if output.latency is None:
+                self._forget_the_gone()
+                output.latency = LatencyWindow()
+            output.latency.add(latency)
+
+    def _forget_the_gone(self) -> None:
+        """Free the latencies of senders that the receiver no longer knows: 0.3 MB per topic."""
+        for (src_id, _), output in list(self._outputs.items()):
+            if not self._end.knows(src_id):
+                output.latency = None
