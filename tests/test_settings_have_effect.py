@@ -141,6 +141,7 @@ effects(
     max_rate=run(OPTION + "odom.max_rate=5"),
     max_age_s=lambda: (withheld(), withheld(topic_options={"cmd_vel": TopicOptions(max_age_s=2.0)})),
     codec=run(OPTION + "odom.codec=zstd"),
+    to=Elsewhere("tests/link/v1/test_relaying.py"),
     keep_s=Elsewhere("tests/link/v1/test_latest_state.py"),
     quantize=run(OPTION + "odom.quantize=pose.pose.position=0.1"),
     depth=run(OPTION + "odom.depth=1", OPTION + "odom={queue: auto}"),

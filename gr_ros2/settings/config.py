@@ -216,6 +216,7 @@ class TopicOptions(Recent, Queued):
         taken; 0 = any time, auto takes the sink's. A number above 0 at the source has every sink take its own bound
     :param keep_s: s for which its newest message is sent again to robots that lack it, although nothing follows and it
         is not transient-local: an e-stop, a mode; 0 = as the publishers' durability has it
+    :param to: robot for which its messages are, 0..254; other robots do not deliver them; auto = all robots
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     """
@@ -230,6 +231,7 @@ class TopicOptions(Recent, Queued):
     weight: Annotated[float, OnlyIn(1), Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
     max_rate: Annotated[float, OnlyIn(1), Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
     keep_s: Annotated[Seconds, OnlyIn(1)] = 0.0
+    to: Annotated[Annotated[int, Field(ge=0, le=254)] | Auto, OnlyIn(1)] = AUTO
     codec: str = AUTO
     quantize: str = ""
 

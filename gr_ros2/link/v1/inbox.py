@@ -30,10 +30,11 @@ from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.sent_packets import SPAN
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
+from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire.control import Control
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import TABLE_TOPIC, EntryV1, Part, read_body
+from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC, EntryV1, Part, read_body
 
 Events = list[Delivered | Lost | Announced]
 
@@ -126,7 +127,7 @@ class Inbox:
         self.sealed_after: Callable[[int], float] | None = None
         """Tells the time in s after which a packet was sealed; None where this cannot be proven."""
         self._max_age_s, self._max_ages = settings.max_age_s, settings.max_ages
-        self._room = room
+        self._room, self._own = room, settings.src_id
         self._control, self._relaying = control, relaying
         self._stats = stats
         bounds = Bounds.of(settings.max_source_bytes, room)
@@ -368,6 +369,9 @@ class Inbox:
 
     def _deliver(self, ready: Ready, topic: AnnouncedTopic) -> None:
         topic_id, order = ready.topic_id, ready.order
+        if topic.dst_id not in (BROADCAST, self._own) and self._own != NOBODY:
+            self._give_up([ready], LedgerRow.NOT_FOR_US)
+            return
         if self.sealed_after is not None and self._old(order[0], topic):
             self._give_up([ready], LedgerRow.NOT_FRESH)
             return

@@ -13,7 +13,7 @@ from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import RELAYED_TOPIC, TABLE_TOPIC
+from gr_ros2.wire.v1 import BROADCAST, RELAYED_TOPIC, TABLE_TOPIC
 
 
 @dataclass(slots=True, eq=False)
@@ -93,6 +93,7 @@ class SentTopic:
             min(self.kept_depth if self.kept else depth, 255),
             codec,
             fresh,
+            BROADCAST if options.to == AUTO else options.to,
         )
 
 

@@ -11,14 +11,15 @@ from gr_ros2.link.events import Announced, Delivered
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.mac import Slots
 from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry
 from tests.link.v1.air import SLOT_S, Robot, registry
 
 ODOM = registry(odom=TopicOptions(queue="latest"))
 
 
-def robot(src_id: int, mode: SealMode = "none", **settings: Any) -> Robot:
+def robot(src_id: int, mode: SealMode = "none", topics: Registry = ODOM, **settings: Any) -> Robot:
     access = Slots(src_id, SLOT_S, random.Random(src_id), period_s=0.1)
-    return Robot(src_id, ODOM, mode=mode, access=access, packet_len=96, hears=True, **{"relay": True, **settings})
+    return Robot(src_id, topics, mode=mode, access=access, packet_len=96, hears=True, **{"relay": True, **settings})
 
 
 class Line:
@@ -87,3 +88,11 @@ def test_without_the_key_nobody_relays_or_is_relayed() -> None:
     assert not line.robots[3].delivered()
     assert not line.robots[2].delivered()
     assert {event.src_id for event in line.robots[0].events if isinstance(event, Delivered)} == {2}
+
+
+def test_a_topic_for_one_robot_comes_out_at_that_one_only_also_over_hops() -> None:
+    goal = registry(goal=TopicOptions(queue="latest", to=4))
+    line = Line(robot(1, topics=goal), *(robot(src_id) for src_id in (2, 3, 4)))
+    line.run(20)
+    assert [len(one.delivered(1)) > 5 for one in line.robots] == [False, False, False, True]
+    assert line.robots[1].end.received.lost[1, 0, "not_for_us"] > 5
