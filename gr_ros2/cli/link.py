@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _SHOW_S = 0.5
-_LOOK_S = 3.0
-"""s after which the graph has told most of what is on it."""
 
 
 def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
@@ -141,7 +139,10 @@ def link(
             signal.signal(number, lambda *_, on=on: _switch(running, on))
         try:
             running.start()
-            answers |= {STATUS: lambda _: running.stats(), PING: lambda robot: running.ping(int(robot))}
+            answers |= {
+                STATUS: lambda _: {**running.stats(), "findings": running.findings()},
+                PING: lambda robot: running.ping(int(robot)),
+            }
             run_observers.run_started(_live(running))
             _show(console, running, duration)
         except KeyboardInterrupt:
@@ -207,7 +208,7 @@ def _opening(running: Any) -> str:
 def _show(console: Console, running: Any, duration: float | None) -> None:
     """Print what runs and what it waits for, with a live table, or plain lines where there is no terminal,
     until the time is over or the link has finished."""
-    from gr_ros2.radio.waiting import Waiting
+    from gr_ros2.radio.waiting import Findings, Waiting
 
     guarded, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
     guarded(say, _opening(running))
@@ -219,20 +220,15 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
     waiting = Waiting(running.source)
     with Live("", console=console, auto_refresh=False) if live else ExitStack() as shows:
         shown = time.monotonic()
-        told: set[str] = set()
-        look_at = shown + _LOOK_S
+        findings = Findings(running.findings)
         while (now := time.monotonic()) < end and not running.finished:
             time.sleep(min(_SHOW_S, end - now))
             running.check()
             notify("WATCHDOG=1")
             if (waits_for := waiting.look()) is not None:
                 guarded(say, waits_for)
-            if now >= look_at:
-                look_at = now + LOG_S
-                for line in running.findings():
-                    if line not in told:
-                        told.add(line)
-                        guarded(say, line)
+            for line in findings.new(now):
+                guarded(say, line)
             if isinstance(shows, Live):
                 guarded(partial(shows.update, refresh=True), tables(running.stats()))
             elif time.monotonic() - shown >= LOG_S:

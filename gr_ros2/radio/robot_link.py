@@ -39,7 +39,7 @@ from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.switch import TransmitSwitch
-from gr_ros2.radio.waiting import shortcut
+from gr_ros2.radio.waiting import foreign, shortcut
 from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import Registry
@@ -376,8 +376,14 @@ class RobotLink(Flowgraph):
     def findings(self) -> list[str]:
         """What a person should know about this link and its surroundings: one line each, mostly none."""
         robots = [peer["robot"] for peer in peers(self.end, self._clock())]
-        line = shortcut(self.source.middleware.discover(), self.config.ros_source.src_id(), robots)
-        return [] if line is None else [line]
+        here, there = self.source.middleware, self.sink.middleware
+        names = {info.topic for graph in {here, there} for info in graph.discover() if info.publishers}
+        services = here.discover_services() if isinstance(here, ServiceGraph) else ()
+        lines = (
+            shortcut([*names, *services], self.config.ros_source.src_id(), robots),
+            foreign(names, self.sink.stats()["topics"]),
+        )
+        return [line for line in lines if line is not None]
 
     @property
     def finished(self) -> bool:

@@ -6,7 +6,8 @@ Invariant: a line is returned only if it has changed. A look changes nothing on 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from math import inf
 from typing import TYPE_CHECKING
 
 from gr_ros2.core.names import INFRASTRUCTURE
@@ -15,23 +16,27 @@ from gr_ros2.middleware import TopicInfo
 if TYPE_CHECKING:
     from gr_ros2.gr import RosSource
 
+_FIRST_S, _EVERY_S = 3.0, 10.0
+"""s after which the graph has told most of what is on it, and s from one look at it to the next."""
 ALL_THERE = "every topic has a publisher"
 _SHOWN = 6
 """Largest number of topics that a line names. Further topics are only counted."""
 
 
-_OF_A_LINK = re.compile(r"/gr_ros2_link_([0-9]+)/statistics")
-"""A topic that every link publishes (``diagnostics``)."""
+_OF_A_LINK = re.compile(r"/gr_ros2_link_([0-9]+)/(?:statistics|transmit)")
+"""A topic that every link with ``diagnostics`` publishes, and a service that every link has."""
+_SHARED = ("/tf", "/tf_static")
+"""Topics that many nodes publish together."""
 
 
-def shortcut(infos: Sequence[TopicInfo], own: int, heard: Iterable[int]) -> str | None:
+def shortcut(names: Iterable[str], own: int, heard: Iterable[int]) -> str | None:
     """One line if another robot's link is on this robot's ROS graph: something other than the radio connects the two.
 
-    :param infos: what is on the graph
+    :param names: topics that are published on the graph, and services
     :param own: this robot
     :param heard: the robots that are heard by radio
     """
-    found = [match for info in infos if info.publishers and (match := _OF_A_LINK.fullmatch(info.topic)) is not None]
+    found = [match for name in names if (match := _OF_A_LINK.fullmatch(name)) is not None]
     others = sorted({int(match[1]) for match in found} - {own})
     if not others:
         return None
@@ -41,6 +46,47 @@ def shortcut(infos: Sequence[TopicInfo], own: int, heard: Iterable[int]) -> str 
         f"{nodes} is on this robot's ROS graph{also}: something other than the radio connects the robots, such as a "
         "cable or Wi-Fi; set another ROS_DOMAIN_ID at each, or ROS_LOCALHOST_ONLY=1"
     )
+
+
+def foreign(published: Iterable[str], outputs: Iterable[str]) -> str | None:
+    """One line if somebody else publishes where this link does: what is received there did not all come by radio.
+
+    :param published: topics with a publisher other than this link
+    :param outputs: topics under which this link publishes what it hears
+    """
+    both = sorted(set(published) & set(outputs) - set(_SHARED))
+    if not both:
+        return None
+    return (
+        f"{_listed(both)}: another program on this robot's ROS graph publishes there too, so not everything there came "
+        "over this link; end it, or set ros_sink.namespace_format"
+    )
+
+
+class Findings:
+    """Tells what a person should know about a link, each line once.
+
+    :param look: returns all lines that are true now
+    """
+
+    def __init__(self, look: Callable[[], Sequence[str]]) -> None:
+        self._look = look
+        self._told: set[str] = set()
+        self._at = -inf
+
+    def new(self, now: float) -> list[str]:
+        """The lines that were not told before; now and then it looks.
+
+        :param now: s, monotonic
+        """
+        if self._at == -inf:
+            self._at = now + _FIRST_S
+        if now < self._at:
+            return []
+        self._at = now + _EVERY_S
+        lines = [line for line in self._look() if line not in self._told]
+        self._told.update(lines)
+        return lines
 
 
 class Waiting:

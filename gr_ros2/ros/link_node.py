@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from gr_ros2.core.errors import ConfigError, GrRos2Error
 from gr_ros2.core.systemd import notify
 from gr_ros2.radio.config import load_link
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.radio.waiting import Waiting
+from gr_ros2.radio.waiting import Findings, Waiting
 from gr_ros2.ros.parameters import Parameter, overrides, parameters
 
 CONFIG = "config"
@@ -178,7 +179,7 @@ def main(args: Sequence[str] | None = None) -> None:
         node.get_logger().info(f"robot {node.link.source.src_id} on {node.link.front_end.name}, {phy.name}{runs_on}")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        waiting = Waiting(node.link.source)
+        waiting, findings = Waiting(node.link.source), Findings(node.link.findings)
         notify("READY=1")
         while not (asked or node.link.finished):
             executor.spin_once(timeout_sec=_LOOK_S)
@@ -186,6 +187,8 @@ def main(args: Sequence[str] | None = None) -> None:
             notify("WATCHDOG=1")
             if (waits_for := waiting.look()) is not None:
                 node.get_logger().info(waits_for)
+            for line in findings.new(time.monotonic()):
+                node.get_logger().warning(line)
     except ExternalShutdownException:
         pass
     except GrRos2Error as error:

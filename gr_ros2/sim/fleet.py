@@ -19,7 +19,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.sim.driver import Driver
 from gr_ros2.sim.motion import RADIUS, TICK, State
 from gr_ros2.sim.roadmap import Roadmap
-from gr_ros2.sim.sensors import TYPES, Sensors
+from gr_ros2.sim.sensors import ALL_TYPES, TYPES, Sensors
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.world import Floats, World
 
@@ -83,12 +83,12 @@ class Fleet:
         return Fleet(settings)
 
     def topics(self) -> dict[str, str]:
-        """Topic name without namespace -> type, in the order of the paper's table 4."""
-        return dict(TYPES)
+        """Topic name without namespace -> type, in the order of the paper's table 4; corrections come last."""
+        return dict(ALL_TYPES if self.settings.rtcm_rate else TYPES)
 
     def rates(self) -> dict[str, float]:
         """Topic name without namespace -> Hz; 0 = once."""
-        return {name: getattr(self.settings, f"{name}_rate") for name in TYPES}
+        return {name: getattr(self.settings, f"{name}_rate") for name in self.topics()}
 
     def state(self, robot_id: int, t: float) -> State:
         """The true place and motion of a robot at simulated time ``t`` >= 0."""
@@ -142,10 +142,10 @@ class Fleet:
                 state = self._log[robot_id - 1][tick].after(TICK)
             others = [self.state(i, t) for i in self.robot_ids if i != robot_id] if topic == "scan" else ()
             payload = sensors[robot_id].read(topic, t, state, others)
-            yield SimMessage(t, robot_id, name, TYPES[topic], payload)
+            yield SimMessage(t, robot_id, name, ALL_TYPES[topic], payload)
 
     def _first_events(self, robot_id: int) -> Iterator[tuple[float, int, int, int, str, float, float]]:
-        phases = np.random.default_rng([self.settings.seed, 3, robot_id]).uniform(size=len(TYPES)).tolist()
-        for order, ((topic, rate), phase) in enumerate(zip(self.rates().items(), phases, strict=True)):
+        phases = np.random.default_rng([self.settings.seed, 3, robot_id]).uniform(size=len(ALL_TYPES)).tolist()
+        for order, ((topic, rate), phase) in enumerate(zip(self.rates().items(), phases, strict=False)):
             offset = 0.0 if topic == "map" else phase
             yield (offset / rate if rate else 0.0, order, robot_id, 0, topic, rate, offset)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gr_ros2.sim.motion import MAX_TURN, RADIUS, State
 from gr_ros2.sim.sim_settings import SimSettings
@@ -27,9 +27,13 @@ TYPES: Final = {
     "clock": "rosgraph_msgs/msg/Clock",
 }
 """The paper's table 4."""
+RTCM: Final = "rtcm"
+ALL_TYPES: Final = {**TYPES, RTCM: "rtcm_msgs/msg/Message"}
+"""And the corrections of a base station, in the type that GNSS drivers use for them."""
 GRAVITY: Final = 9.80665
 _SCAN_MIN: Final = 0.05
 _STORE: Final = get_typestore(Stores.ROS2_HUMBLE)
+_STORE.register(get_types_from_msg("std_msgs/Header header\nuint8[] message\n", ALL_TYPES[RTCM]))
 _TYPE: Final[dict[str, Any]] = {name: _STORE.types[name] for name in _STORE.types}
 _HEADER, _TIME = _TYPE["std_msgs/msg/Header"], _TYPE["builtin_interfaces/msg/Time"]
 _POINT, _POSE = _TYPE["geometry_msgs/msg/Point"], _TYPE["geometry_msgs/msg/Pose"]
@@ -38,7 +42,7 @@ _TWIST = _TYPE["geometry_msgs/msg/Twist"]
 
 
 class Sensors:
-    """All six topics of one robot.
+    """All topics of one robot.
 
     :param start_ns: stamp of t = 0, ns
     :param start: true state at t = 0, where the odometry starts too
@@ -48,7 +52,7 @@ class Sensors:
         self._settings, self._world, self._start_ns = settings, world, start_ns
         self._prefix = settings.frame_prefix(robot_id)
         # One generator per topic. The 2 separates their seeds from those of world and routes, which have 0 and 1.
-        self._rng = {name: np.random.default_rng([settings.seed, 2, robot_id, i]) for i, name in enumerate(TYPES)}
+        self._rng = {name: np.random.default_rng([settings.seed, 2, robot_id, i]) for i, name in enumerate(ALL_TYPES)}
         self._believed = (start.x, start.y, start.heading)
         self._odom_t = 0.0
         rng = self._rng["imu"]
@@ -71,7 +75,7 @@ class Sensors:
         :param others: states of the other robots at ``t``
         """
         message = getattr(self, f"_{topic}")(t, state, others)
-        return bytes(_STORE.serialize_cdr(message, TYPES[topic]))
+        return bytes(_STORE.serialize_cdr(message, ALL_TYPES[topic]))
 
     def _time(self, t: float) -> Any:
         ns = self._start_ns + round(t * 1e9)
@@ -158,6 +162,30 @@ class Sensors:
 
     def _clock(self, t: float, state: State, others: Sequence[State]) -> Any:  # noqa: ARG002
         return _TYPE["rosgraph_msgs/msg/Clock"](clock=self._time(t))
+
+    def _rtcm(self, t: float, state: State, others: Sequence[State]) -> Any:  # noqa: ARG002
+        """The observations of an epoch, one frame (RTCM 10403.3, section 4) per constellation. Their bits are noise to
+        every compression, so they are random here."""
+        frames = b"".join(_rtcm_frame(number, self._rng[RTCM].bytes(_MSM4_LEN - 2)) for number in _MSM4)
+        return _TYPE[ALL_TYPES[RTCM]](header=self._header(t, "gnss"), message=np.frombuffer(frames, np.uint8))
+
+
+_MSM4: Final = (1074, 1084, 1094, 1124)
+"""Messages MSM4 of GPS, GLONASS, Galileo and BeiDou."""
+_MSM4_LEN: Final = 164
+"""Bytes of one with 10 satellites of two signals each: 169 + 10 * 18 + 20 * 48 bits."""
+
+
+def _rtcm_frame(number: int, rest: bytes) -> bytes:
+    """A frame: preamble, length, a message that begins with its number of 12 bits, and the CRC-24Q of all that."""
+    body = (number << 4).to_bytes(2, "big") + rest
+    frame = b"\xd3" + len(body).to_bytes(2, "big") + body
+    crc = 0
+    for byte in frame:
+        crc ^= byte << 16
+        for _ in range(8):
+            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
+    return frame + (crc & 0xFFFFFF).to_bytes(3, "big")
 
 
 def _twist(speed: float, turn: float) -> Any:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 
 from gr_ros2.middleware import Qos, TopicInfo
-from gr_ros2.radio.waiting import shortcut, waiting_line
+from gr_ros2.radio.waiting import Findings, foreign, shortcut, waiting_line
+from tests.domains import domain
+from tests.waiting import wait_for
 
 QOS = Qos("reliable", "volatile", 10)
 ODOM, SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan"
@@ -72,10 +77,49 @@ def test_a_line_is_told_when_it_changes() -> None:
             "gr_ros2_link_2 is on this robot's ROS graph, which is heard by radio too",
         ),
         (["/gr_ros2_link_2/statistics", "/gr_ros2_link_10/statistics"], [], "gr_ros2_link_2, gr_ros2_link_10 is on"),
+        (["/gr_ros2_link_2/transmit"], [], "gr_ros2_link_2 is on this robot's ROS graph: something"),
         (["/my/gr_ros2_link_2/statistics", "/gr_ros2_link_x/statistics"], [], None),
     ],
 )
 def test_another_robots_link_on_this_graph_is_named(topics: list[str], heard: list[int], said: str | None) -> None:
-    infos = [TopicInfo(topic, "std_msgs/msg/String", (Qos(),)) for topic in topics]
-    line = shortcut(infos, 1, heard)
+    line = shortcut(topics, 1, heard)
     assert (line is None) if said is None else (line is not None and line.startswith(said))
+
+
+def test_who_else_publishes_what_was_received_is_named() -> None:
+    outputs = ["/rx_robot_2/odom", "/rx_robot_2/scan", "/tf"]
+    assert foreign(["/odom", "/tf", "/rx_robot_3/odom"], outputs) is None
+    line = foreign(["/odom", "/tf", "/rx_robot_2/odom"], outputs)
+    assert line is not None
+    assert line.startswith("/rx_robot_2/odom: another program on this robot's ROS graph publishes there too")
+
+
+def test_a_finding_is_told_once() -> None:
+    true = ["one"]
+    findings = Findings(lambda: true)
+    assert findings.new(0.0) == []
+    assert findings.new(3.0) == ["one"]
+    true.append("two")
+    assert findings.new(4.0) == []
+    assert findings.new(13.0) == ["two"]
+    assert findings.new(23.0) == []
+
+
+def test_a_link_on_the_same_graph_is_seen_without_diagnostics_too(tmp_path: Path) -> None:
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    from tests.radio.robots import Robot
+
+    ends = [f"ipc://{tmp_path}/{number}" for number in "12"]
+    values: dict[str, Any] = {"version": 1, "diagnostics": {"period_s": 0}}
+
+    def robot(number: int) -> Robot:
+        front_end = {"name": "zmq", "bind": ends[number - 1], "connect": [ends[2 - number]]}
+        graph, state = {"domain_id": domain(9)}, str(tmp_path / f"state-{number}")
+        return Robot(number, front_end, ros_source=graph, ros_sink=graph, state=state, **values)
+
+    with robot(1) as one:
+        assert one.link.findings() == []
+        with robot(2):
+            wait_for(lambda: one.link.stats()["peers"], "the other robot by radio")
+            (line,) = one.link.findings()
+            assert line.startswith("gr_ros2_link_2 is on this robot's ROS graph, which is heard by radio too")

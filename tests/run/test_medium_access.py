@@ -70,3 +70,10 @@ def test_what_cannot_be_is_refused_in_one_line(overrides: list[str], said: str) 
     with pytest.raises(ConfigError, match=said) as refused:
         load_scenario("two-robots-half-duplex", overrides)
     assert "\n" not in str(refused.value)
+
+
+def test_corrections_of_a_base_station_reach_every_robot() -> None:
+    counts, run = delivered("rtk", duration_s=10)
+    assert len(run.robots) == 5
+    assert counts.pop(1) == 4 * 10
+    assert min(counts.values()) >= 0.9 * 4 * 20

@@ -213,3 +213,22 @@ def test_topics_that_nobody_wants_change_no_byte_of_the_others() -> None:
     chosen = list(fleet.messages(2.0, topics=wanted))
     assert chosen == [message for message in fleet.messages(2.0) if message.topic in wanted]
     assert {message.topic for message in chosen} == wanted
+
+
+def test_corrections_are_whole_frames_and_change_nothing_else(messages: list[SimMessage]) -> None:
+    changed = list(Fleet(SimSettings(seed=3, start_time_s=1000.5, rtcm_rate=1.0)).messages(DURATION))
+    corrections = [m for m in changed if m.topic == "/robot_1/rtcm"]
+    assert len(corrections) == DURATION
+    assert [m for m in changed if not m.topic.endswith("rtcm")] == messages
+    data = corrections[0].payload
+    frames = data[data.index(b"\xd3\0\xa4") :]
+    numbers = []
+    while frames.startswith(b"\xd3"):
+        size = int.from_bytes(frames[1:3], "big") + 6
+        rest = int.from_bytes(frames[:size], "big")
+        while rest.bit_length() > 24:  # a polynomial over GF(2), divided by that of CRC-24Q
+            rest ^= 0x1864CFB << rest.bit_length() - 25
+        assert rest == 0
+        numbers.append(int.from_bytes(frames[3:5], "big") >> 4)
+        frames = frames[size:]
+    assert (numbers, frames) == ([1074, 1084, 1094, 1124], b"")
