@@ -55,7 +55,7 @@ def _share(version: int) -> float:
             "phy": {"name": "ofdm", "sample_rate": 1e5},
             "ros_source": {"compression": True},
         }
-        links = [link(number, Path(folder), **settings) for number in (1, 2)]
+        links = [zmq_link(number, Path(folder), **settings) for number in (1, 2)]
         graph = MemoryMiddleware(domain_id=DOMAINS[0])
         stack.callback(graph.close)
         for link in links:
@@ -71,7 +71,7 @@ def _share(version: int) -> float:
     return share
 
 
-def link(number: int, folder: Path, **values: Any) -> RobotLink:
+def zmq_link(number: int, folder: Path, **values: Any) -> RobotLink:
     """One of two robots, over ZeroMQ; its ROS graph is in memory.
 
     :param folder: where both keep their states and sockets

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.live import DOMAINS, link
+from bench.live import DOMAINS, zmq_link
 from bench.repair import quantile
 from bench.rows import Row
 from gr_ros2.middleware import Publisher, Qos
@@ -172,7 +172,7 @@ def _robot_2(near: Connection, folder: Path) -> None:
 
 
 def _link(number: int, folder: Path, options: dict[str, Any]) -> RobotLink:
-    return link(
+    return zmq_link(
         number,
         folder,
         registry=str(folder / "topics.csv"),
