@@ -11,7 +11,7 @@ import json
 import re
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -104,6 +104,43 @@ def differences(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     if version and not __version__.startswith(version):
         found.append(f"gr-ros2 {version} there and {__version__} here")
     return found
+
+
+OUTRUN = ("superseded", "queue_bound", "stale", "cannot_complete")
+"""Reasons to drop a message that did not find its turn."""
+
+
+def same_id(robot: int, stats: Mapping[str, Any]) -> str | None:
+    """One line if another robot sends under this robot's id, which both are told."""
+    if not stats["sink"]["rejected"].get("same_id"):
+        return None
+    return f"another robot sends as robot {robot}, which is this one; give one of them another robot_id"
+
+
+def unheard(robot: int, heard: Sequence[int]) -> str:
+    """One line for a robot that hears others, of which none hears it."""
+    named = ", ".join(str(other) for other in heard)
+    return (
+        f"nobody hears robot {robot}: it hears robot {named}, and none of them names it; is its transmitter on, and "
+        "strong enough?"
+    )
+
+
+def outrun(before: Mapping[str, int], topics: Mapping[str, Any]) -> tuple[str | None, dict[str, int]]:
+    """One line with the topics that grow old because the channel carries less than they offer, and what to compare with
+    at the next look.
+
+    :param before: messages of each topic that did not find their turn, at the look before
+    :param topics: counters of the source, by topic
+    """
+    now = {name: sum(topic["refused"].get(reason, 0) for reason in OUTRUN) for name, topic in topics.items()}
+    old = sorted(name for name, count in now.items() if count > before.get(name, 0))
+    if not old:
+        return None, now
+    return (
+        f"the channel is fuller than it can carry: {', '.join(old)} grow old, since messages are replaced or dropped "
+        "before their turn; send less (max_rate, topics), or raise phy.sample_rate"
+    ), now
 
 
 def heard_nobody(stats: Mapping[str, Any]) -> list[str]:

@@ -198,6 +198,19 @@ def test_credit_paces(rig: Rig) -> None:
     assert rig.source.emitted == 7
 
 
+@pytest.mark.parametrize("backpressure", [False, True])
+def test_a_credit_that_says_since_when_the_air_is_free_tells_a_slow_computer(rig: Rig, backpressure: bool) -> None:
+    """Where the reader of a recording waits for room in the queue, nothing is to be dropped."""
+    source = rig.make(packet_len=64, backpressure=backpressure)
+    source.use_credit()
+    rig.start(credit=True)
+    free = source.clock()
+    rig.probe.message_port_pub(pmt.intern("credit"), pmt.from_double(free))
+    wait_for(lambda: not source._end.pace.out_of_credit, "the credit")
+    assert not source._end.pace.behind(free + 0.1)
+    assert source._end.pace.behind(free + 1.0) != backpressure
+
+
 def test_events_reach_the_observer_in_order(rig: Rig) -> None:
     events: list[Any] = []
     rig.make(packet_len=64, observer=Hears(events.append))
