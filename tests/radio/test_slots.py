@@ -168,3 +168,37 @@ def test_a_front_end_that_hears_itself_alone_shares_nothing() -> None:
     with pytest.raises(ConfigError, match="medium = 'slots': front_end sim reaches no other robot") as refused:
         RobotLink(config(1, {"name": "sim"}, version=1, medium="slots"))
     assert "\n" not in str(refused.value)
+
+
+def test_two_robots_with_one_id_are_told_so_both(tmp_path: Path) -> None:
+    with air(tmp_path, 3), ExitStack() as stack:
+        links = []
+        for place, number in ((1, 1), (2, 2), (3, 1)):
+            values = {"version": 1, "medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
+            state = str(tmp_path / f"state{place}.json")
+            links.append(RobotLink(config(number, front_end(tmp_path, place), state=state, **values)))
+            stack.callback(links[-1].stop)
+        for link in links:
+            link.start()
+        for link in links[::2]:
+            said = "another robot sends as robot 1, which is this one"
+            wait_for(lambda: any(said in line for line in link.findings()), "to be told")  # noqa: B023 - called at once
+        assert not any("another robot" in line for line in links[1].findings())
+
+
+def test_a_channel_that_is_too_full_names_the_topics_that_grow_old(tmp_path: Path) -> None:
+    with air(tmp_path, 2), ExitStack() as stack:
+        values: dict[str, Any] = {"version": 1, "medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
+        options = {"topic_options": {"chat": {"queue": "latest"}}}
+        robots = [
+            stack.enter_context(Robot(number, front_end(tmp_path, number), ros_source=options, **values))
+            for number in (1, 2)
+        ]
+        wait_for(lambda: bool(robots[0].link.stats()["peers"]), "the other robot to be heard")
+        robots[0].link.findings()
+        told = "the channel is fuller than it can carry: /robot_1/chat grow old"
+        wait_for(
+            lambda: robots[0].publish(message(1, 40)) or any(told in line for line in robots[0].link.findings()),
+            "the topic to be named",
+        )
+        assert not any("fuller" in line for line in robots[1].link.findings())
