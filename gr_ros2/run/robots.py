@@ -56,6 +56,7 @@ def start_of_run(
         any_length=any_length,
         mcs_table=mcs_table,
         access=access_of(ways[0].medium, airtime_s, ways[0].seed),
+        relay=ways[0].relay == "gain",
         airtime_share=1.0 if rule is None else sustained(rule),
     )
 
@@ -154,10 +155,13 @@ def _directed(scenario: Scenario) -> list[list[Path]]:
 
 def ears_of(scenario: Scenario, around: Surroundings) -> list[list[int]]:
     """For each recorder of a run the robots whose packets it counts: first that of the result, then those of further
-    receivers. Two robots share one recorder; each of several has its own, for the robots that it can hear."""
+    receivers. Two robots share one recorder; each of several has its own, for the robots that it can hear, or for all
+    where messages are relayed."""
     ways = len(scenario.directions())
     if ways <= 2:
         return [list(range(ways)) for _ in range(1 + len(scenario.receivers))]
+    if scenario.relay != "off":
+        return [[number for number in range(ways) if number != receiver] for receiver in range(ways)]
     heard: list[list[int]] = [[] for _ in range(ways)]
     for number in range(ways):
         for receiver in around.reached(number):
