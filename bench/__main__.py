@@ -43,6 +43,7 @@ BENCHMARKS = {
     "compression": "bench.compression",
     "sweep": "bench.sweep",
     "mac": "bench.mac",
+    "shared": "bench.shared",
     "relay": "bench.relay",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
