@@ -231,6 +231,7 @@ class RobotLink(Flowgraph):
             airtime_share=1.0 if self.config.airtime.rule is None else sustained(self.config.airtime.rule),
             access=self._access if self.sends else lambda _: None,
             lead_s=LEAD_S + (self.front_end.ahead() or 0.0),
+            relay=self.config.relay == "gain",
             observer=observer,
             clock=self._clock,
         )

@@ -37,12 +37,12 @@ def front_end(folder: Path, number: int) -> dict[str, Any]:
 
 
 @contextmanager
-def air(folder: Path, robots: int) -> Iterator[MediumProcess]:
+def air(folder: Path, robots: int, **settings: Any) -> Iterator[MediumProcess]:
     """A medium in lock step, in a thread."""
     addresses = [
         {"connect": f"ipc://{folder}/robot{n}", "bind": f"ipc://{folder}/medium{n}"} for n in range(1, robots + 1)
     ]
-    values = {"phy": PHY, "packet_len": PACKET_LEN, "robots": addresses, "channel": {"snr_db": 20.0}}
+    values = {"phy": PHY, "packet_len": PACKET_LEN, "robots": addresses, "channel": {"snr_db": 20.0}, **settings}
     process = MediumProcess(build(MediumConfig, values))
     over = threading.Event()
     thread = threading.Thread(target=process.run, kwargs={"over": over}, daemon=True)
@@ -93,6 +93,36 @@ def test_in_slots_two_links_lose_nothing_both_ways_and_at_once_most(tmp_path: Pa
     at_once, process = heard(tmp_path / "again", "exclusive")
     assert sum(at_once) < sum(whole)
     assert process.counted["overlapping"] > 0.3 * process.counted["bursts"]
+
+
+def test_a_message_reaches_a_robot_that_does_not_hear_its_sender(tmp_path: Path) -> None:
+    line = [[None, -80.0, None], [-80.0, None, -80.0], [None, -80.0, None]]
+    with air(tmp_path, 3, gains_db=line, channel={}), ExitStack() as stack:
+        first, _, last = (
+            stack.enter_context(
+                Robot(
+                    number,
+                    front_end(tmp_path, number),
+                    hears=(4 - number,) if number != 2 else (),
+                    version=1,
+                    medium="slots",
+                    relay="gain",
+                    phy=PHY,
+                    packet_len=PACKET_LEN,
+                )
+            )
+            for number in (1, 2, 3)
+        )
+        clock = first.link.front_end.clock
+        at = [clock()]
+
+        def tell() -> bool:
+            if clock() >= at[0]:
+                at[0] += 0.3
+                first.publish(message(7, 40))
+            return bool(last.heard)
+
+        wait_for(tell, "a message of robot 1 at robot 3")
 
 
 @pytest.fixture
