@@ -20,7 +20,7 @@ from gr_ros2.medium.gains import paths_between
 from gr_ros2.medium.positions import Motion, Positions
 from gr_ros2.run.load import source_names
 from gr_ros2.run.scenario import RobotConfig, Scenario
-from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.settings.config import ChannelConfig, ScenarioChannel, SinkConfig, SourceConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.recorded_motion import RecordedMotion
@@ -95,6 +95,8 @@ def surroundings(scenario: Scenario, sample_rate: float) -> Surroundings:
 def _placed(scenario: Scenario, paths: Sequence[Sequence[Path]], sample_rate: float) -> Positions:
     """The robots of a scenario where they are."""
     channel = scenario.channel
+    # The losses of a path are measured at levels that its channel must be able to have.
+    bare = [[replace(path, channel=_on_the_way(path.channel)) for path in heard] for heard in paths]
     robots = scenario.robots or (RobotConfig(),) * len(paths)
     motion, world = _motion(scenario, len(paths))
     return Positions(
@@ -102,9 +104,13 @@ def _placed(scenario: Scenario, paths: Sequence[Sequence[Path]], sample_rate: fl
         motion,
         sample_rate,
         *zip(*(channel.levels(robot) for robot in robots), strict=True),
-        paths=paths,
+        paths=bare,
         world=world,
     )
+
+
+def _on_the_way(channel: ChannelConfig) -> ChannelConfig:
+    return channel.on_the_way if isinstance(channel, ScenarioChannel) else channel
 
 
 def _motion(scenario: Scenario, count: int) -> tuple[Motion, World | None]:

@@ -571,6 +571,11 @@ class ScenarioChannel(OnCarrier, Transceiver, ChannelConfig):
         """Whether the levels follow from where the robots are."""
         return self.from_ == "positions"
 
+    @property
+    def on_the_way(self) -> ChannelConfig:
+        """What happens on the way, without what levels follow from."""
+        return ChannelConfig(**{item.name: getattr(self, item.name) for item in fields(ChannelConfig)})
+
     def levels(self, robot: Transceiver) -> tuple[float, float]:
         """Transmit power of a robot in dBm, and noise figure of its receiver in dB."""
         power, figure = robot.tx_power_dbm, robot.noise_figure_db
