@@ -57,7 +57,9 @@ class SendingSide:
         self.hellos = hellos
         self.pings = Pings()
         self.repairs = RepairSlots(settings, self.pace, window, writer=writer, hold=hold)
-        self.reports = ReportSlots(neighbours, writer, hears=settings.hears)
+        self.reports = ReportSlots(
+            neighbours, writer, hears=settings.hears, packet_len=settings.packet_len, shares=settings.shares
+        )
         self.urged = False
         self.heard_at = inf
         self._messages, self._window, self._neighbours = messages, window, neighbours
@@ -92,7 +94,7 @@ class SendingSide:
             return reports.packet(due, now)
         if self._window.pressing and not packing.urgent and (first := self.repairs.first(now)) is not None:
             return first
-        filling = packing.fill(self._window.packets.newest + 1, self._writer.room, now)
+        filling = packing.fill(self._window.packets.newest + 1, self._writer.room - reports.reserved, now)
         if filling is not None:
             self.pace.waited(filling.since, now)
             reports.add(filling.parts, self._writer.room - filling.used, due, now)
