@@ -37,7 +37,7 @@ examples: setup-dev
 grc: setup
 	tools/install-system window
 	$(BIN)/gr-ros2 grc-path --install
-	gnuradio-companion gr_ros2/examples/ofdm_loopback.grc
+	gnuradio-companion gr_ros2/examples/first_link.grc
 
 wheel: setup
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-release.txt

@@ -43,6 +43,7 @@ BENCHMARKS = {
     "compression": "bench.compression",
     "sweep": "bench.sweep",
     "mac": "bench.mac",
+    "shared": "bench.shared",
     "relay": "bench.relay",
     "reliable": "bench.reliable",
 }

@@ -28,7 +28,7 @@ REPEATS, WARM_UP_S, MEASURED_S = 5, 3.0, 8.0
 RATE_HZ = 35.0
 MOST = 1.10
 """Processor time with version 1 over that with version 0."""
-_DOMAINS = (91, 92)
+DOMAINS = (91, 92)
 
 
 def live() -> list[Row]:
@@ -48,8 +48,15 @@ def _share(version: int) -> float:
     settings = SimSettings(robots=2, odom_rate=RATE_HZ)
     messages = [sent.payload for sent in Fleet(settings).messages(WARM_UP_S + MEASURED_S, topics={topic})]
     with TemporaryDirectory() as folder, ExitStack() as stack:
-        links = [_link(number, version, Path(folder)) for number in (1, 2)]
-        graph = MemoryMiddleware(domain_id=_DOMAINS[0])
+        settings: dict[str, Any] = {
+            "registry": str(find_registry("odom", Path())),
+            "packet_len": 64,
+            "version": version,
+            "phy": {"name": "ofdm", "sample_rate": 1e5},
+            "ros_source": {"compression": True},
+        }
+        links = [zmq_link(number, Path(folder), **settings) for number in (1, 2)]
+        graph = MemoryMiddleware(domain_id=DOMAINS[0])
         stack.callback(graph.close)
         for link in links:
             stack.enter_context(link)
@@ -64,23 +71,19 @@ def _share(version: int) -> float:
     return share
 
 
-def _link(number: int, version: int, folder: Path) -> RobotLink:
+def zmq_link(number: int, folder: Path, **values: Any) -> RobotLink:
+    """One of two robots, over ZeroMQ; its ROS graph is in memory.
+
+    :param folder: where both keep their states and sockets
+    :param values: settings of the link beside these
+    """
     own, other = (f"ipc://{folder}/{end}" for end in (number, 3 - number))
-    graph: dict[str, Any] = {"middleware": "memory", "domain_id": _DOMAINS[number - 1]}
-    return RobotLink(
-        link_from(
-            {
-                "registry": str(find_registry("odom", Path())),
-                "packet_len": 64,
-                "version": version,
-                "state": str(folder / f"state-{number}"),
-                "phy": {"name": "ofdm", "sample_rate": 1e5},
-                "front_end": {"name": "zmq", "bind": own, "connect": [other]},
-                "ros_source": {"namespace": f"/robot_{number}", "compression": True, **graph},
-                "ros_sink": graph,
-            }
-        )
-    )
+    graph: dict[str, Any] = {"middleware": "memory", "domain_id": DOMAINS[number - 1]}
+    source = {"namespace": f"/robot_{number}", **graph, **values.pop("ros_source", {})}
+    ends = {"name": "zmq", "bind": own, "connect": [other]}
+    if values.get("version", 1):
+        values["state"] = str(folder / f"state-{number}")
+    return RobotLink(link_from({"front_end": ends, "ros_source": source, "ros_sink": graph, **values}))
 
 
 def _publish(publisher: Publisher, payloads: Iterator[bytes], seconds: float) -> None:

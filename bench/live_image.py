@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
+from bench.live import DOMAINS, zmq_link
 from bench.repair import quantile
 from bench.rows import Row
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.middleware.type_definitions import typestore
-from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
@@ -43,7 +43,6 @@ WAITS = 3.0
 """Airtimes by which the mean age of odometry, which fits into one packet, grows at most: a packet on the air is not
 interrupted, and the one behind it has been composed."""
 MAX_RATE, HZ = 5.0, 35.0
-_DOMAINS = (93, 94)
 _QOS = Qos("reliable", "volatile", 10)
 
 
@@ -92,7 +91,7 @@ class Pair:
         self._far.recv()
         link = stack.enter_context(_link(1, folder, options))
         self.airtime = link.front_end.airtime()
-        graph = stack.enter_context(MemoryMiddleware(domain_id=_DOMAINS[0]))
+        graph = stack.enter_context(MemoryMiddleware(domain_id=DOMAINS[0]))
         self._publishers = {name: graph.advertise(f"/robot_1/{name}", kind, _QOS) for name, kind in TYPES.items()}
         fleet = Fleet(SimSettings(robots=1, odom_rate=HZ))
         self._drive = iter(fleet.messages(600.0, topics={f"/robot_1/{name}" for name in PERIODIC}))
@@ -161,7 +160,7 @@ def _content(payload: bytes) -> bytes:
 
 def _robot_2(near: Connection, folder: Path) -> None:
     """Robot 2 in its process: tells what came out, and when, until it is told to end."""
-    with _link(2, folder, {}), MemoryMiddleware(domain_id=_DOMAINS[1]) as graph:
+    with _link(2, folder, {}), MemoryMiddleware(domain_id=DOMAINS[1]) as graph:
 
         def heard(name: str, payload: bytes) -> None:
             near.send((name, _content(payload), time.monotonic()))
@@ -173,18 +172,11 @@ def _robot_2(near: Connection, folder: Path) -> None:
 
 
 def _link(number: int, folder: Path, options: dict[str, Any]) -> RobotLink:
-    own, other = (f"ipc://{folder}/{end}" for end in (number, 3 - number))
-    graph: dict[str, Any] = {"middleware": "memory", "domain_id": _DOMAINS[number - 1]}
-    return RobotLink(
-        link_from(
-            {
-                "registry": str(folder / "topics.csv"),
-                "packet_len": PACKET_LEN,
-                "state": str(folder / f"state-{number}"),
-                "phy": {"name": "psk", "sample_rate": 1e6},
-                "front_end": {"name": "zmq", "bind": own, "connect": [other]},
-                "ros_source": {"namespace": f"/robot_{number}", "topic_options": options, **graph},
-                "ros_sink": graph,
-            }
-        )
+    return zmq_link(
+        number,
+        folder,
+        registry=str(folder / "topics.csv"),
+        packet_len=PACKET_LEN,
+        phy={"name": "psk", "sample_rate": 1e6},
+        ros_source={"topic_options": options},
     )

@@ -141,6 +141,7 @@ effects(
     max_rate=run(OPTION + "odom.max_rate=5"),
     max_age_s=lambda: (withheld(), withheld(topic_options={"cmd_vel": TopicOptions(max_age_s=2.0)})),
     codec=run(OPTION + "odom.codec=zstd"),
+    to=Elsewhere("tests/link/v1/test_relaying.py"),
     keep_s=Elsewhere("tests/link/v1/test_latest_state.py"),
     quantize=run(OPTION + "odom.quantize=pose.pose.position=0.1"),
     depth=run(OPTION + "odom.depth=1", OPTION + "odom={queue: auto}"),
@@ -330,7 +331,11 @@ effects(
 for part in ("channel", "ros_source", "ros_sink"):
     EFFECTS["Way back", part] = Elsewhere("tests/run/test_scenario.py")
 effects("Scenario", **dict.fromkeys(("robots", "duplex", "gains_db"), Elsewhere("tests/run/test_robots.py")))
-effects("Scenario", medium=Elsewhere("tests/run/test_medium_access.py"))
+effects(
+    "Scenario",
+    medium=Elsewhere("tests/run/test_medium_access.py"),
+    relay=Elsewhere("tests/run/test_relaying.py"),
+)
 effects(
     "Robot",
     ros_source=run("robots=[{ros_source: {repair: 'off'}}, {}]", scenario="two-robots-half-duplex"),
@@ -347,6 +352,7 @@ effects(
     phy=EFFECTS["Scenario", "phy"],
     airtime=EFFECTS["Scenario", "airtime"],
     medium=Elsewhere("tests/radio/test_slots.py"),
+    relay=Elsewhere("tests/radio/test_slots.py"),
     localhost_only=LOCAL,
     front_end=Elsewhere("tests/radio/test_devices.py"),
     transmit=Elsewhere("tests/radio/test_permission.py"),

@@ -69,6 +69,9 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @click.option(
     "--check", "checks", is_flag=True, help="Say what this end and the others have, and what does not match; then end."
 )
+@click.option(
+    "--against", type=click.Path(path_type=Path), metavar="FILE", help="With --check: the other end's YAML file, too."
+)
 @set_option(LinkConfig)
 @dashboard_option
 @pcap_option
@@ -85,6 +88,7 @@ def link(
     transmit: bool | None,
     is_open: bool,
     checks: bool,
+    against: Path | None,
     overrides: tuple[str, ...],
     dashboard: str | None,
     pcap: Path | None,
@@ -120,7 +124,9 @@ def link(
             values = one_line(robot, radio, registry, given, topics)
         settings = _in_one_line(values, overrides, save)
     if checks:
-        return check(settings, duration)
+        return check(settings, duration, against)
+    if against is not None:
+        raise click.UsageError("--against needs --check")
     # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
         from gr_ros2.radio.robot_link import RobotLink

@@ -141,6 +141,9 @@ def _looked_at(look: Dissection, data: bytes, reader: Reader, registry: Registry
             row = announced.get(message.topic_id)
             text = _of_topic(message, row.name if row is not None else _name(message.topic_id, registry))
             yield f"  entry {index}: {text}{', coded' if message.coded else ''}"
+            relayed = look.relayed(index)
+            if relayed is not None:
+                yield f"    relayed: {relayed.describe()}"
     for row in look.announced:
         yield f"  announces {row.describe()}"
 

@@ -133,14 +133,21 @@ def _ping(ask: Ask, robot: int, count: int | None, interval: float, *, as_json: 
     return 0 if told.get("answered") else FAILED
 
 
-def check(settings: LinkConfig, duration: float | None) -> int:
+def check(settings: LinkConfig, duration: float | None, against: Path | None = None) -> int:
     """Print what this end has, what the others have, and what does not match; returns the exit status.
 
     :param duration: s; the check ends before it when every robot heard has answered
+    :param against: YAML file of the other end, which is compared too, whether or not that end is heard
     """
-    from gr_ros2.radio.findings import about, differences, heard_nobody, in_words
+    from gr_ros2.radio.findings import about, compared, differences, heard_nobody, in_words
 
     console = make_console()
+    apart = [] if against is None else compared(settings, load_link(against))
+    if against is not None:
+        for line in apart:
+            console.print(f"{against} does not match: {line}", soft_wrap=True)
+        if not apart:
+            console.print(f"{against} matches", soft_wrap=True)
     with opened(settings) as link:
         own = about(settings, link.phy)
         key = f"{own['key']:08x} (seal {settings.seal})" if settings.key else "none"
@@ -182,7 +189,7 @@ def check(settings: LinkConfig, duration: float | None) -> int:
         wrong += bool(found)
         if not found:
             console.print("  both ends match")
-    return FAILED if wrong else 0
+    return FAILED if wrong or apart else 0
 
 
 def _answered(told: Mapping[int, Mapping[str, Any]]) -> bool:

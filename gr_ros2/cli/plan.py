@@ -22,6 +22,8 @@ _WIDTH = 110
 _ADVICE = 3
 _MOST = 0.95
 """Share of the packets that arrive on a good link."""
+_GOOD = 0.9
+"""Share of the messages that arrive on a link that is not degraded, as on the dashboard."""
 _GRAPH_S = 5.0
 _HEADINGS = ("offered [1/s]", "message [B]", "on air [B]", "load", "rate [1/s]", "PDR", "age [ms]", "p99 [ms]")
 
@@ -147,10 +149,20 @@ def _verdict(forecast: Forecast) -> str:
         heaviest = max(forecast.topics, key=lambda topic: topic.load)
         what = "most of it" if heaviest.load > forecast.load / 2 else "the heaviest topic"
         fits = f"it does not fit, {what} is {heaviest.topic}"
+    elif (arrives := _arrives(forecast)) < _GOOD:
+        fits = (
+            f"the air has room for it, but only {arrives:.0%} of the messages arrive, since packets are lost or collide"
+        )
     return (
         f"Load {forecast.load:.0%}: {fits}. With repair and reports {forecast.used:.0%} of the airtime is used, "
         f"{forecast.pad:.0%} of it for padding; {per_message} bytes on the air per message delivered."
     )
+
+
+def _arrives(forecast: Forecast) -> float:
+    """Share of all messages that arrive, 0..1."""
+    offered = sum(topic.offered_hz for topic in forecast.topics)
+    return sum(topic.offered_hz * (topic.result.pdr or 0.0) for topic in forecast.topics) / offered if offered else 1.0
 
 
 def _air(forecast: Forecast) -> str:

@@ -106,6 +106,7 @@ class EndpointSetup:
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
     :param mcs_table: the rates of an adaptive rate, see :attr:`gr_ros2.phy.Phy.mcs_table`; () for a fixed rate
     :param access: makes what decides when the robot with an id may send; None from it: whenever there is a credit
+    :param relay: whether messages of other robots are sent on
     :param lead_s: s before its burst begins at which a packet is composed that waits for its time
     :param airtime_share: part of the time that this robot may send, above 0..1
     :param close: lets another process start this robot; nothing is stored afterwards
@@ -122,6 +123,7 @@ class EndpointSetup:
     airtime_share: float = 1.0
     close: Callable[[], None] = lambda: None
     access: Callable[[int], Access | None] = lambda _: None
+    relay: bool = False
     lead_s: float = 0.0
 
 
@@ -180,6 +182,7 @@ def make_endpoint(
             half_duplex=start.half_duplex,
             fixed=not start.any_length,
             airtime_share=start.airtime_share,
+            relay=start.relay,
         ),
         boot=start.boot,
         keys=start.keys,
@@ -211,11 +214,12 @@ def start_of(
     airtime_share: float = 1.0,
     access: Callable[[int], Access | None] = lambda _: None,
     lead_s: float = 0.0,
+    relay: bool = False,
 ) -> EndpointSetup:
     """Count this start of a robot in its state file, and read the robot's keys.
 
     :param src_id: id of the robot, -1 for a robot that sends nothing
-    :param access, lead_s: see :class:`EndpointSetup`
+    :param access, lead_s, relay: see :class:`EndpointSetup`
     :raises ConfigError: for a key file or a state file that cannot be read or understood
     """
     keys = Keys(read_key_file(config.key), config.seal) if config.key else None
@@ -230,6 +234,7 @@ def start_of(
         airtime_share=airtime_share,
         access=access,
         lead_s=lead_s,
+        relay=relay,
     )
     if not config.state and not config.key and src_id < 0:
         return replace(setup, boot=int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS))

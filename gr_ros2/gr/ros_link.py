@@ -47,7 +47,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length, mcs_table: see :class:`RosSource`
     :param airtime_share: part of the time that this robot may send, above 0..1
-    :param access, lead_s: see :class:`gr_ros2.gr.ends.EndpointSetup`
+    :param access, lead_s, relay: see :class:`gr_ros2.gr.ends.EndpointSetup`
     :param observer, clock, seed: see :class:`RosSource`
     :raises ConfigError: for settings that contradict each other
     """
@@ -66,6 +66,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         airtime_share: float = 1.0,
         access: Callable[[int], Access | None] = lambda _: None,
         lead_s: float = 0.0,
+        relay: bool = False,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
@@ -82,6 +83,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
             airtime_share=airtime_share,
             access=access,
             lead_s=lead_s,
+            relay=relay,
         )
         rng = random.Random(seed)
         calls = source.version != 0 and (len(rows) < MAX_TOPICS or bool(rows.services))

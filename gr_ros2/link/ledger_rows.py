@@ -35,6 +35,7 @@ class LedgerRow(str, Enum):
     MEMORY = "memory", "sink", "#7f7f7f", "given up incomplete when the sink's memory was full"
     NOT_FRESH = "not_fresh", "sink", "#4b0082", "not taken, since they may have been withheld for longer than max_age_s"
     LATE = "late", "sink", "#cc6677", "not delivered, since they came after the deadline of commands"
+    NOT_FOR_US = "not_for_us", "sink", "#bbbbbb", "for another robot"
     UNSUPPORTED = "unsupported", "sink", "#17becf", "coded or encrypted in a way the sink cannot undo"
     UNKNOWN_DICTIONARY = "unknown_dictionary", "sink", "#999933", "coded with a dictionary the sink does not have"
     DAMAGED = "damaged", "sink", "#882255", "complete but not decodable"

@@ -24,7 +24,7 @@ from gr_ros2.wire import QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 STANDING_S = 0.25
 """s for which a message of a stream waits at most while the computer is too slow. At a third of the processor time that
 the demo needs (``python -m bench slow_computer``), its IMU was 1.9 s old where only the queue's bound dropped. With 0.5
-s instead, its oldest topic was 0.7 to 1.6 s old, with 0.25 s 0.8 s."""
+s its oldest topic was 0.7 to 1.6 s old, with 0.25 s 0.8 s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
 from gr_ros2.wire.control import ENCRYPTS, Hello
 from gr_ros2.wire.mac_block import Block, read_block
+from gr_ros2.wire.relayed import Relayed, read_relayed
 from gr_ros2.wire.table import AnnouncedTopic, read_table
 from gr_ros2.wire.v1 import (
     CRC_LEN,
@@ -71,6 +72,16 @@ class Dissection:
         """An entry, if it is a message or a fragment of one."""
         entry = self.entries[index]
         return entry if isinstance(entry, Part) else None
+
+    def relayed(self, index: int) -> Relayed | None:
+        """Whose message an entry carries, if it begins one of another robot."""
+        entry = self.message(index)
+        if entry is None or entry.topic_id <= TABLE_TOPIC or entry.offset:
+            return None
+        try:
+            return read_relayed(entry.payload)
+        except WireError:
+            return None
 
 
 @dataclass(slots=True)

@@ -55,6 +55,9 @@ NEW = 3
 UNSURE = 1.5
 """Intervals without being named, of which each has two names for each robot, after which a robot may be in step with
 another one."""
+KNOWN_LATE = 9
+"""Slots that this is at least: a host knows a packet some slots after it began, and composes its own ahead. Without it
+two links on one computer (6 ms a slot) picked at random half of the time, and sent 27 instead of 41 packets/s each."""
 EASED = 0.97
 """What v is multiplied by in an open slot. With twice v after an entry in vain, about one robot enters in two slots."""
 _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 64.0, 64.0
@@ -113,6 +116,13 @@ class Slots:
         self._rate = _ENTRY_RATE
         """v; see the module."""
         self._since: float | None = None
+
+    def unheard(self, now: float) -> bool:
+        """Whether robots are heard, of which none has named this one for so long that none can hear it."""
+        if not self.clock.runs or self._since is None or now < self._since + 3 * HEARD_S:
+            return False
+        slot = self.clock.slot(now)
+        return not self._alone(slot) and self._confirmed_at < slot - 2 * self._memory()
 
     # ---- sending
 
@@ -189,7 +199,7 @@ class Slots:
             step = round(max(step, self._rate) * self._rng.uniform(0.5, 1.5))
         ahead = announceable(step)
         places: list[int] = []
-        unsure = alone or self._confirmed_at < now - UNSURE * step or self._unheard(now)
+        unsure = alone or self._confirmed_at < now - max(UNSURE * step, KNOWN_LATE) or self._unheard(now)
         wanted = CHOICE if unsure or self._rng.random() < MIXED else 1
         while ahead <= LONGEST_AHEAD and len(places) < wanted:
             if self._free(base + ahead) and base + ahead not in self._mine:

@@ -28,7 +28,7 @@ from gr_ros2.phy.kernels import decoders, fastest, which
 from gr_ros2.phy.pdus import PDUS, AirPacket, PduPort, octets, packets_of
 from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, StreamTimes, whole_and_rest
-from gr_ros2.phy.tap import SymbolTap
+from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
 from gr_ros2.settings.fields import AUTO, Auto
 
@@ -38,6 +38,7 @@ _log = logging.getLogger(__name__)
 
 
 _LENGTH = pmt.intern(LENGTH_TAG)
+_POINTS = pmt.intern("points")
 _BUFFER = 1 << 17
 """Samples that may wait behind the modulator. GNU Radio hands over at most half of them at once: so many that modulator
 and receiver have a dozen long packets in a call. With a quarter of it, links carry half of the packets of 1,500 B."""
@@ -281,7 +282,7 @@ def _number(value: int) -> Any:
 
 
 class BurstSink(ReceiverBlock):
-    """Complex stream in, message port `pdus` out: the packets whose CRC-32 is right."""
+    """Complex stream in; message ports out: `pdus`, packets whose CRC-32 is right, and `points`, how they look."""
 
     def __init__(self, phy: BurstPhy, own_process: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_rx")
@@ -290,7 +291,8 @@ class BurstSink(ReceiverBlock):
             self.connect(self, self._demodulator)
         else:
             self.connect(self, filter.fir_filter_ccf(1, phy.receiver_taps), self._demodulator)
-        self.msg_connect((self._demodulator, "pdus"), (self, "pdus"))
+        for port in ("pdus", "points"):
+            self.msg_connect((self._demodulator, port), (self, port))
 
     @property
     def damaged(self) -> int:
@@ -311,7 +313,7 @@ class BurstSink(ReceiverBlock):
 
 
 class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
-    """Filtered samples in, message port `pdus` out."""
+    """Filtered samples in, message ports `pdus` and `points` out."""
 
     def __init__(self, phy: BurstPhy, own_process: bool) -> None:
         super().__init__(f"gr_ros2_{phy.name}_demodulator", [np.complex64], None)
@@ -326,6 +328,9 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         self._lag, self._slack = phy.lag, phy.gap // 2
         self.times = StreamTimes(phy.sample_rate)
         self._port = PduPort(self)
+        self._shown = False
+        """Whether somebody reads the port `points`."""
+        self.message_port_register_out(_POINTS)
 
     @property
     def damaged(self) -> int:
@@ -343,6 +348,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self._port.find_readers()
+        self._shown = pmt.is_pair(self.message_subscribers(_POINTS))
         modem = self._modem
         self._engine = ReceiverProcess(modem, self._send) if self._own_process else modem.receiver()
         return super().start()
@@ -359,6 +365,8 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
 
     def _send(self, packets: list[DemodulatedPacket]) -> None:
         self._port.send([self._on_air(packet) for packet in packets])
+        if self._shown and packets:
+            self.message_port_pub(_POINTS, pmt.cons(pmt.PMT_NIL, pmt.to_pmt(self.points()[-SYMBOLS_SHOWN:])))
 
     def _on_air(self, packet: DemodulatedPacket) -> AirPacket:
         modem = self._modem.rates[packet.mcs]

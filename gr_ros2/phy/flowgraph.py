@@ -153,14 +153,17 @@ class TransmitterBlock(HierBlock):
 
 
 class ReceiverBlock(HierBlock):
-    """Complex stream in, message port `pdus` out. Values that a receiver does not measure are 0 or None.
+    """Complex stream in, message ports `pdus` and `points` out. Values that a receiver does not measure are 0 or None.
+
+    `points` gives the constellation points of the newest packets, for a constellation sink, where a PHY has any.
 
     :param name: name in GNU Radio's log
     """
 
     def __init__(self, name: str) -> None:
         super().__init__(name, gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(0, 0, 0))
-        self.message_port_register_hier_out("pdus")
+        for port in ("pdus", "points"):
+            self.message_port_register_hier_out(port)
 
     @property
     def damaged(self) -> int:

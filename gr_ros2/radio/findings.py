@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from gr_ros2 import __version__
 from gr_ros2.gr.ends import LiveEnd
 from gr_ros2.gr.health import LOCKED
-from gr_ros2.phy import Phy
+from gr_ros2.phy import Phy, configured
 from gr_ros2.radio.config import LinkConfig
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.state.keys import read_key_file
 
 _FORMAT = {
@@ -30,6 +32,10 @@ _FORMAT = {
 }
 _ENERGY = ("energy", "bursts_in")
 _NO_PACKETS = ("malformed", "too_long")
+_TUNED = re.compile(r"sends at (\S+) Hz, receives at (\S+) Hz")
+"""In the text of ``about``."""
+_SAME_FREQUENCY = 1e-4
+"""Relative difference below which two frequencies are the same: clocks may be 100 ppm apart."""
 
 
 def about(config: LinkConfig, phy: Phy) -> dict[str, Any]:
@@ -83,10 +89,58 @@ def differences(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
         found.append("phy has other settings there; set the same name, sample_rate and options at both ends")
     if other["key"] != own["key"]:
         found.append(f"key {other['key']:08x} there, {own['key']:08x} here; copy one file to both ends")
+    here_hz, there_hz = _TUNED.search(own["text"]), _TUNED.search(other["text"])
+    if here_hz is not None and there_hz is not None:
+        for sends, receives, sender, receiver in (
+            (there_hz[1], here_hz[2], "the other end", "this end"),
+            (here_hz[1], there_hz[2], "this end", "the other end"),
+        ):
+            if abs(float(sends) - float(receives)) > _SAME_FREQUENCY * float(sends):
+                found.append(
+                    f"{sender} sends at {sends} Hz, and {receiver} receives at {receives} Hz; set frequency there to "
+                    "frequency_rx here, and the other way round"
+                )
     version = other["text"].partition(" ")[0]
     if version and not __version__.startswith(version):
         found.append(f"gr-ros2 {version} there and {__version__} here")
     return found
+
+
+OUTRUN = ("superseded", "queue_bound", "stale", "cannot_complete")
+"""Reasons to drop a message that did not find its turn."""
+
+
+def same_id(robot: int, stats: Mapping[str, Any]) -> str | None:
+    """One line if another robot sends under this robot's id, which both are told."""
+    if not stats["sink"]["rejected"].get("same_id"):
+        return None
+    return f"another robot sends as robot {robot}, which is this one; give one of them another robot_id"
+
+
+def unheard(robot: int, heard: Sequence[int]) -> str:
+    """One line for a robot that hears others, of which none hears it."""
+    named = ", ".join(str(other) for other in heard)
+    return (
+        f"nobody hears robot {robot}: it hears robot {named}, and none of them names it; is its transmitter on, and "
+        "strong enough?"
+    )
+
+
+def outrun(before: Mapping[str, int], topics: Mapping[str, Any]) -> tuple[str | None, dict[str, int]]:
+    """One line with the topics that grow old because the channel carries less than they offer, and what to compare with
+    at the next look.
+
+    :param before: messages of each topic that did not find their turn, at the look before
+    :param topics: counters of the source, by topic
+    """
+    now = {name: sum(topic["refused"].get(reason, 0) for reason in OUTRUN) for name, topic in topics.items()}
+    old = sorted(name for name, count in now.items() if count > before.get(name, 0))
+    if not old:
+        return None, now
+    return (
+        f"the channel is fuller than it can carry: {', '.join(old)} grow old, since messages are replaced or dropped "
+        "before their turn; send less (max_rate, topics), or raise phy.sample_rate"
+    ), now
 
 
 def heard_nobody(stats: Mapping[str, Any]) -> list[str]:
@@ -122,6 +176,20 @@ def heard_nobody(stats: Mapping[str, Any]) -> list[str]:
     return found or [
         "nothing: no signal and no bytes. Is the other end switched on, and are frequency and cable right?"
     ]
+
+
+def compared(config: LinkConfig, other: LinkConfig) -> list[str]:
+    """What does not match between the settings of this end and those of another one, which need not be heard."""
+    described = []
+    for each in (config, other):
+        rate = each.phy.sample_rate
+        described.append(about(each, configured(each.phy, each.packet_len, 0.0 if rate == AUTO else rate)))
+    found = differences(*described)
+    if config.version != other.version:
+        found.append(f"version is {other.version} there and {config.version} here; set the same at both ends")
+    if config.ros_source.src_id() == other.ros_source.src_id():
+        found.append(f"both are robot {config.ros_source.src_id()}; set another namespace or robot_id at one")
+    return found
 
 
 def in_words(peer: Mapping[str, Any]) -> str:

@@ -26,7 +26,7 @@ from gr_ros2.link.access import Access
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import AirtimeLimit, sustained
 from gr_ros2.link.observe import LinkObserver, Observers
-from gr_ros2.mac import access_of
+from gr_ros2.mac import Slots, access_of
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.phy import configured
@@ -34,7 +34,7 @@ from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
-from gr_ros2.radio.findings import about, introduce, peers, ping
+from gr_ros2.radio.findings import about, introduce, outrun, peers, ping, same_id, unheard
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
@@ -88,6 +88,8 @@ class RobotLink(Flowgraph):
         self._interruptions = self._passed_before = 0
         self._worked = False
         """Whether the front end has worked once; if not, nothing has vanished."""
+        self._slots: Slots | None = None
+        self._outrun: dict[str, int] = {}
         self._stack = ExitStack()
         self._observers = Observers[LinkObserver](() if observer is None else (observer,))
         try:
@@ -227,8 +229,9 @@ class RobotLink(Flowgraph):
             any_length=self.phy.any_length,
             mcs_table=self.phy.mcs_table,
             airtime_share=1.0 if self.config.airtime.rule is None else sustained(self.config.airtime.rule),
-            access=self._access() if self.sends else lambda _: None,
+            access=self._access if self.sends else lambda _: None,
             lead_s=LEAD_S + (self.front_end.ahead() or 0.0),
+            relay=self.config.relay == "gain",
             observer=observer,
             clock=self._clock,
         )
@@ -243,10 +246,12 @@ class RobotLink(Flowgraph):
         """Whether other robots send on its channel."""
         return self.config.medium != "exclusive"
 
-    def _access(self) -> Callable[[int], Access | None]:
+    def _access(self, src_id: int) -> Access | None:
         """What decides when it sends. The guard between two robots is what its front end may be late by."""
         airtime_s, seed = self.front_end.airtime(), secrets.randbits(32)
-        return access_of(self.config.medium, airtime_s, seed, guard_s=self.front_end.timing_error_s)
+        access = access_of(self.config.medium, airtime_s, seed, guard_s=self.front_end.timing_error_s)(src_id)
+        self._slots = access if isinstance(access, Slots) else None
+        return access
 
     def _at_rest(self) -> int | None:
         """As :meth:`Radio.at_rest`; None also while a packet is composed or has to be."""
@@ -375,14 +380,22 @@ class RobotLink(Flowgraph):
 
     def findings(self) -> list[str]:
         """What a person should know about this link and its surroundings: one line each, mostly none."""
-        robots = [peer["robot"] for peer in peers(self.end, self._clock())]
+        now, own = self._clock(), self.config.ros_source.src_id()
+        robots = [peer["robot"] for peer in peers(self.end, now)]
         here, there = self.source.middleware, self.sink.middleware
         names = {info.topic for graph in {here, there} for info in graph.discover() if info.publishers}
         services = here.discover_services() if isinstance(here, ServiceGraph) else ()
-        lines = (
-            shortcut([*names, *services], self.config.ros_source.src_id(), robots),
-            foreign(names, self.sink.stats()["topics"]),
-        )
+        full, self._outrun = outrun(self._outrun, self.source.stats()["topics"])
+        sink = self.sink.stats()
+        lines = [
+            shortcut([*names, *services], own, robots),
+            foreign(names, sink["topics"]),
+            same_id(own, {"sink": sink}),
+            full if self._shares else None,
+        ]
+        with self.end.lock:
+            if self._slots is not None and self._slots.unheard(now):
+                lines.append(unheard(own, robots))
         return [line for line in lines if line is not None]
 
     @property

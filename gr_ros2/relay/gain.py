@@ -147,19 +147,23 @@ class Gains:
         state = self._streams[stream]
         return self._gain(stream, state, self._neighbours(now))
 
-    def best(self, now: float, may: Callable[[Stream], bool] = lambda _: True) -> tuple[Stream | None, float]:
-        """The stream that is worth most, and its gain in s; None where nothing is gained.
+    def best(self, now: float, cost: Callable[[Stream], float] = lambda _: 1.0) -> tuple[Stream | None, float]:
+        """The stream whose gain squared is largest for its cost, and its gain in s; None where nothing is gained.
 
-        :param may: whether a stream is to be considered
+        :param cost: of sending a stream's newest message, above 0; infinite where it is not to be considered
         """
         neighbours = self._neighbours(now)
         best: Stream | None = None
-        most = 0.0
+        most = worth = 0.0
         for stream, state in self._streams.items():
             gain = self._gain(stream, state, neighbours)
-            if gain > most and may(stream):
-                best, most = stream, gain
+            if gain and gain * gain / cost(stream) > worth:
+                best, most, worth = stream, gain, gain * gain / cost(stream)
         return best, most
+
+    def neighbours(self, now: float) -> int:
+        """Robots that are heard."""
+        return len(self._neighbours(now))
 
     def sent(self, stream: Stream, now: float) -> None:
         """The newest message of a stream leaves."""

@@ -20,7 +20,7 @@ from gr_ros2.medium.gains import paths_between
 from gr_ros2.medium.positions import Motion, Positions
 from gr_ros2.run.load import source_names
 from gr_ros2.run.scenario import RobotConfig, Scenario
-from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.settings.config import ChannelConfig, ScenarioChannel, SinkConfig, SourceConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.recorded_motion import RecordedMotion
@@ -56,6 +56,7 @@ def start_of_run(
         any_length=any_length,
         mcs_table=mcs_table,
         access=access_of(ways[0].medium, airtime_s, ways[0].seed),
+        relay=ways[0].relay == "gain",
         airtime_share=1.0 if rule is None else sustained(rule),
     )
 
@@ -94,6 +95,8 @@ def surroundings(scenario: Scenario, sample_rate: float) -> Surroundings:
 def _placed(scenario: Scenario, paths: Sequence[Sequence[Path]], sample_rate: float) -> Positions:
     """The robots of a scenario where they are."""
     channel = scenario.channel
+    # The losses of a path are measured at levels that its channel must be able to have.
+    bare = [[replace(path, channel=_on_the_way(path.channel)) for path in heard] for heard in paths]
     robots = scenario.robots or (RobotConfig(),) * len(paths)
     motion, world = _motion(scenario, len(paths))
     return Positions(
@@ -101,9 +104,13 @@ def _placed(scenario: Scenario, paths: Sequence[Sequence[Path]], sample_rate: fl
         motion,
         sample_rate,
         *zip(*(channel.levels(robot) for robot in robots), strict=True),
-        paths=paths,
+        paths=bare,
         world=world,
     )
+
+
+def _on_the_way(channel: ChannelConfig) -> ChannelConfig:
+    return channel.on_the_way if isinstance(channel, ScenarioChannel) else channel
 
 
 def _motion(scenario: Scenario, count: int) -> tuple[Motion, World | None]:
@@ -148,10 +155,13 @@ def _directed(scenario: Scenario) -> list[list[Path]]:
 
 def ears_of(scenario: Scenario, around: Surroundings) -> list[list[int]]:
     """For each recorder of a run the robots whose packets it counts: first that of the result, then those of further
-    receivers. Two robots share one recorder; each of several has its own, for the robots that it can hear."""
+    receivers. Two robots share one recorder; each of several has its own, for the robots that it can hear, or for all
+    where messages are relayed."""
     ways = len(scenario.directions())
     if ways <= 2:
         return [list(range(ways)) for _ in range(1 + len(scenario.receivers))]
+    if scenario.relay != "off":
+        return [[number for number in range(ways) if number != receiver] for receiver in range(ways)]
     heard: list[list[int]] = [[] for _ in range(ways)]
     for number in range(ways):
         for receiver in around.reached(number):

@@ -216,6 +216,7 @@ class TopicOptions(Recent, Queued):
         taken; 0 = any time, auto takes the sink's. A number above 0 at the source has every sink take its own bound
     :param keep_s: s for which its newest message is sent again to robots that lack it, although nothing follows and it
         is not transient-local: an e-stop, a mode; 0 = as the publishers' durability has it
+    :param to: robot for which its messages are, 0..254; other robots do not deliver them; auto = all robots
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     """
@@ -230,6 +231,7 @@ class TopicOptions(Recent, Queued):
     weight: Annotated[float, OnlyIn(1), Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
     max_rate: Annotated[float, OnlyIn(1), Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
     keep_s: Annotated[Seconds, OnlyIn(1)] = 0.0
+    to: Annotated[Annotated[int, Field(ge=0, le=254)] | Auto, OnlyIn(1)] = AUTO
     codec: str = AUTO
     quantize: str = ""
 
@@ -569,6 +571,11 @@ class ScenarioChannel(OnCarrier, Transceiver, ChannelConfig):
         """Whether the levels follow from where the robots are."""
         return self.from_ == "positions"
 
+    @property
+    def on_the_way(self) -> ChannelConfig:
+        """What happens on the way, without what levels follow from."""
+        return ChannelConfig(**{item.name: getattr(self, item.name) for item in fields(ChannelConfig)})
+
     def levels(self, robot: Transceiver) -> tuple[float, float]:
         """Transmit power of a robot in dBm, and noise figure of its receiver in dB."""
         power, figure = robot.tx_power_dbm, robot.noise_figure_db
@@ -657,10 +664,12 @@ class AnyLink(OneWay, Agreed, Named):
     :param airtime: how much a robot may send, whatever waits: settings, or the name of a band alone
     :param medium: when a robot sends on a channel that others use too: slots that it derives from the packets heard,
         aloha (at random, as rarely as the robots heard call for), or exclusive = whenever it has something
+    :param relay: gain = a robot sends on the messages of others that make those who hear it youngest; medium: slots
     """
 
     phy: PhyConfig = Field(default_factory=PhyConfig)
     medium: Medium = "exclusive"
+    relay: Literal["off", "gain"] = "off"
     airtime: Airtime = Field(default_factory=AirtimeConfig)
     localhost_only: bool | Auto = AUTO
 
@@ -668,6 +677,8 @@ class AnyLink(OneWay, Agreed, Named):
     def _medium_fits(self) -> AnyLink:
         if self.medium != "exclusive" and not self.version:
             raise ValueError(f"medium = {self.medium!r}: version 0 says nothing about slots; set version: 1")
+        if self.relay != "off" and self.medium != "slots":
+            raise ValueError(f"relay = {self.relay!r}: the packets of slots name who hears whom; set medium: slots")
         if self.medium != "exclusive" and not self.phy.takes_airtime:
             raise ValueError(f"medium = {self.medium!r}: phy direct takes no airtime; choose another")
         return self

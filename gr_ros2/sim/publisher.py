@@ -13,9 +13,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 
 from gr_ros2.core.errors import MiddlewareError
+from gr_ros2.middleware import join_graph
 from gr_ros2.middleware.base import Middleware, Publisher, Qos
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet
+from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.transforms import TransformPublisher
 
 _DEPTH = 100
@@ -140,3 +143,15 @@ class SimPublisher:
             self.worst_lag_s = max(self.worst_lag_s, -ahead)
             if message.topic in self._transforms:
                 self._transforms[message.topic].follow(message.payload)
+
+
+def simulated_robot(middleware: str = "dds", domain_id: int | Auto = AUTO) -> SimPublisher:
+    """Robot 1 alone, on a graph of its own, driving until the program ends; for GRC.
+
+    :param middleware, domain_id: see :func:`gr_ros2.middleware.join_graph`
+    :raises GrRos2Error: as :func:`gr_ros2.middleware.join_graph`
+    """
+    graph = join_graph(middleware, domain_id=domain_id, node_name="simulated_robot")
+    robot = SimPublisher(Fleet(SimSettings(robots=1)), graph, float("inf"))
+    robot.start()
+    return robot

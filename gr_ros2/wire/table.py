@@ -10,10 +10,10 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError, VersionError
-from gr_ros2.wire.format import QOS_NAMES
+from gr_ros2.wire.format import BROADCAST, QOS_NAMES
 
 _FORMAT = 1
-_QOS, _RELIABLE, _LATCHED, _FRESH = 3, 4, 8, 16
+_QOS, _RELIABLE, _LATCHED, _FRESH, _ADDRESSED = 3, 4, 8, 16, 32
 _FIXED = 4
 
 
@@ -29,6 +29,7 @@ class AnnouncedTopic(NamedTuple):
     :param depth: history depth of its publishers, 1..255; 0 if unknown
     :param codec: how its messages are coded, '' if they are not; the codec defines the text
     :param fresh: its messages are of no use when they are old: they have a deadline or a lifespan, or are calls
+    :param dst_id: the robot for which its messages are, 255 for all
     """
 
     topic_id: int
@@ -40,12 +41,14 @@ class AnnouncedTopic(NamedTuple):
     depth: int = 0
     codec: str = ""
     fresh: bool = False
+    dst_id: int = BROADCAST
 
     def describe(self) -> str:
         """The row in words."""
         words = [f"topic {self.topic_id}: {self.name} {self.type_name}, {QOS_NAMES[self.qos]}"]
         words += ["reliable"] * self.reliable + ["latched"] * self.latched + ["of no use when old"] * self.fresh
         words += [f"depth {self.depth}"] * (self.depth > 0) + [f"codec {self.codec}"] * bool(self.codec)
+        words += [f"for robot {self.dst_id}"] * (self.dst_id != BROADCAST)
         return ", ".join(words)
 
 
@@ -57,12 +60,15 @@ def write_table(rows: Iterable[AnnouncedTopic]) -> bytes:
     parts = [bytes((_FORMAT,))]
     for row in rows:
         texts = [text.encode() for text in (row.name, row.type_name, row.codec)]
-        if not 0 <= row.topic_id < 240 or not 0 <= row.qos < 3 or not 0 <= row.depth < 256:
+        numbers = row.topic_id, row.qos, row.depth, row.dst_id
+        if any(not 0 <= value <= most for value, most in zip(numbers, (239, 2, 255, BROADCAST), strict=True)):
             raise EncodeError(f"a field of {row} is out of range")
         if max(map(len, texts)) > 255:
             raise EncodeError(f"{row}: name, type and codec have at most 255 bytes each")
         flags = row.qos | row.reliable * _RELIABLE | row.latched * _LATCHED | row.fresh * _FRESH
-        parts.append(bytes((row.topic_id, flags, row.depth)))
+        addressed = row.dst_id != BROADCAST
+        parts.append(bytes((row.topic_id, flags | addressed * _ADDRESSED, row.depth)))
+        parts.append(bytes((row.dst_id,)) * addressed)
         parts += [bytes((len(text),)) + text for text in texts]
     return b"".join(parts)
 
@@ -81,6 +87,11 @@ def read_table(data: bytes) -> tuple[AnnouncedTopic, ...]:
             raise EntryBoundsError(f"row {len(rows)} of a table runs past byte {len(data)}")
         topic_id, flags, depth = data[position : position + 3]
         position += 3
+        dst_id = BROADCAST
+        if flags & _ADDRESSED:
+            dst_id, position = data[position], position + 1
+            if dst_id == BROADCAST:
+                raise EntryKindError(f"row {len(rows)} of a table is for robot {BROADCAST}")
         texts: list[str] = []
         for _ in range(3):
             start = position + 1
@@ -91,13 +102,13 @@ def read_table(data: bytes) -> tuple[AnnouncedTopic, ...]:
                 texts.append(data[start:position].decode())
             except UnicodeDecodeError as error:
                 raise EntryKindError(f"a text in row {len(rows)} of a table is no UTF-8") from error
-        if topic_id >= 240 or flags & _QOS == _QOS or flags > 31 or any(row.topic_id == topic_id for row in rows):
+        if topic_id >= 240 or flags & _QOS == _QOS or flags > 63 or any(row.topic_id == topic_id for row in rows):
             raise EntryKindError(f"topic id {topic_id} or flags {flags:#x} in row {len(rows)} of a table")
         name, type_name, codec = texts
         reliable, latched = flags & _RELIABLE != 0, flags & _LATCHED != 0
         rows.append(
             AnnouncedTopic(
-                topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec, flags & _FRESH != 0
+                topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec, flags & _FRESH != 0, dst_id
             )
         )
     return tuple(rows)

@@ -488,6 +488,9 @@ local function read_table(bytes)
         local flags = bytes:get_index(at + 1)
         local row = { id = bytes:get_index(at), flags = flags, depth = bytes:get_index(at + 2) }
         at = at + 3
+        if math.floor(flags / 32) % 2 == 1 then
+            at = at + 1 -- the robot for which it is
+        end
         for _, text in ipairs({ "name", "kind", "codec" }) do
             if at >= bytes:len() or at + 1 + bytes:get_index(at) > bytes:len() then
                 return nil

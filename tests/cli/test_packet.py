@@ -167,9 +167,13 @@ def hello(vector: dict[str, Any], key: bytes = b"") -> str:
 
 
 def check_entries(vector: dict[str, Any], lines: list[str]) -> None:
+    relayed = [line for line in lines if line.startswith("    relayed: ")]
+    lines = [line for line in lines if line not in relayed]
+    assert len(relayed) == sum(entry.get("topic_id", 0) > 240 for entry in vector["entries"])
+    assert all("relayed: robot 7's (boot ends in cafe) topic 3, from its packet 70000.1, hop 2" in r for r in relayed)
     assert len(lines) == len(vector["entries"])
     for line, entry in zip(lines, vector["entries"], strict=True):
-        if "topic_id" in entry:
+        if "payload" in entry:
             payload = entry["payload"]
             assert f": topic {entry['topic_id']}, " in line
             assert f"payload {len(payload) // 2} bytes: {payload[:32]}" in line
@@ -177,7 +181,7 @@ def check_entries(vector: dict[str, Any], lines: list[str]) -> None:
             if entry["offset"]:
                 assert f"began {entry['back']} packets ago, bytes from {entry['offset']} on" in line
         else:
-            (kind,) = {"hello", "ask", "report", "heard", "ping", "about"} & entry.keys()
+            (kind,) = {"hello", "ask", "report", "heard", "ping", "about", "newest"} & entry.keys()
             assert f": {'pong' if entry.get('reply') else kind}, " in line
             shown = str(entry.get("number", entry[kind]))
             if kind == "hello":

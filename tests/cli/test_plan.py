@@ -28,6 +28,14 @@ def test_it_says_what_fits(capsys: pytest.CaptureFixture[str]) -> None:
     assert ": it fits." in out
 
 
+def test_room_on_the_air_is_not_enough_where_packets_collide(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["plan", "two-robots-half-duplex", "--duration", "5", "--no-advice"]) == 0
+    out = capsys.readouterr().out
+    said = re.search(r": the air has room for it, but only (\d+)% of the messages arrive, since packets", out)
+    assert said is not None, out
+    assert int(said[1]) < 90
+
+
 def test_it_says_what_does_not_fit_and_what_to_change(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["plan", "paper-ofdm-paced", "--duration", "3", "--set", "ros_source.compression=false"]) == 0
     out = capsys.readouterr().out

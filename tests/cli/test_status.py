@@ -104,6 +104,18 @@ def test_nobody_there(ends: Ends) -> None:
     lone = ends.run("link", str(ends.files[0]), "--check", "--duration", "1")
     assert lone.returncode == 1
     assert "nothing: no signal and no bytes" in lone.stdout
+    other = ends.run(
+        "link",
+        str(ends.files[0]),
+        "--check",
+        "--duration",
+        "1",
+        "--against",
+        str(ends.files[1]),
+        "--set",
+        "packet_len=99",
+    )
+    assert f"{ends.files[1]} does not match: packet_len is 220 there and 99 here" in other.stdout
     assert "start one with gr-ros2 link" in ends.run("status").stderr
     refused = ends.run("ping", "2", str(ends.files[0]), "--set", "version=0")
     assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)

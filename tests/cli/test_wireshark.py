@@ -22,6 +22,7 @@ from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.mac_block import read_block
+from gr_ros2.wire.relayed import read_relayed
 from gr_ros2.wire.v0 import V0, PacketV0, with_crc
 from gr_ros2.wire.v1 import Header, crc, session_crc, write_header
 from gr_ros2.wire.v1 import decode as read
@@ -188,7 +189,10 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
             (hidden,) = values(tree, "gr_ros2.ciphertext")
             assert bytes.fromhex(hidden.replace(":", "")) in data[:-8]
             continue
-        parts = [entry for entry in entries if "topic_id" in entry]
+        parts = [entry for entry in entries if "payload" in entry]
+        relayed = [read_relayed(bytes.fromhex(part["payload"])) for part in parts if part["topic_id"] > 240]
+        for field in ("origin", "start", "number", "place", "topic_id", "coded", "hops"):
+            assert numbers(f"relayed.{field}") == [getattr(message, field) for message in relayed], field
         assert numbers("topic_id") == [entry["topic_id"] for entry in parts]
         assert [one.replace(":", "") for one in values(tree, "gr_ros2.payload")] == [
             entry["payload"] for entry in parts if entry["payload"]
@@ -214,6 +218,7 @@ CONTROLS = {
     "ask": {"ask": "src_id"},
     "report": {"report": "src_id", "boot": "boot", "number": "number", "arrived": "arrived", "loss": "loss"},
     "heard": {"heard": "src_id", "echo": "echo", "since": "since"},
+    "newest": {"newest": "origin", "start": "start", "topic_id": "topic_id", "number": "number"},
 }
 """Names of values in the vectors, and of the dissector's fields."""
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from html.parser import HTMLParser
 
 from gr_ros2.dashboard.state import DashboardState
-from gr_ros2.dashboard.tables import colour, packets_html, paths_html, tiles_html, topics_html
+from gr_ros2.dashboard.tables import colour, packets_html, paths_html, team_html, tiles_html, topics_html
 from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.record.team import PairView, TeamView
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, at
 
 
@@ -74,3 +75,12 @@ def test_colours_repeat_and_strangers_are_grey() -> None:
 
 def test_a_link_that_repairs_nothing_says_nothing_of_repair() -> None:
     assert "repair" not in tiles_html(snapshot(), None, None)
+
+
+def test_who_hears_whom_has_a_cell_for_each_pair() -> None:
+    pairs = {(1, 2): PairView(0.5, 17.6), (2, 1): PairView(None, None)}
+    html = team_html(Snapshot(team=TeamView(9.0, (1, 2), (), pairs, {}, {})))
+    assert Balanced(html)
+    assert '<td data-pair="1 2">50%, 18 dB</td>' in html
+    assert '<td data-pair="2 1">–</td>' in html
+    assert team_html(Snapshot()) == ""

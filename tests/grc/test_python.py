@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,16 +63,21 @@ def home(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.fixture
-def flowgraph(home: Path) -> tuple[Path, list[int]]:
-    """An example on two domains of its own."""
+def on_own_domains(name: str, home: Path) -> tuple[Path, list[int]]:
+    """A copy of an example, and its two domains."""
     domains = free_domains()
-    path = home / "psk_loopback.grc"
-    text = example("psk_loopback.grc").read_text()
+    path = home / name
+    text = example(name).read_text()
     for ours, number in zip(("'41'", "'42'"), domains, strict=True):
         text = text.replace(f"value: {ours}", f"value: '{number}'")
     path.write_text(text)
     return path, domains
+
+
+@pytest.fixture
+def flowgraph(home: Path) -> tuple[Path, list[int]]:
+    """An example on two domains of its own."""
+    return on_own_domains("psk_loopback.grc", home)
 
 
 def carries(domains: list[int]) -> None:
@@ -209,6 +214,38 @@ def screen(tmp_path: Path) -> Iterator[tuple[str, Path]]:
         server.terminate()
 
 
+class Keyboard:
+    """Looks for windows and presses keys.
+
+    :param environ: names the display
+    """
+
+    def __init__(self, environ: Mapping[str, str]) -> None:
+        self._environ = environ
+
+    def run(self, *words: str) -> str:
+        """What xdotool prints."""
+        return subprocess.run(["xdotool", *words], env=self._environ, capture_output=True, text=True).stdout.strip()
+
+    def window(self, title: str) -> str:
+        """The first window that is shown with this in its title; '' while there is none."""
+        return self.run("search", "--onlyvisible", "--name", title).partition("\n")[0]
+
+    def press(self, window: str, key: str, until: Callable[[], object], what: str) -> None:
+        """A key again and again, since a window takes none until it is ready; with time for what the key does."""
+        again = 0.0
+
+        def done() -> object:
+            nonlocal again
+            if not until() and time.monotonic() > again:
+                self.run("windowfocus", window)
+                self.run("key", key)
+                again = time.monotonic() + KEY_S
+            return until()
+
+        wait_for(done, what)
+
+
 def colours(pixels: Path) -> int:
     """How many different pixels a screen has."""
     data = pixels.read_bytes()
@@ -255,33 +292,16 @@ def test_the_window_draws_an_example_runs_it_and_closes(
     preferences = home / ".gnuradio" / "config.conf"
     preferences.write_text(f"{preferences.read_text()}xterm_executable = {terminal}\n")
     environ = plain(home, DISPLAY=display)
-
-    def xdotool(*words: str) -> str:
-        return subprocess.run(["xdotool", *words], env=environ, capture_output=True, text=True).stdout.strip()
-
-    def press(key: str, until: Callable[[], object], what: str) -> None:
-        """A key again and again, since a window takes none until it is ready; with time for what the key does."""
-        again = 0.0
-
-        def done() -> object:
-            nonlocal again
-            if not until() and time.monotonic() > again:
-                xdotool("windowfocus", window)
-                xdotool("key", key)
-                again = time.monotonic() + KEY_S
-            return until()
-
-        wait_for(done, what)
-
+    keyboard = Keyboard(environ)
     empty = colours(pixels)
     with (home / "log").open("w") as log:
         command = [GRC, path]
         grc = subprocess.Popen(command, env=environ, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=home)
     try:
-        wait_for(lambda: xdotool("search", "--onlyvisible", "--name", "psk_loopback.grc"), "the window")
-        window = xdotool("search", "--onlyvisible", "--name", "psk_loopback.grc").splitlines()[0]
+        wait_for(lambda: keyboard.window("psk_loopback.grc"), "the window")
+        window = keyboard.window("psk_loopback.grc")
         wait_for(lambda: colours(pixels) > empty + 100, "blocks to be drawn")
-        press(F6, path.with_suffix(".py").is_file, "the flowgraph to be generated")
+        keyboard.press(window, F6, path.with_suffix(".py").is_file, "the flowgraph to be generated")
         wait_for(started.is_file, "the flowgraph to be run")
         carries(domains)
         process = Path("/proc") / started.read_text().strip()
@@ -291,11 +311,44 @@ def test_the_window_draws_an_example_runs_it_and_closes(
             os.kill(int(process.name), signal.SIGTERM)
             wait_for(lambda: not process.exists(), "the flowgraph to end")
         else:
-            press(F7, lambda: not process.exists(), "the flowgraph to be stopped")
-        press("ctrl+q", lambda: grc.poll() is not None, "the window to be closed")
+            keyboard.press(window, F7, lambda: not process.exists(), "the flowgraph to be stopped")
+        keyboard.press(window, "ctrl+q", lambda: grc.poll() is not None, "the window to be closed")
         assert grc.returncode == 0
     finally:
         grc.kill()
         grc.wait()
     said = (home / "log").read_text()
     assert not re.search("Traceback|gr_ros2.*[Ee]rror", said), said
+
+
+@pytest.mark.slow
+def test_the_first_example_runs_on_the_play_button_in_a_window_of_its_own(home: Path, screen: tuple[str, Path]) -> None:
+    """Its window opens and its robot's topics come out on the other graph; its end does not disturb GRC."""
+    path, domains = on_own_domains("first_link.grc", home)
+    display, pixels = screen
+    environ = plain(home, DISPLAY=display, XDG_RUNTIME_DIR=str(home))
+    preferences = home / ".gnuradio" / "config.conf"  # GRC asks whether there is one before it runs anything
+    preferences.write_text(f"{preferences.read_text()}xterm_executable = /bin/false\n")
+    keyboard = Keyboard(environ)
+    empty = colours(pixels)
+    heard: list[bytes] = []
+    with (home / "log").open("w") as log:
+        grc = subprocess.Popen([GRC, path], env=environ, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=home)
+    try:
+        wait_for(lambda: keyboard.window("first_link.grc"), "the window")
+        window = keyboard.window("first_link.grc")
+        wait_for(lambda: colours(pixels) > empty + 100, "blocks to be drawn")
+        title = "ROS topics over OFDM"
+        keyboard.press(window, F6, lambda: keyboard.window(title), "the flowgraph's window")
+        with DdsMiddleware(domain_id=domains[1], localhost_only=True) as graph:
+            graph.subscribe("/rx_robot_1/odom", ODOM, Qos(depth=0), heard.append)
+            wait_for(lambda: len(heard) > 10, "odometry of the simulated robot")
+        said = (home / "log").read_text()
+        assert not re.search("Traceback|gr_ros2.*[Ee]rror|terminal", said), said
+        keyboard.run("windowkill", keyboard.window(title))  # no window manager is here that could close it
+        wait_for(lambda: not keyboard.window(title), "the flowgraph's window to be closed")
+        keyboard.press(window, "ctrl+q", lambda: grc.poll() is not None, "GRC to be closed")
+        assert grc.returncode == 0
+    finally:
+        grc.kill()
+        grc.wait()

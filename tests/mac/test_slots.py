@@ -139,6 +139,25 @@ def test_an_entrant_that_nobody_names_starts_over() -> None:
     assert not made.reserved
 
 
+@pytest.mark.parametrize("names", [True, False])
+def test_a_robot_that_none_of_those_it_hears_names_knows_it(names: bool) -> None:
+    made = robot()
+    begin, _ = send(made, 0.0)
+    assert not made.unheard(begin)
+    for slot in range(40, 1000, 5):
+        hear(made, 1, slot, Block(0, (5, 5), 1, (5 if names else 7, NOBODY)))
+    assert made.unheard(made.clock.begin(1001)) is not names
+    assert not made.unheard(made.clock.begin(5000)), "nobody is heard any more"
+
+
+def test_a_robot_that_asks_ahead_of_the_end_of_its_silence_gets_a_slot_after_it() -> None:
+    made = Slots(5, SLOT, random.Random(1))
+    at = made.departure(3.0)
+    assert at == pytest.approx(3.5)
+    assert made.block() is None
+    assert made.departure(at - 0.005) > at
+
+
 def test_a_host_that_was_late_sends_in_a_later_slot() -> None:
     made = robot(5)
     begin, _ = send(made, 1.0)

@@ -10,10 +10,10 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.radio.findings import about, differences, heard_nobody, in_words
+from gr_ros2.radio.findings import about, compared, differences, heard_nobody, in_words
 from gr_ros2.state.keys import new_key_file
 from tests.radio.cables import SerialCable
-from tests.radio.robots import Robot
+from tests.radio.robots import Robot, config
 from tests.waiting import wait_for
 
 Wrong = Callable[[Path], dict[str, Any]]
@@ -58,6 +58,34 @@ def test_another_packet_len_is_named(tmp_path: Path) -> None:
         wait_for(lambda: (one.link.ping(2)["about"] or {}).get("packet_len") == 128, "what the other end is")
         (line,) = differences(about(one.link.config, one.link.phy), one.link.ping(2)["about"])
     assert "packet_len is 128 there and 64 here" in line
+
+
+def test_frequencies_that_do_not_meet_are_named() -> None:
+    def end(text: str) -> dict[str, Any]:
+        return {"packet_len": 64, "phy": 1, "key": 0, "text": f"0.1.0 psk 1e+06, {text}"}
+
+    here = end("sends at 433200000.0 Hz, receives at 434400000.0 Hz")
+    assert differences(here, end("sends at 434400000 Hz, receives at 433200100.0 Hz")) == []
+    assert differences(here, end("")) == []
+    both = differences(here, here)
+    assert both[0].startswith("the other end sends at 433200000.0 Hz, and this end receives at 434400000.0 Hz; set")
+    assert both[1].startswith("this end sends at 433200000.0 Hz, and the other end receives at 434400000.0 Hz; set")
+
+
+def test_files_are_compared_without_hearing_the_other_end(tmp_path: Path) -> None:
+    uhd = {"name": "uhd", "frequency": 433.2e6, "frequency_rx": 434.4e6}
+    here = config(1, uhd, version=1)
+    swapped = {**uhd, "frequency": 434.4e6, "frequency_rx": 433.2e6}
+    assert compared(here, config(2, swapped, version=1)) == []
+    assert "sends at 433200000.0 Hz" in compared(here, config(2, uhd, version=1))[0]
+    wrong = config(
+        1, swapped, packet_len=80, key=key(tmp_path, "other"), version=1, phy={"name": "psk", "sample_rate": 1e6}
+    )
+    found = " ".join(compared(here, wrong))
+    for said in ("packet_len is 80 there", "phy has other settings", "key ", "both are robot 1"):
+        assert said in found
+    (line,) = compared(here, config(2, swapped, version=0))
+    assert line.startswith("version is 0 there and 1 here")
 
 
 @pytest.mark.parametrize(

@@ -37,12 +37,12 @@ def front_end(folder: Path, number: int) -> dict[str, Any]:
 
 
 @contextmanager
-def air(folder: Path, robots: int) -> Iterator[MediumProcess]:
+def air(folder: Path, robots: int, **settings: Any) -> Iterator[MediumProcess]:
     """A medium in lock step, in a thread."""
     addresses = [
         {"connect": f"ipc://{folder}/robot{n}", "bind": f"ipc://{folder}/medium{n}"} for n in range(1, robots + 1)
     ]
-    values = {"phy": PHY, "packet_len": PACKET_LEN, "robots": addresses, "channel": {"snr_db": 20.0}}
+    values = {"phy": PHY, "packet_len": PACKET_LEN, "robots": addresses, "channel": {"snr_db": 20.0}, **settings}
     process = MediumProcess(build(MediumConfig, values))
     over = threading.Event()
     thread = threading.Thread(target=process.run, kwargs={"over": over}, daemon=True)
@@ -95,6 +95,36 @@ def test_in_slots_two_links_lose_nothing_both_ways_and_at_once_most(tmp_path: Pa
     assert process.counted["overlapping"] > 0.3 * process.counted["bursts"]
 
 
+def test_a_message_reaches_a_robot_that_does_not_hear_its_sender(tmp_path: Path) -> None:
+    line = [[None, -80.0, None], [-80.0, None, -80.0], [None, -80.0, None]]
+    with air(tmp_path, 3, gains_db=line, channel={}), ExitStack() as stack:
+        first, _, last = (
+            stack.enter_context(
+                Robot(
+                    number,
+                    front_end(tmp_path, number),
+                    hears=(4 - number,) if number != 2 else (),
+                    version=1,
+                    medium="slots",
+                    relay="gain",
+                    phy=PHY,
+                    packet_len=PACKET_LEN,
+                )
+            )
+            for number in (1, 2, 3)
+        )
+        clock = first.link.front_end.clock
+        at = [clock()]
+
+        def tell() -> bool:
+            if clock() >= at[0]:
+                at[0] += 0.3
+                first.publish(message(7, 40))
+            return bool(last.heard)
+
+        wait_for(tell, "a message of robot 1 at robot 3")
+
+
 @pytest.fixture
 def accesses(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Access, float]]:
     """Medium access of the links that are made, and s between two packets."""
@@ -138,3 +168,37 @@ def test_a_front_end_that_hears_itself_alone_shares_nothing() -> None:
     with pytest.raises(ConfigError, match="medium = 'slots': front_end sim reaches no other robot") as refused:
         RobotLink(config(1, {"name": "sim"}, version=1, medium="slots"))
     assert "\n" not in str(refused.value)
+
+
+def test_two_robots_with_one_id_are_told_so_both(tmp_path: Path) -> None:
+    with air(tmp_path, 3), ExitStack() as stack:
+        links = []
+        for place, number in ((1, 1), (2, 2), (3, 1)):
+            values = {"version": 1, "medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
+            state = str(tmp_path / f"state{place}.json")
+            links.append(RobotLink(config(number, front_end(tmp_path, place), state=state, **values)))
+            stack.callback(links[-1].stop)
+        for link in links:
+            link.start()
+        for link in links[::2]:
+            said = "another robot sends as robot 1, which is this one"
+            wait_for(lambda: any(said in line for line in link.findings()), "to be told")  # noqa: B023 - called at once
+        assert not any("another robot" in line for line in links[1].findings())
+
+
+def test_a_channel_that_is_too_full_names_the_topics_that_grow_old(tmp_path: Path) -> None:
+    with air(tmp_path, 2), ExitStack() as stack:
+        values: dict[str, Any] = {"version": 1, "medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
+        options = {"topic_options": {"chat": {"queue": "latest"}}}
+        robots = [
+            stack.enter_context(Robot(number, front_end(tmp_path, number), ros_source=options, **values))
+            for number in (1, 2)
+        ]
+        wait_for(lambda: bool(robots[0].link.stats()["peers"]), "the other robot to be heard")
+        robots[0].link.findings()
+        told = "the channel is fuller than it can carry: /robot_1/chat grow old"
+        wait_for(
+            lambda: robots[0].publish(message(1, 40)) or any(told in line for line in robots[0].link.findings()),
+            "the topic to be named",
+        )
+        assert not any("fuller" in line for line in robots[1].link.findings())

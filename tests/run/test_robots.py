@@ -16,6 +16,7 @@ from gr_ros2.report.table import summary_grid
 from gr_ros2.run.robots import ears_of, surroundings
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import dump, load_scenario, scenario_from
+from gr_ros2.settings.config import replaced
 from tests.e2e.support import check_books
 
 
@@ -97,3 +98,9 @@ def test_without_gains_the_snr_is_that_of_the_channel() -> None:
 def test_what_does_not_go_together_is_refused(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_scenario("two-robots-half-duplex", [override])
+
+
+def test_the_losses_at_levels_from_positions_can_be_measured() -> None:
+    scenario = load_scenario("demo-team")
+    channel = surroundings(scenario, 2e5).path(0, 1).channel
+    assert replaced(channel, snr_db=2.5).snr_db == 2.5

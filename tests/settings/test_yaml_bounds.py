@@ -5,15 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import yaml
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import read_yaml
 from gr_ros2.settings.files import BUILTIN_DIR, parse_override
 from gr_ros2.settings.yaml_bounds import MOST_CHARACTERS, MOST_LEVELS, check_bounds
-from gr_ros2.settings.yaml_text import parse_yaml
 from tests.work import calls
 
 CALLS_PER_CHARACTER, CALLS = 100, 10_000
@@ -71,15 +67,3 @@ def test_what_people_write_passes(tmp_path: Path) -> None:
     base = {"x": 1, "y": [1, 2]}
     assert read_yaml(path) == {"base": base, "one": {**base, "z": 3}, "other": base}
     check_bounds("[" * (MOST_LEVELS - 1) + "]" * (MOST_LEVELS - 1))
-
-
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.text(max_size=20),
-    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=5), inner, max_size=5),
-    max_leaves=30,
-)
-
-
-@given(VALUES)
-def test_what_is_in_bounds_is_let_through(value: object) -> None:
-    assert parse_yaml(yaml.safe_dump(value), "here") == value

@@ -240,6 +240,8 @@ rows = st.builds(
     st.booleans(),
     U8,
     st.text(max_size=20),
+    st.booleans(),
+    U8,
 )
 
 

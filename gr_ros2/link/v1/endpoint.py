@@ -25,6 +25,7 @@ from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
+from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.pings import Pings
 from gr_ros2.link.v1.receiving import ReceivingSide
@@ -115,7 +116,18 @@ class EndpointV1:
             shares=access is not None,
         )
         hellos = Hellos(settings, boot, messages, window, neighbours, encrypts=keys.encrypts)
-        self._sending = SendingSide(settings, messages, window, neighbours, hellos=hellos, writer=writer, hold=hold)
+        self._sending = SendingSide(
+            settings,
+            messages,
+            window,
+            neighbours,
+            hellos=hellos,
+            writer=writer,
+            hold=hold,
+            relaying=self._receiving.relaying,
+        )
+        if self._receiving.relaying is not None:
+            messages.relayed_left = self._receiving.relaying.left
         self._receiving.tell(self._sending, messages, window, rate)
         self.pace, self.pings = self._sending.pace, self._sending.pings
 
@@ -183,12 +195,19 @@ class EndpointV1:
 
     def knows(self, src_id: int) -> bool:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""
-        return self.neighbours.get(src_id) is not None
+        return self._inbox(src_id) is not None
 
     def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""
-        neighbour = self.neighbours.get(src_id)
-        return {} if neighbour is None else neighbour.inbox.announced.topics
+        inbox = self._inbox(src_id)
+        return {} if inbox is None else inbox.announced.topics
+
+    def _inbox(self, src_id: int) -> Inbox | None:
+        """What has come of a robot, directly or over others."""
+        neighbour, relaying = self.neighbours.get(src_id), self._receiving.relaying
+        if neighbour is not None:
+            return neighbour.inbox
+        return None if relaying is None else relaying.far.get(src_id)
 
     def unpublished(self, event: Delivered) -> Lost:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""

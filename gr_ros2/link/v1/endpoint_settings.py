@@ -31,6 +31,7 @@ class Settings:
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
     :param shares: whether others send on the same channel, as medium access lets them: reports are few then
+    :param relay: whether messages of other robots are sent on
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
     :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
         topics with a deadline or lifespan, no bound for others; 0 = no bound
@@ -56,6 +57,7 @@ class Settings:
     hears: bool = True
     half_duplex: bool = False
     shares: bool = False
+    relay: bool = False
     hold_s: float = 1.0
     max_age_s: float | Auto = AUTO
     max_ages: Mapping[str, float] = field(default_factory=dict)
@@ -89,12 +91,14 @@ def settings_of(
     half_duplex: bool = False,
     fixed: bool = True,
     airtime_share: float = 1.0,
+    relay: bool = False,
 ) -> Settings:
     """The settings of an end, made from those of its blocks.
 
     :param hears: whether it receives and can report
     :param fixed: whether every packet must be as long as the longest
     :param airtime_share: see :class:`Settings`
+    :param relay: likewise
     :raises ConfigError: neither block names the robot, although it would send something
     """
     send = SourceConfig() if source is None else source
@@ -108,6 +112,7 @@ def settings_of(
         expected_loss=send.expected_loss,
         hears=hears,
         half_duplex=half_duplex,
+        relay=relay,
         hold_s=take.hold_s,
         max_age_s=take.max_age_s,
         max_ages={

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
@@ -30,10 +30,11 @@ from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
 from gr_ros2.link.v1.sent_packets import SPAN
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
+from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire.control import Control
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import TABLE_TOPIC, EntryV1, Part, read_body
+from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC, EntryV1, Part, read_body
 
 Events = list[Delivered | Lost | Announced]
 
@@ -42,6 +43,8 @@ _PACKET_COST, _EQUATION_COST = 250, 350
 of the list of gaps)."""
 _REACHED = 256
 """Arrivals remembered, from which the age of a command follows."""
+_OVER = 256
+"""Messages over other robots that are remembered, because the origin's own packets may bring them too."""
 _INCOMPLETE_S = 60.0
 """s that an incomplete message waits for its next fragment."""
 MAX_AGE_S = 15.0
@@ -75,6 +78,16 @@ class Bounds(NamedTuple):
         return cls(span, equations, most // 4, most, most // 4)
 
 
+class Passing(Protocol):
+    """What is told of messages that may be sent on."""
+
+    def direct(self, src_id: int, boot: int, ready: Ready, now: float) -> None:
+        """A message has come from the robot that made it."""
+
+    def receive(self, via: int, ready: Ready, now: float) -> Events:
+        """A message of another robot has come over one that is heard."""
+
+
 class Inbox:
     """What arrives from one start of one robot.
 
@@ -86,6 +99,7 @@ class Inbox:
         many as its depth
     :param stats: receiver statistics, shared with other inboxes
     :param control: called with entries that are not messages
+    :param relaying: is told of messages that came, where they are relayed
     :ivar reports: what the robot is told of its packets
     :ivar announced: its topics
     :ivar order: which of its messages wait for an earlier one
@@ -104,6 +118,7 @@ class Inbox:
         marks: dict[int, tuple[int, ...]],
         stats: ReceiverStats,
         control: Callable[[Control], None],
+        relaying: Passing | None = None,
     ) -> None:
         self.src_id, self.boot = src_id, boot
         self.counts: Counter[str] = Counter()
@@ -112,8 +127,8 @@ class Inbox:
         self.sealed_after: Callable[[int], float] | None = None
         """Tells the time in s after which a packet was sealed; None where this cannot be proven."""
         self._max_age_s, self._max_ages = settings.max_age_s, settings.max_ages
-        self._room = room
-        self._control = control
+        self._room, self._own = room, settings.src_id
+        self._control, self._relaying = control, relaying
         self._stats = stats
         bounds = Bounds.of(settings.max_source_bytes, room)
         self.decoder = RepairDecoder(room, self._plausible, bounds.span, bounds.equations)
@@ -134,6 +149,8 @@ class Inbox:
         self.announced = AnnouncedTopics(topics, decoder_for, bounds.unknown)
         self._last: dict[int, tuple[int, int]] = {}
         """The newest message that was delivered, by topic."""
+        self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
+        """Messages that came over other robots, by topic id and order: they may come again."""
         self._events: Events = []
         self._now = 0.0
 
@@ -305,6 +322,11 @@ class Inbox:
 
     def _arrived(self, ready: Ready) -> None:
         """A message is complete."""
+        if ready.topic_id > TABLE_TOPIC:
+            self._of_another(ready)
+            return
+        if self._relaying is not None:
+            self._relaying.direct(self.src_id, self.boot, ready, self._now)
         if ready.topic_id == TABLE_TOPIC:
             self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
             self._table(ready.payload)
@@ -318,13 +340,50 @@ class Inbox:
         else:
             self._deliver(ready, topic)
 
+    def _of_another(self, ready: Ready) -> None:
+        """A message of another robot."""
+        if self._relaying is None:
+            self._stats.dropped["relayed"] += 1
+            return
+        events = self._relaying.receive(self.src_id, ready, self._now)
+        self._events.extend(events)
+
+    def relayed(self, ready: Ready, now: float) -> Events:
+        """Take a message of this robot that has come over another one."""
+        self._now = now
+        if ready.topic_id == TABLE_TOPIC:
+            self._table(ready.payload)
+        else:
+            self._over.append((ready.topic_id, ready.order))
+            topic = self.announced.topic_of(ready)
+            if topic is not None:
+                self._deliver(ready, topic)
+            else:
+                for lost in self.announced.wait(ready):
+                    self._give_up([lost], self.announced.unknown(lost))
+        events, self._events = self._events, []
+        return events
+
+    def adopt(self, far: Inbox) -> None:
+        """Go on from what has come of this start over other robots."""
+        self._last.update(far._last)
+        self._over.extend(far._over)
+        if not self.announced.topics:
+            self.announced = far.announced
+
     def _deliver(self, ready: Ready, topic: AnnouncedTopic) -> None:
         topic_id, order = ready.topic_id, ready.order
+        if topic.dst_id not in (BROADCAST, self._own) and self._own != NOBODY:
+            self._give_up([ready], LedgerRow.NOT_FOR_US)
+            return
         if self.sealed_after is not None and self._old(order[0], topic):
             self._give_up([ready], LedgerRow.NOT_FRESH)
             return
         if topic.fresh and self._late(order[0], topic):
             self._give_up([ready], LedgerRow.LATE)
+            return
+        if order <= self._last.get(topic_id, (-1, -1)) and (topic_id, order) in self._over:
+            self._stats.repeats += 1
             return
         if order <= self._last.get(topic_id, (-1, -1)):
             self._give_up([ready], _passed_over(topic))

@@ -27,7 +27,7 @@ from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
 from gr_ros2.settings.config import QueuePolicy
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import NewTopic, Registry
-from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC
+from gr_ros2.wire.v1 import MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOPIC
 
 Observer = Callable[[Accepted | Refused | Missed], None]
 
@@ -83,6 +83,13 @@ class Outbox:
         self.sent = SentTopics(codec, settings.commands)
         self.kept = KeptMessages(self.sent, room, self.stats, self._admit)
         self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)
+        self.relayed: SentTopic | None = None
+        """The queue of messages of other robots, where they are relayed."""
+        self.relayed_left: Callable[[float], None] = lambda _: None
+        """Called when one of them has left whole."""
+        if settings.relay:
+            self.relayed = self.sent.relay()
+            self.packing.turns.join(RELAYED_TOPIC)
         if topics:
             self.sent.add(topics)
             self._tabulate()
@@ -182,7 +189,7 @@ class Outbox:
     @property
     def idle(self) -> bool:
         """Whether nothing waits."""
-        return not any(topic.queue for topic in self.sent.values())
+        return not any(topic.queue for topic_id, topic in self.sent.items() if topic_id != RELAYED_TOPIC)
 
     def reconfigure(self, settings: Settings) -> None:
         """Use other settings from now on."""
@@ -217,6 +224,8 @@ class Outbox:
             waited_for=now + WORTH * self._settings.hold_s,
         )
         self.kept.left(message, now, reported=self.reported)
+        if message.topic_id == RELAYED_TOPIC:
+            self.relayed_left(now)
 
     def _drop(self, dropped: list[Dropped]) -> None:
         for item in dropped:

@@ -29,12 +29,25 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
 from gr_ros2.link.v1.outbox import Outbox
+from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.settings.config import NOBODY
-from gr_ros2.wire.control import CAN_HEAR, ECHO_LEN, REPORTED, WANTS_PROOF, About, Ask, Control, Hello, Ping, Report
+from gr_ros2.wire.control import (
+    CAN_HEAR,
+    ECHO_LEN,
+    REPORTED,
+    WANTS_PROOF,
+    About,
+    Ask,
+    Control,
+    Hello,
+    Newest,
+    Ping,
+    Report,
+)
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST, Header, PacketV1, read_body, read_header
@@ -52,6 +65,7 @@ class ReceivingSide:
     :param access: is told what is heard on a channel that others share
     :ivar stats: what arrived and what did not
     :ivar neighbours: the robots that are heard
+    :ivar relaying: what is sent on of what others make; None where nothing is
     """
 
     def __init__(
@@ -80,6 +94,9 @@ class ReceivingSide:
         self.neighbours = Neighbours(
             own, settings, keys, heard=heard, save=save, inbox=self._inbox, dropped=self.stats.dropped
         )
+        self.relaying = Relaying(settings.src_id, self.neighbours, self.stats.dropped) if settings.relay else None
+        if self.relaying is not None:
+            self.relaying.tell(lambda src_id, boot: self._inbox(src_id, boot, 0, settings.packet_len))
         self._events: list[ReceiverEvent] = []
         self._now = -inf
         self._sender: Neighbour | None = None
@@ -130,7 +147,7 @@ class ReceivingSide:
             header = read_header(arrival.data, self._settings.packet_len)
             opened = self._open(arrival.data, header, now)
             if opened is None or opened.new:  # what was here before says nothing about now
-                self._note_slot(header, arrival, trusted=opened is not None)
+                self._note_slot(header, arrival, now, trusted=opened is not None)
             if opened is None:
                 return
             if arrival.snr_db is not None and opened.new:
@@ -144,12 +161,14 @@ class ReceivingSide:
             for early in self.neighbours.early(opened.neighbour.src_id):
                 self._receive(ReceivedPacket(early), now)
 
-    def _note_slot(self, header: Header, arrival: ReceivedPacket, *, trusted: bool) -> None:
-        """Tell medium access what was heard, and when its burst began."""
+    def _note_slot(self, header: Header, arrival: ReceivedPacket, now: float, *, trusted: bool) -> None:
+        """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
         if self._access is None or arrival.received_at is None or header.src_id == self._settings.src_id:
             return
         block = read_block(header.block)[0] if header.block else None
         self._access.hear(header.src_id, block, arrival.received_at, trusted=trusted)
+        if self.relaying is not None and trusted:
+            self.relaying.heard(header.src_id, block, now)
 
     def _open(self, data: bytes, header: Header, now: float) -> Opened | None:
         own = self._settings.src_id
@@ -201,7 +220,7 @@ class ReceivingSide:
         for entry in entries:
             if isinstance(entry, Hello):
                 inbox.order.told = self._settings.hears and entry.capabilities & REPORTED != 0
-            elif isinstance(entry, (Ask, Report)):
+            elif isinstance(entry, (Ask, Report, Newest)):
                 self._entry(entry)
             elif isinstance(entry, (Ping, About)):
                 sending.pings.receive(neighbour.src_id, self._settings.src_id, entry, now)
@@ -237,6 +256,9 @@ class ReceivingSide:
         assert self._sender is not None
         if isinstance(entry, Report):
             self._reported(self._sender.src_id, entry)
+        elif isinstance(entry, Newest):
+            if self.relaying is not None:
+                self.relaying.newest(self._sender.src_id, entry)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
             for topic_id in entry.topic_ids:
                 self._messages.kept.ask(topic_id, self._now)
@@ -276,7 +298,11 @@ class ReceivingSide:
             marks=self._marks.setdefault(src_id, {}),
             stats=self.stats,
             control=self._entry,
+            relaying=self.relaying,
         )
+        far = None if self.relaying is None else self.relaying.far.get(src_id)
+        if far is not None and far.boot == boot:
+            inbox.adopt(far)
         inbox.reports.tells_snr = self._rate is not None
         return inbox
 

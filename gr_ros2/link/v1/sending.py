@@ -17,11 +17,13 @@ from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.neighbours import Neighbours
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.pings import Pings
+from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.repair_slots import RepairSlots
 from gr_ros2.link.v1.report_slots import ReportSlots
 from gr_ros2.link.v1.writer import PacketWriter
-from gr_ros2.wire.control import Heard, Hello
+from gr_ros2.relay.gain import TOLD
+from gr_ros2.wire.control import NEWEST_LEN, Heard, Hello
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
 MOST_REPEATS = 32
@@ -32,6 +34,7 @@ the time doubles with each repeat, as in Trickle (RFC 6206). A robot that comes 
 class SendingSide:
     """The choice of what leaves next.
 
+    :param relaying: what is sent on of what others make; None where nothing is
     :ivar pace: when packets may leave
     :ivar hellos: when this robot announces itself
     :ivar pings: its questions and answers
@@ -51,8 +54,10 @@ class SendingSide:
         hellos: Hellos,
         writer: PacketWriter,
         hold: Hold,
+        relaying: Relaying | None = None,
     ) -> None:
         self.settings = settings
+        self._relaying = relaying
         self.pace = Pace(settings.packet_rate)
         self.hellos = hellos
         self.pings = Pings()
@@ -94,10 +99,16 @@ class SendingSide:
             return reports.packet(due, now)
         if self._window.pressing and not packing.urgent and (first := self.repairs.first(now)) is not None:
             return first
-        filling = packing.fill(self._window.packets.newest + 1, self._writer.room - reports.reserved, now)
+        room = self._writer.room
+        if self._relaying is not None and messages.relayed is not None:
+            self._relaying.offer(messages.relayed, now)
+            room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
+        filling = packing.fill(self._window.packets.newest + 1, room - reports.reserved, now)
         if filling is not None:
             self.pace.waited(filling.since, now)
-            reports.add(filling.parts, self._writer.room - filling.used, due, now)
+            reports.add(filling.parts, room - filling.used, due, now)
+            if self._relaying is not None:
+                filling.parts += self._relaying.gains.tells()
             return self._writer.source(filling.parts, filling.lifetimes, filling.qos, filling.sent, now)
         if now >= hellos.due:  # it let messages go first, and none of them is worth sending any more
             return self._hello(now)

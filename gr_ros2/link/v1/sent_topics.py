@@ -13,7 +13,7 @@ from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import TABLE_TOPIC
+from gr_ros2.wire.v1 import BROADCAST, RELAYED_TOPIC, TABLE_TOPIC
 
 
 @dataclass(slots=True, eq=False)
@@ -93,6 +93,7 @@ class SentTopic:
             min(self.kept_depth if self.kept else depth, 255),
             codec,
             fresh,
+            BROADCAST if options.to == AUTO else options.to,
         )
 
 
@@ -126,13 +127,19 @@ class SentTopics(dict[int, SentTopic]):
             )
         self.find_deadlines()
 
+    def relay(self) -> SentTopic:
+        """Send messages of other robots too; returns their queue."""
+        topic = Topic(RELAYED_TOPIC, "", "")
+        self[RELAYED_TOPIC] = SentTopic(topic, TopicQueue("latest"), qos_class(topic.options), 1.0, latched=False)
+        return self[RELAYED_TOPIC]
+
     def find_deadlines(self) -> None:
         """Note which queues have a deadline."""
         self.deadlines = [topic.queue for topic in self.values() if topic.queue.deadline_s]
 
     def named(self) -> Iterator[SentTopic]:
-        """All topics, without the table of topics."""
-        return (topic for topic_id, topic in self.items() if topic_id != TABLE_TOPIC)
+        """All topics, without the table of topics and messages of other robots."""
+        return (topic for topic_id, topic in self.items() if topic_id < TABLE_TOPIC)
 
     def table(self) -> list[AnnouncedTopic]:
         """The rows of the table of topics."""

@@ -1,0 +1,182 @@
+"""Messages of other robots at one robot: what it holds of them, what it sends on, and what it delivers.
+
+A robot that is not heard directly is *far*: its table of topics and its messages come over others. The table travels
+like a message, as topic 240 of its origin behind the full boot number; whoever hears the origin itself sends it on
+under the number that the origin has reached, again every ``TABLE_S``.
+
+Invariants: a message is delivered once, whether it comes directly or over others; of the topics that are relayed the
+newest message counts; memory is bounded by ``MOST_FAR`` robots and the topics that they announce.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from math import inf
+
+from gr_ros2.core.errors import WireError
+from gr_ros2.link.v1.inbox import Events, Inbox
+from gr_ros2.link.v1.neighbours import Neighbours
+from gr_ros2.link.v1.order import Ready
+from gr_ros2.link.v1.packing import Message
+from gr_ros2.link.v1.sent_topics import SentTopic
+from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.wire.control import Newest
+from gr_ros2.wire.mac_block import NOBODY, Block
+from gr_ros2.wire.relayed import MOST_HOPS, RELAYED_LEN, Relayed, read_relayed, write_relayed
+from gr_ros2.wire.v1 import BROADCAST, RELAYED_TOPIC, TABLE_TOPIC
+
+TABLE_S = 5.0
+"""s after which the table of a robot that is heard is worth sending on again: some may have come since."""
+MOST_FAR = 64
+"""Robots that are known over others only."""
+_BOOT_LEN = 8
+
+
+class Relaying:
+    """See the module.
+
+    :param src_id: of this robot
+    :param neighbours: the robots that are heard
+    :param dropped: counts what came and was of no use
+    :ivar hops: over how many robots the newest message of each robot came; 0 for directly
+    """
+
+    def __init__(self, src_id: int, neighbours: Neighbours, dropped: Counter[str]) -> None:
+        self.src_id = src_id
+        self.hops: dict[int, int] = {}
+        self.relayed: Counter[tuple[int, int]] = Counter()
+        """Messages sent on, by origin and topic id."""
+        self.far: dict[int, Inbox] = {}
+        self.gains = Gains(src_id)
+        self._neighbours, self._dropped = neighbours, dropped
+        self._newest: dict[Stream, Relayed] = {}
+        self._tables: dict[int, tuple[int, bytes, float]] = {}
+        """Robots that are heard: boot number, table, and when it was last worth sending on."""
+        self._chosen: Stream | None = None
+        self._make_inbox: Callable[[int, int], Inbox]
+
+    def tell(self, make_inbox: Callable[[int, int], Inbox]) -> None:
+        """Use this to make the inbox of a far robot from its id and boot number."""
+        self._make_inbox = make_inbox
+
+    # ---- what arrives
+
+    def heard(self, src_id: int, block: Block | None, now: float) -> None:
+        """A packet of a robot was heard.
+
+        :param block: tells whom that robot hears
+        """
+        names = () if block is None else [name for name in block.names if name != NOBODY]
+        self.gains.neighbour(src_id, now, names, 0 if block is None else block.heard)
+        boot, table, at = self._tables.get(src_id, (0, b"", now))
+        neighbour = self._neighbours.get(src_id)
+        if table and neighbour is not None and now - at > TABLE_S:
+            self._table(src_id, boot, table, neighbour.inbox.newest, now)
+
+    def newest(self, src_id: int, newest: Newest) -> None:
+        """A robot tells the newest message that it has of a topic."""
+        self.gains.told(src_id, newest)
+
+    def direct(self, src_id: int, boot: int, ready: Ready, now: float) -> None:
+        """A message has come from the robot that made it."""
+        number, place = ready.order
+        self.hops[src_id] = 0
+        if ready.topic_id == TABLE_TOPIC:
+            if self._tables.get(src_id, (0, b"", 0.0))[:2] != (boot, ready.payload):
+                self._table(src_id, boot, ready.payload, number, now)
+            return
+        message = Relayed(src_id, boot & 0xFFFF, number, place, ready.topic_id, 0, ready.payload, ready.coded)
+        self._take(src_id, message, now)
+
+    def receive(self, via: int, ready: Ready, now: float) -> Events:
+        """A message of another robot has come over one that is heard."""
+        try:
+            message = read_relayed(ready.payload)
+        except WireError as error:
+            self._dropped[error.kind] += 1
+            return []
+        if not self._take(via, message, now):
+            self._dropped["relayed_before"] += 1
+            return []
+        self.hops[message.origin] = message.hops
+        if message.dst_id not in (BROADCAST, self.src_id):
+            return []
+        if message.topic_id == TABLE_TOPIC:
+            return self._announced(message, now)
+        inbox = self._inbox(message.origin, message.start)
+        if inbox is None:
+            self._dropped["unknown_origin"] += 1
+            return []
+        order = message.number, message.place
+        return inbox.relayed(Ready(message.topic_id, order, message.payload, -1, message.coded, False), now)
+
+    def _take(self, via: int, message: Relayed, now: float) -> bool:
+        stream = Stream(message.origin, message.start, message.topic_id)
+        new = self.gains.message(via, stream, message.number, now)
+        if new:
+            self._newest[stream] = message
+        return new
+
+    def _table(self, src_id: int, boot: int, table: bytes, number: int, now: float) -> None:
+        self._tables[src_id] = boot, table, now
+        payload = boot.to_bytes(_BOOT_LEN, "big") + table
+        self._take(src_id, Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload), now)
+
+    def _announced(self, message: Relayed, now: float) -> Events:
+        """The table of a far robot."""
+        boot = int.from_bytes(message.payload[:_BOOT_LEN], "big")
+        if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start:
+            self._dropped["bad_table"] += 1
+            return []
+        inbox = self._inbox(message.origin, message.start)
+        if inbox is None:
+            known = self.far.get(message.origin)
+            if known is not None and known.boot > boot:
+                self._dropped["old_start"] += 1
+                return []
+            if known is None and len(self.far) >= MOST_FAR:
+                self._dropped["max_sources"] += 1
+                return []
+            inbox = self.far[message.origin] = self._make_inbox(message.origin, boot)
+        ready = Ready(TABLE_TOPIC, (message.number, message.place), message.payload[_BOOT_LEN:], -1, False, False)
+        return inbox.relayed(ready, now)
+
+    def _inbox(self, origin: int, start: int) -> Inbox | None:
+        """Where messages of a start of a robot come together, directly or over others."""
+        neighbour = self._neighbours.get(origin)
+        for inbox in (None if neighbour is None else neighbour.inbox, self.far.get(origin)):
+            if inbox is not None and inbox.boot & 0xFFFF == start:
+                return inbox
+        return None
+
+    # ---- what leaves
+
+    def offer(self, topic: SentTopic, now: float) -> None:
+        """Let the message that is worth most compete for the next packet, unless one is leaving.
+
+        Its value is ``g^2 / c`` as for own messages, with g the gain per neighbour.
+
+        :param topic: the queue of relayed messages
+        """
+        if topic.queue and topic.queue[0].started:
+            return
+        while topic.queue:
+            topic.queue.popleft()
+        self._chosen, gain = self.gains.best(now, self._cost)
+        if self._chosen is None:
+            return
+        message = self._newest[self._chosen]
+        payload = write_relayed(message._replace(hops=min(message.hops + 1, MOST_HOPS)))
+        topic.newest = now - gain / max(self.gains.neighbours(now), 1)
+        topic.queue.append(Message(-1, RELAYED_TOPIC, payload, 0, now, repeat=True))
+
+    def _cost(self, stream: Stream) -> float:
+        message = self._newest.get(stream)
+        return inf if message is None else RELAYED_LEN + len(message.payload)
+
+    def left(self, now: float) -> None:
+        """The message that was offered has left whole."""
+        if self._chosen is not None:
+            self.gains.sent(self._chosen, now)
+            self.relayed[self._chosen.origin, self._chosen.topic_id] += 1

@@ -1,0 +1,98 @@
+"""Messages of robots that are not heard directly: who gets them, once, whole and decoded, and who does not."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+
+from gr_ros2.link.events import Announced, Delivered
+from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.mac import Slots
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry
+from tests.link.v1.air import SLOT_S, Robot, registry
+
+ODOM = registry(odom=TopicOptions(queue="latest"))
+
+
+def robot(src_id: int, mode: SealMode = "none", topics: Registry = ODOM, **settings: Any) -> Robot:
+    access = Slots(src_id, SLOT_S, random.Random(src_id), period_s=0.1)
+    return Robot(src_id, topics, mode=mode, access=access, packet_len=96, hears=True, **{"relay": True, **settings})
+
+
+class Line:
+    """Robots in a row of which each hears the next on both sides; packets that overlap destroy each other."""
+
+    def __init__(self, *robots: Robot, loss: float = 0.0) -> None:
+        self.robots = list(robots)
+        self.now, self._rng, self._loss = 0.0, random.Random(1), loss
+        self._messages = 0
+        self.said: list[tuple[int, bytes]] = []
+
+    def near(self, one: int) -> list[int]:
+        return [other for other in (one - 1, one + 1) if 0 <= other < len(self.robots)]
+
+    def run(self, seconds: float) -> None:
+        """So long; every robot has a new message every 0.3 s."""
+        end = self.now + seconds
+        while self.now < end:
+            if self.now >= 0.3 * self._messages:
+                self._messages += 1
+                for one in self.robots:
+                    self.said.append((one.src_id, b"%d says %d" % (one.src_id, self._messages)))
+                    one.end.messages.submit(0, self.said[-1][1], self.now)
+            left = {n: data for n, one in enumerate(self.robots) if (data := one.slot(self.now)) is not None}
+            for n, one in enumerate(self.robots):
+                heard = [left[near] for near in self.near(n) if near in left]
+                if len(heard) == 1 and n not in left and self._rng.random() >= self._loss:
+                    one.receive(heard[0], self.now + SLOT_S, self.now)
+            self.now += SLOT_S / 8
+            for one in self.robots:
+                one.events += one.end.handle_timeout(self.now)
+
+
+@pytest.mark.parametrize("mode", ["none", "authenticate", "encrypt"])
+def test_messages_cross_three_robots(mode: SealMode) -> None:
+    line = Line(*(robot(src_id, mode) for src_id in range(1, 6)), loss=0.1)
+    line.run(30)
+    first, last = line.robots[0], line.robots[-1]
+    got = last.delivered(1)
+    assert len(got) == len(set(got)) >= 15
+    assert set(got) <= {payload for src_id, payload in line.said if src_id == 1}
+    assert len(first.delivered(5)) >= 15
+    assert {event.src_id for event in last.events if isinstance(event, Announced)} == {1, 2, 3, 4}
+
+
+def test_without_relaying_only_neighbours_are_heard() -> None:
+    line = Line(*(robot(src_id, relay=False) for src_id in range(1, 4)))
+    line.run(10)
+    assert line.robots[2].delivered(2)
+    assert not line.robots[2].delivered(1)
+
+
+def test_a_message_comes_out_once_at_who_hears_it_both_ways() -> None:
+    line = Line(*(robot(src_id) for src_id in range(1, 4)), loss=0.2)
+    line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
+    line.run(20)
+    for one in line.robots:
+        keys = [(event.src_id, event.key) for event in one.events if isinstance(event, Delivered)]
+        assert len(keys) == len(set(keys)) > 60
+
+
+def test_without_the_key_nobody_relays_or_is_relayed() -> None:
+    line = Line(robot(1, "encrypt"), robot(2, "encrypt"), robot(3), robot(4, "encrypt"))
+    line.run(20)
+    assert line.robots[1].delivered(1)
+    assert not line.robots[3].delivered()
+    assert not line.robots[2].delivered()
+    assert {event.src_id for event in line.robots[0].events if isinstance(event, Delivered)} == {2}
+
+
+def test_a_topic_for_one_robot_comes_out_at_that_one_only_also_over_hops() -> None:
+    goal = registry(goal=TopicOptions(queue="latest", to=4))
+    line = Line(robot(1, topics=goal), *(robot(src_id) for src_id in (2, 3, 4)))
+    line.run(20)
+    assert [len(one.delivered(1)) > 5 for one in line.robots] == [False, False, False, True]
+    assert line.robots[1].end.received.lost[1, 0, "not_for_us"] > 5
