@@ -45,9 +45,10 @@ BENCHMARKS = {
     "mac": "bench.mac",
     "shared": "bench.shared",
     "relay": "bench.relay",
+    "reliable": "bench.reliable",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
-LONG = ("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay")
+LONG = ("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable")
 """Many minutes: only when named."""
 
 

@@ -81,8 +81,9 @@ def zmq_link(number: int, folder: Path, **values: Any) -> RobotLink:
     graph: dict[str, Any] = {"middleware": "memory", "domain_id": DOMAINS[number - 1]}
     source = {"namespace": f"/robot_{number}", **graph, **values.pop("ros_source", {})}
     ends = {"name": "zmq", "bind": own, "connect": [other]}
-    state = str(folder / f"state-{number}")
-    return RobotLink(link_from({"state": state, "front_end": ends, "ros_source": source, "ros_sink": graph, **values}))
+    if values.get("version", 1):
+        values["state"] = str(folder / f"state-{number}")
+    return RobotLink(link_from({"front_end": ends, "ros_source": source, "ros_sink": graph, **values}))
 
 
 def _publish(publisher: Publisher, payloads: Iterator[bytes], seconds: float) -> None:

@@ -10,7 +10,7 @@ from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Relayed, read_relayed, write_relayed
 
-MOST_LINES = 4000
+MOST_LINES = 12_000
 """Lines of Python for a message heard, and for a choice among 40 streams for 40 neighbours."""
 _STEP = 20
 """Bytes that make a packet: sender, time, two robots that it hears, a number told, message."""

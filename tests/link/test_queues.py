@@ -76,7 +76,7 @@ def overloaded(source: Robot, airtime: float, seconds: float = 8.0) -> dict[int,
 
 
 def test_a_computer_that_is_too_slow_drops_the_oldest_and_starves_no_topic() -> None:
-    source = robot(3, queue="fifo")
+    source = robot(3)
     ages = overloaded(source, airtime=0.005)
     assert set(refused(source.end)) == {"overload"}
     for late in ages.values():
@@ -87,15 +87,21 @@ def test_a_computer_that_is_too_slow_drops_the_oldest_and_starves_no_topic() -> 
     assert min(counts) > 0.5 * max(counts)
 
 
-def test_an_air_that_is_too_slow_drops_at_the_bound_of_the_queue() -> None:
+def test_a_topic_whose_every_message_is_wanted_loses_none_to_a_slow_computer_before_its_bound() -> None:
     source = robot(3, queue="fifo")
+    overloaded(source, airtime=0.005)
+    assert set(refused(source.end)) == {"queue_bound"}
+
+
+def test_an_air_that_is_too_slow_drops_at_the_bound_of_the_queue() -> None:
+    source = robot(3)
     ages = overloaded(source, airtime=0.05)
     assert set(refused(source.end)) == {"queue_bound"}
     assert max(max(late) for late in ages.values()) > 1.9
 
 
 def test_a_burst_after_which_nothing_comes_leaves_whole_however_slow_the_computer_is() -> None:
-    source = robot(queue="fifo")
+    source = robot()
     overloaded(source, airtime=0.005, seconds=3.0)
     assert source.end.pace.behind(3.0)
     leave(source, 4.0)
@@ -112,7 +118,7 @@ def test_a_burst_after_which_nothing_comes_leaves_whole_however_slow_the_compute
 
 
 def test_a_sending_thread_that_does_not_run_is_a_computer_that_is_too_slow() -> None:
-    source = robot(queue="fifo")
+    source = robot()
     leave(source, 0.0)
     source.end.pace.credit(1, ready=0.0)
     for tick in range(200):

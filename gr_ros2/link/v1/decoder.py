@@ -68,6 +68,10 @@ class RepairDecoder:
         """Number of equations held that do not determine a packet yet."""
         return len(self._rows)
 
+    def lacks(self, first: int) -> bool:
+        """Whether an equation is held that does not determine a packet yet and names none before ``first``."""
+        return any(pivot >= first for pivot in self._rows)
+
     def begin(self, number: int) -> None:
         """Ignore all packets older than this number."""
         if number > self.floor:

@@ -82,7 +82,7 @@ class EndpointV1:
         lead_s: float = 0.0,
     ) -> None:
         self._access, self._lead = access, lead_s
-        self.settings = settings
+        self.settings = settings = replace(settings, shares=access is not None)
         self.boot = boot
         self.keys = keys = keys if keys is not None else Keys()
         self.mcs_table = tuple(mcs_table)
@@ -92,7 +92,10 @@ class EndpointV1:
         self._hold = hold = Hold()
         room = room_of(settings, keys, block=access is not None)
         self.window = window = RepairWindow(
-            "idle" if settings.repair == AUTO else settings.repair, room, settings.expected_loss
+            "idle" if settings.repair == AUTO else settings.repair,
+            room,
+            settings.expected_loss,
+            shares=settings.shares,
         )
         self.messages = messages = Outbox(topics, settings, self, boot=boot, room=room, codec=codec, observer=observer)
         self.sent = messages.stats

@@ -30,6 +30,7 @@ class Settings:
     :param expected_loss: share of packets that are lost, used until a report gives it
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
+    :param shares: whether others send on the same channel, as medium access lets them: reports are few then
     :param relay: whether messages of other robots are sent on
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
     :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
@@ -55,6 +56,7 @@ class Settings:
     expected_loss: float = 0.2
     hears: bool = True
     half_duplex: bool = False
+    shares: bool = False
     relay: bool = False
     hold_s: float = 1.0
     max_age_s: float | Auto = AUTO

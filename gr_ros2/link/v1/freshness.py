@@ -15,7 +15,7 @@ topics.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from gr_ros2.link.fragment import Outgoing
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
@@ -59,9 +59,10 @@ class Turns:
             return -1
         return next((topic_id for topic_id in self._line if topic_id in pending), -1)
 
-    def sent(self, holder: int) -> None:
-        """A packet left that belonged to this topic, or to none."""
+    def sent(self, topic_ids: Iterable[int]) -> None:
+        """A packet left that belonged to these topics, or to none."""
         self._packets += 1
-        if holder >= 0:
-            self._line.remove(holder)
-            self._line.append(holder)
+        for topic_id in topic_ids:
+            if topic_id in self._line:
+                self._line.remove(topic_id)
+                self._line.append(topic_id)

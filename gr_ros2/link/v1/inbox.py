@@ -27,7 +27,7 @@ from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready
 from gr_ros2.link.v1.peers import MAP
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
-from gr_ros2.link.v1.reports import Reporter
+from gr_ros2.link.v1.reports import Reporter, SharedReporter
 from gr_ros2.link.v1.sent_packets import SPAN
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
 from gr_ros2.settings.config import NOBODY
@@ -136,18 +136,17 @@ class Inbox:
         self.decoder.newest = first - 1
         self._first = first
         self.order = Order(self.decoder, first, settings.hold_s, bounds.ordered, room)
-        self.reports = Reporter(
-            (src_id, boot),
-            self.decoder,
-            self.order,
-            half_duplex=settings.half_duplex,
-            airtime_share=settings.airtime_share,
+        self._reassembly = Reassembly(bounds.fragments)
+        of, share = (src_id, boot), settings.airtime_share
+        self.reports: Reporter = (
+            SharedReporter(of, self.decoder, self.order, self._reassembly, airtime_share=share)
+            if settings.shares
+            else Reporter(of, self.decoder, self.order, half_duplex=settings.half_duplex, airtime_share=share)
         )
         self._commands, self._deadlines = settings.commands, settings.deadlines
         self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
         """Numbers that its packets have reached, and when, s."""
         self.announced = AnnouncedTopics(topics, decoder_for, bounds.unknown)
-        self._reassembly = Reassembly(bounds.fragments)
         self._last: dict[int, tuple[int, int]] = {}
         """The newest message that was delivered, by topic."""
         self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
@@ -200,6 +199,7 @@ class Inbox:
     ) -> Events:
         """Take a repair; only one that was not here before calls for a report."""
         self.reports.unreported += new
+        self.reports.repairable()
         self._advance(number, now, here=False)
         window = mask.bit_length()
         if oldest:
@@ -294,7 +294,11 @@ class Inbox:
         for place, entry in enumerate(entries):
             if not isinstance(entry, Part):
                 self._control(entry)
-            elif entry.last and not entry.offset:
+                continue
+            topic = self.announced.topics.get(entry.topic_id)
+            if topic is None or topic.reliable or topic.latched:
+                self.reports.repairable()
+            if entry.last and not entry.offset:
                 self._arrived(Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired))
             else:
                 self._fragment(entry, number, place, qos, repaired=repaired)

@@ -38,12 +38,14 @@ class Lifetime:
     :param in_order: whether later messages wait for it
     :param long: whether it takes many packets, so that others go before it
     :param awaited: whether a later message of its topic waits already
+    :param left: whether it has left whole
     """
 
     expires: float = inf
     in_order: bool = False
     long: bool = False
     awaited: bool = False
+    left: bool = False
 
     def end(self) -> None:
         """It was replaced by a newer message, or needs no repair."""

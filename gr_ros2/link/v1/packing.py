@@ -69,15 +69,25 @@ class Packing:
     :param boot: boot number of this start, for keys
     :param room: bytes of the longest body
     :param left: called with a message that has left whole, before its lifetime may end with the next one
+    :param shares: whether others send on the same channel: a turn comes seldom then, and long messages take the room
+        that others leave in every packet
     :ivar turns: whose turn it is
     """
 
     def __init__(
-        self, topics: SentTopics, stats: SenderStats, left: Callable[[Message, float], None], *, boot: int, room: int
+        self,
+        topics: SentTopics,
+        stats: SenderStats,
+        left: Callable[[Message, float], None],
+        *,
+        boot: int,
+        room: int,
+        shares: bool = False,
     ) -> None:
         self.turns = Turns()
         self._topics, self._stats, self._left = topics, stats, left
         self._boot = boot
+        self._shares = shares
         self._room = room
         self._open: dict[int, Sequence[Outgoing]] = {}
         """Messages that may continue or start now, by topic."""
@@ -102,7 +112,9 @@ class Packing:
             assert isinstance(message, Message)
             remaining = message.remaining
             taken, size = fit(room - used, remaining, number - message.begin, message.offset)
-            if taken < 0 or not (taken == remaining or _may_cut(message, taken, used, room)):
+            if taken < 0 or not (
+                taken == remaining or _may_cut(message, taken, used, room, large=1 if self._shares else LARGE)
+            ):
                 continue
             picks.append((message, taken))
             used += size
@@ -130,7 +142,7 @@ class Packing:
         return RANK[message.qos] + 0.5 * self._long(message)
 
     def _long(self, message: Outgoing) -> bool:
-        return len(message.payload) > LONG * self._room
+        return len(message.payload) > (1 if self._shares else LONG) * self._room
 
     def _heap(self, now: float) -> list[tuple[float, float, int, int]]:
         """Topics that may send, the most urgent and most valuable first."""
@@ -175,20 +187,25 @@ class Packing:
                 qos = message.qos
             stats.payload_bytes += taken
             if last:
+                lifetime.left = True
                 topic.queue.popleft()
                 topic.newest = max(topic.newest, message.submitted)
                 stats.sent[topic_id] += not message.repeat
                 self._left(message, now)
-        self.turns.sent(self._holder)
+        # On a shared channel a topic that goes along in a packet has had a turn: fresh messages are in every packet.
+        self.turns.sent([message.topic_id for message, _ in picks] if self._shares else [self._holder])
         stats.entries += len(picks)
         free = (message.submitted for message, _ in picks if not self._topics[message.topic_id].topic.options.max_rate)
         return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, min(free, default=inf))
 
 
-def _may_cut(message: Message, taken: int, used: int, room: int) -> bool:
-    """Whether a fragment of this many bytes is worth its header."""
+def _may_cut(message: Message, taken: int, used: int, room: int, *, large: int) -> bool:
+    """Whether a fragment of this many bytes is worth its header.
+
+    :param large: packets from which on a message is cut with slack
+    """
     if not used:
         return True
     if taken < (MIN_FRAGMENT if message.qos == 1 else room // SHARE):
         return False
-    return message.started or message.qos == 1 or message.remaining > LARGE * room
+    return message.started or message.qos == 1 or message.remaining > large * room

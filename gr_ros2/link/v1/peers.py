@@ -11,6 +11,7 @@ from heapq import heappop, heappush
 from math import inf
 
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
+from gr_ros2.link.v1.shared import SharedRepairs, newest_of
 from gr_ros2.link.v1.unreported import Unreported
 
 START = 64
@@ -82,6 +83,7 @@ class Peers:
 
     :param packets: the packets that they confirm
     :param unreported: what holds while there are none
+    :param shared: on a channel that others share
     :ivar all: the peers, by robot id
     :ivar loss: share of packets that the peer with the most losses loses, as far as it is known or expected
     :ivar proven: some peer may take packets up to this number for replays
@@ -92,18 +94,20 @@ class Peers:
         sent
     """
 
-    def __init__(self, packets: SentPackets, unreported: Unreported) -> None:
+    def __init__(self, packets: SentPackets, unreported: Unreported, shared: SharedRepairs | None = None) -> None:
         self.all: dict[int, Peer] = {}
         self.loss = unreported.loss
         self.proven = 0
         self.in_vain = False
         self.once: set[int] = set()
-        self._packets, self._unreported = packets, unreported
+        self._packets, self._unreported, self._shared = packets, unreported, shared
         self._resend: list[int] = []
         """Negated numbers of the packets that the only peer lacks."""
         self.urges: list[tuple[bool, int]] = []
         self._times: dict[int, float] = {}
         """When the newest packets left, s."""
+        self._served: set[int] = set()
+        """Peers that lack the packet that was urgent last."""
         self._period = 0.0
         """Mean time between two of them, s."""
 
@@ -163,6 +167,8 @@ class Peers:
         self._note_times(peer, number, loss, now)
         records, bit, delay = self._packets.records, peer.bit, peer.delay
         peer.waits = -1
+        before = number if self._shared is None else self._shared.waited_for(now, self._period)
+        missing: list[Sent] = []
         for back in range(MAP):
             record = records.get(number - back)
             if arrived >> back & 1:
@@ -170,15 +176,13 @@ class Peers:
                     record.confirmed |= bit
                     peer.lost.discard(record.number)
             elif record is None or not record.alive(now):
-                if number > back:
+                if 0 < number - back <= before:
                     peer.waits = number - back
             elif record.confirmed & bit:
                 continue
-            elif now - record.at >= delay and record.number not in peer.lost:
-                peer.lost.add(record.number)
-                heappush(self._resend, -record.number)
-                if any(lifetime.in_order for lifetime in record.lifetimes):
-                    heappush(self.urges, (all(lifetime.long for lifetime in record.lifetimes), record.number))
+            elif now - record.at >= delay:
+                missing.append(record)
+        self._lacks(peer, missing)
         peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
         self._note()
         if settled:
@@ -189,6 +193,17 @@ class Peers:
                     peer.lost.discard(older)
             peer.settled = max(peer.settled, number - MAP + 1)
         self._packets.retire(now)
+
+    def _lacks(self, peer: Peer, missing: list[Sent]) -> None:
+        """A report names these packets, the newest first, as lost."""
+        if self._shared is not None:
+            self._shared.lacks(missing)
+        for record in missing:
+            if record.number not in peer.lost:
+                peer.lost.add(record.number)
+                heappush(self._resend, -record.number)
+                if any(lifetime.in_order for lifetime in record.lifetimes):
+                    heappush(self.urges, (all(lifetime.long for lifetime in record.lifetimes), record.number))
 
     def urgent(self, now: float) -> Sent | None:
         """The oldest packet that a report names as lost and for which later messages wait; packets of long messages go
@@ -201,8 +216,17 @@ class Peers:
                 continue
             for peer in lacking:
                 peer.lost.discard(number)
+            self._served = {id(peer) for peer in lacking}
             return record
+        self._served = set()
         return None
+
+    def served(self, window: list[Sent]) -> None:
+        """A combination brings one packet back to each peer, beside those to whom ``urgent`` was due."""
+        for peer in self.all.values():
+            lost = None if id(peer) in self._served else newest_of(window, peer.lost)
+            if lost is not None:
+                peer.lost.discard(lost)
 
     def lost(self, now: float) -> Sent | None:
         """The newest live packet that the only peer lacks and that has not been sent again since."""

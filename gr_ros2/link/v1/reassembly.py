@@ -14,6 +14,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
+from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.wire.v1 import Part
 
 _PARTIAL_COST, _FRAGMENT_COST = 450, 130
@@ -25,6 +26,7 @@ _FEW = 64
 class PartialMessage:
     """A message of which a part is missing.
 
+    :param newest: packet of its newest fragment
     :param place: its place among the entries of the packet in which it began; -1 until that packet is here
     """
 
@@ -35,6 +37,7 @@ class PartialMessage:
     pieces: dict[int, bytes] = field(default_factory=dict)
     size: int = 0
     total: int = -1
+    newest: int = -1
     place: int = -1
     repaired: bool = False
 
@@ -92,6 +95,7 @@ class Reassembly:
         else:
             self._partials.move_to_end(name)
         partial.last = now
+        partial.newest = max(partial.newest, number)
         self._grown[part.topic_id] = partial
         partial.repaired |= repaired
         if part.offset in partial.pieces:
@@ -139,6 +143,13 @@ class Reassembly:
         self._grown.clear()
         self._held = 0
         return ended
+
+    def lacks(self, known: RepairDecoder) -> bool:
+        """Whether a packet is missing between the fragments of a message of which nothing more is to come.
+
+        :param known: the packets that are here
+        """
+        return any(partial.total >= 0 or partial.newest < known.newest for partial in self._partials.values())
 
     def growing(self, topic_id: int, since: float) -> bool:
         """Whether a message of a topic has had a fragment since a time."""

@@ -21,6 +21,7 @@ from gr_ros2.link.v1.combining import Combining, Repair
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import SPAN, Sent, SentPackets
+from gr_ros2.link.v1.shared import SharedRepairs
 from gr_ros2.link.v1.thrift import Thrift
 from gr_ros2.link.v1.unreported import Unreported
 
@@ -38,18 +39,22 @@ class RepairWindow:
         ``off`` uses none
     :param room: bytes of the longest body
     :param expected_loss: share of packets lost, used until a report arrives
+    :param shares: whether others send on the same channel
     :ivar counts: repair packets by kind: ``resent``, ``combined``
     :ivar packets: what has left and may be repaired
     :ivar peers: what reports tell of them
     :ivar thrift: when a report is overdue
     """
 
-    def __init__(self, mode: RepairMode, room: int, expected_loss: float = 0.0, span: int = SPAN) -> None:
+    def __init__(
+        self, mode: RepairMode, room: int, expected_loss: float = 0.0, span: int = SPAN, *, shares: bool = False
+    ) -> None:
         self.mode = mode
         self.counts: Counter[str] = Counter()
         self.packets = SentPackets(span)
         self._unreported = Unreported(expected_loss)
-        self.peers = Peers(self.packets, self._unreported)
+        self._shared = SharedRepairs(self.packets) if shares else None
+        self.peers = Peers(self.packets, self._unreported, self._shared)
         self.thrift = Thrift(self.packets, self.peers)
         self._combining = Combining(self.packets, room)
 
@@ -63,6 +68,8 @@ class RepairWindow:
         self.peers.sent(number, now)
         if not self.peers:
             self._unreported.sent(number, lifetimes)
+        elif self._shared is not None:
+            self._shared.sent(number, lifetimes, self.peers.loss)
         if lifetimes:
             self.thrift.sent()
         self.packets.add(number, body, data, lifetimes, now)
@@ -76,6 +83,8 @@ class RepairWindow:
         if self.mode == "off" or not self.packets.unconfirmed(now):
             return None
         thrifty = self.mode == "thrifty"
+        if self._shared is not None and self.peers and (again := self._urgent_of_all(now, idle=True)) is not None:
+            return again
         if thrifty and (again := self.peers.lost(now)) is not None:
             return self._again(again, now)
         window = self._combining.window(now)
@@ -92,6 +101,8 @@ class RepairWindow:
         where there are no reports, a repair of a long message over the newest packets."""
         if self.mode == "off":
             return None
+        if self._shared is not None and self.peers:
+            return self._urgent_of_all(now)
         again = self.peers.urgent(now)
         if again is not None:
             return self._again(again, now)
@@ -107,11 +118,15 @@ class RepairWindow:
     @property
     def pressing(self) -> bool:
         """Whether ``urgent`` or ``Peers.over`` may have something."""
+        if self._shared is not None and self._shared.due:
+            return True
         return bool(self.peers.urges) or self.peers.in_vain or self._unreported.due(self.packets.newest)
 
     def tell(self, number: int, now: float) -> Repair | None:
         """A repair from which peers learn that a packet is not repaired any more; None if there is none."""
         self.peers.told()
+        if self._shared is not None:
+            return self._for_all(now, lacking=False)
         self.packets.retire(now)
         window = self._combining.around(number, now)
         return self._combination(window, now) if window else None
@@ -126,6 +141,29 @@ class RepairWindow:
                 if record is not None and record.alive(now):
                     return record.lifetimes
         return ()
+
+    def _urgent_of_all(self, now: float, *, idle: bool = False) -> Sent | Repair | None:
+        """What goes before new packets on a shared channel."""
+        assert self._shared is not None
+        if not self._shared.may_leave(idle=idle):
+            return None
+        again = self.peers.urgent(now)
+        if again is not None:
+            return self._for_all(now) if len(self.peers.all) > 1 else self._again(again, now)
+        return self._for_all(now) if self._shared.due else None
+
+    def _for_all(self, now: float, *, lacking: bool = True) -> Repair | None:
+        """A combination of all that is alive.
+
+        :param lacking: whether it counts as bringing one packet back to each peer
+        """
+        assert self._shared is not None
+        window = self._shared.window(now)
+        self._shared.combined(now)
+        self.peers.told()
+        if lacking:
+            self.peers.served(window)
+        return self._combination(window, now) if window else None
 
     def _again(self, record: Sent, now: float) -> Sent:
         record.at = now

@@ -10,8 +10,16 @@ from gr_ros2.link.v1.neighbours import Neighbour
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.requests import Requests
 from gr_ros2.link.v1.writer import PacketWriter
-from gr_ros2.wire.v1 import EntryV1
+from gr_ros2.wire.control import REPORT_LEN
+from gr_ros2.wire.v1 import MAX_WINDOW, EntryV1
 
+REPORTS, AT_ONCE = 0.05, 8
+"""On a channel that many share: most of the bytes of all packets that reports take, and most reports in one packet."""
+LENGTH_LEN = 1
+"""Bytes by which the last fragment of a packet grows when a report follows it: it cannot leave out its length then."""
+MASK_LEN = (MAX_WINDOW + 7) // 8
+"""Bytes kept free there for the mask of a repair. Without it a repair of full packets names those too that are not
+repaired any more, and who lacks one of these cannot use it."""
 FORCED = 20
 """Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
 
@@ -20,19 +28,42 @@ class ReportSlots:
     """The reports that one robot sends about others.
 
     :param hears: whether it hears any
+    :param packet_len: bytes of its longest packet
+    :param shares: whether others send on the same channel
     :ivar requests: what it asks others for
+    :ivar reserved: bytes that messages leave free for the reports that are due, and for the mask of a repair
     """
 
-    def __init__(self, neighbours: Iterable[Neighbour], writer: PacketWriter, *, hears: bool) -> None:
+    def __init__(
+        self,
+        neighbours: Iterable[Neighbour],
+        writer: PacketWriter,
+        *,
+        hears: bool,
+        packet_len: int = 0,
+        shares: bool = False,
+    ) -> None:
         self.requests = Requests(neighbours, hears=hears)
         self._neighbours = neighbours if hears else ()
         self._writer = writer
+        self._packet_len, self._shares = packet_len, shares
+        self._allowed = 0.0
+        """Bytes of reports that may leave on a shared channel."""
+        self.reserved = 0
         self._unheard = 0
         """New packets since a report became due and found no room."""
 
     def due(self, now: float) -> list[Reporter]:
-        """The reports that are due."""
-        return [report for n in self._neighbours if (report := n.inbox.reports).due(now) <= now]
+        """The reports that are due; on a shared channel as many as may leave, those first that miss something."""
+        due = [report for n in self._neighbours if (report := n.inbox.reports).due(now) <= now]
+        if self._shares:
+            self._allowed = min(self._allowed + REPORTS * self._packet_len, AT_ONCE * REPORT_LEN)
+            due.sort(key=lambda report: (not report.lacks, report.reported_at))
+            del due[int(self._allowed / REPORT_LEN) :]
+            size = sum(report.size for report in due)
+            self._allowed -= size
+            self.reserved = MASK_LEN + size + LENGTH_LEN * bool(due)
+        return due
 
     @property
     def overdue(self) -> bool:
@@ -49,6 +80,7 @@ class ReportSlots:
 
         :param free: bytes that they may take
         """
+        free -= LENGTH_LEN * self._shares
         for report in due:
             if free >= report.size:
                 free -= report.size
@@ -56,6 +88,8 @@ class ReportSlots:
                 self._unheard = 0
             else:
                 self._unheard += 1
+        if self._shares:  # no slot may be left for them
+            entries += self.requests.entries(free, now)
 
     def packet(self, due: Iterable[Reporter], now: float) -> SentPacket:
         """A packet with reports, and with requests where there is room."""

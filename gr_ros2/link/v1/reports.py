@@ -5,6 +5,11 @@ nothing is lost, because it costs both ends as much as a message, and reports be
 share of the packets. While messages wait for an earlier one, reports go on: the last one may be lost, and with it that
 they wait.
 
+*Where many share a channel* (:class:`SharedReporter`), reports about all by all would fill it: among 20 robots with
+10 Hz of odometry they took half of the bytes sent. Then packets are reported only if something in them may be repaired:
+topics without reliable publishers need no reports, since the next message is the repair. Who misses something reports
+after each packet of the sender, before those who only confirm.
+
 Invariant: a report tells state, not events, so a lost report costs nothing but time.
 """
 
@@ -15,6 +20,7 @@ from math import inf
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.order import Order
 from gr_ros2.link.v1.peers import MAP, PROMPT
+from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.snr import SnrFilter
 from gr_ros2.wire.control import REPORT_LEN, Report, reportable
 
@@ -31,6 +37,8 @@ _PAUSE_S, _CALM_S = 0.1, 0.5
 """s after which a report is due, even about a single packet: at first and after a loss, and at most."""
 _CALM = 1 / 128
 """Share of lost packets up to which reports become rarer."""
+CONFIRM_S = 1.0
+"""s between two reports to a sender of which nothing is missed or heard since, on a channel that many share."""
 _SLOWER = 1.1
 """By how much the time between two reports grows then. The sender expects reports at their recent interval, so that it
 must not grow faster."""
@@ -74,7 +82,7 @@ class Reporter:
         """Reports before their time that may leave."""
         self._missed = False
         """Whether a packet went missing since the last report."""
-        self._reported_at = 0.0
+        self.reported_at = 0.0
         self._pause = self._shortest
         """s after which the next report is due."""
         self._old_turn = False
@@ -103,14 +111,22 @@ class Reporter:
     def due(self, now: float) -> float:
         """When the next report is due, s; infinite if there is nothing to report."""
         if not self.unreported:
-            return self._reported_at + max(_CALM_S, self._shortest) if self._order.told and self._order.held else inf
+            return self.reported_at + max(_CALM_S, self._shortest) if self._order.told and self._order.held else inf
         half = self._half_duplex or self._scarce
         every = _EVERY * (4 if half else 1)
         most = min(every * self._pause / self._shortest, max(every, MAP // 2))
         prompt = (self._missed or (self.tells_snr and self.snr.changed)) and not half and self._unspent >= 1
         if prompt or self.unreported >= most:
             return now
-        return self._reported_at + self._pause
+        return self.reported_at + self._pause
+
+    def repairable(self) -> None:
+        """Something has arrived that the sender repairs until it is confirmed. Here all packets are reported."""
+
+    @property
+    def lacks(self) -> bool:
+        """Whether something is known to be missing."""
+        return self._missed
 
     @property
     def helps(self) -> bool:
@@ -130,7 +146,7 @@ class Reporter:
         self.unreported = 0
         self._missed = False
         self._unspent = max(self._unspent - 1, 0.0)
-        self._reported_at = now
+        self.reported_at = now
         decoder, wanted = self._decoder, self._order.wanted
         newest = decoder.newest
         base = newest
@@ -148,3 +164,42 @@ class Reporter:
         snr_db = snr.reported_db = reportable(snr.snr_db) if self.tells_snr and snr.snr_db is not None else None
         src_id, boot = self._sender
         return Report(src_id, boot & 0xFFFF, max(base, 0) & 0xFFFF, arrived, settled, loss, snr_db)
+
+
+class SharedReporter(Reporter):
+    """The same on a channel that many share, see the module.
+
+    :param reassembly: knows which messages are incomplete
+    """
+
+    def __init__(
+        self,
+        sender: tuple[int, int],
+        decoder: RepairDecoder,
+        order: Order,
+        reassembly: Reassembly,
+        *,
+        airtime_share: float = 1.0,
+    ) -> None:
+        super().__init__(sender, decoder, order, half_duplex=True, airtime_share=airtime_share)
+        self._reassembly = reassembly
+        self._confirms = False
+
+    def repairable(self) -> None:
+        """Something has arrived that the sender repairs until it is confirmed."""
+        self._confirms = True
+
+    @property
+    def lacks(self) -> bool:
+        """Whether something is known to be missing."""
+        decoder, order = self._decoder, self._order
+        return order.held > 0 or decoder.lacks(order.wanted) or self._reassembly.lacks(decoder)
+
+    def due(self, now: float) -> float:
+        if self.lacks:
+            return now if self.unreported else self.reported_at + CONFIRM_S
+        return self.reported_at + CONFIRM_S if self._confirms and self.unreported else inf
+
+    def make(self, now: float) -> Report:
+        self._confirms = False
+        return super().make(now)

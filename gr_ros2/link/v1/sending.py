@@ -62,7 +62,9 @@ class SendingSide:
         self.hellos = hellos
         self.pings = Pings()
         self.repairs = RepairSlots(settings, self.pace, window, writer=writer, hold=hold)
-        self.reports = ReportSlots(neighbours, writer, hears=settings.hears)
+        self.reports = ReportSlots(
+            neighbours, writer, hears=settings.hears, packet_len=settings.packet_len, shares=settings.shares
+        )
         self.urged = False
         self.heard_at = inf
         self._messages, self._window, self._neighbours = messages, window, neighbours
@@ -101,7 +103,7 @@ class SendingSide:
         if self._relaying is not None and messages.relayed is not None:
             self._relaying.offer(messages.relayed, now)
             room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
-        filling = packing.fill(self._window.packets.newest + 1, room, now)
+        filling = packing.fill(self._window.packets.newest + 1, room - reports.reserved, now)
         if filling is not None:
             self.pace.waited(filling.since, now)
             reports.add(filling.parts, room - filling.used, due, now)

@@ -25,6 +25,7 @@ class Sent:
 
     :param at: when it was last sent, s
     :param confirmed: one bit per peer
+    :param combined: number of combinations for all peers that it is in, on a shared channel
     :param covered: number of repairs of it while nobody reported, divided by the number that is enough
     """
 
@@ -35,6 +36,7 @@ class Sent:
     at: float
     confirmed: int = 0
     covered: float = 0.0
+    combined: int = 0
 
     def alive(self, now: float) -> bool:
         """Whether a message in it is still worth something."""

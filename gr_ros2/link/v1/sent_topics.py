@@ -47,8 +47,10 @@ class SentTopic:
 
     @property
     def is_stream(self) -> bool:
-        """Whether its messages are useless when newer ones have come, should the computer be too slow for all."""
-        return self.topic.is_topic and not self.kept and not self.topic.options.max_rate
+        """Whether its messages are useless when newer ones have come, should the computer be too slow for all. Whoever
+        sets ``queue`` to fifo wants every message."""
+        options = self.topic.options
+        return self.topic.is_topic and not self.kept and not options.max_rate and options.queue != "fifo"
 
     @property
     def kept_depth(self) -> int:

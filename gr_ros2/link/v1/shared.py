@@ -1,0 +1,106 @@
+"""Repairs on a channel that many share.
+
+A robot's turn comes seldom there, and something new always waits. So no slot is idle, and repairs of messages in order
+go before new messages, never two in a row. As soon as such a message has left, a combination of it follows where losses
+are to be expected. Each further one that reports call for brings back one packet to every peer, whichever that lacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import inf
+
+from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.link.v1.sent_packets import Sent, SentPackets
+from gr_ros2.link.v1.unreported import MOST_LOSS
+from gr_ros2.wire.v1 import MAX_WINDOW
+
+TOLD = 2
+"""Mean times between two new packets for which reports may be older than what a repair has told all peers: that
+something is not repaired any more."""
+OWED = 0.5
+"""Packets expected to be lost of a message in order after which a repair follows it at once."""
+
+
+class SharedRepairs:
+    """What one sender on a shared channel knows of its repairs.
+
+    :param packets: what has left and may be repaired
+    :ivar within: whether a message in order goes on in later packets
+    """
+
+    def __init__(self, packets: SentPackets) -> None:
+        self.within = False
+        self._packets = packets
+        self._ordered = -1
+        """The newest packet with a part of a message in order."""
+        self._since = 0
+        """New packets since the last combination."""
+        self._told_at = -inf
+        """When that left, s: it says what is not repaired any more."""
+        self._owed = 0.0
+
+    def sent(self, number: int, lifetimes: tuple[Lifetime, ...], loss: float) -> None:
+        """A source packet leaves.
+
+        :param loss: share of packets that the peer with the most losses loses
+        """
+        self._since += 1
+        ordered = [lifetime for lifetime in lifetimes if lifetime.in_order]
+        if ordered:
+            self._ordered = number
+            self.within = not all(lifetime.left for lifetime in ordered)
+            loss = min(loss, MOST_LOSS)
+            self._owed += loss / (1 - loss)
+
+    @property
+    def due(self) -> bool:
+        """Whether a repair is due that no report has called for."""
+        return self._owed >= OWED
+
+    def may_leave(self, *, idle: bool) -> bool:
+        """Whether a repair may leave now.
+
+        :param idle: nothing new waits
+        """
+        return not self.within and (self._since > 0 or idle)
+
+    def combined(self, now: float) -> None:
+        """A combination leaves."""
+        self._since = 0
+        self._told_at = now
+        self._owed = max(self._owed - 1, 0.0)
+
+    def window(self, now: float) -> list[Sent]:
+        """All that is alive up to the newest packet in order, newest first."""
+        packets = self._packets
+        packets.retire(now)
+        window: list[Sent] = []
+        for newest in (self._ordered, packets.newest):  # where all in order is confirmed, it says at least that
+            first = max(packets.oldest, newest - MAX_WINDOW + 1)
+            window = window or list(packets.live(first, newest, now))[::-1]
+        for record in window:
+            record.at = now
+            record.combined += 1
+        return window
+
+    def waited_for(self, now: float, period: float) -> int:
+        """The number up to which peers may wait in vain for a packet: only messages in order wait, and only for what
+        they were not told of.
+
+        :param period: mean time between two new packets, s
+        """
+        return 0 if self.within or now < self._told_at + TOLD * period else self._ordered - 1
+
+    @staticmethod
+    def lacks(missing: list[Sent]) -> None:
+        """Leave out of the packets that a peer misses, newest first, as many as it may have combinations, which do not
+        show in a report: all but one of these, since it may have lost one, and never the newest."""
+        if missing:
+            had = max(record.combined for record in missing)
+            del missing[max(len(missing) - had + 1, 1) :]
+
+
+def newest_of(window: Iterable[Sent], lost: set[int]) -> int | None:
+    """The newest packet of a window that a peer lacks."""
+    return max((record.number for record in window if record.number in lost), default=None)

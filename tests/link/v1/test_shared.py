@@ -1,0 +1,94 @@
+"""Many on one channel: reports about what may be repaired, those first that miss something, and repairs for all."""
+
+from __future__ import annotations
+
+from math import inf
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from bench import reliable
+from gr_ros2.link.v1.combining import Repair
+from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.link.v1.order import Order
+from gr_ros2.link.v1.reassembly import Reassembly
+from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.reports import CONFIRM_S, SharedReporter
+from gr_ros2.wire.v1 import Part
+
+ROOM = 100
+
+
+def reporter() -> tuple[SharedReporter, RepairDecoder, Reassembly]:
+    decoder = RepairDecoder(ROOM, lambda _: True, 1000)
+    reassembly = Reassembly(10_000)
+    return SharedReporter((1, 1), decoder, Order(decoder, 1, 1.0, 10_000, ROOM), reassembly), decoder, reassembly
+
+
+def test_packets_that_nobody_repairs_are_not_reported() -> None:
+    reports, _, _ = reporter()
+    reports.arrived(late=False)
+    reports.missed(3, counts=True)
+    assert reports.due(5.0) == inf
+    reports.repairable()
+    assert reports.due(5.0) == CONFIRM_S, "it was never reported"
+    reports.make(5.0)
+    assert reports.due(5.0) == inf
+
+
+def test_who_misses_something_reports_at_once() -> None:
+    reports, decoder, reassembly = reporter()
+    reports.arrived(late=False)
+    decoder.source(2, b"")
+    reassembly.add(Part(1, b"begin", 0, 0, False, False), 2, 0, repaired=False, now=0.0)
+    assert reports.due(1.0) == inf, "the message goes on"
+    decoder.source(3, b"")
+    assert reports.due(1.0) == 1.0, "it does not"
+    reports.make(1.0)
+    assert reports.due(1.0) == 1.0 + CONFIRM_S, "the report may have been lost"
+
+
+def window(peers: int) -> RepairWindow:
+    """A sender of a message in order of three packets, which has left; the peers lose packets."""
+    made = RepairWindow("thrifty", ROOM, shares=True)
+    for src_id in range(peers):
+        made.peers.meet(src_id, 0.0)
+    made.sent(1, b"old", b"", (Lifetime(expires=0.5),), 0.0)
+    lifetime = Lifetime(in_order=True)
+    for number in (2, 3, 4):
+        lifetime.left = number == 4
+        made.sent(number, b"body %d" % number, b"", (lifetime,), float(number))
+    return made
+
+
+def test_one_repair_serves_peers_that_lack_different_packets() -> None:
+    made = window(3)
+    for src_id, lost in enumerate((2, 3, 4)):
+        made.peers.report(src_id, 4, 0b11111 ^ 1 << 4 - lost, settled=True, loss=0.1, now=5.0)
+    repair = made.urgent(5.0)
+    assert isinstance(repair, Repair)
+    assert (repair.number, repair.mask, repair.oldest) == (4, 0b111, True)
+    made.sent(5, b"new", b"", (Lifetime(),), 5.1)
+    assert made.urgent(5.1) is None
+
+
+def test_repairs_leave_room_for_new_messages() -> None:
+    made = window(2)
+    for src_id in (0, 1):
+        made.peers.report(src_id, 4, 0b11001, settled=True, loss=0.1, now=5.0)
+    assert made.urgent(5.0) is not None
+    assert made.urgent(5.0) is None, "a new message goes first"
+    assert made.next(5.0) is not None, "nothing new waits"
+
+
+@pytest.mark.slow
+def test_reliable_messages_arrive_beside_fresh_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("T0", 8.0), ("T1", 20.0), ("END", 30.0)):
+        monkeypatch.setattr(reliable, name, value)
+    both, alone = (reliable.talk(reliable=with_them, robots=6) for with_them in (True, False))
+    assert len(both.delays) >= 5 * 6
+    assert both.delays[-1] < inf
+    assert both.reports <= 0.05
+    assert both.age <= 1.3 * alone.age
