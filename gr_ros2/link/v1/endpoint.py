@@ -92,7 +92,10 @@ class EndpointV1:
         self._hold = hold = Hold()
         room = room_of(settings, keys, block=access is not None)
         self.window = window = RepairWindow(
-            "idle" if settings.repair == AUTO else settings.repair, room, settings.expected_loss
+            "idle" if settings.repair == AUTO else settings.repair,
+            room,
+            settings.expected_loss,
+            proves=keys.sealed and settings.hears and not settings.half_duplex and settings.airtime_share == 1,
         )
         self.messages = messages = Outbox(topics, settings, self, boot=boot, room=room, codec=codec, observer=observer)
         self.sent = messages.stats

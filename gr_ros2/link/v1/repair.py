@@ -38,17 +38,20 @@ class RepairWindow:
         ``off`` uses none
     :param room: bytes of the longest body
     :param expected_loss: share of packets lost, used until a report arrives
+    :param proves: see :class:`Unreported`
     :ivar counts: repair packets by kind: ``resent``, ``combined``
     :ivar packets: what has left and may be repaired
     :ivar peers: what reports tell of them
     :ivar thrift: when a report is overdue
     """
 
-    def __init__(self, mode: RepairMode, room: int, expected_loss: float = 0.0, span: int = SPAN) -> None:
+    def __init__(
+        self, mode: RepairMode, room: int, expected_loss: float = 0.0, span: int = SPAN, *, proves: bool = False
+    ) -> None:
         self.mode = mode
         self.counts: Counter[str] = Counter()
         self.packets = SentPackets(span)
-        self._unreported = Unreported(expected_loss)
+        self._unreported = Unreported(expected_loss, proves=proves)
         self.peers = Peers(self.packets, self._unreported)
         self.thrift = Thrift(self.packets, self.peers)
         self._combining = Combining(self.packets, room)
@@ -141,7 +144,7 @@ class RepairWindow:
         repair, combined = found
         first = combined[-1].number
         if not self.peers:
-            self._unreported.cover(combined)
+            self._unreported.cover(combined, now)
         self._unreported.repaired()
         if self.mode == "thrifty":
             self.thrift.combined(now, first, repair.number)
