@@ -96,6 +96,7 @@ class EndpointV1:
             room,
             settings.expected_loss,
             shares=settings.shares,
+            proves=keys.sealed and settings.hears and settings.idle_is_free,
         )
         self.messages = messages = Outbox(topics, settings, self, boot=boot, room=room, codec=codec, observer=observer)
         self.sent = messages.stats

@@ -82,6 +82,11 @@ class Settings:
                 "or run a link both ways"
             )
 
+    @property
+    def idle_is_free(self) -> bool:
+        """Whether a packet in a slot that would be idle takes airtime from nobody."""
+        return self.airtime_share == 1 and not (self.half_duplex or self.shares)
+
 
 def settings_of(
     source: SourceConfig | None,

@@ -40,6 +40,7 @@ class RepairWindow:
     :param room: bytes of the longest body
     :param expected_loss: share of packets lost, used until a report arrives
     :param shares: whether others send on the same channel
+    :param proves: see :class:`Unreported`
     :ivar counts: repair packets by kind: ``resent``, ``combined``
     :ivar packets: what has left and may be repaired
     :ivar peers: what reports tell of them
@@ -47,12 +48,19 @@ class RepairWindow:
     """
 
     def __init__(
-        self, mode: RepairMode, room: int, expected_loss: float = 0.0, span: int = SPAN, *, shares: bool = False
+        self,
+        mode: RepairMode,
+        room: int,
+        expected_loss: float = 0.0,
+        span: int = SPAN,
+        *,
+        shares: bool = False,
+        proves: bool = False,
     ) -> None:
         self.mode = mode
         self.counts: Counter[str] = Counter()
         self.packets = SentPackets(span)
-        self._unreported = Unreported(expected_loss)
+        self._unreported = Unreported(expected_loss, proves=proves)
         self._shared = SharedRepairs(self.packets) if shares else None
         self.peers = Peers(self.packets, self._unreported, self._shared)
         self.thrift = Thrift(self.packets, self.peers)
@@ -179,7 +187,7 @@ class RepairWindow:
         repair, combined = found
         first = combined[-1].number
         if not self.peers:
-            self._unreported.cover(combined)
+            self._unreported.cover(combined, now)
         self._unreported.repaired()
         if self.mode == "thrifty":
             self.thrift.combined(now, first, repair.number)

@@ -2,13 +2,14 @@
 
 A long message that is delivered in order has its repairs while it is sent, if anything waits for it: no report will
 call for them. A packet is over after as many repairs as the expected losses need, so that a robot that nobody hears
-falls silent.
+falls silent. Where packets are taken only after a proof (``proofs``) and idle slots are its own, it does not do so
+before others had time to prove that they hear it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
+from math import inf, sqrt
 
 from gr_ros2.link.v1.lifetime import GROUP, Lifetime
 from gr_ros2.link.v1.sent_packets import Sent
@@ -17,15 +18,23 @@ from gr_ros2.wire.v1 import MAX_WINDOW
 MOST_LOSS = 0.5
 """Loss up to which repairs are sent without reports in proportion to it."""
 
+MEETING_S = 5.0
+"""s after the start of a robot in which it does not fall silent, where packets are taken only after a proof. Without
+it, a message that was said once at the start came never, if the hello of the other robot came after its repairs: on a
+busy computer, in one of three starts."""
+
 
 class Unreported:
     """The repairs of one sender that no report calls for.
 
     :param loss: share of packets that are expected to be lost
+    :param proves: whether others take packets only after a proof, and idle slots take airtime from nobody
     """
 
-    def __init__(self, loss: float) -> None:
+    def __init__(self, loss: float, *, proves: bool = False) -> None:
         self.loss = loss
+        self._silent_from = inf if proves else -inf
+        """When packets may be over, s; inf until the first one leaves."""
         self._owed = 0.0
         """Number of repairs of long messages that are due."""
         self._awaited = -1
@@ -56,8 +65,12 @@ class Unreported:
         """A combination leaves."""
         self._owed = max(self._owed - 1, 0.0)
 
-    def cover(self, packets: Sequence[Sent]) -> None:
+    def cover(self, packets: Sequence[Sent], now: float) -> None:
         """These packets were combined, and nobody reports: those that were combined often enough are over."""
+        if now < self._silent_from:
+            if self._silent_from == inf:
+                self._silent_from = now + MEETING_S
+            return
         share = 1 / self._enough(len(packets))
         for record in packets:
             record.covered += share

@@ -14,6 +14,7 @@ from gr_ros2.link.events import Delivered, Gone, Rejected
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Seal, SealMode, subkey
+from gr_ros2.link.v1.unreported import MEETING_S
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.wire.control import Report
 from gr_ros2.wire.v1 import Header, Part, RepairHeader, body_room, write_body, write_header, write_repair_header
@@ -419,6 +420,28 @@ def test_what_was_withheld_for_long_is_not_executed() -> None:
     assert not any(payload.startswith(b"late") for payload in two.delivered())
     assert two.end.received.lost[1, 0, LedgerRow.NOT_FRESH.value] > 50
     assert any(payload.startswith(b"line") for payload in two.delivered())  # nobody said that it must be fresh
+
+
+def test_what_was_said_before_the_other_robot_could_prove_that_it_hears_is_repaired() -> None:
+    """The hello of the other robot comes later than a sender without proofs would have fallen silent."""
+    one, two = Robot(1, registry(), mode="encrypt"), Robot(2, registry(), mode="encrypt")
+    air = Air(one, two)
+    air.lost = lambda sender, _: sender is two
+    one.end.messages.submit(0, b"said once", air.now)
+    air.run(3.0)
+    assert not two.delivered()
+    air.lost = lambda _, __: False
+    air.run(3.0)
+    assert two.delivered() == [b"said once"]
+    assert one.end.idle
+
+
+def test_a_sealed_robot_that_nobody_hears_falls_silent() -> None:
+    one = Robot(1, registry(), mode="encrypt")
+    air = Air(one)
+    one.end.messages.submit(0, b"said once", air.now)
+    air.run(MEETING_S + 2.0)
+    assert one.end.idle
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])
