@@ -8,8 +8,7 @@ they wait.
 *Where many share a channel* (:class:`SharedReporter`), reports about all by all would fill it: among 20 robots with
 10 Hz of odometry they took half of the bytes sent. Then packets are reported only if something in them may be repaired:
 topics without reliable publishers need no reports, since the next message is the repair, and who repairs nothing needs
-none at all. Who misses something reports
-after each packet of the sender, before those who only confirm.
+none at all. Who misses something reports after each packet of the sender, before those who only confirm.
 
 Invariant: a report tells state, not events, so a lost report costs nothing but time.
 """
