@@ -6,20 +6,22 @@ from collections.abc import Iterable
 from math import inf
 
 from gr_ros2.link.events import SentPacket
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
+from gr_ros2.link.v1.peers import MAP
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.requests import Requests
 from gr_ros2.link.v1.writer import PacketWriter
 from gr_ros2.wire.control import REPORT_LEN
-from gr_ros2.wire.v1 import MAX_WINDOW, EntryV1
+from gr_ros2.wire.v1 import EntryV1
 
 REPORTS, AT_ONCE = 0.05, 8
 """On a channel that many share: most of the bytes of all packets that reports take, and most reports in one packet."""
 LENGTH_LEN = 1
 """Bytes by which the last fragment of a packet grows when a report follows it: it cannot leave out its length then."""
-MASK_LEN = (MAX_WINDOW + 7) // 8
+MASK_LEN = MAP // 8
 """Bytes kept free there for the mask of a repair. Without it a repair of full packets names those too that are not
-repaired any more, and who lacks one of these cannot use it."""
+repaired any more, and who lacks one of these cannot use it. A mask of more packets than a report covers may not fit."""
 FORCED = 20
 """Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
 
@@ -27,28 +29,18 @@ FORCED = 20
 class ReportSlots:
     """The reports that one robot sends about others.
 
-    :param hears: whether it hears any
-    :param packet_len: bytes of its longest packet
-    :param shares: whether others send on the same channel
     :ivar requests: what it asks others for
     :ivar reserved: bytes that messages leave free for the reports that are due, and for the mask of a repair
     """
 
-    def __init__(
-        self,
-        neighbours: Iterable[Neighbour],
-        writer: PacketWriter,
-        *,
-        hears: bool,
-        packet_len: int = 0,
-        shares: bool = False,
-    ) -> None:
-        self.requests = Requests(neighbours, hears=hears)
-        self._neighbours = neighbours if hears else ()
+    def __init__(self, settings: Settings, neighbours: Iterable[Neighbour], writer: PacketWriter) -> None:
+        self.requests = Requests(neighbours, hears=settings.hears)
+        self._neighbours = neighbours if settings.hears else ()
         self._writer = writer
-        self._packet_len, self._shares = packet_len, shares
+        self._packet_len, self._shares = settings.packet_len, settings.shares
         self._allowed = 0.0
         """Bytes of reports that may leave on a shared channel."""
+        self._mask_len = MASK_LEN if settings.repair != "off" else 0
         self.reserved = 0
         self._unheard = 0
         """New packets since a report became due and found no room."""
@@ -62,7 +54,7 @@ class ReportSlots:
             del due[int(self._allowed / REPORT_LEN) :]
             size = sum(report.size for report in due)
             self._allowed -= size
-            self.reserved = MASK_LEN + size + LENGTH_LEN * bool(due)
+            self.reserved = self._mask_len + size + LENGTH_LEN * bool(due)
         return due
 
     @property

@@ -7,8 +7,8 @@ they wait.
 
 *Where many share a channel* (:class:`SharedReporter`), reports about all by all would fill it: among 20 robots with
 10 Hz of odometry they took half of the bytes sent. Then packets are reported only if something in them may be repaired:
-topics without reliable publishers need no reports, since the next message is the repair. Who misses something reports
-after each packet of the sender, before those who only confirm.
+topics without reliable publishers need no reports, since the next message is the repair, and who repairs nothing needs
+none at all. Who misses something reports after each packet of the sender, before those who only confirm.
 
 Invariant: a report tells state, not events, so a lost report costs nothing but time.
 """
@@ -196,9 +196,10 @@ class SharedReporter(Reporter):
         return order.held > 0 or decoder.lacks(order.wanted) or self._reassembly.lacks(decoder)
 
     def due(self, now: float) -> float:
-        if self.lacks:
+        if self._order.told and self.lacks:
             return now if self.unreported else self.reported_at + CONFIRM_S
-        return self.reported_at + CONFIRM_S if self._confirms and self.unreported else inf
+        wanted = (self._order.told and self._confirms) or (self.tells_snr and self.snr.changed)
+        return self.reported_at + CONFIRM_S if wanted and self.unreported else inf
 
     def make(self, now: float) -> Report:
         self._confirms = False

@@ -62,9 +62,7 @@ class SendingSide:
         self.hellos = hellos
         self.pings = Pings()
         self.repairs = RepairSlots(settings, self.pace, window, writer=writer, hold=hold)
-        self.reports = ReportSlots(
-            neighbours, writer, hears=settings.hears, packet_len=settings.packet_len, shares=settings.shares
-        )
+        self.reports = ReportSlots(settings, neighbours, writer)
         self.urged = False
         self.heard_at = inf
         self._messages, self._window, self._neighbours = messages, window, neighbours

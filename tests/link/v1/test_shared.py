@@ -24,7 +24,9 @@ ROOM = 100
 def reporter() -> tuple[SharedReporter, RepairDecoder, Reassembly]:
     decoder = RepairDecoder(ROOM, lambda _: True, 1000)
     reassembly = Reassembly(10_000)
-    return SharedReporter((1, 1), decoder, Order(decoder, 1, 1.0, 10_000, ROOM), reassembly), decoder, reassembly
+    order = Order(decoder, 1, 1.0, 10_000, ROOM)
+    order.told = True
+    return SharedReporter((1, 1), decoder, order, reassembly), decoder, reassembly
 
 
 def test_packets_that_nobody_repairs_are_not_reported() -> None:
