@@ -54,6 +54,8 @@ class RepairDecoder:
         self._bodies: dict[int, bytes] = {}
         self._rows: dict[int, tuple[bytes, bytes]] = {}
         """By pivot: the coefficients of the equation from the pivot on, and its right side."""
+        self._grown = False
+        """Whether an equation was added since they were solved for each other's pivots."""
 
     def __contains__(self, number: int) -> bool:
         """Whether a source packet is known."""
@@ -146,7 +148,7 @@ class RepairDecoder:
             if right:
                 return self._disbelieve()
             self.counts["redundant"] += 1
-            return []
+            return self._solve()
         factor = TIMES[INVERSE[left & 255]]
         body = right.to_bytes(room, "little").translate(factor)
         if left < 256:
@@ -155,6 +157,7 @@ class RepairDecoder:
             self.counts["too_many"] += 1
             return []
         self.counts["held"] += 1
+        self._grown = True
         rows[pivot] = (left.to_bytes((left.bit_length() + 7) >> 3, "little").translate(factor), body)
         return []
 
@@ -193,6 +196,41 @@ class RepairDecoder:
                 if item[0] not in known and item[0] not in bodies:
                     known.add(item[0])
                     found.append(item)
+        return found
+
+    def _solve(self) -> Found:
+        """Take the pivots out of each other's equations; return the packets that this determines.
+
+        A repair that follows from the equations may name packets that they determine together, while none does so
+        alone: those of which older packets are not worth a repair any more, for instance.
+        """
+        rows, room = self._rows, self._room
+        if not self._grown or len(rows) > MAX_WINDOW:
+            return []
+        self._grown = False
+        found: Found = []
+        pivots = sorted(rows)
+        for index in range(len(pivots) - 2, -1, -1):
+            pivot = pivots[index]
+            coefficients = rows[pivot][0]
+            left, right = (int.from_bytes(side, "little") for side in rows[pivot])
+            for other in pivots[index + 1 :]:
+                shift = other - pivot
+                if shift >= len(coefficients):
+                    break
+                factor = left >> shift * 8 & 255
+                if not factor or other not in rows or shift + len(rows[other][0]) > MAX_WINDOW:
+                    continue
+                more, side = (int.from_bytes(held.translate(TIMES[factor]), "little") for held in rows[other])
+                left, right = left ^ more << shift * 8, right ^ side
+            if left == 1:
+                del rows[pivot]
+                found += self._accept(pivot, right.to_bytes(room, "little"))
+                if not rows:
+                    break
+            else:
+                size = (left.bit_length() + 7) >> 3
+                rows[pivot] = (left.to_bytes(size, "little"), right.to_bytes(room, "little"))
         return found
 
     def _naming(self, number: int) -> list[int]:

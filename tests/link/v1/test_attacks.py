@@ -115,8 +115,8 @@ def test_replays_after_the_window_and_a_clock_set_back() -> None:
     # A robot whose state file is lost and whose clock was set back is taken once it proves that it is there now.
     recorded = of(air, one)
     one.start(boot=5)
-    talk(one, air, 100, 5)
-    assert b"genuine 104" in two.delivered()
+    talk(one, air, 100, 60)
+    assert b"genuine 159" in two.delivered()
     attack(two, recorded, air.now)
     check_alive(one, two, air)
     assert not set(two.delivered()) & {b"genuine %d" % number for number in range(30)}

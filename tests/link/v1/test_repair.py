@@ -103,6 +103,22 @@ def test_equations_that_contradict_each_other_are_dropped() -> None:
     assert (receiver.equations, receiver.counts["implausible"]) == (0, 1)
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.integers(2, 60), st.data())
+def test_packets_that_are_still_worth_it_are_recovered_without_the_others(count: int, data: st.DataObject) -> None:
+    """Repairs that name all packets, fewer than these; then repairs that name some: as many as these need, and one."""
+    receiver = decoder()
+    some = sorted(data.draw(st.sets(st.integers(1, count), min_size=1, max_size=count - 1)))
+    before = data.draw(st.integers(0, count - 1))
+    found: set[int] = set()
+    for row in range(before + len(some) + 1):
+        named = list(range(1, count + 1)) if row < before else some
+        mask = sum(1 << named[-1] - number for number in named)
+        combined = combine([(number, body(number)) for number in named], row)
+        found |= known(receiver.repair(named[-1], mask, row, combined))
+    assert found >= set(some)
+
+
 def test_memory_is_bounded() -> None:
     receiver = decoder(span=100)
     for number in range(0, 5000, 2):
