@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gr_ros2.cli.params import SCENARIO, set_option
+from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.study.forecast import Advice, Cut, Effect, Forecast, Planner
 from gr_ros2.study.traffic import is_bag, link_values, of_recording, recorded_graph
@@ -160,9 +161,10 @@ def _verdict(forecast: Forecast) -> str:
 
 
 def _arrives(forecast: Forecast) -> float:
-    """Share of all messages that arrive, 0..1."""
-    offered = sum(topic.offered_hz for topic in forecast.topics)
-    return sum(topic.offered_hz * (topic.result.pdr or 0.0) for topic in forecast.topics) / offered if offered else 1.0
+    """Share of all messages that arrive, 0..1, without those that newer ones replaced before they left."""
+    results = [topic.result for topic in forecast.topics]
+    left = sum(result.sent - result.ledger.get(LedgerRow.SUPERSEDED.value, 0) for result in results)
+    return sum(result.delivered for result in results) / left if left else 1.0
 
 
 def _air(forecast: Forecast) -> str:
