@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -51,8 +52,12 @@ def test_the_layout_is_the_one_that_matplotlib_computes(tmp_path: Path) -> None:
 
 
 def test_pyplot_is_not_touched(tmp_path: Path) -> None:
-    save_figure(latency_figure({"a": [0.1]}), tmp_path, "latency")
-    assert "matplotlib.pyplot" not in sys.modules
+    code = (
+        "import sys; from pathlib import Path; from gr_ros2.report.figures import latency_figure, save_figure; "
+        "save_figure(latency_figure({'a': [0.1]}), Path(sys.argv[1]), 'latency'); "
+        "sys.exit('matplotlib.pyplot' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
 
 
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
