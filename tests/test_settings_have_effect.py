@@ -488,6 +488,8 @@ def other(setting: Setting) -> Any:
     """A value that is not the default."""
     if setting.name in ("key", "state"):
         return "somewhere"
+    if setting.name == "to":
+        return 7
     if isinstance(setting.default, bool):
         return not setting.default
     if isinstance(setting.default, tuple):

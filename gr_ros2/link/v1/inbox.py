@@ -204,8 +204,11 @@ class Inbox:
         window = mask.bit_length()
         if oldest:
             self.order.repaired_from(number - window + 1)
+        redundant = self.decoder.counts["redundant"]
         for found in self.decoder.repair(number, mask, row, combined):
             self._recovered(found)
+        if self.decoder.counts["redundant"] > redundant:
+            self.reports.repaired_in_vain()
         if mask + 1 != 1 << window:
             self.order.left_out(number, mask)
         return self._settled()

@@ -115,9 +115,9 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float, m
             one.end.handle_timeout(now)
             two.end.handle_timeout(now)
     assert happened["here"] > messages / 8
-    for kind in ("outage", "half", "sender restarted", "late", "twice"):
+    for kind in ("outage", "half", "late", "twice"):
         assert happened[kind], kind
-    for kind in ("thinned", "receiver restarted", "came round"):
+    for kind in ("thinned", "sender restarted", "receiver restarted", "came round"):
         assert happened[kind] or messages < 40_000, kind
 
 
