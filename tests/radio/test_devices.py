@@ -60,6 +60,13 @@ def with_driver(driver: Path) -> dict[str, str]:
     return {**os.environ, "SOAPY_SDR_PLUGIN_PATH": str(driver)}
 
 
+def python(driver: Path, code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A program that finds it, run to its end."""
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], env=with_driver(driver), capture_output=True, text=True, cwd=ROOT
+    )
+
+
 def talk(
     driver: Path,
     front_end: dict[str, Any],
@@ -70,13 +77,7 @@ def talk(
     unsent: int = 0,
 ) -> dict[str, Any]:
     """What became of messages over the loopback device, once so many came back and so many samples were not taken."""
-    done = subprocess.run(
-        [sys.executable, "-c", TALK, *map(json.dumps, (front_end, values, count, wanted, unsent))],
-        env=with_driver(driver),
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-    )
+    done = python(driver, TALK, *map(json.dumps, (front_end, values, count, wanted, unsent)))
     assert done.returncode == 0, done.stderr
     result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return result
@@ -130,9 +131,8 @@ def test_a_link_that_only_receives_opens_no_transmitter(driver: Path, tmp_path: 
         "    link.check()\n"
         "    print(json.dumps(link.stats()))\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=with_driver(driver), capture_output=True, text=True, cwd=ROOT, check=True
-    )
+    done = python(driver, code)
+    assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout.splitlines()[-1])
     assert told["packets"]["out"] == 0
     assert not told["airtime"]["transmits"]
@@ -178,8 +178,7 @@ radio.close()
 
 @pytest.mark.parametrize("args", ["driver=loopback,clock=1000000", "driver=loopback"])
 def test_a_device_with_a_clock_sends_at_the_time_asked_for_and_tells_when_it_received(driver: Path, args: str) -> None:
-    run = [sys.executable, "-c", TIMED, args]
-    done = subprocess.run(run, env=with_driver(driver), capture_output=True, text=True, cwd=ROOT)
+    done = python(driver, TIMED, args)
     assert done.returncode == 0, done.stderr
     stated_s, errors_s = json.loads(done.stdout.splitlines()[-1])
     clocked = "clock" in args
@@ -248,13 +247,7 @@ def test_what_a_device_cannot_do_is_said_in_a_line(
     log = tmp_path / "log"
     front_end = {"name": "soapy", "frequency": 1e8, **change, "args": f"{change['args']},log={log}"}
     code = f"from tests.radio.robots import *; RobotLink(config(1, {front_end!r}))"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=with_driver(driver),
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-    )
+    done = python(driver, code)
     assert done.stderr.splitlines()[-1].startswith("gr_ros2.core.errors.RadioError: front_end soapy: ")
     assert re.search(said, done.stderr.splitlines()[-1])
     assert log.read_text().splitlines()[-1] == "tx closed"
@@ -276,9 +269,8 @@ def test_a_device_that_falls_silent_is_waited_for_and_opened_again(driver: Path,
         "print(json.dumps(link.stats()))\n"
         "link.stop()\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=with_driver(driver), capture_output=True, text=True, cwd=ROOT, check=True
-    )
+    done = python(driver, code)
+    assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout.splitlines()[-1])
     assert done.stderr.count("no samples for 3 s") == 2
     assert "front end soapy is back" in done.stderr
