@@ -214,6 +214,7 @@ class RepairDecoder:
             pivot = pivots[index]
             coefficients = rows[pivot][0]
             left, right = (int.from_bytes(side, "little") for side in rows[pivot])
+            before = left
             for other in pivots[index + 1 :]:
                 shift = other - pivot
                 if shift >= len(coefficients):
@@ -228,7 +229,7 @@ class RepairDecoder:
                 found += self._accept(pivot, right.to_bytes(room, "little"))
                 if not rows:
                     break
-            else:
+            elif left != before:
                 size = (left.bit_length() + 7) >> 3
                 rows[pivot] = (left.to_bytes(size, "little"), right.to_bytes(room, "little"))
         return found
