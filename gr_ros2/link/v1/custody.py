@@ -225,9 +225,9 @@ class Custody:
             return
         records = self._packets.records
         for name, held in [(name, held) for name, held in self._held.items() if held.taker == robot]:
-            while 0 <= held.low <= held.last:
+            while held.out is not None and 0 <= held.low <= held.last:
                 record = records.get(held.low)
-                if record is not None and not record.confirmed & peer.bit:
+                if record is not None and not record.confirmed & peer.bit and held.out.lifetime in record.lifetimes:
                     break
                 held.low += 1
             if 0 <= held.last < held.low:

@@ -134,7 +134,7 @@ class RepairWindow:
         """A repair from which peers learn that a packet is not repaired any more; None if there is none."""
         self.peers.told()
         if self._shared is not None:
-            return self._for_all(now, lacking=False)
+            return self._for_all(now, number, lacking=False)
         self.packets.retire(now)
         window = self._combining.around(number, now)
         return self._combination(window, now) if window else None

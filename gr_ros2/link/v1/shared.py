@@ -39,7 +39,7 @@ class SharedRepairs:
         self._since = 0
         """New packets since the last combination."""
         self._told_at = -inf
-        """When that left, s: it says what is not repaired any more."""
+        """When one over the oldest packet left, s: it says what is not repaired any more."""
         self._owed = 0.0
 
     def sent(self, number: int, lifetimes: tuple[Lifetime, ...], loss: float) -> None:
@@ -71,7 +71,6 @@ class SharedRepairs:
     def combined(self, now: float) -> None:
         """A combination leaves."""
         self._since = 0
-        self._told_at = now
         self._owed = max(self._owed - 1, 0.0)
 
     def window(self, now: float, lost: int) -> list[Sent]:
@@ -82,10 +81,12 @@ class SharedRepairs:
         packets = self._packets
         packets.retire(now)
         window: list[Sent] = []
-        ordered = self._ordered if lost < 0 else min(self._ordered, lost + MAX_WINDOW // 2)
+        ordered = self._ordered if lost < 0 else min(self._ordered, max(lost, packets.oldest) + MAX_WINDOW // 2)
         for newest in (ordered, packets.newest):  # where all in order is confirmed, it says at least that
             first = max(packets.oldest, newest - MAX_WINDOW + 1)
             window = window or list(packets.live(first, newest, now))[::-1]
+        if not window or window[-1].number == packets.oldest:
+            self._told_at = now
         for record in window:
             record.at = now
             record.combined += 1
