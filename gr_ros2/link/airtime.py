@@ -39,7 +39,8 @@ class AirtimeClock(Generic[T]):
     :param listens: called when a packet is about to leave; returns s after which to listen again because somebody else
         sends, 0 if the channel is clear. None: nobody listens
     :raises ConfigError: for a negative airtime, lead or ahead
-    :ivar refused: packets that were refused, by reason: ``airtime_limit`` or ``transmit_off``
+    :ivar refused: packets that were refused, by reason: ``airtime_limit`` or ``transmit_off``; others may be
+        counted here too
     :ivar used: s of airtime of all packets taken
     :ivar deferred: how often a packet did not leave because somebody else was sending
     :ivar held: whether the credits given last had been held back by the limit or the switch
