@@ -31,7 +31,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
-    :param lead: s before the channel is free at which a credit is given
+    :param lead: s before the channel is free at which a credit is given at the earliest
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
     :param timed, listens: see :class:`AirtimeClock`
@@ -59,7 +59,9 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
-        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead, limit, timed=timed, listens=listens)
+        self._clock: AirtimeClock[Any] = AirtimeClock(
+            airtime, lead, ahead, limit, measured=True, timed=timed, listens=listens
+        )
         self._admits = admits
         self._now = clock
         self._left = 0
