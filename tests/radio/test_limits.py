@@ -20,13 +20,14 @@ from tests.waiting import wait_for
 AIRTIME = 0.02
 
 
-def limited(folder: Path) -> dict[str, Any]:
-    """A tenth of each second: five packets."""
-    return {"airtime_limit": {"duty_cycle": 0.1, "window_s": 1}, "robot_id": 1, "state": str(folder / "robot.json")}
+def limited(folder: Path, window_s: float) -> dict[str, Any]:
+    """A tenth of each window: five packets of a second."""
+    limit = {"duty_cycle": 0.1, "window_s": window_s}
+    return {"airtime_limit": limit, "robot_id": 1, "state": str(folder / "robot.json")}
 
 
 def test_no_second_has_more_packets_than_the_limit_lets_through(tmp_path: Path) -> None:
-    top, gate, probe = Flowgraph("test", "test"), make_gate(AIRTIME, **limited(tmp_path)), Probe()
+    top, gate, probe = Flowgraph("test", "test"), make_gate(AIRTIME, **limited(tmp_path, 1)), Probe()
     top.msg_connect((probe, "pdus"), (gate, "pdus"))
     top.msg_connect((gate, "pdus"), (probe, "pdus"))
     top.msg_connect((gate, "credit"), (probe, "credit"))
@@ -43,15 +44,15 @@ def test_no_second_has_more_packets_than_the_limit_lets_through(tmp_path: Path) 
 
 
 def test_its_account_survives_a_restart_and_has_one_user(tmp_path: Path) -> None:
-    gate = make_gate(AIRTIME, **limited(tmp_path))
+    gate = make_gate(AIRTIME, **limited(tmp_path, 1000))
     limit = gate._clock.limit
     assert limit is not None
     assert limit.reserve(time.monotonic(), AIRTIME)
     with pytest.raises(ConfigError, match="another link of this robot uses it"):
-        make_gate(AIRTIME, **limited(tmp_path))
+        make_gate(AIRTIME, **limited(tmp_path, 1000))
     del gate, limit
     gc.collect()
-    assert make_gate(AIRTIME, **limited(tmp_path)).account()["spent_s"] >= AIRTIME
+    assert make_gate(AIRTIME, **limited(tmp_path, 1000)).account()["spent_s"] >= AIRTIME
 
 
 @pytest.mark.parametrize(
