@@ -90,9 +90,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """The source id on the wire."""
         self._start = EndpointSetup()
         if end is None:
-            start = self._start = start_of(
-                self.config, self.src_id, reports=False, any_length=any_length, mcs_table=mcs_table
-            )
+            setup = EndpointSetup(any_length=any_length, mcs_table=mcs_table)
+            start = self._start = start_of(self.config, self.src_id, setup)
             rng = random.Random(seed)
             end = LiveEnd(
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)

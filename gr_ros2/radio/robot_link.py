@@ -21,7 +21,7 @@ from typing import Any
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.ends import account_of, own_settings
+from gr_ros2.gr.ends import EndpointSetup, account_of, own_settings
 from gr_ros2.link.access import Access
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import AirtimeLimit, sustained
@@ -219,19 +219,22 @@ class RobotLink(Flowgraph):
 
     def _one_block(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
         """Both directions share one endpoint, so that received packets can change what is sent."""
-        both = RosLink(
-            self._registry if self.sends else Registry.empty(),
-            self.config.ros_source if self.sends else replace(self.config.ros_source, registry="", topics=()),
-            self._sink_config(),
-            middleware=graphs,
+        setup = EndpointSetup(
             reports=self.sends,
             half_duplex=self._shares or getattr(self.front_end.options, "half_duplex", False),
             any_length=self.phy.any_length,
             mcs_table=self.phy.mcs_table,
-            airtime_share=1.0 if self.config.airtime.rule is None else sustained(self.config.airtime.rule),
+            airtime_share=sustained(self.config.airtime.rule),
             access=self._access if self.sends else lambda _: None,
             lead_s=LEAD_S + (self.front_end.ahead() or 0.0),
             relay=self.config.relay == "gain",
+        )
+        both = RosLink(
+            self._registry if self.sends else Registry.empty(),
+            self.config.ros_source if self.sends else replace(self.config.ros_source, registry="", topics=()),
+            self._sink_config(),
+            setup=setup,
+            middleware=graphs,
             observer=observer,
             clock=self._clock,
         )

@@ -48,7 +48,6 @@ def start_of_run(
     :param airtime_s: of the longest packet
     """
     answered = _answered(ways)
-    rule = ways[0].airtime.rule
     return EndpointSetup(
         ways[0].seed + 1,
         reports=answered,
@@ -57,7 +56,7 @@ def start_of_run(
         mcs_table=mcs_table,
         access=access_of(ways[0].medium, airtime_s, ways[0].seed),
         relay=ways[0].relay == "gain",
-        airtime_share=1.0 if rule is None else sustained(rule),
+        airtime_share=sustained(ways[0].airtime.rule),
     )
 
 
