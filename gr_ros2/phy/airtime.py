@@ -122,10 +122,10 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         infinite if it has ended. Takes no lock."""
         if not self._running:
             return 0.0
-        return max(0.0, time.monotonic() - self._looks_at) if self._thread.alive else inf
+        return max(0.0, self._now() - self._looks_at) if self._thread.alive else inf
 
     def start(self) -> bool:
-        self._looks_at = time.monotonic()
+        self._looks_at = self._now()
         with self._changed:
             self._running = True
         self._thread.start(self._run, "gr-ros2-airtime")
@@ -177,5 +177,5 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             at = self._clock.next_timeout(now)
             self._looks_at = inf if at is None else max(at, now)
             self._changed.wait(None if at is None else max(0.0, at - now))
-            self._looks_at = time.monotonic()
+            self._looks_at = self._now()
         return pdus, credits
