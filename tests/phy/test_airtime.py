@@ -89,11 +89,11 @@ def test_a_packet_that_passes_late_is_measured(top: Flowgraph) -> None:
     assert list(gate.passed_at) == [happened]
 
 
-def test_on_a_clock_that_lags_behind_the_machines_its_thread_does_not_count_as_stuck(top: Flowgraph) -> None:
-    gate = AirtimeGate(0.5, clock=lambda: time.monotonic() - 100.0)
+def test_on_a_clock_that_stands_still_its_thread_does_not_count_as_stuck(top: Flowgraph) -> None:
+    gate = AirtimeGate(0.5, clock=lambda: 0.0)
     wire(top, gate).post(bytes(1))
     wait_for(lambda: gate.backlog, "a packet on the air")
-    assert gate.stalled_s() < 50.0
+    assert gate.stalled_s() == 0.0
 
 
 def test_when_packets_passed_is_not_kept_unless_asked_for(top: Flowgraph) -> None:
