@@ -190,7 +190,7 @@ class Way(Protocol):
 
 
 class Links(Protocol):
-    """The links of a run: :class:`gr_ros2.run.direction.Directions` or :class:`gr_ros2.run.team.Team`.
+    """The links of a run: :class:`gr_ros2.run.direction.Directions` or :class:`gr_ros2.run.team.LiveTeam`.
 
     :ivar listened: of the ways, the first ones whose output is recorded
     :ivar channels: how many they use
@@ -246,11 +246,11 @@ class _Run:
     def _links(self, phys: Sequence[Phy], around: Surroundings, stack: ExitStack) -> Links:
         # Only a run in real time needs GNU Radio.
         from gr_ros2.run.direction import Directions
-        from gr_ros2.run.team import Team
+        from gr_ros2.run.team import LiveTeam
 
         common: dict[str, Any] = {"records": self.records, "stack": stack}
         if self.scenario.robots:
-            return Team(self.scenario, self.registry, phys, around, **common)
+            return LiveTeam(self.scenario, self.registry, phys, around, **common)
         return Directions(self.scenario, self.registry, phys, **common)
 
     def _robots(self, stack: ExitStack) -> dict[int, Middleware]:

@@ -83,7 +83,7 @@ class LiveRobot:
         return {name: stats[name] for name in ("source", "sink", "packets")}
 
 
-class Team:
+class LiveTeam:
     """The robots of a scenario and the medium between them, ready to start.
 
     :param scenario: in which every robot's graph has a domain of its own
