@@ -19,15 +19,12 @@ from gnuradio import gr
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, octets, with_begin
+from gr_ros2.phy.pdus import CREDIT, PDUS, credit_of, leave_at_of, mcs_of, octets, with_begin
 from gr_ros2.phy.threads import BlockThread
-
-_ONE, _HELD_BACK = pmt.from_long(1), pmt.from_long(0)
 
 
 class AirtimeGate(gr.basic_block):  # type: ignore[misc]
-    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come, for which the
-    air is free since this time in s; an integer for packets that the limit or the switch held back, after a 0).
+    """Message ports `pdus` in, `pdus` out, `credit` out (see :class:`gr_ros2.gr.source.RosSource`).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
@@ -162,15 +159,12 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 if not self._running:
                     return
                 pdus, credits = self._step()
-                free = self._clock.free
+                free = inf if self._clock.held else self._clock.free
             for begins_at, pdu in pdus:
                 self.message_port_pub(PDUS, with_begin(pdu, begins_at))
             self.passed += len(pdus)
-            if credits and self._clock.held:
-                self.message_port_pub(CREDIT, _HELD_BACK)
-            credit = _ONE if self._clock.held else pmt.from_double(free)
-            for _ in range(credits):
-                self.message_port_pub(CREDIT, credit)
+            if credits:
+                self.message_port_pub(CREDIT, credit_of(credits, free))
 
     def _step(self) -> tuple[list[tuple[float, Any]], int]:
         """What is due; waits until something is due."""

@@ -10,12 +10,11 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-import pmt
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.flowgraph import Flowgraph
-from gr_ros2.phy.pdus import pdu_of
+from gr_ros2.phy.pdus import credited, pdu_of
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 
@@ -66,7 +65,7 @@ def test_a_credit_says_since_when_the_air_is_free(top: Flowgraph) -> None:
     begin = time.monotonic()
     probe.post(b"x")
     wait_for(lambda: probe.credits == 2, "the next credit")
-    first, second = (pmt.to_double(message) for message in probe.granted)
+    first, second = (credited(message)[1] for message in probe.granted)
     assert first == -inf
     assert second >= begin + 0.02
 
