@@ -168,7 +168,7 @@ class RepairWindow:
         """
         assert self._shared is not None
         window = self._shared.window(now, lost)
-        self._shared.combined(now)
+        self._shared.combined()
         self.peers.told()
         if lacking:
             self.peers.served(window)

@@ -68,7 +68,7 @@ class SharedRepairs:
         """
         return not self.within and (self._since > 0 or idle)
 
-    def combined(self, now: float) -> None:
+    def combined(self) -> None:
         """A combination leaves."""
         self._since = 0
         self._owed = max(self._owed - 1, 0.0)
