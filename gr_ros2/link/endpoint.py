@@ -188,8 +188,11 @@ class Questions(Protocol):
         :param key: number that stands for the key, 0 for none
         """
 
-    def put(self, robot: int, now: float) -> dict[str, Any]:
-        """Ask a robot as soon as a packet may leave; returns what has come of all questions to it so far."""
+    def put(self, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
+        """Ask a robot as soon as a packet may leave; returns what has come of all questions to it so far.
+
+        :param anew: forget the earlier ones
+        """
 
 
 class Endpoint(PacketSide, Protocol):
