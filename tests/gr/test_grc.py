@@ -471,10 +471,18 @@ for path in sys.argv[1:]:
     for block in graph.blocks:
         block.create_labels()
         block.create_shapes()
-    found[path] = [
+    blocks = [
         [block.name, [*block.coordinate, block.coordinate[0] + block.width, block.coordinate[1] + block.height]]
         for block in graph.blocks
     ]
+    wires = []
+    for wire in graph.connections:
+        wire.create_shapes()
+        start, end = wire.source_port.connector_coordinate_absolute, wire.sink_port.connector_coordinate_absolute
+        places = [start, *([x + a, y + b] for (x, y), (a, b) in zip((start, start, end, end, end), wire._rel_points))]
+        ends = [wire.source_block.name, wire.sink_block.name]
+        wires.append([ends, places])
+    found[path] = [blocks, wires]
 print(json.dumps(found))
 """
 
