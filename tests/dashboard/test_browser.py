@@ -56,8 +56,8 @@ look(document);
 FOCUSED = """
 let node = document.activeElement;
 while (node.shadowRoot?.activeElement) node = node.shadowRoot.activeElement;
-const ring = getComputedStyle(node);
-return [node.getAttribute("aria-label") || node.innerText, ring.outlineStyle, ring.outlineWidth, node === document.body];
+const ring = getComputedStyle(node), name = node.getAttribute("aria-label") || node.innerText;
+return [name, ring.outlineStyle, ring.outlineWidth, node === document.body];
 """
 """The element with the keyboard's focus: its name, and the ring around it."""
 PALE = """
