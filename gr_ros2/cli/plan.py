@@ -158,7 +158,8 @@ def _verdict(forecast: Forecast) -> str:
         )
     else:
         fits = "it fits"
-    return f"Load {forecast.load:.0%}: {fits}."
+    per_message = _number(forecast.air_bytes_per_message, 1, ".0f")
+    return f"Load {forecast.load:.0%}: {fits}. {per_message} bytes on the air per message delivered."
 
 
 def _arrives(forecast: Forecast) -> float:

@@ -38,7 +38,7 @@ def explanation(result: Result, trace: Trace) -> list[str]:
         *air_lines(result),
         *_capacity(result, trace, packets),
         *_packets(result, packets),
-        *_in_flight(trace, packets),
+        *_in_flight(result, trace, packets),
         *_trend(result, trace),
     ]
 
@@ -84,7 +84,7 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     if passed - came:
         text += f", {passed - came:,} were lost on the way"
     if len(t_sent) - passed:
-        text += f", {len(t_sent) - passed:,} had not come out of the PHY by the end"
+        text += f", {len(t_sent) - passed:,} left after the last that arrived (lost, or in the PHY at the end)"
     yield text + "."
     wanted, complete, whole = _fragments(packets, passed)
     if wanted > 1.05 and came < passed:
@@ -144,7 +144,7 @@ def _busy(kinds: Mapping[str, float], span: float) -> str:
     return f"{text}, with {parts[0][0]}" if parts else text
 
 
-def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
+def _in_flight(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     """Where the messages in flight were at the end."""
     left: dict[tuple[int, int], int] = {}
     for src_id, serial, total in _messages_sent(packets)[0]:
@@ -161,8 +161,9 @@ def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
                 under_way += 1
             else:
                 gone += 1
+    waited = "waited in the PHY, on the air or for repair" if air_uses(result) else "waited in the PHY or on the air"
     where = {
-        "had left the source whole and waited in the PHY or on the air": gone,
+        f"had left the source whole and {waited}": gone,
         "had left in part": under_way,
         "had not left the source's queue": waiting,
     }

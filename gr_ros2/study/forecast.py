@@ -94,6 +94,8 @@ class Forecast:
     :param airtime_s: of one packet
     :param capacity: packets/s the radio carries
     :param used: part of the airtime that is used, 0..1; of the busiest channel, where each robot has its own
+    :param air_bytes_per_message: packet bytes on the air per message delivered, PAD and headers included
+    :param pad: part of the packets' bytes that is PAD
     :param allowed: part of the airtime that may be used, 0..1; loads are parts of this
     :param shared: whether all robots use one channel
     """
@@ -102,6 +104,8 @@ class Forecast:
     airtime_s: float
     capacity: float
     used: float
+    air_bytes_per_message: float | None
+    pad: float
     allowed: float
     shared: bool
     topics: tuple[TopicForecast, ...]
@@ -446,17 +450,20 @@ class Planner:
             for message in messages[-1]:
                 payloads[src_id, message.topic_id].append(message.payload)
         shares: Counter[tuple[int, int]] = Counter()
+        padded = sent_bytes = 0
         senders: dict[str, Counter[str]] = {}
         begun, ended = np.inf, 0.0
 
         wire = scenario.ros_source.wire_format
 
         def share(sent: SentPacket) -> None:
-            nonlocal begun, ended
+            nonlocal padded, sent_bytes, begun, ended
             own_airtime = phy.airtime(len(sent.data))
             senders.setdefault(str(sent.identity.src_id), Counter())[sent.kind] += own_airtime  # type: ignore[assignment]
+            sent_bytes += len(sent.data)
             begun, ended = min(begun, sent.now), max(ended, sent.now + own_airtime)
             layout = wire.layout(sent.packet, scenario.packet_len, len(sent.data))
+            padded += sum(span.size for span in layout if span.kind == "pad")
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:
                 if span.entry is not None:
@@ -493,6 +500,7 @@ class Planner:
                     result=result,
                 )
             )
+        delivered = sum(topic.result.delivered for topic in topics)
         spent = [float(kinds.total()) for kinds in senders.values()]
         span = max(ended - begun, airtime)
         sending = {str(way.ros_source.src_id()) for way in ways}
@@ -501,6 +509,8 @@ class Planner:
             airtime_s=airtime,
             capacity=allowed / airtime,
             used=min((sum(spent) if shared else max(spent, default=0.0)) / span, 1.0),
+            air_bytes_per_message=sent_bytes / delivered if delivered else None,
+            pad=padded / sent_bytes if sent_bytes else 0.0,
             allowed=allowed,
             shared=shared,
             topics=tuple(topics),
