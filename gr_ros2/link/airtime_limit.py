@@ -174,9 +174,9 @@ class AirtimeLimit:
             self._sum = 0.0
 
 
-def sustained(rule: AirtimeRule) -> float:
-    """The share of the time that a transmitter with more to send than it may is on the air, 0..1."""
-    return rule.duty_cycle * (1 - BURST) if rule.duty_cycle < 1 else 1.0
+def sustained(rule: AirtimeRule | None) -> float:
+    """The share of the time that a transmitter with more to send than it may is on the air, 0..1; None = no limit."""
+    return rule.duty_cycle * (1 - BURST) if rule is not None and rule.duty_cycle < 1 else 1.0
 
 
 def at_full_load(rule: AirtimeRule, longest: float) -> AirtimeLimit:

@@ -19,22 +19,20 @@ from gnuradio import gr
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, with_begin
+from gr_ros2.phy.pdus import CREDIT, PDUS, credit_of, leave_at_of, mcs_of, octets, with_begin
 from gr_ros2.phy.threads import BlockThread
-
-_ONE, _HELD_BACK = pmt.from_long(1), pmt.from_long(0)
 
 
 class AirtimeGate(gr.basic_block):  # type: ignore[misc]
-    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come, for which the
-    air is free since this time in s; an integer for packets that the limit or the switch held back, after a 0).
+    """Message ports `pdus` in, `pdus` out, `credit` out (see :class:`gr_ros2.gr.source.RosSource`).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
-    :param lead: s before the channel is free at which a credit is given
+    :param lead: s before the channel is free at which a credit is given at the earliest
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
     :param timed, listens: see :class:`AirtimeClock`
+    :param admits: whether a packet with these bytes may be sent at all; others count as refused, `not_sealed`
     :param clock: s, monotonic
     :param times: store when each packet passed; off by default, since a link that runs without end would store too many
     :ivar lateness: delays of packets after the time at which they should pass
@@ -52,12 +50,16 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         limit: AirtimeLimit | None = None,
         timed: bool = False,
         listens: Callable[[], float] | None = None,
+        admits: Callable[[bytes], bool] | None = None,
         times: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
-        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead, limit, timed=timed, listens=listens)
+        self._clock: AirtimeClock[Any] = AirtimeClock(
+            airtime, lead, ahead, limit, measured=True, timed=timed, listens=listens
+        )
+        self._admits = admits
         self._now = clock
         self._left = 0
         """Packets that have passed or are about to."""
@@ -122,10 +124,10 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         infinite if it has ended. Takes no lock."""
         if not self._running:
             return 0.0
-        return max(0.0, time.monotonic() - self._looks_at) if self._thread.alive else inf
+        return max(0.0, self._now() - self._looks_at) if self._thread.alive else inf
 
     def start(self) -> bool:
-        self._looks_at = time.monotonic()
+        self._looks_at = self._now()
         with self._changed:
             self._running = True
         self._thread.start(self._run, "gr-ros2-airtime")
@@ -142,8 +144,12 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         airtime = None
         if self._airtime_of is not None:
             airtime = self._airtime_of(int(pmt.length(pmt.cdr(pdu))), mcs_of(pdu) or 0)
+        admitted = self._admits is None or self._admits(octets(pmt.cdr(pdu)))
         with self._changed:
-            self._clock.offer(pdu, self._now(), airtime, leave_at_of(pdu))
+            if admitted:
+                self._clock.offer(pdu, self._now(), airtime, leave_at_of(pdu))
+            else:
+                self._clock.refused["not_sealed"] += 1
             self.arrived += 1
             self._changed.notify_all()
 
@@ -153,15 +159,12 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 if not self._running:
                     return
                 pdus, credits = self._step()
-                free = self._clock.free
+                free = inf if self._clock.held else self._clock.free
             for begins_at, pdu in pdus:
                 self.message_port_pub(PDUS, with_begin(pdu, begins_at))
             self.passed += len(pdus)
-            if credits and self._clock.held:
-                self.message_port_pub(CREDIT, _HELD_BACK)
-            credit = _ONE if self._clock.held else pmt.from_double(free)
-            for _ in range(credits):
-                self.message_port_pub(CREDIT, credit)
+            if credits:
+                self.message_port_pub(CREDIT, credit_of(credits, free))
 
     def _step(self) -> tuple[list[tuple[float, Any]], int]:
         """What is due; waits until something is due."""
@@ -177,5 +180,5 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             at = self._clock.next_timeout(now)
             self._looks_at = inf if at is None else max(at, now)
             self._changed.wait(None if at is None else max(0.0, at - now))
-            self._looks_at = time.monotonic()
+            self._looks_at = self._now()
         return pdus, credits

@@ -23,6 +23,8 @@ _BEHIND = 0.01
 """A link falls behind if its latency grows by more than this share of the run. Otherwise its queues just fluctuate."""
 _ABOVE = 1.05
 """More airtime than this part of the time means that several sent at once."""
+_SLOW = 0.01
+"""A clock that lags behind real time by more than this share of the run is named."""
 _UNSEEN = 0.0005
 """Smaller shares of the air are not named."""
 _CHANNELS = 4
@@ -188,10 +190,19 @@ def _trend(result: Result, trace: Trace) -> Iterator[str]:
 
 
 def lateness_lines(result: Result) -> list[str]:
-    """Whether the computer kept up with the run's clock: one sentence where it did not."""
+    """Whether the computer kept up with the run's clock: a sentence where it did not."""
+    lines = []
+    slow_s = result.counters.get("medium", {}).get("slow_s", 0.0)
+    if slow_s > _SLOW * result.duration_s:
+        lines.append(
+            f"The computer carried {len(result.config['robots'])} robots at "
+            f"{_percent(result.duration_s / (result.duration_s + slow_s))} of real time: "
+            f"{_seconds(result.duration_s)} on their clock took {_seconds(slow_s)} longer. Nothing is lost by it, but "
+            "programs on their graphs see a slower world."
+        )
     late = result.lateness
     if late is None or not late.moments:
-        return []
+        return lines
     parts = sorted(late.worst_s.items(), key=lambda item: -item[1])
     worst = ", ".join(f"{name} {_seconds(value)}" for name, value in parts)
     times = "once" if late.moments == 1 else f"{late.moments:,} times"
@@ -204,7 +215,7 @@ def lateness_lines(result: Result) -> list[str]:
             f"; {_percent(late.lost_after / late.lost)} of the losses follow such moments, as do "
             f"{_percent(late.sent_after / late.sent)} of all messages"
         )
-    return [f"{text}."]
+    return [*lines, f"{text}."]
 
 
 def _entries_per_message(packets: Packets, topic: str) -> float:
