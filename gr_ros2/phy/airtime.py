@@ -103,7 +103,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
 
     def account(self) -> dict[str, Any]:
         """Whether it sends, s of airtime sent since the start, packets refused by reason; with a limit also the s sent
-        in its window, the s allowed, the window, and how often the account could not be stored."""
+        in its window, the s allowed, the window, how often the account could not be stored, and whether it is now."""
         with self._changed:
             clock, limit = self._clock, self._clock.limit
             told = {"transmits": clock.transmits, "sent_s": clock.used, "refused": dict(clock.refused)}
@@ -117,6 +117,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 "window_s": limit.rule.window_s,
                 "waits_s": max(limit.earliest(now, 0.0) - now, 0.0),
                 "unsaved": limit.unsaved,
+                "stored": limit.stored,
             }
 
     def stalled_s(self) -> float:

@@ -272,12 +272,13 @@ class RobotLink(Flowgraph):
                 raise
             self._lose(error)
 
-    def ping(self, robot: int) -> dict[str, Any]:
+    def ping(self, robot: int, *, anew: bool = False) -> dict[str, Any]:
         """Ask another robot, which answers at once; returns what has come of all questions to it so far.
 
+        :param anew: forget the earlier ones
         :raises ConfigError: with version 0
         """
-        return {**ping(self.end, robot, self._clock()), **self.source.rate()}
+        return {**ping(self.end, robot, self._clock(), anew=anew), **self.source.rate()}
 
     @property
     def remark(self) -> str:

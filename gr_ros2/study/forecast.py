@@ -354,8 +354,10 @@ class Planner:
             # A message costs more where fewer others share its packets.
             cuts, last = [cut for cut, _ in applied], applied[-1][1]
             load = last.load
-            kept = {row: own / (rates.get(row) or offered[row]) for row, own in self._demand(last)[1].items()}
-            cost |= {name: max(cost[name], own) for name, own in kept.items()}
+            there, loads = self._demand(last)  # with what found no place before
+            offered = there | offered
+            kept = {row: own / (rates.get(row) or offered[row]) for row, own in loads.items()}
+            cost |= {name: max(cost.get(name, 0.0), own) for name, own in kept.items()}
         return cuts
 
     def _demand(self, forecast: Forecast) -> tuple[dict[str, float], dict[str, float]]:
