@@ -123,7 +123,10 @@ class ReceivingSide:
             self._forget(gone.src_id)
             gone.inbox.order.told = False
             self._report_all(gone.inbox.handle_timeout(now))
-            self._events.append(Gone(gone.src_id, gone.boot))
+            if self.relaying is None or not self.relaying.reaches(gone.src_id, gone.boot, now):
+                self._events.append(Gone(gone.src_id, gone.boot))
+        if self.relaying is not None:
+            self._events += self.relaying.handle_timeout(now)
         self._messages.reported = bool(self._window.peers)
         events, self._events = self._events, []
         return events
@@ -132,6 +135,8 @@ class ReceivingSide:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
         times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
         times += [n.heard + self._give_up_s for n in self.neighbours if not n.gone]
+        if self.relaying is not None and (at := self.relaying.next_timeout()) is not None:
+            times.append(at)
         return min(times, default=None)
 
     def unpublished(self, event: Delivered) -> Lost:
@@ -274,6 +279,8 @@ class ReceivingSide:
         loss, now = report.loss / 128, self._now
         self._window.peers.report(sender, number, report.arrived, settled=report.settled, loss=loss, now=now)
         self._sending.repairs.reported()
+        if self.relaying is not None:
+            self.relaying.custody.reported(sender)
         self._messages.reported = True
         if self._rate is not None and report.snr_db is not None:
             self._rate.report(sender, report.snr_db, loss, now)
@@ -281,6 +288,8 @@ class ReceivingSide:
     def _forget(self, src_id: int) -> None:
         """A receiver is gone, or has started again."""
         self._window.peers.forget(src_id)
+        if self.relaying is not None:
+            self.relaying.custody.gone(src_id)
         if not self._window.peers:
             self._sending.hellos.hurry(self._now)
         if self._rate is not None:

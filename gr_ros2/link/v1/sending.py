@@ -102,6 +102,7 @@ class SendingSide:
         room = self._writer.room
         if self._relaying is not None and messages.relayed is not None:
             self._relaying.offer(messages.relayed, now)
+            self._relaying.custody.offer(now)
             room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
         filling = packing.fill(self._window.packets.newest + 1, room - reports.reserved, now)
         if filling is not None:
