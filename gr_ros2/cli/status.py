@@ -58,7 +58,7 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
     for peer in peers:
         table.add_row(
             str(peer["robot"]),
-            "silent" if peer["silent"] else "heard",
+            "silent" if peer["silent"] else f"over {peer['over']}, hop {peer['hops']}" if peer["hops"] else "heard",
             _seconds(peer["heard_s"]),
             _decibels(peer["snr_db"]),
             f"{peer['loss']:.1%}",
@@ -102,7 +102,7 @@ def airtime_words(account: Mapping[str, Any]) -> str:
         )
         if account["waits_s"] > 1:
             words.append(f"the limit lets the next packet leave in {account['waits_s']:.0f} s")
-    if account.get("unsaved"):
+    if not account.get("stored", True):
         words.append("its airtime account cannot be stored")
     return ", ".join(words)
 

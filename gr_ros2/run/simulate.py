@@ -194,11 +194,8 @@ def simulate(
 
 
 def coupled(scenario: Scenario) -> Scenario:
-    """What is forecast together: all robots where they share a channel, else the first direction alone."""
-    ways = scenario.directions()
-    if len(ways) > 1:
-        return scenario if scenario.duplex == "half" else ways[0]
-    return replace(scenario, receivers=())
+    """What is forecast together: all robots that send, with one receiver where only one does."""
+    return scenario if len(scenario.directions()) > 1 else replace(scenario, receivers=())
 
 
 _OfSender = Received | Delivered | Lost
@@ -369,9 +366,7 @@ class Robot:
         if self._clock is not None:
             self._clock.due(now)
             credits = self._clock.grants(now)
-            if credits and self._clock.held:
-                self.endpoint.pace.paused()
-            self.endpoint.pace.credit(credits)
+            self.endpoint.pace.credit(credits, inf if credits and self._clock.held else None)
         while self._coming is not None and self._coming.t <= now:
             self.endpoint.messages.submit(self._coming.topic_id, self._coming.payload, now)
             if not self._until:

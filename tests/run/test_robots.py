@@ -53,7 +53,7 @@ def test_twenty_robots_have_a_table_each(tmp_path: Path) -> None:
     assert sum(topic.delivered for topic in result.topics) > 0
     again = read_result(write_result(result, tmp_path / "result.json"))
     assert again.receivers == result.receivers
-    assert "/robot_3/odom at /robot_2" in [line[1] for line in summary_grid([again]).sections[0]]
+    assert "/robot_3/odom at /robot_2" in [line[0] for line in summary_grid([again]).sections[0]]
 
 
 def levels(around: Surroundings) -> list[list[tuple[int, float]]]:
@@ -86,7 +86,6 @@ def test_without_gains_the_snr_is_that_of_the_channel() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("time=real", "set time to packets or samples"),
         ("robots=1", "two or more"),
         ("robots=[{}, {ros_source: {namespace: /robot_1}}]", "each with its own"),
         ("gains_db=[[1, 2]]", "2 robots need 2 rows of 2 numbers"),

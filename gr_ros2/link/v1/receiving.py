@@ -123,7 +123,10 @@ class ReceivingSide:
             self._forget(gone.src_id)
             gone.inbox.order.told = False
             self._report_all(gone.inbox.handle_timeout(now))
-            self._events.append(Gone(gone.src_id, gone.boot))
+            if self.relaying is None or not self.relaying.reaches(gone.src_id, gone.boot, now):
+                self._events.append(Gone(gone.src_id, gone.boot))
+        if self.relaying is not None:
+            self._events += self.relaying.handle_timeout(now)
         self._messages.reported = bool(self._window.peers)
         events, self._events = self._events, []
         return events
@@ -132,6 +135,8 @@ class ReceivingSide:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
         times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
         times += [n.heard + self._give_up_s for n in self.neighbours if not n.gone]
+        if self.relaying is not None and (at := self.relaying.next_timeout()) is not None:
+            times.append(at)
         return min(times, default=None)
 
     def unpublished(self, event: Delivered) -> Lost:
@@ -149,6 +154,9 @@ class ReceivingSide:
             if opened is None or opened.new:  # what was here before says nothing about now
                 self._note_slot(header, arrival, now, trusted=opened is not None)
             if opened is None:
+                return
+            if not self._for_us(header):
+                self.stats.dropped["not_for_us"] += 1
                 return
             if arrival.snr_db is not None and opened.new:
                 opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
@@ -176,7 +184,7 @@ class ReceivingSide:
             self.neighbours.check_own(data, header)
             self.stats.dropped["own"] += 1
             return None
-        if header.dst_id not in (BROADCAST, own) and own != NOBODY:
+        if self._access is None and not self._for_us(header):  # where it is shared, all have to know whose slot it is
             self.stats.dropped["not_for_us"] += 1
             return None
         if header.sealed and not self._sealed:
@@ -184,6 +192,10 @@ class ReceivingSide:
         if self._sealed and not header.sealed:
             raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
         return self.neighbours.open(data, header, now)
+
+    def _for_us(self, header: Header) -> bool:
+        own = self._settings.src_id
+        return header.dst_id in (BROADCAST, own) or own == NOBODY
 
     def _use(self, arrival: ReceivedPacket, opened: Opened, now: float) -> bool:
         """Take an opened packet; returns whether packets that were kept until a proof can be taken now."""
@@ -243,7 +255,7 @@ class ReceivingSide:
             self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
         self._forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
-        if hears:
+        if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
             self._window.peers.meet(neighbour.src_id, now)
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)
@@ -274,6 +286,8 @@ class ReceivingSide:
         loss, now = report.loss / 128, self._now
         self._window.peers.report(sender, number, report.arrived, settled=report.settled, loss=loss, now=now)
         self._sending.repairs.reported()
+        if self.relaying is not None:
+            self.relaying.custody.reported(sender)
         self._messages.reported = True
         if self._rate is not None and report.snr_db is not None:
             self._rate.report(sender, report.snr_db, loss, now)
@@ -281,6 +295,8 @@ class ReceivingSide:
     def _forget(self, src_id: int) -> None:
         """A receiver is gone, or has started again."""
         self._window.peers.forget(src_id)
+        if self.relaying is not None:
+            self.relaying.custody.gone(src_id)
         if not self._window.peers:
             self._sending.hellos.hurry(self._now)
         if self._rate is not None:
