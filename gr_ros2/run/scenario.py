@@ -299,7 +299,9 @@ def _robot(values: Mapping[str, Any], given: Any, number: int, shared: Mapping[s
     if not isinstance(block, Mapping) or not isinstance(values.get("ros_source", {}), Mapping):
         return given  # build() says what is wrong with it
     kept = {key: value for key, value in values.get("ros_source", {}).items() if key not in _OWN_KEYS}
-    source = {**kept, "namespace": f"/robot_{number}", **block}
+    # The ids 0..254 are enough for 255 robots if the last one has the first id.
+    last = {"robot_id": 0} if number == BROADCAST else {}
+    source = {**kept, "namespace": f"/robot_{number}", **last, **block}
     block = with_shared({"ros_source": source}, shared, f"{prefix}robots[{number - 1}].")["ros_source"]
     return {**given, "ros_source": block}
 

@@ -124,15 +124,24 @@ class ReceivingSide:
             gone.inbox.order.told = False
             self._report_all(gone.inbox.handle_timeout(now))
             self._events.append(Gone(gone.src_id, gone.boot))
+        for neighbour in self.neighbours:
+            neighbour.timeout = None
         self._messages.reported = bool(self._window.peers)
         events, self._events = self._events, []
         return events
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
-        times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
-        times += [n.heard + self._give_up_s for n in self.neighbours if not n.gone]
-        return min(times, default=None)
+        # Asked after each packet, so only its sender is looked at anew.
+        times = [n.timeout if n.timeout is not None else self._timeout(n) for n in self.neighbours]
+        soonest = min(times, default=inf)
+        return None if soonest == inf else soonest
+
+    def _timeout(self, neighbour: Neighbour) -> float:
+        waits = neighbour.inbox.next_timeout()
+        gone = inf if neighbour.gone else neighbour.heard + self._give_up_s
+        neighbour.timeout = gone if waits is None else min(waits, gone)
+        return neighbour.timeout
 
     def unpublished(self, event: Delivered) -> Lost:
         """Count a message that was delivered but not published on the ROS graph. A latched message may come again."""
@@ -150,6 +159,7 @@ class ReceivingSide:
                 self._note_slot(header, arrival, now, trusted=opened is not None)
             if opened is None:
                 return
+            opened.neighbour.timeout = None
             if arrival.snr_db is not None and opened.new:
                 opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
             proved = self._use(arrival, opened, now)
