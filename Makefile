@@ -44,11 +44,11 @@ wheel: setup
 	@$(BIN)/python tools/make-wheels
 
 deb:
-	@tools/make-deb
+	@tools/make-deb $(ARCHITECTURE)
 
 release: setup
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-release.txt
-	@$(BIN)/python tools/release
+	@$(BIN)/python tools/release $(VERSION)
 
 setup:
 	@tools/set-up run

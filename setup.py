@@ -118,8 +118,7 @@ setup(
     },
     ext_modules=[
         *(kernels(variant, flags) for variant, flags in VARIANTS.items()),
-        # PyPI has no wheel of cyclonedds for Linux on ARM.
-        *([LIBDDSC] if WHEEL_FOR == "x86_64" or (not WHEEL_FOR and sys.version_info[:2] > NEWEST_CYCLONEDDS) else []),
+        *([LIBDDSC] if MACHINE == "x86_64" and (WHEEL_FOR or sys.version_info[:2] > NEWEST_CYCLONEDDS) else []),
     ],
     cmdclass={"build_ext": BuildLibraries},
     options={"bdist_wheel": {"py_limited_api": "cp310", "plat_name": f"linux_{WHEEL_FOR}"}} if WHEEL_FOR else {},
@@ -137,7 +136,8 @@ setup(
         "backports.zstd>=1.8; python_version < '3.14'",
         "click>=8.1,<9",
         "cryptography>=41",
-        f"{CYCLONEDDS}; python_version < '3.14'",
+        # PyPI has neither a wheel of it for Linux on ARM nor the C sources to make one from.
+        f"{CYCLONEDDS}; python_version < '3.14' and (sys_platform != 'linux' or platform_machine == 'x86_64')",
         "jinja2>=3.1,<4",
         "matplotlib>=3.9,<4",
         # That of the distribution's GNU Radio: Debian's and Ubuntu's was built for numpy 2 from Python 3.13 on.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -15,6 +16,13 @@ def version() -> str:
     """The version, from where it stands."""
     (found,) = re.findall(r'^__version__ = "(.+)"$', (ROOT / "gr_ros2" / "__init__.py").read_text("utf-8"), re.M)
     return str(found)
+
+
+def compiling_for(machine: str) -> dict[str, str]:
+    """The environment in which setup.py makes a wheel for an architecture: that of GNU's name, with its compiler."""
+    compiler = f"{machine}-linux-gnu-g++"
+    tools = {"GR_ROS2_WHEEL": machine, "CC": compiler, "CXX": compiler, "LDSHARED": f"{compiler} -shared"}
+    return {**os.environ, **tools, "LDCXXSHARED": f"{compiler} -shared"}
 
 
 def copy_of_clone(target: Path) -> None:

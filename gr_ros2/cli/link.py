@@ -22,9 +22,9 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import RowName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.ping import check
-from gr_ros2.cli.status import PING, STATUS, tables
+from gr_ros2.cli.status import PING, STATUS, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.guard import Guard
 from gr_ros2.core.systemd import notify
 from gr_ros2.middleware import MIDDLEWARE
@@ -229,31 +229,29 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
         findings = Findings(running.findings)
         while (now := time.monotonic()) < end and not running.finished:
             time.sleep(min(_SHOW_S, end - now))
-            running.check()
-            notify("WATCHDOG=1")
+            _watch(running)
             if (waits_for := waiting.look()) is not None:
                 guarded(say, waits_for)
             for line in findings.new(now):
                 guarded(say, line)
-            if isinstance(shows, Live):
-                guarded(partial(shows.update, refresh=True), tables(running.stats()))
-            elif time.monotonic() - shown >= LOG_S:
+            stats, due = running.stats(), time.monotonic() - shown >= LOG_S
+            if due:
                 shown = time.monotonic()
-                guarded(say, status_line(running.stats()))
+                notify(f"STATUS={status_line(stats)}")
+            if isinstance(shows, Live):
+                guarded(partial(shows.update, refresh=True), tables(stats))
+            elif due:
+                guarded(say, status_line(stats))
 
 
-def airtime_words(account: Mapping[str, Any]) -> str:
-    """What a link says about how much it may send; '' where nothing limits it."""
-    words = [] if account["transmits"] else ["sending is off"]
-    if "spent_s" in account and account["allowed_s"] < account["window_s"]:
-        words.append(
-            f"sent {account['spent_s']:.3g} of {account['allowed_s']:.3g} s allowed in {account['window_s']:g} s"
-        )
-        if account["waits_s"] > 1:
-            words.append(f"the limit lets the next packet leave in {account['waits_s']:.0f} s")
-    if account.get("unsaved"):
-        words.append("its airtime account cannot be stored")
-    return ", ".join(words)
+def _watch(running: Any) -> None:
+    """Check the link, and tell systemd that it goes on, or what does not."""
+    try:
+        running.check()
+    except RadioError as error:
+        notify(f"STATUS={error}")
+        raise
+    notify("WATCHDOG=1")
 
 
 def status_line(stats: Mapping[str, Any]) -> str:

@@ -18,6 +18,7 @@ import click
 from gr_ros2 import __version__
 from gr_ros2.cli.ending import BAD_INPUT, FAILED, INTERRUPTED, on_signals
 from gr_ros2.core.errors import BackendMissingError, BagError, ConfigError, GrRos2Error, WireError
+from gr_ros2.core.preferences import check_home
 
 _BAD_INPUT_ERRORS = (ConfigError, WireError, BagError, BackendMissingError)
 _GNU_RADIO = ("gnuradio", "pmt")
@@ -83,6 +84,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
         if cmd_name not in self._lazy:
             return None
+        check_home()
         module, _, attribute = self._lazy[cmd_name][0].partition(":")
         command = getattr(import_module(module), attribute)
         assert isinstance(command, click.Command)

@@ -86,9 +86,25 @@ def _air(stats: Stats) -> list[str]:
     total = sum(air.values())
     shares = ", ".join(f"{kind} {count / total:.0%}" for kind, count in air.items()) if total else "nothing"
     packets = stats["packets"]
+    limit = airtime_words(stats["airtime"])
     return [
-        f"packets sent: {packets['out']} ({shares}), {packets['backlog']} wait; received: {stats['sink']['packets']}"
+        f"packets sent: {packets['out']} ({shares}), {packets['backlog']} wait; received: {stats['sink']['packets']}",
+        *([limit] if limit else []),
     ]
+
+
+def airtime_words(account: Mapping[str, Any]) -> str:
+    """What a link says about how much it may send; '' where nothing limits it."""
+    words = [] if account["transmits"] else ["sending is off"]
+    if "spent_s" in account and account["allowed_s"] < account["window_s"]:
+        words.append(
+            f"sent {account['spent_s']:.3g} of {account['allowed_s']:.3g} s allowed in {account['window_s']:g} s"
+        )
+        if account["waits_s"] > 1:
+            words.append(f"the limit lets the next packet leave in {account['waits_s']:.0f} s")
+    if account.get("unsaved"):
+        words.append("its airtime account cannot be stored")
+    return ", ".join(words)
 
 
 def _troubles(stats: Stats) -> list[str]:
@@ -98,6 +114,7 @@ def _troubles(stats: Stats) -> list[str]:
         **{f"refused: {reason}": count for reason, count in sink["rejected"].items()},
         "damaged": packets["damaged"],
         "not sent": packets["refused"],
+        **{f"not sent: {reason}": count for reason, count in stats["airtime"]["refused"].items()},
         "not published": sink["publish_failed"],
     }
     words = _reasons(lost)

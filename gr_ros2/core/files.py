@@ -26,14 +26,14 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         yield part
         if durable:
-            _sync(part)
+            sync(part)
         part.replace(path)
     except BaseException:
         with suppress(OSError):
             part.unlink()
         raise
     if durable:
-        _sync(path.parent)
+        sync(path.parent)
 
 
 def write_whole(path: Path, content: Any, write: Callable[[Any, Path], object]) -> Path:
@@ -68,7 +68,11 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk.
+
+    :raises OSError: they cannot be written
+    """
     number = os.open(path, os.O_RDONLY)
     try:
         os.fsync(number)

@@ -14,13 +14,13 @@ from typing import Any
 from gr_ros2 import __version__
 from gr_ros2.core.backends import BackendTable
 from gr_ros2.core.errors import BackendMissingError, PhyError
+from gr_ros2.core.preferences import check_preferences
 from gr_ros2.doctor.finding import Finding
 from gr_ros2.doctor.programs import output_of
 from gr_ros2.grc.python import finds_us, grc_program
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.phy.kernels.library import loaded
-from gr_ros2.phy.preferences import check_preferences
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.settings.config import DEFAULT_MIDDLEWARE
 

@@ -38,7 +38,7 @@ MIDDLEWARE = BackendTable(
             "gr_ros2.middleware.dds",
             "DdsMiddleware",
             "embedded DDS, no ROS install",
-            "Cyclone DDS 11.0, which the installation of gr-ros2 brings",
+            "Cyclone DDS 11.0, which the installation of gr-ros2 brings (not on Linux on ARM: there use rclpy)",
             title="DDS (embedded)",
             localhost_only=True,
         ),

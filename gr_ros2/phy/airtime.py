@@ -19,7 +19,7 @@ from gnuradio import gr
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, with_begin
+from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, octets, with_begin
 from gr_ros2.phy.threads import BlockThread
 
 _ONE, _HELD_BACK = pmt.from_long(1), pmt.from_long(0)
@@ -31,10 +31,11 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
-    :param lead: s before the channel is free at which a credit is given
+    :param lead: s before the channel is free at which a credit is given at the earliest
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
     :param timed, listens: see :class:`AirtimeClock`
+    :param admits: whether a packet with these bytes may be sent at all; others count as refused, `not_sealed`
     :param clock: s, monotonic
     :param times: store when each packet passed; off by default, since a link that runs without end would store too many
     :ivar lateness: delays of packets after the time at which they should pass
@@ -52,12 +53,16 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         limit: AirtimeLimit | None = None,
         timed: bool = False,
         listens: Callable[[], float] | None = None,
+        admits: Callable[[bytes], bool] | None = None,
         times: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
-        self._clock: AirtimeClock[Any] = AirtimeClock(airtime, lead, ahead, limit, timed=timed, listens=listens)
+        self._clock: AirtimeClock[Any] = AirtimeClock(
+            airtime, lead, ahead, limit, measured=True, timed=timed, listens=listens
+        )
+        self._admits = admits
         self._now = clock
         self._left = 0
         """Packets that have passed or are about to."""
@@ -142,8 +147,12 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         airtime = None
         if self._airtime_of is not None:
             airtime = self._airtime_of(int(pmt.length(pmt.cdr(pdu))), mcs_of(pdu) or 0)
+        admitted = self._admits is None or self._admits(octets(pmt.cdr(pdu)))
         with self._changed:
-            self._clock.offer(pdu, self._now(), airtime, leave_at_of(pdu))
+            if admitted:
+                self._clock.offer(pdu, self._now(), airtime, leave_at_of(pdu))
+            else:
+                self._clock.refused["not_sealed"] += 1
             self.arrived += 1
             self._changed.notify_all()
 

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from gnuradio import gr
 
 from gr_ros2.core.errors import PhyError
+from gr_ros2.core.preferences import check_preferences
 from gr_ros2.phy.base import SymbolSource
-from gr_ros2.phy.preferences import check_preferences
 from gr_ros2.phy.threads import start_flowgraph
 
 _Self = TypeVar("_Self", bound="Flowgraph")

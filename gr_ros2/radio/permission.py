@@ -5,6 +5,7 @@ Invariant: a front end without a radio asks for nothing.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +13,10 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.settings.airtime import AirtimeConfig
 from gr_ros2.settings.fields import Auto
+from gr_ros2.wire import is_sealed
+
+_NO_KEY = ", and there is no key: anybody could read, forge and replay its packets; set key (gr-ros2 key new FILE), or "
+_log = logging.getLogger(__name__)
 
 
 def permitted(
@@ -33,11 +38,31 @@ def permitted(
             "(docs/how-to/radios.md, Before you send); --listen-only or transmit: false only receives"
         )
     if not guarded:
-        raise ConfigError(
-            f"{on_air}, and there is no key: anybody could read, forge and replay its packets; set key (gr-ros2 key "
-            "new FILE), or --open, open: true in the file"
-        )
+        raise ConfigError(f"{on_air}{_NO_KEY}--open, open: true in the file")
     return True
+
+
+class SealedOnly:
+    """Lets only packets pass that a key seals, and says once what to do about the others: for a radio whose link is
+    another block, so that what it sends is known when it comes.
+
+    :param front_end: of the radio
+    :param options: its settings
+    """
+
+    def __init__(self, front_end: type[FrontEnd], options: Mapping[str, Any]) -> None:
+        self._told = (
+            f"front_end {front_end.name} would send {front_end.on_air(options)}{_NO_KEY}open: True in its block of GRC"
+        )
+        self._said = False
+
+    def __call__(self, packet: bytes) -> bool:
+        """Whether a packet may leave."""
+        passes = is_sealed(packet)
+        if not passes and not self._said:
+            self._said = True
+            _log.error("%s", self._told)
+        return passes
 
 
 def check_band(airtime: AirtimeConfig, options: Mapping[str, Any], sample_rate: float) -> None:

@@ -7,8 +7,7 @@ direction waits for the other. Received samples can be impaired only if the chan
 from __future__ import annotations
 
 import random
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ends import account_of
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.airtime import AirtimeGate
@@ -25,11 +23,11 @@ from gr_ros2.phy.flowgraph import HierBlock
 from gr_ros2.phy.path import PacketPath
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.front_end import FrontEnd
-from gr_ros2.radio.permission import check_band, permitted
+from gr_ros2.radio.limits import open_limit
+from gr_ros2.radio.permission import SealedOnly, check_band, permitted
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording
 from gr_ros2.settings.config import ChannelConfig, airtime_from, build
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.state.airtime import AirtimeFile
 
 _LEAST_WAIT_S = 0.001
 """s after which a channel that was not clear is listened to again, at least."""
@@ -44,6 +42,7 @@ class Radio(PacketPath, HierBlock):
     :param record: SigMF recording to write of all samples received, '' = none
     :param limit: what limits the airtime; None = nothing
     :param listens: whether each packet waits until nobody else is heard
+    :param admits: whether a packet may be sent at all, by its bytes; None: every one
     :param changeable: add a channel that can be changed while running, if the front end has no radio
     :param instrumented: add parts for a dashboard: a channel that can be changed, and taps for spectrum and
         constellation
@@ -60,6 +59,7 @@ class Radio(PacketPath, HierBlock):
         record: str = "",
         limit: AirtimeLimit | None = None,
         listens: bool = False,
+        admits: Callable[[bytes], bool] | None = None,
         changeable: bool = False,
         instrumented: bool = False,
     ) -> None:
@@ -89,6 +89,7 @@ class Radio(PacketPath, HierBlock):
             limit=limit,
             timed=front_end.clock_offset is not None,
             listens=_Listener(front_end) if listens else None,
+            admits=admits,
             clock=front_end.clock,
         )
         if not front_end.transmits:
@@ -219,6 +220,7 @@ def make_radio(
     channel: Mapping[str, Any] | None = None,
     record: str = "",
     transmit: bool | Auto = AUTO,
+    open: bool = False,
     airtime_limit: str | Mapping[str, Any] = "",
     robot_id: int | Auto = AUTO,
     state: str = "",
@@ -235,6 +237,7 @@ def make_radio(
         are given, even empty, they can be changed while the radio runs
     :param record: SigMF recording to write of all samples received, '' = none
     :param transmit: whether it may send: auto = yes, where no radio is connected; a radio needs True
+    :param open: a radio also sends packets that no key seals, which anybody can read, forge and replay
     :param airtime_limit: how much it may send: name of a band, or settings of
         :class:`gr_ros2.settings.airtime.AirtimeConfig`; '' = no limit
     :param robot_id: with ``airtime_limit``: the robot whose account this is, as for its link
@@ -254,13 +257,9 @@ def make_radio(
         opened = kind(modem, transmits=sends, **options)
         undo.callback(opened.close)
         limit = None
-        if limits.rule is not None and sends:
-            if robot_id == AUTO:
-                raise ConfigError("airtime_limit: whose account is it? set robot_id to that of the robot's link")
-            file = AirtimeFile(account_of(state, robot_id))
-            undo.callback(file.close)
-            longest, now = opened.airtime(), time.monotonic()
-            limit = AirtimeLimit(limits.rule, longest, now=now, spent=file.spent, save=file.save)
+        if sends:
+            longest, now = opened.airtime(), opened.clock()
+            limit = open_limit(limits, longest, now, robot_id=robot_id, state=state, closing=undo)
         radio = Radio(
             modem,
             opened,
@@ -268,9 +267,8 @@ def make_radio(
             record=record,
             limit=limit,
             listens=limits.listen_before_send and sends,
+            admits=SealedOnly(kind, options) if kind.has_radio and not open else None,
             changeable=channel is not None,
         )
-        if limit is not None:
-            radio.closing.callback(file.close)
-        undo.pop_all()
+        radio.closing = undo.pop_all()
         return radio

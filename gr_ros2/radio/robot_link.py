@@ -21,7 +21,7 @@ from typing import Any
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.ends import account_of, own_settings
+from gr_ros2.gr.ends import own_settings
 from gr_ros2.link.access import Access
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import AirtimeLimit, sustained
@@ -36,6 +36,7 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.findings import about, introduce, outrun, peers, ping, same_id, unheard
 from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.limits import open_limit
 from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.switch import TransmitSwitch
@@ -43,7 +44,6 @@ from gr_ros2.radio.waiting import foreign, shortcut
 from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import Registry
-from gr_ros2.state.airtime import AirtimeFile
 
 _STOP_S, _RETRY_S = 10.0, 1.0
 """s that a flowgraph may take to stop when its device has vanished, and s between two attempts to open it."""
@@ -201,13 +201,12 @@ class RobotLink(Flowgraph):
     @cached_property
     def _limit(self) -> AirtimeLimit | None:
         """What limits the airtime, with what earlier starts of this robot have sent."""
-        rule = self.config.airtime.rule
-        if rule is None or not self.sends:
+        if not self.sends:
             return None
-        file = AirtimeFile(account_of(self.config.ros_source.state, self.config.ros_source.src_id()))
-        self._stack.callback(file.close)
-        longest, now = self.front_end.airtime(), time.monotonic()
-        return AirtimeLimit(rule, longest, now=now, spent=file.spent, save=file.save)
+        source, longest, now = self.config.ros_source, self.front_end.airtime(), self.front_end.clock()
+        return open_limit(
+            self.config.airtime, longest, now, robot_id=source.src_id(), state=source.state, closing=self._stack
+        )
 
     def transmit(self, *, on: bool) -> None:
         """Switch sending off, at once for all packets that have not reached the device, or on again.

@@ -69,6 +69,15 @@ class AirtimeRule:
         return ", ".join([*words, *([f"at most {self.max_burst_s:g} s at a time"] if self.max_burst_s else [])])
 
 
+def _sends(given: Any) -> Any:
+    """A share that lets something leave: ``auto`` in its place would mean no limit."""
+    if isinstance(given, int | float) and not isinstance(given, bool) and given <= 0:
+        raise ValueError(
+            "nothing could be sent; set transmit: false (--listen-only) for that, or a share above 0 to 1, as in 0.01"
+        )
+    return given
+
+
 _STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
 
 
@@ -98,7 +107,9 @@ class AirtimeConfig(Windowed):
 
     band: str = ""
     duty_cycle: Annotated[
-        Annotated[float, Field(gt=0, le=1)] | Auto, Field(title="Largest share of the time that it sends")
+        Annotated[float, Field(gt=0, le=1)] | Auto,
+        BeforeValidator(_sends),
+        Field(title="Largest share of the time that it sends"),
     ] = AUTO
     window_s: Annotated[
         Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)] | Auto, Field(title="Time of that share (s)")

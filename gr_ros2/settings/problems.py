@@ -87,6 +87,8 @@ def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[A
         return f"{key} is missing{purpose}"
     secret = keys[-1] == "key"  # a key by mistake must not be shown
     value = "" if secret or isinstance(item["input"], Mapping) else f" = {item['input']!r}"
+    if item["type"] == "value_error":  # the setting has words of its own
+        return f"{key}{value}: {_asked(item, purpose)}"
     if setting is not None and setting.derives and not isinstance(item["input"], bool) and item["input"] in _LIKE_AUTO:
         return f"{key}{value}: write {AUTO}{purpose}"
     ranges = [_asked(one, purpose) for one in group if one["type"] != "literal_error"][:1]

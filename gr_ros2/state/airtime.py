@@ -18,7 +18,6 @@ import logging
 import os
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -50,7 +49,7 @@ class AirtimeFile:
     :param wall: s since 1970
     :param uptime: s since this computer was switched on, suspended time included
     :param boot: name of this boot of the computer
-    :raises ConfigError: another link uses the file, or it is not such a file
+    :raises ConfigError: another link uses the file, it cannot be opened, or it is not such a file
     """
 
     def __init__(
@@ -69,10 +68,16 @@ class AirtimeFile:
         self._said = self._closed = False
         self.spent: Spent = ()
         """What earlier starts have spent or reserved, as of now."""
-        with suppress(OSError):  # ``save`` says what is wrong
-            if self._path.exists():
-                self._open()
-                self.spent = self._read()
+        try:
+            self._open()
+            self.spent = self._read()
+        except (FileNotFoundError, NotADirectoryError):
+            pass  # ``save`` makes it, or says what is wrong
+        except OSError as error:
+            raise ConfigError(
+                f"{self._path}: cannot be opened ({error.strerror}), so what was sent would be forgotten; let this "
+                "user write it (sudo chown), or run the link as its owner"
+            ) from error
 
     def save(self, spent: Spent) -> None:
         """Store an account.

@@ -1,6 +1,7 @@
 """The file of a fleet's keys: one key per line, 64 hex digits; the first seals, all are accepted.
 
-Invariants: a key file that other users may read or write is refused; an existing file is never overwritten.
+Invariants: a key file that other users may read or write is refused; an existing file is never overwritten; a new key
+is on the disk before anybody is told that it exists.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import stat
 from pathlib import Path
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.files import sync
 
 _LIKE_A_KEY = re.compile(r"(0[xX])?[0-9a-fA-F:]{32,}")
 """A setting that nobody means as a path. It must not be repeated in an error or a log."""
@@ -30,11 +32,18 @@ def new_key_file(path: str | Path) -> None:
         raise ConfigError(f"{path}: exists; a key is never overwritten, so choose another name") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror})") from error
-    with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write(
-            "# Key of a gr-ros2 fleet: the first line seals, all are accepted. Keep it secret.\n"
-            f"{secrets.token_hex(KEY_LEN)}\n"
-        )
+    try:
+        with os.fdopen(descriptor, "w", encoding="ascii") as file:
+            file.write(
+                "# Key of a gr-ros2 fleet: the first line seals, all are accepted. Keep it secret.\n"
+                f"{secrets.token_hex(KEY_LEN)}\n"
+            )
+            file.flush()
+            os.fsync(file.fileno())
+        sync(Path(path).absolute().parent)
+    except OSError as error:
+        Path(path).unlink()  # nobody has seen the key
+        raise ConfigError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def checked_key_file(path: str) -> str:
@@ -76,5 +85,5 @@ def read_key_file(path: str | Path) -> tuple[bytes, ...]:
             if len(keys[-1]) != KEY_LEN:
                 raise ConfigError(f"{path}:{number}: not {2 * KEY_LEN} hex digits; make one with gr-ros2 key new FILE")
     if not keys:
-        raise ConfigError(f"{path}: no key in it; make one with gr-ros2 key new FILE")
+        raise ConfigError(f"{path}: no key in it; restore it, or delete it and run gr-ros2 key new {path}")
     return tuple(keys)

@@ -34,7 +34,7 @@ from gr_ros2.wire.format import (
 from gr_ros2.wire.numbers import unwrap
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v0 import V0
-from gr_ros2.wire.v1 import V1
+from gr_ros2.wire.v1 import V1, is_sealed
 
 __all__ = [
     "BROADCAST",
@@ -60,6 +60,7 @@ __all__ = [
     "WireError",
     "decode",
     "format_of",
+    "is_sealed",
     "unwrap",
 ]
 

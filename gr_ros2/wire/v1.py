@@ -177,6 +177,11 @@ def crc(data: bytes, session: int) -> bytes:
     return crc32(data, session).to_bytes(CRC_LEN, "big")
 
 
+def is_sealed(data: bytes) -> bool:
+    """Whether a packet's header says that a key seals it."""
+    return len(data) > HEADER_LEN and data[0] >> 4 & 7 == VERSION and data[0] & _SEALED != 0
+
+
 def body_room(packet_len: int, *, sealed: bool = False, addressed: bool = False, block: bool = False) -> int:
     """Bytes of the longest body of a source packet, whatever the length of its block for medium access."""
     used = HEADER_LEN + addressed * ADDRESS_LEN + REPAIR_HEADER_LEN + (TAG_LEN if sealed else CRC_LEN)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +42,12 @@ class Ends:
             )
         self.running: list[subprocess.Popen[str]] = []
 
-    def link(self, number: int, *options: str) -> subprocess.Popen[str]:
+    def link(self, number: int, *options: str, terminal: int | None = None) -> subprocess.Popen[str]:
         with (self.folder / f"log-{number}").open("w") as log:
             process = subprocess.Popen(
                 [*COMMAND, "link", str(self.files[number - 1]), *options],
-                env=self.env,
-                stdout=log,
+                env={**self.env, "TERM": "xterm", "COLUMNS": "120", "LINES": "40"},
+                stdout=log if terminal is None else terminal,
                 stderr=log,
                 text=True,
             )
@@ -66,6 +69,37 @@ def ends(tmp_path: Path) -> Iterator[Ends]:
     for process in made.running:
         process.send_signal(signal.SIGINT)
         process.wait(PATIENCE_S)
+
+
+@pytest.mark.slow
+def test_in_a_terminal_a_link_shows_a_table_and_plain_lines_elsewhere(ends: Ends) -> None:
+    terminal, slave = pty.openpty()
+    shown: list[str] = []
+
+    def read() -> None:
+        with suppress(OSError):  # the link has ended
+            while text := os.read(terminal, 4096):
+                shown.append(text.decode(errors="replace"))
+
+    def says(*words: str) -> None:
+        wait_for(lambda: all(word in "".join(shown) for word in words), " and ".join(words))
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    first = ends.link(1, "--set", "airtime.duty_cycle=0.5", terminal=slave)
+    os.close(slave)
+    ends.link(2)
+    says("heard ago", "packets lost", "packets sent", "sent 0", "of 1.8e+03 s allowed in 3600 s")
+    shown.clear()
+    first.send_signal(signal.SIGUSR1)
+    says("sending is off")
+    first.send_signal(signal.SIGINT)
+    assert first.wait(PATIENCE_S) == 0
+    reader.join()
+    os.close(terminal)
+    log = ends.folder / "log-2"
+    wait_for(lambda: "10 s; " in log.read_text(), "a plain line")
+    assert "\x1b" not in log.read_text()
 
 
 def test_a_running_link_tells_what_it_does(ends: Ends) -> None:

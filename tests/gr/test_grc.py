@@ -204,7 +204,7 @@ def test_a_radio_offers_what_it_can_do(name: str) -> None:
     channel = set() if FRONT_ENDS.load(name).has_radio else {"snr_db", "frequency_offset", "packet_loss"}
     sampled = set() if FRONT_ENDS.load(name).carries_packets else {"sample_rate", "record"}
     made = {"phy", "phy_options", "packet_len", "airtime_limit", "robot_id", "state"} | sampled
-    made |= {"transmit"} if FRONT_ENDS.load(name).has_radio else set()
+    made |= {"transmit", "open"} if FRONT_ENDS.load(name).has_radio else set()
     assert set(offered) == settings - refused | channel | made
     assert offered.get("record", "file_save") == "file_save"
     for setting in offered:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.airtime import AirtimeClock
+from gr_ros2.link.airtime import LEAD_S, LEAST_LEAD_S, MEASURED, AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.settings.airtime import AirtimeRule
 
@@ -71,6 +71,46 @@ def test_at_most_two_packets_are_here_or_promised_however_short_they_are() -> No
     assert clock.next_timeout(0.0) == pytest.approx(0.001), "the next credit comes when the first is through"
     assert packets(clock.due(0.001)) == ["a"]
     assert clock.grants(0.001) == 1
+
+
+def steady(clock: AirtimeClock[str], packets: int, composing: float, now: float = 0.0) -> tuple[float, float]:
+    """A source that always has something to send and takes so long for each packet: how long before the air is free
+    the last credit was given, and how long the air was free in between, s."""
+    lead = gaps = free = 0.0
+    for _ in range(packets):
+        while not clock.grants(now):
+            at = clock.next_timeout(now)
+            assert at is not None
+            now = max(at, now + 1e-9)
+            clock.due(now)
+        lead, now = free - now, now + composing
+        gaps += max(0.0, now - free) if free else 0.0
+        free = (clock.offer("packet", now) or 0.0) + 0.02
+    return lead, gaps
+
+
+@pytest.mark.parametrize("composing", [0.0, 0.0004, 0.003, 0.005])
+def test_a_measured_lead_is_what_the_source_needs_and_the_air_never_waits_for_it(composing: float) -> None:
+    clock: AirtimeClock[str] = AirtimeClock(0.02, measured=True)
+    assert steady(clock, 3, composing)[0] == pytest.approx(LEAD_S, abs=1e-6)
+    lead, gaps = steady(clock, 2 * MEASURED, composing, now=1.0)
+    assert lead == pytest.approx(max(composing, LEAST_LEAD_S), abs=1e-6)
+    assert gaps == pytest.approx(0.0, abs=1e-6 * MEASURED)
+
+
+def test_a_pause_of_the_computer_or_of_the_topics_does_not_change_a_measured_lead() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(0.02, measured=True)
+    steady(clock, 2 * MEASURED, 0.001)
+    steady(clock, 2, 0.5, now=10.0)
+    assert steady(clock, 2, 0.001, now=20.0)[0] == pytest.approx(0.001, abs=1e-6)
+
+
+def test_one_packet_that_took_longer_lengthens_a_measured_lead_for_a_while() -> None:
+    clock: AirtimeClock[str] = AirtimeClock(0.02, measured=True)
+    steady(clock, 2 * MEASURED, 0.001)
+    steady(clock, 1, 0.004, now=10.0)
+    assert steady(clock, MEASURED, 0.001, now=20.0)[0] == pytest.approx(0.004, abs=1e-6)
+    assert steady(clock, 2, 0.001, now=30.0)[0] == pytest.approx(0.001, abs=1e-6)
 
 
 def test_when_the_first_packet_is_due() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,12 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import make_radio
 from gr_ros2.state.keys import new_key_file
+from tests.gr.probe import Probe
 from tests.radio.cables import SerialCable
 from tests.radio.robots import Robot, config
 from tests.waiting import wait_for
@@ -105,6 +108,32 @@ def test_a_radio_of_grc_asks_too(tmp_path: Path) -> None:
             radio = make_radio(**modem, transmit=word)
             assert radio.transmits is word
             radio.close()
+
+
+def test_a_radio_of_grc_sends_what_a_key_seals(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Its link is another block, so what it may send is decided packet by packet."""
+    sealed, clear = bytes([0x18]) + bytes(30), bytes([0x10]) + bytes(30)
+    top = Flowgraph("test", "test")
+    with SerialCable(tmp_path) as cable, ExitStack() as closing:
+        sends = []
+        for end, is_open in zip(cable.ends, (False, True), strict=True):
+            modem = {"phy": "modem", "packet_len": 64, "phy_options": {"bit_rate": 1e6}, "front_end": "serial"}
+            radio = make_radio(**modem, device=str(end), transmit=True, open=is_open, half_duplex=False)
+            closing.callback(radio.close)
+            probe = Probe()
+            top.msg_connect((probe, "pdus"), (radio, "pdus"))
+            top.msg_connect((radio, "pdus"), (probe, "pdus"))
+            sends.append((probe, radio))
+        closing.callback(top.stop)
+        top.start()
+        for probe, _ in sends:
+            for packet in (clear, sealed, clear):
+                probe.post(packet)
+        (guarded, radio), (anybody, _) = sends
+        wait_for(lambda: anybody.packets == [sealed], "what the key seals")
+        wait_for(lambda: guarded.packets == [clear, sealed, clear], "everything")
+        wait_for(lambda: radio.gate.account()["refused"] == {"not_sealed": 2}, "the count")
+    assert caplog.text.count("there is no key: anybody could read, forge and replay its packets") == 1
 
 
 def test_a_band_holds_in_grc_as_in_a_link(tmp_path: Path) -> None:

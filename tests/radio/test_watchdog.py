@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator, Sequence
 from math import inf
 from pathlib import Path
 
@@ -63,24 +64,58 @@ def test_a_sending_thread_that_has_ended_is_named(tmp_path: Path) -> None:
         assert one.link.source.stalled_s(0.0) == inf
 
 
-def test_systemd_hears_of_a_link_that_runs(tmp_path: Path) -> None:
-    front_end = udp()
-    (tmp_path / "robot.yaml").write_text(
+@pytest.fixture
+def systemd(tmp_path: Path) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as made:
+        made.bind(str(tmp_path / "notify"))
+        made.settimeout(PATIENCE_S)
+        yield made
+
+
+def service(folder: Path, command: Sequence[str] = ("-m", "gr_ros2.cli")) -> subprocess.Popen[bytes]:
+    """A link as systemd starts it."""
+    (folder / "robot.yaml").write_text(
         f"ros_source: {{robot_id: 1, namespace: /robot_1, topics: [odom], middleware: memory}}\n"
-        f"ros_sink: {{middleware: memory}}\nstate: {tmp_path / 'state'}\nphy: {{name: modem}}\nfront_end: {front_end}\n"
+        f"ros_sink: {{middleware: memory}}\nstate: {folder / 'state'}\nphy: {{name: modem}}\nfront_end: {udp()}\n"
     )
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
-        systemd.bind(str(tmp_path / "notify"))
-        systemd.settimeout(PATIENCE_S)
-        process = subprocess.Popen(
-            [sys.executable, "-m", "gr_ros2.cli", "link", str(tmp_path / "robot.yaml")],
-            env={**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify"), "XDG_RUNTIME_DIR": str(tmp_path)},
-            stdout=subprocess.DEVNULL,
-            cwd=ROOT,
-        )
-        assert [systemd.recv(100) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1", b"WATCHDOG=1"]
-        process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE_S) == 0
+    return subprocess.Popen(
+        [sys.executable, *command, "link", str(folder / "robot.yaml")],
+        env={**os.environ, "NOTIFY_SOCKET": str(folder / "notify"), "XDG_RUNTIME_DIR": str(folder)},
+        stdout=subprocess.DEVNULL,
+        cwd=ROOT,
+    )
+
+
+def test_systemd_hears_of_a_link_that_runs(tmp_path: Path, systemd: socket.socket) -> None:
+    process = service(tmp_path)
+    assert [systemd.recv(100) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1", b"WATCHDOG=1"]
+    process.send_signal(signal.SIGINT)
+    assert process.wait(PATIENCE_S) == 0
+
+
+HANGS = """
+import runpy, threading
+from gr_ros2.gr.source import RosSource
+from gr_ros2.radio import robot_link
+robot_link.STALLED_S = 1.0
+RosSource._compose = lambda self: threading.Event().wait() and []
+runpy.run_module("gr_ros2.cli", run_name="__main__")
+"""
+
+
+def test_systemd_hears_nothing_more_once_the_sending_thread_hangs_but_what_hangs(
+    tmp_path: Path, systemd: socket.socket
+) -> None:
+    process = service(tmp_path, ["-c", HANGS])
+    told = [systemd.recv(200)]
+    while not told[-1].startswith(b"STATUS="):
+        told.append(systemd.recv(200))
+    assert told[0] == b"READY=1"
+    assert b"the sending thread has not gone on" in told[-1]
+    assert process.wait(PATIENCE_S) == 1
+    systemd.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        systemd.recv(200)
 
 
 def test_the_template_of_systemd_asks_for_both() -> None:

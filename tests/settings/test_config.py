@@ -23,6 +23,7 @@ from gr_ros2.settings.config import (
     SinkConfig,
     SourceConfig,
     TopicOptions,
+    airtime_from,
     build,
     read_yaml,
 )
@@ -254,6 +255,12 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
 
 
 SCENARIO = {"name": "one", "registry": "table4.csv", "ros_source": {"namespace": "/robot_1"}}
+
+
+@pytest.mark.parametrize("share", [0, -1, 0.0])
+def test_a_share_of_nothing_is_not_answered_with_no_limit(share: float) -> None:
+    with pytest.raises(ConfigError, match=r"duty_cycle = .*: nothing could be sent; set transmit: false"):
+        airtime_from({"duty_cycle": share})
 
 
 @pytest.mark.parametrize(

@@ -139,6 +139,12 @@ def test_a_file_of_something_else_is_refused_with_the_remedy(tmp_path: Path) -> 
         AirtimeFile(tmp_path / "a")
 
 
+def test_an_account_that_cannot_be_opened_is_not_forgotten(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()  # what not even root can open
+    with pytest.raises(ConfigError, match="what was sent would be forgotten; let this user write it"):
+        AirtimeFile(tmp_path / "a")
+
+
 def _done_by(work: object) -> int | None:
     process = multiprocessing.get_context("fork").Process(target=work)  # type: ignore[arg-type]
     process.start()

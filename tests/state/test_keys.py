@@ -104,6 +104,17 @@ def test_a_second_process_is_told_who_uses_the_file(tmp_path: Path) -> None:
         files[0].save(3, 77, 1)
 
 
+def test_a_full_disk_leaves_no_part_of_a_key(tmp_path: Path) -> None:
+    code = (
+        "import resource, signal, sys; from gr_ros2.state.keys import new_key_file\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (40, 40))\n"
+        "new_key_file(sys.argv[1])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "key"], capture_output=True, text=True, check=False)
+    assert "key: cannot be written (File too large)" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_key_by_mistake_is_not_repeated(capsys: pytest.CaptureFixture[str]) -> None:
     key = "0123456789abcdef" * 4
     with pytest.raises(ConfigError) as error:

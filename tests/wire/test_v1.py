@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import EncodeError, WireError
-from gr_ros2.wire import v1
+from gr_ros2.wire import is_sealed, v1
 from gr_ros2.wire.control import About, Ask, Heard, Hello, Newest, Ping, Report
 from gr_ros2.wire.mac_block import MOST_LEN
 from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
@@ -123,6 +123,13 @@ def test_any_body_reads_or_is_refused_by_name(body: bytes, room: int) -> None:
 @given(headers(st.integers(0, 3), st.booleans()), st.binary(min_size=8, max_size=9))
 def test_headers_read_back(header: Header, trailer: bytes) -> None:
     assert v1.read_header(v1.write_header(header) + trailer, 64) == header
+
+
+def test_what_a_key_seals_is_told_by_its_header() -> None:
+    for sealed in (False, True):
+        assert is_sealed(v1.write_header(Header(0, sealed, 1, 2)) + bytes(9)) is sealed
+    assert not is_sealed(bytes([0x08]) + bytes(40)), "version 0"
+    assert not is_sealed(b"")
 
 
 @given(st.binary(max_size=24), st.integers(0, 24))

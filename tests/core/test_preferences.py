@@ -11,9 +11,10 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.cli import main
+from gr_ros2.core import preferences
 from gr_ros2.core.errors import PhyError
 from gr_ros2.doctor import installed
-from gr_ros2.phy import preferences
 
 NOWHERE = "/proc/none"
 """No folder can be made there, even by root."""
@@ -55,3 +56,18 @@ def test_a_version_of_gnu_radio_that_needs_no_home_is_not_refused(monkeypatch: p
     monkeypatch.setattr(preferences, "TRIAL", "")
     monkeypatch.setenv("HOME", NOWHERE)
     preferences.check_preferences()
+
+
+def test_a_home_that_cannot_be_read_is_refused_before_gnu_radio_is_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(path: Path) -> None:  # as for another user than root
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
+    assert main.run(["scenarios"]) == 0  # a home in which GNU Radio has kept nothing yet
+    monkeypatch.setattr(preferences.Path, "stat", refuse)
+    assert main.run(["doctor"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"gr-ros2: HOME = {tmp_path} cannot be read, and GNU Radio keeps its preferences there")
