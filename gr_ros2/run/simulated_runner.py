@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gr_ros2.core.guard import Guard
-from gr_ros2.link import ReceiverEvent
+from gr_ros2.link import Delivered, ReceiverEvent
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import Result
@@ -30,6 +30,7 @@ from gr_ros2.run.recorders import Ear, FurtherRecorders, make_recorder, make_tea
 from gr_ros2.run.robots import ears_of, recorder_of
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.simulate import Simulation, TimedEvent, pass_on
+from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.registry import Registry
 
 _REPORT_S = 0.05
@@ -70,7 +71,8 @@ def run_simulated(
             for way in ways:
                 ids, names = source_names(way, registry).values(), _published_as(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
-        run = Simulation(scenario, registry, phys)
+        tasks = TaskRun(scenario, ways, registry) if scenario.task else None
+        run = Simulation(scenario, registry, phys, messages=None if tasks is None else tasks.messages())
         ears = ears_of(scenario, run.around)
         heard = [ways[number] for number in ears[0]]
         recorder = make_recorder(registry, heard, None if bag is None else bag.take)
@@ -89,6 +91,8 @@ def run_simulated(
         for timed_event in run.events():
             clock.now, robot, event = timed_event
             number = recorder_of(scenario, robot.number) if isinstance(event, ReceiverEvent) else 0
+            if tasks is not None and isinstance(event, Delivered):
+                tasks.delivered(robot.number, event, clock.now)
             pass_on(further.at(number) if number else link_observers, timed_event)
             if team is not None:
                 _follow(team, timed_event)
@@ -115,6 +119,7 @@ def run_simulated(
         phy=numbers(recorder),
         wall_s=time.monotonic() - began,
         incomplete=tuple(run_observers.incomplete()),
+        task={} if tasks is None else tasks.numbers(),
         counters={**there, **back, "listener": {} if bag is None else dict(bag.written)},
     )
     published_as = {name: other for way in ways for name, other in _published_as(way, registry).items()}
