@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import partial
 
 from fuzz.loop import main, within
 from gr_ros2.core.errors import WireError
+from gr_ros2.link.v1.custody import MOST_HELD, Custody
+from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.sent_topics import SentTopics
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.wire.control import Newest
-from gr_ros2.wire.relayed import Relayed, read_relayed, write_relayed
+from gr_ros2.wire.relayed import Relayed, read_carried, read_relayed, write_carried, write_relayed
 
 MOST_LINES = 12_000
 """Lines of Python for a message heard, and for a choice among 40 streams for 40 neighbours."""
@@ -20,6 +24,19 @@ def relay(data: bytes) -> None:
     """Take the bytes as packets heard, and choose in between."""
     gains = Gains(1)
     now = 0.0
+    topics, window = SentTopics(None, ()), RepairWindow("off", 200)
+    topics.carry()
+    custody = Custody(
+        (1, 1),
+        topics,
+        window.packets,
+        window.peers,
+        gains=gains,
+        room=200,
+        most=10_000,
+        dropped=Counter(),
+        drop=lambda _: None,
+    )
     for start in range(0, min(len(data), 40 * _STEP), _STEP):
         src_id, later, *names = (data[start : start + 4] + bytes(4))[:4]
         now += later / 256
@@ -39,6 +56,21 @@ def relay(data: bytes) -> None:
             assert gains.has(best) >= 0
             gains.sent(best, now)
         assert len(gains.tells()) <= 2
+        carry(custody, data[start + 5 : start + _STEP], src_id, now)
+
+
+def carry(custody: Custody, data: bytes, src_id: int, now: float) -> None:
+    """Take the bytes as a message that a robot hands over."""
+    try:
+        taker, message = read_carried(data)
+    except WireError:
+        return
+    assert write_carried(taker, message) == data
+    held = len(custody)
+    custody.routes.note(message.origin, src_id, message.hops, now)
+    within(MOST_LINES, partial(custody.take, message, src_id, now))
+    within(MOST_LINES, partial(custody.offer, now))
+    assert held <= len(custody) <= MOST_HELD
 
 
 def corpus() -> list[bytes]:
@@ -47,7 +79,11 @@ def corpus() -> list[bytes]:
     for n in range(40):
         message = write_relayed(Relayed(n % 7, 1, n, 0, 0, n % 4, b"odom"))
         heard += bytes((2 + n % 3, 64, 1, 3, n, 0)) + message
-    return [b"", heard[:_STEP], heard]
+    carried = b"".join(
+        bytes((2 + n % 3, 64, 1, 3, n)) + write_carried(1, Relayed(n % 7, 1, n, 128, 0, n % 4, b"go", dst_id=9))
+        for n in range(40)
+    )
+    return [b"", heard[:_STEP], heard, b"".join(carried[at : at + 19] + b"!" for at in range(0, len(carried), 19))]
 
 
 if __name__ == "__main__":

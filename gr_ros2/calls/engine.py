@@ -58,10 +58,12 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class OutgoingFrame:
-    """A frame to be sent. It is useless after ``lifespan_s`` seconds; infinity means that there is no limit."""
+    """A frame to be sent to a robot. It is useless after ``lifespan_s`` seconds; infinity means that there is no
+    limit."""
 
     data: bytes
     lifespan_s: float
+    robot: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +157,7 @@ class Calls:
         expires = now + deadline_s if deadline_s else inf
         self._made[self._number] = _Made(service, token, expires)
         frame = CallFrame(robot, boot, self._number, payload, service.service_id, deadline_s)
-        return OutgoingFrame(write_frame(frame), deadline_s or inf)
+        return OutgoingFrame(write_frame(frame), deadline_s or inf, robot)
 
     def withdrawn(self, robot: int, service_ids: Iterable[int]) -> None:
         """A robot no longer has these services. Calls of them will not be answered."""
@@ -175,9 +177,8 @@ class Calls:
             self.counters["late"] += 1
             return None
         self.counters[f"replied:{served.name}"] += 1
-        return OutgoingFrame(
-            write_frame(CallFrame(served.robot, served.boot, served.number, payload)), served.expires - now
-        )
+        frame = CallFrame(served.robot, served.boot, served.number, payload)
+        return OutgoingFrame(write_frame(frame), served.expires - now, served.robot)
 
     # ---- frames
 

@@ -147,7 +147,7 @@ def link(
             running.start()
             answers |= {
                 STATUS: lambda _: {**running.stats(), "findings": running.findings()},
-                PING: lambda robot: running.ping(int(robot)),
+                PING: lambda asks: running.ping(int(asks["robot"]), anew=bool(asks["anew"])),
             }
             run_observers.run_started(_live(running))
             _show(console, running, duration)

@@ -143,7 +143,9 @@ def _looked_at(look: Dissection, data: bytes, reader: Reader, registry: Registry
             yield f"  entry {index}: {text}{', coded' if message.coded else ''}"
             relayed = look.relayed(index)
             if relayed is not None:
-                yield f"    relayed: {relayed.describe()}"
+                taker, of = relayed
+                way = "" if taker == BROADCAST else f", taken on by robot {taker}"
+                yield f"    relayed: {of.describe()}{way}"
     for row in look.announced:
         yield f"  announces {row.describe()}"
 

@@ -34,8 +34,8 @@ CHECK_S = 15.0
 """s after which a check ends, if it is not told otherwise."""
 _CHECK_PINGS, _CHECK_EVERY_S = 10, 0.3
 
-Ask = Callable[[], Mapping[str, Any]]
-"""Asks the robot; returns what has come of all questions so far."""
+Ask = Callable[[bool], Mapping[str, Any]]
+"""Asks the robot, anew or not; returns what has come of all questions so far."""
 
 
 def without_topics(settings: LinkConfig) -> LinkConfig:
@@ -97,11 +97,16 @@ def ping(
         count = 10
     if config is not None:
         with opened(load_link(config, overrides)) as link:
-            return _ping(lambda: link.ping(robot), robot, count, interval, as_json=as_json)
+            return _ping(lambda anew: link.ping(robot, anew=anew), robot, count, interval, as_json=as_json)
     if overrides:
         raise click.UsageError("--set needs CONFIG; the settings of a running link are its own")
     chosen = find_link(pid)
-    return _ping(lambda: request(chosen, {PING: robot})[PING], robot, count, interval, as_json=as_json)
+
+    def ask(anew: bool) -> Mapping[str, Any]:
+        told: Mapping[str, Any] = request(chosen, {PING: {"robot": robot, "anew": anew}})[PING]
+        return told
+
+    return _ping(ask, robot, count, interval, as_json=as_json)
 
 
 def _ping(ask: Ask, robot: int, count: int | None, interval: float, *, as_json: bool) -> int:
@@ -114,7 +119,7 @@ def _ping(ask: Ask, robot: int, count: int | None, interval: float, *, as_json: 
         shows = console.is_terminal and not as_json
         with Live("", console=console, auto_refresh=False) if shows else nullcontext() as live:
             while count is None or asked < count:
-                told = ask()
+                told = ask(not asked)
                 asked += 1
                 line = f"robot {robot}: {in_words(told)}"
                 if isinstance(live, Live):
@@ -123,7 +128,7 @@ def _ping(ask: Ask, robot: int, count: int | None, interval: float, *, as_json: 
                     logged = time.monotonic()
                     console.print(line, soft_wrap=True)
                 time.sleep(interval)
-            told = ask()  # the answer to the last question has come by now; this one's is not waited for
+            told = ask(False)  # the answer to the last question has come by now; this one's is not waited for
     except KeyboardInterrupt:
         pass
     if as_json:

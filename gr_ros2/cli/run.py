@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -132,7 +132,7 @@ def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.
         nonlocal shown, begun
         if not begun:
             begun = True
-            bar.console.print(*_graphs(progress.domains), sep="", end="", soft_wrap=True)
+            bar.console.print(*_graphs(progress.graphs), sep="", end="", soft_wrap=True)
         done = min(progress.elapsed_s, scenario.duration_s) if scenario.duration_s else progress.elapsed_s
         bar.update(task, completed=done, sent=progress.sent, delivered=progress.delivered)
         if not bar.console.is_terminal and time.monotonic() - shown >= LOG_S:
@@ -145,11 +145,11 @@ def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.
     return advance
 
 
-def _graphs(domains: tuple[int | None, int | None]) -> Iterator[str]:
+def _graphs(graphs: Iterable[tuple[str, int | None]]) -> Iterator[str]:
     """Where other programs can join in, a line each."""
-    for domain, what in zip(domains, ("messages are sent", "they come out"), strict=True):
+    for what, domain in graphs:
         if domain is not None:
-            yield f"ROS_DOMAIN_ID={domain} ROS_LOCALHOST_ONLY=1: the graph on which {what}\n"
+            yield f"ROS_DOMAIN_ID={domain} ROS_LOCALHOST_ONLY=1: {what}\n"
 
 
 def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path, drawn: bool | None) -> None:

@@ -102,7 +102,7 @@ def airtime_words(account: Mapping[str, Any]) -> str:
         )
         if account["waits_s"] > 1:
             words.append(f"the limit lets the next packet leave in {account['waits_s']:.0f} s")
-    if account.get("unsaved"):
+    if not account.get("stored", True):
         words.append("its airtime account cannot be stored")
     return ", ".join(words)
 

@@ -252,7 +252,7 @@ class LiveCalls:
     def _send(self, frame: OutgoingFrame | None, now: float) -> None:
         """Send a frame. Called with the lock held."""
         if frame is not None:
-            self._messages.submit(self._row, frame.data, now, frame.lifespan_s)
+            self._messages.submit(self._row, frame.data, now, frame.lifespan_s, frame.robot)
             self._work.notify()
 
     def _tell_first(self, counter: str, error: Exception) -> None:

@@ -95,7 +95,7 @@ def message_codec(dictionaries: Sequence[str], registry: Sequence[Topic] = ()) -
 
 @dataclass(frozen=True)
 class EndpointSetup:
-    """What a version 1 endpoint must know about the current start of its robot.
+    """What a version 1 endpoint must know about its robot's radio, and about the current start of its robot.
 
     :param boot: number of this start, greater than all earlier numbers
     :param heard: the last packet heard from each other robot before this start, by robot id: boot number and packet
@@ -203,39 +203,17 @@ def make_endpoint(
     )
 
 
-def start_of(
-    config: SourceConfig | SinkConfig,
-    src_id: int,
-    *,
-    reports: bool,
-    half_duplex: bool = False,
-    any_length: bool = False,
-    mcs_table: Sequence[Mcs] = (),
-    airtime_share: float = 1.0,
-    access: Callable[[int], Access | None] = lambda _: None,
-    lead_s: float = 0.0,
-    relay: bool = False,
-) -> EndpointSetup:
+def start_of(config: SourceConfig | SinkConfig, src_id: int, setup: EndpointSetup) -> EndpointSetup:
     """Count this start of a robot in its state file, and read the robot's keys.
 
     :param src_id: id of the robot, -1 for a robot that sends nothing
-    :param access, lead_s, relay: see :class:`EndpointSetup`
+    :param setup: what is known of its radio
     :raises ConfigError: for a key file or a state file that cannot be read or understood
     """
     keys = Keys(read_key_file(config.key), config.seal) if config.key else None
     if not config.version:
-        return EndpointSetup(mcs_table=mcs_table)
-    setup = EndpointSetup(
-        keys=keys,
-        reports=reports,
-        half_duplex=half_duplex,
-        any_length=any_length,
-        mcs_table=mcs_table,
-        airtime_share=airtime_share,
-        access=access,
-        lead_s=lead_s,
-        relay=relay,
-    )
+        return setup
+    setup = replace(setup, keys=keys)
     if not config.state and not config.key and src_id < 0:
         return replace(setup, boot=int(time.time()) << RANDOM_BITS | secrets.randbits(RANDOM_BITS))
     file = BootFile(

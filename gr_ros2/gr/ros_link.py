@@ -11,7 +11,7 @@ from __future__ import annotations
 import random
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -19,19 +19,20 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.ends import LiveEnd, make_endpoint, own_settings, read_registry, start_of
+from gr_ros2.gr.ends import EndpointSetup, LiveEnd, make_endpoint, own_settings, read_registry, start_of
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
-from gr_ros2.link.access import Access
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.rate import Mcs
 from gr_ros2.mac import GUARD_S, access_of
 from gr_ros2.middleware import Middleware
 from gr_ros2.settings.config import SinkConfig, SourceConfig, airtime_from, build
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import MAX_TOPICS, Registry
+
+_HEARD = EndpointSetup(reports=True)
+"""Of a robot whose others hear it, on a channel of its own."""
 
 
 class RosLink(gr.hier_block2):  # type: ignore[misc]
@@ -43,11 +44,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param source: settings of the sending half
     :param sink: settings of the receiving half
     :param middleware: an open Middleware for the source and one for the sink; None: opened as the settings say
-    :param reports: whether it tells the others what it hears; False for a robot that only receives
-    :param half_duplex: whether sending and receiving share the airtime
-    :param any_length, mcs_table: see :class:`RosSource`
-    :param airtime_share: part of the time that this robot may send, above 0..1
-    :param access, lead_s, relay: see :class:`gr_ros2.gr.ends.EndpointSetup`
+    :param setup: what is known of the radio; the start of the robot is counted here
     :param observer, clock, seed: see :class:`RosSource`
     :raises ConfigError: for settings that contradict each other
     """
@@ -58,33 +55,15 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         source: SourceConfig,
         sink: SinkConfig,
         *,
+        setup: EndpointSetup = _HEARD,
         middleware: tuple[Middleware, Middleware] | None = None,
-        reports: bool = True,
-        half_duplex: bool = False,
-        any_length: bool = False,
-        mcs_table: Sequence[Mcs] = (),
-        airtime_share: float = 1.0,
-        access: Callable[[int], Access | None] = lambda _: None,
-        lead_s: float = 0.0,
-        relay: bool = False,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         seed: int | None = None,
     ) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
         rows = read_registry(registry, needed=not source.version)
-        start = self._start = start_of(
-            source,
-            source.src_id(),
-            reports=reports,
-            half_duplex=half_duplex,
-            any_length=any_length,
-            mcs_table=mcs_table,
-            airtime_share=airtime_share,
-            access=access,
-            lead_s=lead_s,
-            relay=relay,
-        )
+        start = self._start = start_of(source, source.src_id(), setup)
         rng = random.Random(seed)
         calls = source.version != 0 and (len(rows) < MAX_TOPICS or bool(rows.services))
         self.end = LiveEnd(
@@ -149,17 +128,15 @@ def make_link(
         sink = replace(sink, robot_id=source.src_id())
     limits = airtime_from(airtime_limit)
     limits.check_seal(encrypts=bool(source.key) and source.seal == "encrypt")
-    rule = limits.rule
     shares = medium != "exclusive"
     if shares and not (source.version and airtime_s > 0):
         raise ConfigError(f"medium = {medium!r}: needs version 1, and airtime_s above 0: that of the longest packet")
-    return RosLink(
-        source.registry,
-        source,
-        sink,
+    setup = EndpointSetup(
+        reports=True,
         half_duplex=half_duplex or shares,
         any_length=any_length,
         access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=slot_guard_s),
         lead_s=LEAD_S,
-        airtime_share=1.0 if rule is None else sustained(rule),
+        airtime_share=sustained(limits.rule),
     )
+    return RosLink(source.registry, source, sink, setup=setup)

@@ -92,7 +92,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self.registry = rows.with_options(self.config.topic_options, announced=self.config.version != 0)
         self._start = EndpointSetup()
         if end is None:
-            start = self._start = start_of(self.config, robot_of(None, self.config), reports=False)
+            start = self._start = start_of(self.config, robot_of(None, self.config), EndpointSetup())
             if self.config.key:
                 debug_logger("gr_ros2.gr.sink", self.config.debug).warning(
                     "ros2_sink: one way, a key keeps out what is forged or was heard before; what never came here is "

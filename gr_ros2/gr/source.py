@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any
 
-import pmt
 from gnuradio import gr
 
 from gr_ros2.core.errors import GrRos2Error
@@ -31,7 +30,7 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware
-from gr_ros2.phy.pdus import CREDIT, AirPacket, PduPort
+from gr_ros2.phy.pdus import CREDIT, AirPacket, PduPort, credited
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import SourceConfig, replaced
 from gr_ros2.settings.fields import Auto
@@ -46,10 +45,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     """Subscribes to topics of a ROS graph and emits their messages as packets.
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
-    optional. From the first `credit` message on, each message lets one packet leave. An integer lets that many leave;
-    0 says that sending was held back, so that the time since the last packet is not the pace of the PHY. A real number
-    is the time in s, of this block's clock, since when the air is free for the packet: messages that wait all the same
-    wait for the computer.
+    optional. From the first `credit` message on, packets wait for credits. A credit is a pair: an integer, so many
+    packets may leave; and a real number, the time in s of this block's clock since when the air is free for them.
+    Messages that wait all the same wait for the computer. Infinity says that the packets were held back until now, so
+    that the time since the last one is not the pace of the PHY. An integer alone says nothing of the air, and any other
+    message lets one packet leave.
 
     The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` leaves the
     graph, and so does the end of the process. A middleware that is passed in open must be started and closed by the
@@ -90,9 +90,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """The source id on the wire."""
         self._start = EndpointSetup()
         if end is None:
-            start = self._start = start_of(
-                self.config, self.src_id, reports=False, any_length=any_length, mcs_table=mcs_table
-            )
+            setup = EndpointSetup(any_length=any_length, mcs_table=mcs_table)
+            start = self._start = start_of(self.config, self.src_id, setup)
             rng = random.Random(seed)
             end = LiveEnd(
                 lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
@@ -260,13 +259,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._room.notify_all()
 
     def _credit(self, message: Any) -> None:
-        packets = pmt.to_long(message) if pmt.is_integer(message) else 1
-        # Whoever waits for room in a queue wants nothing dropped.
-        ready = pmt.to_double(message) if pmt.is_real(message) and not self.config.backpressure else inf
+        packets, since = credited(message)
+        if self.config.backpressure and since != inf:
+            since = None  # whoever waits for room in a queue wants nothing dropped
         with self._lock:
-            if packets <= 0:
-                self._end.pace.paused()
-            self._end.pace.credit(max(0, packets), ready)
+            self._end.pace.credit(max(0, packets), since)
             self._live.wake()
 
     def _pump(self) -> None:

@@ -51,6 +51,7 @@ class AirtimeLimit:
     :param save: stores what is reserved; None: nothing outlives this object
     :raises ConfigError: for a packet that can never be sent
     :ivar unsaved: how often the account could not be stored
+    :ivar stored: whether it was stored when that was tried last
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class AirtimeLimit:
         self._burst_since, self._over = -inf, now
         """When the burst began, and when the newest packet was over. An earlier start may have sent until now."""
         self._reserved, self._reserved_until, self._again = 0.0, -inf, -inf
-        self.unsaved = 0
+        self.unsaved, self.stored = 0, True
 
     @property
     def budget(self) -> float:
@@ -120,10 +121,10 @@ class AirtimeLimit:
         try:
             self._save([*((end - now, spent) for end, spent in self._bins), (until - now, chunk)])
         except ConfigError:
-            self.unsaved += 1
+            self.unsaved, self.stored = self.unsaved + 1, False
             self._again = now + AGAIN_S
             return False
-        self._reserved, self._reserved_until = chunk, until
+        self._reserved, self._reserved_until, self.stored = chunk, until, True
         return True
 
     def again(self, now: float) -> float | None:
@@ -174,9 +175,9 @@ class AirtimeLimit:
             self._sum = 0.0
 
 
-def sustained(rule: AirtimeRule) -> float:
-    """The share of the time that a transmitter with more to send than it may is on the air, 0..1."""
-    return rule.duty_cycle * (1 - BURST) if rule.duty_cycle < 1 else 1.0
+def sustained(rule: AirtimeRule | None) -> float:
+    """The share of the time that a transmitter with more to send than it may is on the air, 0..1; None = no limit."""
+    return rule.duty_cycle * (1 - BURST) if rule is not None and rule.duty_cycle < 1 else 1.0
 
 
 def at_full_load(rule: AirtimeRule, longest: float) -> AirtimeLimit:

@@ -27,7 +27,7 @@ from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
 from gr_ros2.settings.config import QueuePolicy, SinkConfig, SourceConfig
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry
 from gr_ros2.wire import AnnouncedTopic
 
@@ -48,12 +48,15 @@ def check_live(changes: Mapping[str, Any]) -> None:
 class MessageSide(Protocol):
     """The messages that an end sends."""
 
-    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+    def submit(
+        self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf, dst_id: int | Auto = AUTO
+    ) -> None:
         """Take a serialized message.
 
         It may be refused, and it may cause waiting messages of its topic to be dropped; all are counted and observed.
 
         :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline (version 1)
+        :param dst_id: the robot for which it is, auto as its topic says: others carry it there (version 1)
         :raises ConfigError: for a topic that is not sent
         """
 
@@ -185,8 +188,11 @@ class Questions(Protocol):
         :param key: number that stands for the key, 0 for none
         """
 
-    def put(self, robot: int, now: float) -> dict[str, Any]:
-        """Ask a robot as soon as a packet may leave; returns what has come of all questions to it so far."""
+    def put(self, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
+        """Ask a robot as soon as a packet may leave; returns what has come of all questions to it so far.
+
+        :param anew: forget the earlier ones
+        """
 
 
 class Endpoint(PacketSide, Protocol):

@@ -14,8 +14,6 @@ from gr_ros2.settings.fields import AUTO, Auto
 
 _INTERVALS = 15
 """Number of packet intervals whose median estimates the interval of credits."""
-_WINDOW_S = 0.5
-"""s over which it is found out whether the computer keeps up."""
 _ENOUGH, _RECENT_S = 3, 10.0
 """Intervals that must have been measured within so many seconds before a message is dropped because of them. With one,
 the pause of a busy computer stopped the commands of a link for good: what was dropped measured nothing better."""
@@ -42,12 +40,8 @@ class Pace:
         """When the last intervals were measured."""
         self._median = 0.0
         self._free = -inf
-        self._ready = inf
-        """Since when the PHY could have sent what the newest credit asks for; infinite if it does not say so."""
-        self._idle, self._window = 0.0, -inf
-        """s for which the PHY was idle although a message waited, since the begin of the window."""
-        self._slow = False
-        """Whether it was so for more than half of the last window."""
+        self._since = inf
+        """Since when the air is free for what the newest credit asks for; infinite if that is not known."""
         self.change(packet_rate)
 
     def change(self, packet_rate: float | Auto) -> None:
@@ -62,18 +56,27 @@ class Pace:
         if self._credits is None:
             self._credits = 0
 
-    def credit(self, packets: int = 1, ready: float = inf) -> None:
+    def credit(self, packets: int = 1, since: float | None = None) -> None:
         """The PHY can take this many further packets; the first call does what ``use_credit`` does.
 
-        :param ready: s, since when the air is free for them; infinite if that is not known
+        :param since: s, since when the air is free for them; None if that is not known. Infinite: they were held back
+            until now, by a limit of airtime or its switch. The time since the last packet left then is not the interval
+            of the PHY, and a message must not be dropped as if it were
         """
-        self._ready = ready
+        self._since = inf if since is None else since
+        if since == inf:
+            self._busy_since = inf
         self._credits = (self._credits or 0) + (0 if self._unpaced else packets)
 
-    def paused(self) -> None:
-        """Sending was held back, by a limit of airtime or its switch: the time since the last packet left is not the
-        interval of the PHY, and a message must not be dropped as if it were."""
-        self._busy_since = inf
+    @property
+    def ready(self) -> float:
+        """s, since when a packet could have left; infinite if that is not known."""
+        return max(self._since, self.slot)
+
+    @property
+    def credited(self) -> bool:
+        """Whether there is a credit for a packet."""
+        return bool(self._credits)
 
     @property
     def out_of_credit(self) -> bool:
@@ -118,18 +121,6 @@ class Pace:
             self._credited = now
             self._free = min(self._free, now + LEAD_S)
         return True
-
-    def waited(self, since: float, now: float) -> None:
-        """A message leaves that could have left since then, as far as it is known here."""
-        self._idle += max(0.0, now - max(since, self._ready, self.slot))
-        if now - self._window >= _WINDOW_S:
-            self._slow = self._idle > (now - self._window) / 2
-            self._idle, self._window = 0.0, now
-
-    def behind(self, now: float) -> bool:
-        """Whether messages that wait do so because the computer is too slow, not the air."""
-        stuck = bool(self._credits) and now - max(self._ready, self.slot) > _WINDOW_S
-        return self._slow or stuck
 
     def left(self, now: float, *, waiting: bool) -> None:
         """A packet left.

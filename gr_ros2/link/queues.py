@@ -77,6 +77,8 @@ class TopicQueue(deque[Outgoing]):
         self.since = inf
         """When ``flush_timeout_s`` began to run: with the first message, or when a message started. A drop does not
         restart it; otherwise a topic faster than the timeout would never be sent."""
+        self.closed = False
+        """Whether no message may start for now."""
 
     def change(self, policy: QueuePolicy, deadline_s: float) -> None:
         """Set another policy or deadline, from now on; the deadline applies to waiting messages too."""
@@ -144,9 +146,9 @@ class TopicQueue(deque[Outgoing]):
 
     def open(self, now: float) -> Sequence[Outgoing]:
         """The messages that may continue or start."""
-        if not self._interval:
+        if not self._interval and not self.closed:
             return self
-        return [self[0]] if self and (self[0].started or now >= self._opens) else []
+        return [self[0]] if self and (self[0].started or (now >= self._opens and not self.closed)) else []
 
     def opens(self, now: float) -> float:
         """When the next message may start, if one waits for ``max_rate``; otherwise infinite."""

@@ -19,9 +19,11 @@ from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
 from gr_ros2.wire.control import ENCRYPTS, Hello
 from gr_ros2.wire.mac_block import Block, read_block
-from gr_ros2.wire.relayed import Relayed, read_relayed
+from gr_ros2.wire.relayed import Relayed, read_carried, read_relayed
 from gr_ros2.wire.table import AnnouncedTopic, read_table
 from gr_ros2.wire.v1 import (
+    BROADCAST,
+    CARRIED_TOPIC,
     CRC_LEN,
     QOS_REPAIR,
     TABLE_TOPIC,
@@ -73,13 +75,16 @@ class Dissection:
         entry = self.entries[index]
         return entry if isinstance(entry, Part) else None
 
-    def relayed(self, index: int) -> Relayed | None:
-        """Whose message an entry carries, if it begins one of another robot."""
+    def relayed(self, index: int) -> tuple[int, Relayed] | None:
+        """Whose message an entry carries, if it begins one of another robot; and the robot that is to take it on, 255
+        for none."""
         entry = self.message(index)
         if entry is None or entry.topic_id <= TABLE_TOPIC or entry.offset:
             return None
         try:
-            return read_relayed(entry.payload)
+            if entry.topic_id == CARRIED_TOPIC:
+                return read_carried(entry.payload)
+            return BROADCAST, read_relayed(entry.payload)
         except WireError:
             return None
 

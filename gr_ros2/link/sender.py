@@ -23,7 +23,7 @@ from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
 from gr_ros2.link.schedule import PaperScheduler, Plan
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.settings.config import QueuePolicy, SourceConfig, replaced
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry
 from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
@@ -82,7 +82,14 @@ class Sender:
         """Per topic, serial and coded bytes of the message for robots that join late."""
         self._repeat_at: dict[int, float] = {}
 
-    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:  # noqa: ARG002
+    def submit(
+        self,
+        topic_id: int,
+        payload: bytes,
+        now: float,
+        lifespan_s: float = inf,  # noqa: ARG002 - as in other versions
+        dst_id: int | Auto = AUTO,  # noqa: ARG002
+    ) -> None:
         """Take a serialized message.
 
         It may be refused (``too_large``), and it may cause the oldest waiting message of its topic to be dropped

@@ -86,6 +86,9 @@ class Surroundings(ABC):
     moves: bool
     passes: bool
 
+    def begin(self, now: float) -> None:  # noqa: B027 - most do not move
+        """A run begins at a time in s, on a clock that went before: robots move from now on."""
+
     @abstractmethod
     def hearers(self, sender: int, now: float) -> Hearers:
         """Those who hear a robot at a time in s: the same object as long as nothing has changed for this robot."""

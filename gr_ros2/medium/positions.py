@@ -64,12 +64,15 @@ class Positions(Surroundings):
             self._shadowing = Shadowing(channel.shadowing_db, channel.decorrelation_m, channel.seed)
         self.reach_m = self.range_m(LEAST_DB - _SIGMAS * channel.shadowing_db)
         """Distance beyond which nobody hears anything, m."""
-        self._step = -1
+        self._begin_s, self._step = 0.0, -1
         self._places = self._velocities = np.zeros((self.robots, 2))
         self._one = self._other = np.zeros((0, 0), np.float32)
         self._known = np.zeros(self.robots, bool)
         self._heard: dict[int, Hearers] = {}
         self._near: dict[int, NDArray[np.bool_]] = {}
+
+    def begin(self, now: float) -> None:
+        self._begin_s = now
 
     def path(self, sender: int, receiver: int) -> Path:
         return self._paths[sender][receiver]
@@ -101,7 +104,7 @@ class Positions(Surroundings):
 
     def _go(self, now: float) -> None:
         """Move the robots to where they are at a time."""
-        step = math.floor(now / STEP_S + 1e-9)
+        step = max(0, math.floor((now - self._begin_s) / STEP_S + 1e-9))
         if step == self._step:
             return
         self._step = step

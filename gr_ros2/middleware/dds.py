@@ -10,17 +10,16 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 
 from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
-from gr_ros2.middleware.base import MessageCallback, Qos, TopicInfo, grouped
+from gr_ros2.middleware.base import MessageCallback, Qos, TopicInfo
 from gr_ros2.middleware.cdr_dds import (
     DdsError,
-    DiscoveredEndpoint,
     EndpointWatch,
     Entity,
     RawReader,
@@ -32,9 +31,9 @@ from gr_ros2.middleware.cdr_dds import (
 )
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
+from gr_ros2.middleware.dds_found import FoundEndpoints
 from gr_ros2.middleware.dds_services import DdsClient, DdsServer, ServiceParticipant
 from gr_ros2.middleware.services import (
-    DESCRIPTION_TYPE,
     SERVICE_QOS,
     ReplyCallback,
     RequestCallback,
@@ -89,10 +88,10 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         self._subscriptions: list[DdsSubscription] = []
         self._advertised: list[DdsPublisher] = []
         self._pairs: list[DdsServer | DdsClient] = []
-        self._found: dict[int, dict[bytes, DiscoveredEndpoint]] = {_PUBLICATIONS: {}, _SUBSCRIPTIONS: {}}
         self._participant = POOL.join(self.domain_id, options, ros_graph.PARTICIPANT_USER_DATA)
         try:
             self._guid = guid(self._participant)
+            self._others = FoundEndpoints(self._guid)
             self._waitset = WaitSet(self._participant)
             self._watches = {
                 number: EndpointWatch(self._participant, publishers=number == _PUBLICATIONS)
@@ -152,48 +151,16 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
 
     def discover(self) -> list[TopicInfo]:
         """The topics seen so far; a fresh participant needs a moment (tenths of a second) to see any."""
-        with self._lock:
-            publishers, subscribers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
-        return grouped(self._foreign(publishers), self._foreign(subscribers))
+        return self._others.topics()
 
     def discover_services(self) -> dict[str, str]:
-        return {name: type_name for name, type_name, _ in self._servers()}
+        return {name: type_name for name, type_name, _ in self._others.servers()}
 
     def uncallable(self) -> frozenset[str]:
-        return frozenset(name for name, _, callable_here in self._servers() if not callable_here)
-
-    def _servers(self) -> Iterator[tuple[str, str, bool]]:
-        """Name, type, and whether it can be called from here, of each server: a reader of requests and a writer of
-        replies in one participant."""
-        with self._lock:
-            writers, readers = (list(self._found[number].values()) for number in (_PUBLICATIONS, _SUBSCRIPTIONS))
-        replying = {(writer.participant, writer.topic) for writer in writers if writer.participant != self._guid}
-        for reader in readers:
-            service = ros_graph.ros_service(reader.topic, reader.type_name)
-            if service is not None:
-                (_, _), (replies, _) = ros_graph.dds_service(*service)
-                if (reader.participant, replies) in replying:
-                    yield (*service, reader.is_cyclone)
+        return frozenset(name for name, _, callable_here in self._others.servers() if not callable_here)
 
     def witnesses(self, topic: str, type_name: str) -> list[Witness]:
-        name, kind = ros_graph.dds_topic(topic), ros_graph.dds_type(type_name)
-        with self._lock:
-            everyone = [endpoint for found in self._found.values() for endpoint in found.values()]
-        hashes: dict[str, set[bytes]] = {}
-        services: dict[bytes, list[str]] = {}
-        for endpoint in everyone:
-            if endpoint.participant == self._guid or not endpoint.is_cyclone:
-                continue  # services of Fast DDS cannot be called from here
-            if (endpoint.topic, endpoint.type_name) == (name, kind):
-                hashes.setdefault(ros_graph.announced_hash(endpoint.user_data), set()).add(endpoint.participant)
-            service = ros_graph.ros_service(endpoint.topic, endpoint.type_name)
-            if service is not None and service[1] == DESCRIPTION_TYPE:
-                services.setdefault(endpoint.participant, []).append(service[0])
-        found = []
-        for digest in sorted(hashes.keys() - {""}):
-            named = sorted({service for owner in hashes[digest] for service in services.get(owner, ())})
-            found.append(Witness(digest, tuple(named)))
-        return found
+        return self._others.witnesses(topic, type_name)
 
     def close(self) -> None:
         worker = threading.current_thread() is self._thread
@@ -243,7 +210,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
     def make_pair(self, end: DdsServer | DdsClient) -> None:
         names = ros_graph.dds_service(end.name, end.type_name)
         topics = [create_topic(self._participant, *name) for name in names]
-        data = [ros_graph.endpoint_user_data(self._announced_hash(name)) + end.mark for _, name in names]
+        data = [ros_graph.endpoint_user_data(self._others.hash_of(name)) + end.mark for _, name in names]
         # The writer is first: a reader alone on a topic of requests makes clients of Fast DDS wait for ever.
         writer = RawWriter(self._participant, topics[end.writes], SERVICE_QOS, data[end.writes])
         reader = RawReader(self._participant, topics[end.reads], SERVICE_QOS, data[end.reads])
@@ -326,15 +293,10 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
                 self.count("dds_failed", str(error))
 
     def _graph_changed(self, number: int) -> None:
-        found, changed = self._found[number], set()
+        changed: set[str] = set()
         while changes := self._watches[number].take():
-            for key, endpoint in changes:
-                with self._lock:
-                    before = found.pop(key, None)
-                    if endpoint is not None:
-                        found[key] = endpoint
-                changed |= {e.topic for e in (before, endpoint) if e is not None}
-        if self._gid_bytes == 24 and ros_graph.DISCOVERY_TOPIC in changed and self._sees_short_gids():
+            changed |= self._others.change(changes, publishers=number == _PUBLICATIONS)
+        if self._gid_bytes == 24 and ros_graph.DISCOVERY_TOPIC in changed and self._others.has_short_gids():
             self._gid_bytes = 16
             self.announce()
         if number == _PUBLICATIONS:
@@ -343,27 +305,14 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             for subscription in affected:
                 subscription.adapt(self._offers(subscription.topic, subscription.type_name))
 
-    def _sees_short_gids(self) -> bool:
-        with self._lock:
-            everyone = [endpoint for found in self._found.values() for endpoint in found.values()]
-        return any(ros_graph.has_short_gids(endpoint.topic, endpoint.user_data) for endpoint in everyone)
-
     def _offers(self, topic: str, type_name: str) -> list[Qos]:
         """The QoS of the publishers of a topic; publishers of another type are counted and left out."""
-        with self._lock:
-            all_of_topic = [e for e in self._found[_PUBLICATIONS].values() if e.topic == ros_graph.dds_topic(topic)]
+        all_of_topic = self._others.publishers(topic)
         ours = ros_graph.dds_type(type_name)
         for other in {e.type_name for e in all_of_topic} - {ours}:
             text = f"{topic}: a publisher sends {ros_graph.ros_type(other)}, subscribed is {type_name}"
             self.count_once(f"incompatible_type:{topic}", text)
         return [e.qos for e in all_of_topic if e.type_name == ours]
-
-    def _foreign(self, endpoints: Iterable[DiscoveredEndpoint]) -> Iterator[tuple[str, str, Qos]]:
-        """Topic, type and QoS of the endpoints of other participants that belong to ROS topics."""
-        for endpoint in endpoints:
-            topic = ros_graph.ros_topic(endpoint.topic)
-            if topic is not None and endpoint.participant != self._guid:
-                yield topic, ros_graph.ros_type(endpoint.type_name), endpoint.qos
 
     # Bookkeeping.
 
@@ -383,18 +332,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         """User data of an endpoint: the type hash that other endpoints on the graph announce, otherwise that of ROS."""
         from gr_ros2.middleware.type_definitions import type_hash
 
-        return ros_graph.endpoint_user_data(self._announced_hash(ros_graph.dds_type(type_name)) or type_hash(type_name))
-
-    def _announced_hash(self, name: str) -> str:
-        """The hash that other endpoints announce for a type on DDS; '' if none does."""
-        with self._lock:
-            told = [
-                ros_graph.announced_hash(endpoint.user_data)
-                for found in self._found.values()
-                for endpoint in found.values()
-                if endpoint.type_name == name and endpoint.participant != self._guid
-            ]
-        return next(filter(None, told), "")
+        return ros_graph.endpoint_user_data(self._others.hash_of(ros_graph.dds_type(type_name)) or type_hash(type_name))
 
     def _attach(self, key: Entity, entities: Iterable[Entity], service: Callable[[], object]) -> None:
         with self._lock:

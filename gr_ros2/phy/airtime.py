@@ -19,15 +19,12 @@ from gnuradio import gr
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.phy.pdus import CREDIT, PDUS, leave_at_of, mcs_of, octets, with_begin
+from gr_ros2.phy.pdus import CREDIT, PDUS, credit_of, leave_at_of, mcs_of, octets, with_begin
 from gr_ros2.phy.threads import BlockThread
-
-_ONE, _HELD_BACK = pmt.from_long(1), pmt.from_long(0)
 
 
 class AirtimeGate(gr.basic_block):  # type: ignore[misc]
-    """Message ports `pdus` in, `pdus` out, `credit` out (one message: one more packet may come, for which the
-    air is free since this time in s; an integer for packets that the limit or the switch held back, after a 0).
+    """Message ports `pdus` in, `pdus` out, `credit` out (see :class:`gr_ros2.gr.source.RosSource`).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
@@ -106,7 +103,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
 
     def account(self) -> dict[str, Any]:
         """Whether it sends, s of airtime sent since the start, packets refused by reason; with a limit also the s sent
-        in its window, the s allowed, the window, and how often the account could not be stored."""
+        in its window, the s allowed, the window, how often the account could not be stored, and whether it is now."""
         with self._changed:
             clock, limit = self._clock, self._clock.limit
             told = {"transmits": clock.transmits, "sent_s": clock.used, "refused": dict(clock.refused)}
@@ -120,6 +117,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 "window_s": limit.rule.window_s,
                 "waits_s": max(limit.earliest(now, 0.0) - now, 0.0),
                 "unsaved": limit.unsaved,
+                "stored": limit.stored,
             }
 
     def stalled_s(self) -> float:
@@ -127,10 +125,10 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         infinite if it has ended. Takes no lock."""
         if not self._running:
             return 0.0
-        return max(0.0, time.monotonic() - self._looks_at) if self._thread.alive else inf
+        return max(0.0, self._now() - self._looks_at) if self._thread.alive else inf
 
     def start(self) -> bool:
-        self._looks_at = time.monotonic()
+        self._looks_at = self._now()
         with self._changed:
             self._running = True
         self._thread.start(self._run, "gr-ros2-airtime")
@@ -162,15 +160,12 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
                 if not self._running:
                     return
                 pdus, credits = self._step()
-                free = self._clock.free
+                free = inf if self._clock.held else self._clock.free
             for begins_at, pdu in pdus:
                 self.message_port_pub(PDUS, with_begin(pdu, begins_at))
             self.passed += len(pdus)
-            if credits and self._clock.held:
-                self.message_port_pub(CREDIT, _HELD_BACK)
-            credit = _ONE if self._clock.held else pmt.from_double(free)
-            for _ in range(credits):
-                self.message_port_pub(CREDIT, credit)
+            if credits:
+                self.message_port_pub(CREDIT, credit_of(credits, free))
 
     def _step(self) -> tuple[list[tuple[float, Any]], int]:
         """What is due; waits until something is due."""
@@ -186,5 +181,5 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             at = self._clock.next_timeout(now)
             self._looks_at = inf if at is None else max(at, now)
             self._changed.wait(None if at is None else max(0.0, at - now))
-            self._looks_at = time.monotonic()
+            self._looks_at = self._now()
         return pdus, credits

@@ -208,3 +208,20 @@ class PduPort:
     def send_pdu(self, pdu: Any) -> None:
         """Send one packet as a PDU with metadata."""
         self._publish(PDUS, pdu)
+
+
+def credit_of(packets: int, since: float) -> Any:
+    """The credit for so many further packets.
+
+    :param since: s on the clock of both blocks, since when the air is free for them; infinite = they were held back
+        until now, by a limit or a switch
+    """
+    return pmt.cons(pmt.from_long(packets), pmt.from_double(since))
+
+
+def credited(message: Any) -> tuple[int, float | None]:
+    """What a credit says: how many packets, and since when the air is free for them. An integer alone says how many,
+    any other message stands for one packet; both say nothing of the air (None)."""
+    if pmt.is_pair(message) and pmt.is_integer(pmt.car(message)) and pmt.is_real(pmt.cdr(message)):
+        return int(pmt.to_long(pmt.car(message))), float(pmt.to_double(pmt.cdr(message)))
+    return (int(pmt.to_long(message)) if pmt.is_integer(message) else 1), None

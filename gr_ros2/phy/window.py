@@ -25,7 +25,7 @@ _POLL_S = 0.001
 
 
 class CreditWindow(gr.basic_block):  # type: ignore[misc]
-    """Message port `credit` out: an integer, the number of further packets that may come.
+    """Message port `credit` out: an integer, the number of further packets that may come, whenever the air is free.
 
     :param progress: returns how many packets have passed
     :param window: packets in progress, 1 or more

@@ -65,15 +65,16 @@ def peers(live: LiveEnd, now: float) -> list[dict[str, Any]]:
     return [{**asdict(peer), "start": f"{peer.start:016x}"} for peer in sorted(found, key=lambda peer: peer.heard_s)]
 
 
-def ping(live: LiveEnd, robot: int, now: float) -> dict[str, Any]:
+def ping(live: LiveEnd, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
     """Ask a robot, and say what has come of all questions to it so far.
 
+    :param anew: forget the earlier ones
     :raises ConfigError: with version 0, which has no such questions
     """
     with live.lock:
         questions = live.endpoint.questions
         questions.wall_s = time.time() - now  # the clock of the wall may have been set
-        told = questions.put(robot, now)
+        told = questions.put(robot, now, anew=anew)
         here = next((peer.snr_db for peer in live.endpoint.peers(now) if peer.robot == robot), None)
         live.work.notify()
     return {**told, "robot": robot, "snr_here_db": questions.snr_db() if here is None else here}

@@ -163,13 +163,20 @@ class MediumProcess:
     """See the module.
 
     :param clock: s, monotonic
+    :param around: who hears whom; None: as the configuration says
     :raises ConfigError: for a PHY whose bursts cannot be summed here
     :raises RadioError: when an address cannot be used
     :ivar counted: ``bursts``: from the robots; ``overlapping``: those that began while another robot sent;
         ``malformed``, ``wrong_rate``: refused messages; ``waited``: steps for which a robot was waited for in vain
+    :ivar lost_s: s by which its clock is behind real time, in lock step: robots or this process were late
     """
 
-    def __init__(self, config: MediumConfig, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        config: MediumConfig,
+        clock: Callable[[], float] = time.monotonic,
+        around: Surroundings | None = None,
+    ) -> None:
         self.config, self._clock = config, clock
         assert config.phy.sample_rate != AUTO
         phy = configured(config.phy, config.packet_len, config.phy.sample_rate)
@@ -180,9 +187,12 @@ class MediumProcess:
         self.counted: Counter[str] = Counter()
         self._rate = phy.sample_rate
         self._longest = phy.airtime_samples()
-        self._medium = SampleMedium(config.around(), [phy] * len(config.robots), shared=True, seed=config.seed)
+        self._medium = SampleMedium(
+            around or config.around(), [phy] * len(config.robots), shared=True, seed=config.seed
+        )
         self._id = int.from_bytes(os.urandom(4), "little")
         self._now = self._handed = 0.0
+        self.lost_s = 0.0
         self._began = clock()
         self._busy = [0.0] * len(config.robots)
         """s until which each robot sends."""
@@ -200,6 +210,11 @@ class MediumProcess:
     def close(self) -> None:
         """Close all sockets. Idempotent."""
         self._stack.close()
+
+    @property
+    def now(self) -> float:
+        """s on its clock."""
+        return self._now
 
     @property
     def robots(self) -> int:
@@ -236,7 +251,9 @@ class MediumProcess:
                 break
             self._take(min(max(left, 0.0), _AGAIN_S) if not late else _AGAIN_S)
         self.counted["waited"] += sum(link.answered < self._now for link in waiting)
-        self._began += max(0.0, -left - STEP_S)  # time that was lost is not made up for
+        lost_s = max(0.0, -left - STEP_S)  # it is not made up for
+        self._began += lost_s
+        self.lost_s += lost_s
 
     def _take(self, timeout_s: float) -> None:
         """Take what robots send, until something has come or the time is over."""

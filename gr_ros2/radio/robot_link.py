@@ -8,26 +8,18 @@ that was opened. If opening fails half-way, everything is released too.
 from __future__ import annotations
 
 import logging
-import secrets
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import cached_property
 from math import inf
 from typing import Any
 
-from gr_ros2.core.errors import ConfigError, RadioError
-from gr_ros2.gr import RosLink, RosSink, RosSource
-from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.ends import own_settings
-from gr_ros2.link.access import Access
-from gr_ros2.link.airtime import LEAD_S
-from gr_ros2.link.airtime_limit import AirtimeLimit, sustained
+from gr_ros2.core.errors import RadioError
+from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.observe import LinkObserver, Observers
-from gr_ros2.mac import Slots, access_of
-from gr_ros2.middleware import Middleware, join_graph
+from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.phy import configured
 from gr_ros2.phy.flowgraph import Flowgraph
@@ -39,10 +31,10 @@ from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.limits import open_limit
 from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
+from gr_ros2.radio.ros_side import RosSide
 from gr_ros2.radio.switch import TransmitSwitch
 from gr_ros2.radio.waiting import foreign, shortcut
-from gr_ros2.settings.config import SinkConfig
-from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 
 _STOP_S, _RETRY_S = 10.0, 1.0
@@ -78,7 +70,6 @@ class RobotLink(Flowgraph):
     ) -> None:
         super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
-        self._registry = config.load_registry()
         self._clock = clock or time.monotonic
         self._own_clock = clock is not None
         self._started: float | None = None
@@ -88,7 +79,6 @@ class RobotLink(Flowgraph):
         self._interruptions = self._passed_before = 0
         self._worked = False
         """Whether the front end has worked once; if not, nothing has vanished."""
-        self._slots: Slots | None = None
         self._outrun: dict[str, int] = {}
         self._stack = ExitStack()
         self._observers = Observers[LinkObserver](() if observer is None else (observer,))
@@ -111,13 +101,18 @@ class RobotLink(Flowgraph):
         self._stack.callback(self._close_radio)
         if not self._own_clock:
             self._clock = self.front_end.clock
-        self.calls: LiveCalls | None = None
-        """The services that cross the link; None with version 0 and where the front end loops back."""
-        graphs = self._graphs(middleware)
-        if self.front_end.loops_back:
-            self._two_blocks(graphs, observer)
-        else:
-            self._one_block(graphs, observer)
+        self._ros = RosSide(
+            config,
+            self.phy,
+            self.front_end,
+            sends=self.sends,
+            middleware=middleware,
+            observer=observer,
+            clock=self._clock,
+            stack=self._stack,
+        )
+        self.node_name, graphs = self._ros.node_name, self._ros.graphs
+        self.source, self.sink, self.end, self.calls = self._ros.source, self._ros.sink, self._ros.end, self._ros.calls
         self._connect_radio()
         self.source.use_credit()
         if config.version:
@@ -157,11 +152,11 @@ class RobotLink(Flowgraph):
 
     def _connect_radio(self) -> None:
         """Connect the radio with the blocks of ROS."""
-        sends, receives = self._blocks
+        sends, receives = self._ros.blocks
         if self.sends:  # without credit, nothing leaves
             self.msg_connect(sends, "pdus", self.radio, "pdus")
             self.msg_connect(self.radio, "credit", sends, "credit")
-            if self._shares:
+            if self._ros.shares:
                 self.front_end.follow(self._at_rest)
         self.msg_connect(self.radio, "pdus", receives, "pdus")
 
@@ -216,100 +211,16 @@ class RobotLink(Flowgraph):
         self.radio.transmit(on=on)
         _log.warning("link %s: sending is %s", self.config.name, "on" if on else "off")
 
-    def _one_block(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
-        """Both directions share one endpoint, so that received packets can change what is sent."""
-        both = RosLink(
-            self._registry if self.sends else Registry.empty(),
-            self.config.ros_source if self.sends else replace(self.config.ros_source, registry="", topics=()),
-            self._sink_config(),
-            middleware=graphs,
-            reports=self.sends,
-            half_duplex=self._shares or getattr(self.front_end.options, "half_duplex", False),
-            any_length=self.phy.any_length,
-            mcs_table=self.phy.mcs_table,
-            airtime_share=1.0 if self.config.airtime.rule is None else sustained(self.config.airtime.rule),
-            access=self._access if self.sends else lambda _: None,
-            lead_s=LEAD_S + (self.front_end.ahead() or 0.0),
-            relay=self.config.relay == "gain",
-            observer=observer,
-            clock=self._clock,
-        )
-        self._stack.callback(both.close)
-        self.source, self.sink, self.calls = both.source, both.sink, both.calls
-        self.end = both.end
-        """What sends and receives; where the front end loops back, what receives."""
-        self._blocks = both, both
-
-    @property
-    def _shares(self) -> bool:
-        """Whether other robots send on its channel."""
-        return self.config.medium != "exclusive"
-
-    def _access(self, src_id: int) -> Access | None:
-        """What decides when it sends. The guard between two robots is what its front end may be late by."""
-        airtime_s, seed = self.front_end.airtime(), secrets.randbits(32)
-        access = access_of(self.config.medium, airtime_s, seed, guard_s=self.front_end.timing_error_s)(src_id)
-        self._slots = access if isinstance(access, Slots) else None
-        return access
-
     def _at_rest(self) -> int | None:
         """As :meth:`Radio.at_rest`; None also while a packet is composed or has to be."""
         if self.source.composed != self.radio.gate.arrived or self.source.due(self._clock()):
             return None
         return self.radio.at_rest()
 
-    def _two_blocks(self, graphs: tuple[Middleware, Middleware], observer: LinkObserver | None) -> None:
-        """A robot that receives its own packets has two endpoints: one sends and one receives.
-
-        :raises ConfigError: it should share its channel with others
-        """
-        if self._shares:
-            raise ConfigError(
-                f"medium = {self.config.medium!r}: front_end {self.front_end.name} reaches no other robot; leave it "
-                "out, or set another front_end"
-            )
-        common: dict[str, Any] = {"observer": observer, "clock": self._clock}
-        source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
-        carried: dict[str, Any] = {"any_length": self.phy.any_length, "mcs_table": self.phy.mcs_table}
-        self.source = RosSource(self._registry, middleware=graphs[0], **carried, **common, **source)
-        self._stack.callback(self.source.close)
-        self.sink = RosSink(self._registry, middleware=graphs[1], **common, **sink)
-        self._stack.callback(self.sink.close)
-        self.end = self.sink.live
-        self._blocks = self.source, self.sink
-
-    @property
-    def node_name(self) -> str:
-        """The node name that ``ros2 node list`` shows."""
-        return f"gr_ros2_link_{self.config.ros_source.src_id()}"
-
     @property
     def registry(self) -> Registry:
         """The topics that are sent; it grows if they are looked for on the ROS graph."""
         return self.source.subscriptions.registry
-
-    def _graphs(self, middleware: Middleware | None) -> tuple[Middleware, Middleware]:
-        """The participants of source and sink: one for both if they are on the same graph."""
-        if middleware is not None:
-            return middleware, middleware
-        source, sink = self.config.ros_source, self.config.ros_sink
-        places = [(source.middleware, source.domain_id), (sink.middleware, sink.domain_id)]
-        opened = {place: self._graph(*place) for place in dict.fromkeys(places)}
-        return opened[places[0]], opened[places[1]]
-
-    def _graph(self, name: str, domain_id: int | Auto) -> Middleware:
-        graph = join_graph(
-            name, domain_id=domain_id, node_name=self.node_name, localhost_only=self.config.localhost_only
-        )
-        self._stack.callback(graph.close)
-        return graph
-
-    def _sink_config(self) -> SinkConfig:
-        """The settings of the sink. Its robot id lets it recognise the robot's own packets on a shared medium."""
-        sink = self.config.ros_sink
-        if sink.robot_id == AUTO:
-            return replace(sink, robot_id=self.config.ros_source.src_id())
-        return sink
 
     def start(self, max_noutput_items: int = 10_000_000) -> None:
         """Begin sending and receiving.
@@ -361,12 +272,13 @@ class RobotLink(Flowgraph):
                 raise
             self._lose(error)
 
-    def ping(self, robot: int) -> dict[str, Any]:
+    def ping(self, robot: int, *, anew: bool = False) -> dict[str, Any]:
         """Ask another robot, which answers at once; returns what has come of all questions to it so far.
 
+        :param anew: forget the earlier ones
         :raises ConfigError: with version 0
         """
-        return {**ping(self.end, robot, self._clock()), **self.source.rate()}
+        return {**ping(self.end, robot, self._clock(), anew=anew), **self.source.rate()}
 
     @property
     def remark(self) -> str:
@@ -390,10 +302,10 @@ class RobotLink(Flowgraph):
             shortcut([*names, *services], own, robots),
             foreign(names, sink["topics"]),
             same_id(own, {"sink": sink}),
-            full if self._shares else None,
+            full if self._ros.shares else None,
         ]
         with self.end.lock:
-            if self._slots is not None and self._slots.unheard(now):
+            if self._ros.slots is not None and self._ros.slots.unheard(now):
                 lines.append(unheard(own, robots))
         return [line for line in lines if line is not None]
 

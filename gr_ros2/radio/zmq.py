@@ -25,7 +25,7 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable
 from math import isfinite, nan
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pmt
@@ -119,11 +119,18 @@ class ZmqOptions(FrontEndOptions):
 class MediumClock:
     """The clock of a link in lock step: it goes as a medium process says, and stands still without one.
 
-    Invariants: it never goes back, also when the medium process is started again.
+    Invariants: it never goes back, also when the medium process is started again; all links of this process that use
+    one medium process have one clock.
+
+    :param machine: s, monotonic
     """
 
-    def __init__(self) -> None:
-        self._now = time.monotonic()
+    _OFFSETS: ClassVar[dict[int, float]] = {}
+    """s of this machine's clock at the start of each medium process, by its number."""
+
+    def __init__(self, machine: Callable[[], float] = time.monotonic) -> None:
+        self._machine = machine
+        self._now = machine()
         self._medium = -1
         self._offset = nan
 
@@ -133,7 +140,7 @@ class MediumClock:
     def tick(self, medium: int, at: float) -> None:
         """It is ``at`` on the clock of a medium process, which has drawn this number at its start."""
         if medium != self._medium:
-            self._medium, self._offset = medium, self._now - at
+            self._medium, self._offset = medium, self._OFFSETS.setdefault(medium, self._machine() - at)
         self._now = min(max(self._now, at + self._offset), self._now + _MOST_STEP_S)
 
     def there(self, at: float) -> float:

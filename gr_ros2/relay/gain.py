@@ -111,6 +111,11 @@ class Gains:
         if len(robot.named) > heard:
             robot.named = {name: at for name, at in robot.named.items() if robot.packets - at <= heard + 2}
 
+    def hears(self, src_id: int, now: float) -> bool:
+        """Whether a robot is heard and says that it hears this one."""
+        robot = self._heard.get(src_id)
+        return robot is not None and now - robot.at < HEARD_S and self.src_id in robot.named
+
     def message(self, via: int, stream: Stream, number: int, now: float) -> bool:
         """A message was heard.
 

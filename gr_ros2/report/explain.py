@@ -21,6 +21,8 @@ from gr_ros2.report.table import milliseconds
 _KINDS = {"new": "new messages", "repair": "repair", "report": "reports", "hello": "hellos"}
 _BEHIND = 0.01
 """A link falls behind if its latency grows by more than this share of the run. Otherwise its queues just fluctuate."""
+_SLOW = 0.01
+"""A clock that lags behind real time by more than this share of the run is named."""
 _UNSEEN = 0.0005
 """Smaller shares of the air are not named."""
 _CHANNELS = 4
@@ -178,6 +180,14 @@ def _trend(result: Result, trace: Trace) -> Iterator[str]:
 
 def lateness_lines(result: Result) -> Iterator[str]:
     """Whether the computer kept up with the run's clock: one sentence where it did not."""
+    slow_s = result.counters.get("medium", {}).get("slow_s", 0.0)
+    if slow_s > _SLOW * result.duration_s:
+        yield (
+            f"The computer carried {len(result.config['robots'])} robots at "
+            f"{_percent(result.duration_s / (result.duration_s + slow_s))} of real time: "
+            f"{_seconds(result.duration_s)} on their clock took {_seconds(slow_s)} longer. Nothing is lost by it, but "
+            "programs on their graphs see a slower world."
+        )
     late = result.lateness
     if late is None or not late.moments:
         return

@@ -19,16 +19,19 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import EndpointSetup, LiveEnd, make_endpoint, own_settings
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import SenderEvent
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
 from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.record.lateness import modem_lateness
 from gr_ros2.run.load import recorded_names, source_names
+from gr_ros2.run.recorders import RunRecords
 from gr_ros2.run.robots import Halves, halves_of_robots, start_of_run
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.settings.config import ChannelConfig, SinkConfig, SourceConfig, replaced
+from gr_ros2.settings.config import ChannelConfig, SinkConfig, SourceConfig, replaced, robot_of
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 
@@ -228,3 +231,87 @@ class ReportDirection:
             instrumented=instrumented,
         )
         stack.callback(self.link.stop)
+
+
+class Directions:
+    """The links of a run whose robots have a channel each, ready to start: a direction for each robot that offers
+    messages, and the ways back for reports.
+
+    :param records: observe them
+    :param stack: closes what is opened here
+    """
+
+    def __init__(
+        self, scenario: Scenario, registry: Registry, phys: Sequence[Phy], *, records: RunRecords, stack: ExitStack
+    ) -> None:
+        ways = scenario.directions()
+        common: dict[str, Any] = {
+            "observer": records.all,
+            "stack": stack,
+            "instrumented": records.run_observers.instruments,
+        }
+        live: list[LiveEnd] = []
+        if scenario.version:
+            any_length = all(phy.any_length for phy in phys)
+            live = live_ends(ways, registry, any_length=any_length, mcs_table=phys[0].mcs_table)
+        ends: Sequence[LiveEnd | None] = live or [None] * (2 + len(scenario.receivers))
+        further = [records.further.at(number) for number in range(1, 1 + len(scenario.receivers))]
+        forward = Direction(ways[0], registry, phys[0], ends, further=further, **common)
+        self.ways = [forward]
+        if len(ways) > 1:
+            self.ways.append(Direction(ways[1], registry, phys[1], ends[1::-1], **common))
+        self.links = [direction.link for direction in self.ways]
+        if scenario.reports is not None:
+            common["delay_s"] = scenario.reports.delay_s
+            receivers = zip(live[1:], halves_of_robots(ways)[1:], scenario.report_channels(), strict=True)
+            for end, halves, channel in receivers:
+                pair, src_id = (live[0], end), robot_of(*halves)
+                reporting = ReportDirection(forward, phys[0], pair, src_id, channel=channel, **common)
+                self.links.append(reporting.link)
+        self._timed = scenario.time != "unthrottled"
+        self.clock: Callable[[], float] = time.monotonic
+        self.listened = self.channels = len(self.ways)
+
+    @property
+    def graphs(self) -> tuple[tuple[str, int | None], ...]:
+        """Where other programs can join in: what is there, and the ROS domain."""
+        forward = self.ways[0]
+        return (
+            ("the graph on which messages are sent", forward.input.domain_id),
+            ("the graph on which they come out", forward.output.domain_id),
+        )
+
+    def start(self) -> None:
+        """Start all links."""
+        for link in self.links:
+            link.start()
+
+    def run_began(self, now: float) -> None:
+        """Messages come from now on, s, monotonic."""
+        for link in self.links:
+            link.run_began(now)
+
+    def check(self) -> None:
+        """Nothing here can break."""
+
+    def stop(self) -> None:
+        """Stop all links."""
+        for link in self.links:
+            link.stop()
+
+    def lateness(self, records: RunRecords) -> dict[str, list[Lateness]] | None:
+        """How late packets were in each part; None where the links wait for the computer."""
+        if not self._timed:
+            return None
+        parts: dict[str, list[Lateness]] = {"gate": [], "modem": []}
+        for way in self.ways:
+            gate = way.link.gate_lateness()
+            if gate is not None:
+                parts["gate"].append(gate)
+                parts["modem"].append(modem_lateness(way.link.passed_at(), records.recorder.received_at(way.src_id)))
+        return parts
+
+    def counters(self) -> dict[str, Any]:
+        """What each part of the first direction counted, and of the second as ``back``."""
+        forward, *back = (way.counters() for way in self.ways)
+        return {**forward, **({"back": back[0]} if back else {})}

@@ -19,8 +19,19 @@ def on_own_domains(scenario: Scenario, stack: ExitStack) -> Scenario:
     """
     if not scenario.own_domains:
         return scenario
-    given = [scenario.ros_source.domain_id, scenario.ros_sink.domain_id]
+    given = [
+        end.domain_id for end in (scenario.ros_source, scenario.ros_sink, *(one.ros_source for one in scenario.robots))
+    ]
     free = (number for number in FREE if number not in given)
+    if scenario.robots:
+        domains = [
+            stack.enter_context(ReservedDomain(free)).number if domain == AUTO else domain for domain in given[2:]
+        ]
+        robots = [
+            replace(robot, ros_source=replaced(robot.ros_source, domain_id=domain))
+            for robot, domain in zip(scenario.robots, domains, strict=True)
+        ]
+        return replace(scenario, robots=tuple(robots))
     here, there = (stack.enter_context(ReservedDomain(free)).number if domain == AUTO else domain for domain in given)
     back = scenario.back
     if back is not None:  # the way back has the same two graphs

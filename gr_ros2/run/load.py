@@ -72,6 +72,14 @@ def source_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
     return {topic.on_graph(scenario.ros_source.namespace): topic.topic_id for topic in chosen}
 
 
+def published_names(scenario: Scenario, registry: Registry) -> dict[str, str]:
+    """Name of every topic at the sink, by its name at the source."""
+    format_, src_id = scenario.ros_sink.namespace_format, scenario.ros_source.src_id()
+    topics = registry.with_options(scenario.ros_sink.topic_options)
+    names = source_names(scenario, registry)
+    return {name: topics[topic_id].republished(format_, src_id) for name, topic_id in names.items()}
+
+
 def recorded_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
     """Those of :func:`source_names` that the scenario's recording has.
 

@@ -24,14 +24,14 @@ class Progress:
 
     :param elapsed_s: s since its start
     :param duration_s: s that it takes, 0 = until the bag ends
-    :param domains: ROS domains of the first source's and the first sink's graph; None where others cannot join it
+    :param graphs: the ROS graphs of the run: what they are, and their domains; None where others cannot join one
     """
 
     elapsed_s: float
     duration_s: float
     sent: int
     delivered: int
-    domains: tuple[int | None, int | None] = (None, None)
+    graphs: tuple[tuple[str, int | None], ...] = ()
 
 
 @dataclass

@@ -1,23 +1,33 @@
-"""The recorders of a run: one for each receiver, because every receiver has losses of its own.
+"""What a run records of itself, in real time and in simulated time: one recorder for each receiver, because every
+receiver has losses of its own, the team where robots share a channel, and the result that follows from them.
 
 Invariant: each recorder gets the events of all senders, and those of its own receiver only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from typing import Any
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.phy import Phy
 from gr_ros2.record.positions import position_reader
 from gr_ros2.record.recorder import Recorder
-from gr_ros2.record.result import ReceiverResult
+from gr_ros2.record.result import LatenessResult, ReceiverResult, Result
 from gr_ros2.record.team import TeamRecord
-from gr_ros2.run.load import source_names
-from gr_ros2.run.scenario import Scenario
+from gr_ros2.record.trace import Trace
+from gr_ros2.run.load import published_names, source_names
+from gr_ros2.run.observers import LiveLink, LiveRun, RunObservers
+from gr_ros2.run.outcome import Outcome, phy_numbers
+from gr_ros2.run.robots import recorder_of
+from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.settings.registry import Registry
+
+if TYPE_CHECKING:
+    from gr_ros2.gr import RosSource
 
 
 def make_recorder(
@@ -143,3 +153,145 @@ class FurtherRecorders:
             )
             for number, (recorder, name) in enumerate(zip(self._recorders, self._names, strict=True), 2)
         )
+
+
+class RunRecords:
+    """Who observes what of a run, and its result.
+
+    :param phys: one per direction
+    :param ears: see :func:`gr_ros2.run.robots.ears_of`
+    :param on_delivery: see :func:`make_recorder`; of what the first receiver gets
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        registry: Registry,
+        phys: Sequence[Phy],
+        ears: Sequence[Sequence[int]],
+        *,
+        run_observers: RunObservers,
+        on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
+    ) -> None:
+        self._scenario, self._registry, self._phy = scenario, registry, phys[0]
+        self._config = dump(scenario)
+        self.ways = ways = scenario.directions()
+        self.run_observers = run_observers
+        heard = [ways[number] for number in ears[0]]
+        self.recorder = make_recorder(registry, heard, on_delivery)
+        called = [robot.ros_source.namespace for robot in scenario.robots] if len(ears) == len(ways) else None
+        self.further = FurtherRecorders(registry, ways, ears[1:], called and called[1:])
+        self.team = make_team(registry, ways, phys[0])
+        self.all = Observers[LinkObserver]()
+        """Observes the first receiver, and what everybody sends."""
+        own = self.recorder if len(ways) < 3 else Ear(self.recorder, [way.ros_source.src_id() for way in heard])
+        self._recorded = self.all.add(own, needed=True)
+        self.all.add(self.further)
+        self.all.add(run_observers)
+
+    def of(self, number: int, src_id: int) -> LinkObserver:
+        """What observes a robot.
+
+        :param number: its place among the robots of the run
+        :param src_id: -1 for none
+        """
+        recorder = recorder_of(self._scenario, number)
+        receiving = self.further.at(recorder) if recorder else self.all
+        return RobotObserver(self.all, receiving, self.team, src_id)
+
+    def live_run(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        sources: Mapping[int, RosSource] | None = None,
+        links: Sequence[LiveLink] = (),
+    ) -> LiveRun:
+        """The run as its observers see it.
+
+        :param sources, links: see :class:`LiveRun`; a run in simulated time has none
+        """
+        return LiveRun(
+            name=self._scenario.name,
+            duration_s=self._scenario.duration_s,
+            packet_len=self._scenario.packet_len,
+            registry=self._registry,
+            topics={
+                (way.ros_source.src_id(), topic_id): name
+                for way in self.ways
+                for name, topic_id in source_names(way, self._registry).items()
+            },
+            sources=sources or {},
+            links=links,
+            ledger=self.recorder.ledger,
+            clock=clock,
+            team=self.team,
+        )
+
+    def check(self) -> None:
+        """:raises GrRos2Error: if a recorder has failed, see :meth:`gr_ros2.core.guard.Guard.check`"""
+        self._recorded.check()
+        self.further.check()
+
+    def unresolved(self) -> int:
+        """Messages whose result is open, at all receivers together."""
+        return self.recorder.ledger.unresolved() + self.further.unresolved()
+
+    def outcome(
+        self,
+        *,
+        begin: float,
+        end: float,
+        played: float,
+        drained: bool,
+        channels: int,
+        began: float,
+        lateness: Callable[[Trace], LatenessResult | None] = lambda _: None,
+        **rest: Any,
+    ) -> Outcome:
+        """Close the ledgers and compute the result.
+
+        :param begin, end: s on the run's clock, when submission began and ended
+        :param played: s during which messages were submitted
+        :param drained: see :meth:`gr_ros2.record.recorder.Recorder.finish`
+        :param channels: how many the robots used
+        :param began: s, monotonic, when the run was started
+        :param rest: further fields of the result
+        """
+        topics = self.recorder.finish(played, end, drained)
+        names = {name: other for way in self.ways for name, other in published_names(way, self._registry).items()}
+        trace = self.recorder.trace(begin, end, names)
+        numbers = partial(phy_numbers, self._phy, channels)
+        result = Result(
+            scenario=self._scenario.name,
+            seed=self._scenario.seed,
+            duration_s=played,
+            config=self._config,
+            topics=topics,
+            receivers=self.further.finish(played, end, drained, numbers),
+            packets=self.recorder.ledger.packets(),
+            phy=numbers(self.recorder),
+            wall_s=time.monotonic() - began,
+            lateness=lateness(trace),
+            **rest,
+        )
+        return Outcome(result, trace, self.team)
+
+
+class RobotObserver:
+    """Passes on what one robot sends and receives.
+
+    :param sending, receiving: observe its two halves
+    :param team: follows it, where it shares a channel
+    """
+
+    def __init__(self, sending: LinkObserver, receiving: LinkObserver, team: TeamRecord | None, src_id: int) -> None:
+        self._sending, self._receiving, self._team, self._src_id = sending, receiving, team, src_id
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        self._sending.sender_event(src_id, event)
+        if self._team is not None:
+            self._team.sender_event(src_id, event)
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        self._receiving.receiver_event(event, now)
+        if self._team is not None:
+            self._team.receiver_event(self._src_id, event, now)

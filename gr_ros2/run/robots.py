@@ -48,7 +48,6 @@ def start_of_run(
     :param airtime_s: of the longest packet
     """
     answered = _answered(ways)
-    rule = ways[0].airtime.rule
     return EndpointSetup(
         ways[0].seed + 1,
         reports=answered,
@@ -57,7 +56,7 @@ def start_of_run(
         mcs_table=mcs_table,
         access=access_of(ways[0].medium, airtime_s, ways[0].seed),
         relay=ways[0].relay == "gain",
-        airtime_share=1.0 if rule is None else sustained(rule),
+        airtime_share=sustained(ways[0].airtime.rule),
     )
 
 
@@ -86,8 +85,18 @@ def surroundings(scenario: Scenario, sample_rate: float) -> Surroundings:
     """Who hears whom among the robots of a scenario.
 
     :param sample_rate: samples/s, which is the bandwidth of the noise
-    :raises ConfigError: where levels follow from positions that nothing tells
+    :raises ConfigError: where levels follow from positions that nothing tells, or from what no link in real time has
     """
+    if not (scenario.simulated or scenario.robots):
+        for key, wanted, alone in (
+            ("duplex", scenario.duplex == "half", "full"),
+            ("channel.from", scenario.channel.from_positions, "settings"),
+        ):
+            if wanted:
+                raise ConfigError(
+                    f"{key}: time = {scenario.time!r} has that for robots alone; set robots, or time to packets or "
+                    f"samples, or leave it {alone}"
+                )
     fixed = _between(scenario, sample_rate) if scenario.robots else _directed(scenario)
     return _placed(scenario, fixed, sample_rate) if scenario.channel.from_positions else FixedPaths(fixed)
 

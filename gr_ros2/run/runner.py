@@ -13,33 +13,36 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from shutil import copyfile
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.core.files import make_folder, write_whole
 from gr_ros2.core.guard import Guard, one_line
-from gr_ros2.gr.ends import LiveEnd
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.link.observe import LinkObserver, Observers
+from gr_ros2.medium.base import Surroundings
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.record.lateness import lateness_result, modem_lateness
+from gr_ros2.phy import Phy
+from gr_ros2.record.lateness import lateness_result
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
 from gr_ros2.run.domains import on_own_domains
 from gr_ros2.run.load import make_phys, recording
-from gr_ros2.run.observers import LiveRun, RunObserver, RunObservers
-from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, phy_numbers
+from gr_ros2.run.observers import LiveLink, RunObserver, RunObservers
+from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2.run.pulse import Pulse
-from gr_ros2.run.recorders import FurtherRecorders, make_recorder
+from gr_ros2.run.recorders import RunRecords
 from gr_ros2.run.repeat import repetitions
-from gr_ros2.run.robots import halves_of_robots
-from gr_ros2.run.scenario import Scenario, dump
+from gr_ros2.run.robots import ears_of, surroundings
+from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulated_runner import run_simulated
-from gr_ros2.settings.config import robot_of
+from gr_ros2.settings.config import replaced
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
+
+if TYPE_CHECKING:
+    from gr_ros2.gr import RosSink, RosSource
 
 __all__ = ["DELIVERED_BAG", "Outcome", "Progress", "run_repetitions", "run_scenario"]
 
@@ -167,19 +170,58 @@ def run_repetitions(
     return results
 
 
+class Way(Protocol):
+    """A robot that offers messages, and where they come out: :class:`gr_ros2.run.direction.Direction` or
+    :class:`gr_ros2.run.team.LiveRobot`."""
+
+    scenario: Scenario
+    src_id: int
+    source: RosSource
+    sink: RosSink
+
+    @property
+    def topics(self) -> Mapping[str, int]: ...
+    @property
+    def input(self) -> Middleware: ...
+    @property
+    def output(self) -> Middleware: ...
+    def output_topics(self) -> dict[str, str]: ...
+    def empty(self, unresolved: bool) -> bool: ...
+
+
+class Links(Protocol):
+    """The links of a run: :class:`gr_ros2.run.direction.Directions` or :class:`gr_ros2.run.team.LiveTeam`.
+
+    :ivar listened: of the ways, the first ones whose output is recorded
+    :ivar channels: how many they use
+    """
+
+    @property
+    def ways(self) -> Sequence[Way]: ...
+    @property
+    def links(self) -> Sequence[LiveLink]: ...
+    @property
+    def graphs(self) -> tuple[tuple[str, int | None], ...]: ...
+
+    listened: int
+    channels: int
+    clock: Callable[[], float]
+
+    def start(self) -> None: ...
+    def run_began(self, now: float) -> None: ...
+    def check(self) -> None: ...
+    def stop(self) -> None: ...
+    def lateness(self, records: RunRecords) -> dict[str, list[Lateness]] | None: ...
+    def counters(self) -> dict[str, Any]: ...
+
+
 class _Run:
     def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, run_observers: RunObservers) -> None:
-        # Only a run in real time needs GNU Radio.
-        from gr_ros2.run.direction import Direction, ReportDirection, live_ends
-
-        self.config = dump(scenario)
+        self.registry = registry = scenario.load_registry()
+        phys = make_phys(scenario.directions(), registry)
+        around = surroundings(scenario, phys[0].sample_rate)
+        self.records = RunRecords(scenario, registry, phys, ears_of(scenario, around), run_observers=run_observers)
         self.scenario = scenario = on_own_domains(scenario, stack)
-        self.registry = scenario.load_registry()
-        ways = scenario.directions()
-        phys = make_phys(ways, self.registry)
-        self.phy = phys[0]
-        self.recorder = make_recorder(self.registry, ways)
-        self.further = FurtherRecorders(self.registry, ways)
         self.run_observers = run_observers
         self.progress_guard = Guard("progress")
         self.pulse = Pulse()
@@ -188,146 +230,108 @@ class _Run:
         self.listener: DeliveryRecorder | None = None
         self.sim: SimPublisher | None = None
         try:
-            link_observers = Observers[LinkObserver]()
-            self.recording = link_observers.add(self.recorder, needed=True)
-            link_observers.add(self.further)
-            link_observers.add(run_observers)
-            common: dict[str, Any] = {
-                "observer": link_observers,
-                "stack": stack,
-                "instrumented": run_observers.instruments,
-            }
-            live: list[LiveEnd] = []
-            if scenario.version:
-                any_length = all(phy.any_length for phy in phys)
-                live = live_ends(ways, self.registry, any_length=any_length, mcs_table=self.phy.mcs_table)
-            ends: Sequence[LiveEnd | None] = live or [None] * (2 + len(scenario.receivers))
-            further = [self.further.at(number) for number in range(1, 1 + len(scenario.receivers))]
-            forward = Direction(ways[0], self.registry, phys[0], ends, further=further, **common)
-            self.directions = [forward]
-            if len(ways) > 1:
-                self.directions.append(Direction(ways[1], self.registry, phys[1], ends[1::-1], **common))
-            self.links = [direction.link for direction in self.directions]
-            if scenario.reports is not None:
-                common["delay_s"] = scenario.reports.delay_s
-                receivers = zip(live[1:], halves_of_robots(ways)[1:], scenario.report_channels(), strict=True)
-                for end, halves, channel in receivers:
-                    pair, src_id = (live[0], end), robot_of(*halves)
-                    reporting = ReportDirection(forward, self.phy, pair, src_id, channel=channel, **common)
-                    self.links.append(reporting.link)
+            self.links = self._links(phys, around, stack)
+            self.ways, self.clock = self.links.ways, self.links.clock
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)
-            run_observers.run_started(self._live())
+            sources = {way.src_id: way.source for way in self.ways}
+            run_observers.run_started(self.records.live_run(self.clock, sources, self.links.links))
             if scenario.bag_path is None:
-                self.sim = SimPublisher(Fleet(scenario.sim), self._robots(stack), scenario.duration_s)
+                fleet, robots = Fleet(scenario.sim), self._robots(stack)
+                self.sim = SimPublisher(fleet, robots, scenario.duration_s, clock=self.clock)
                 stack.callback(self.sim.close)
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
 
-    def _live(self) -> LiveRun:
-        return LiveRun(
-            name=self.scenario.name,
-            duration_s=self.scenario.duration_s,
-            packet_len=self.scenario.packet_len,
-            registry=self.registry,
-            topics={(way.src_id, topic_id): name for way in self.directions for name, topic_id in way.topics.items()},
-            sources={way.src_id: way.source for way in self.directions},
-            links=self.links,
-            ledger=self.recorder.ledger,
-        )
+    def _links(self, phys: Sequence[Phy], around: Surroundings, stack: ExitStack) -> Links:
+        # Only a run in real time needs GNU Radio.
+        from gr_ros2.run.direction import Directions
+        from gr_ros2.run.team import LiveTeam
+
+        common: dict[str, Any] = {"records": self.records, "stack": stack}
+        if self.scenario.robots:
+            return LiveTeam(self.scenario, self.registry, phys, around, **common)
+        return Directions(self.scenario, self.registry, phys, **common)
 
     def _robots(self, stack: ExitStack) -> dict[int, Middleware]:
         """The graph of every simulated robot: that of its source, or else the graph at the other end of the link."""
         from gr_ros2.run.direction import open_graph
 
         ids = range(1, self.scenario.sim.robots + 1)
-        robots = dict.fromkeys(ids, self.directions[0].output)
-        for way in self.directions:
+        robots = dict.fromkeys(ids, self.ways[0].output)
+        for way in self.ways:
             if way.src_id in robots:
                 end = way.scenario.ros_source
                 robots[way.src_id] = stack.enter_context(open_graph(self.scenario, end, f"robot_{way.src_id}"))
         return robots
 
+    @property
+    def _listened(self) -> Sequence[Way]:
+        return self.ways[: self.links.listened]
+
     def _listen(self, out: Path, stack: ExitStack) -> DeliveryRecorder:
         from gr_ros2.run.direction import open_graph
 
-        graphs = {
-            stack.enter_context(open_graph(self.scenario, way.scenario.ros_sink, "listener")): way.output_topics()
-            for way in self.directions
-        }
+        graphs = {}
+        for way in self._listened:
+            end = replaced(way.scenario.ros_sink, middleware=way.output.name, domain_id=way.output.domain_id)
+            graphs[stack.enter_context(open_graph(self.scenario, end, "listener"))] = way.output_topics()
         listener = DeliveryRecorder(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)
         return listener
 
     def execute(self, on_progress: Callable[[Progress], None] | None) -> Outcome:
         scenario = self.scenario
-        wall = begin = end = time.monotonic()
+        wall = time.monotonic()
+        begin = end = self.clock()
         try:
-            for link in self.links:
-                link.start()
+            self.links.start()
             self._wait_matched()
-            begin = end = time.monotonic()
+            begin = end = self.clock()
             self.pulse.start()
-            for link in self.links:
-                link.run_began(begin)
-            (self.sim or self.directions[0].input).start()
+            self.links.run_began(begin)
+            (self.sim or self.ways[0].input).start()
             while not self._submitted(begin):
                 time.sleep(_POLL_S)
                 self._report(on_progress, begin)
-            end = time.monotonic()
+            end = self.clock()
             if self.sim is not None:
                 self.sim.stop()
             self._drain(on_progress, begin)
         except KeyboardInterrupt:
             self.interrupted = True
-            end = time.monotonic()
+            end = self.clock()
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
-        drained = not self.interrupted and self._empty()
+        drained = not self.interrupted and all(way.empty(bool(self.records.unresolved())) for way in self.ways)
         self.pulse.close()
-        stopped = time.monotonic()
-        for link in self.links:
-            link.stop()
+        stopped = self.clock()
+        self.links.stop()
         self.run_observers.settle()
-        self._check_recorders()
+        self.records.check()
         self._check_alone()
         played = end - begin
         if scenario.duration_s and not self.interrupted:
             played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
-        topics = self.recorder.finish(played, end, drained)
-        names = {
-            name: other for way in self.directions for name, other in zip(way.topics, way.output_topics(), strict=True)
-        }
-        trace = self.recorder.trace(begin, end, names)
-        numbers = partial(phy_numbers, self.phy, len(self.directions))
-        result = Result(
-            scenario=scenario.name,
-            seed=scenario.seed,
-            duration_s=played,
-            config=self.config,
-            topics=topics,
-            receivers=self.further.finish(played, end, drained, numbers),
-            packets=self.recorder.ledger.packets(),
-            phy=numbers(self.recorder),
-            wall_s=time.monotonic() - wall,
+        return self.records.outcome(
+            begin=begin,
+            end=end,
+            played=played,
+            drained=drained,
+            channels=self.links.channels,
+            began=wall,
+            lateness=partial(self._lateness, begin, stopped),
             interrupted=self.interrupted,
             counters=self._counters(),
-            lateness=self._lateness(begin, stopped, trace),
             incomplete=tuple(self._incomplete()),
         )
-        return Outcome(result, trace)
 
     def _lateness(self, begin: float, end: float, trace: Trace) -> LatenessResult | None:
-        """How late the computer was; None where the link waits for the computer."""
-        if self.scenario.time == "unthrottled":
+        """How late the computer was; None where the links wait for the computer."""
+        parts = self.links.lateness(self.records)
+        if parts is None:
             return None
-        parts: dict[str, list[Lateness]] = {"threads": [self.pulse.lateness], "gate": [], "modem": []}
-        for way in self.directions:
-            gate = way.link.gate_lateness()
-            if gate is not None:
-                parts["gate"].append(gate)
-                parts["modem"].append(modem_lateness(way.link.passed_at(), self.recorder.received_at(way.src_id)))
-        return lateness_result(parts, begin, end, trace)
+        return lateness_result({"threads": [self.pulse.lateness], **parts}, begin, end, trace)
 
     def _wait_matched(self) -> None:
         """Wait until all publishers and subscribers of both graphs have found each other, so that no message is
@@ -344,19 +348,17 @@ class _Run:
         )
 
     def _sim_matched(self, sim: SimPublisher) -> bool:
-        wanted = [name for way in self.directions for name in way.topics if name in sim.publishers]
-        return all(sim.publishers[name].matched() for name in wanted) and all(
-            way.source.matched for way in self.directions
-        )
+        wanted = [name for way in self.ways for name in way.topics if name in sim.publishers]
+        return all(sim.publishers[name].matched() for name in wanted) and all(way.source.matched for way in self.ways)
 
     def _submitted(self, begin: float) -> bool:
         if self.sim is not None:
             return self.sim.finished
-        bag = self.directions[0].input
+        bag = self.ways[0].input
         assert isinstance(bag, BagMiddleware)
         if bag.error is not None:
             raise bag.error
-        over = bool(self.scenario.duration_s) and time.monotonic() - begin >= self.scenario.duration_s
+        over = bool(self.scenario.duration_s) and self.clock() - begin >= self.scenario.duration_s
         return bag.finished or over
 
     def _drain(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
@@ -364,19 +366,11 @@ class _Run:
         restarts that time."""
         limit = time.monotonic() + self.scenario.drain_s
         before = (0, 0)
-        while time.monotonic() < limit and self._unresolved():
+        while time.monotonic() < limit and self.records.unresolved():
             time.sleep(_POLL_S)
             self._report(on_progress, begin)
-            if self.scenario.time == "unthrottled" and (now := self.recorder.progress()) != before:
+            if self.scenario.time == "unthrottled" and (now := self.records.recorder.progress()) != before:
                 before, limit = now, time.monotonic() + self.scenario.drain_s
-
-    def _empty(self) -> bool:
-        """Whether nothing is left in any direction."""
-        return all(way.empty(bool(self._unresolved())) for way in self.directions)
-
-    def _check_recorders(self) -> None:
-        self.recording.check()
-        self.further.check()
 
     def _check_alone(self) -> None:
         """Check that the links sent only what this run's robots published, and that nobody else published what comes
@@ -385,10 +379,11 @@ class _Run:
         :raises RunError: when another program is on one of the graphs
         """
         heard = {} if self.listener is None else dict(self.listener.received)
-        for way in self.directions:
+        for way in self.ways:
             sent = {name: topic["submitted"] for name, topic in way.source.stats()["topics"].items()}
             own = {} if self.sim is None else self.sim.published
             self._compare(way.input, sent, own, own.keys())
+        for way in self._listened:
             came_out = {name: topic["delivered"] for name, topic in way.sink.stats()["topics"].items()}
             self._compare(way.output, heard, came_out, way.output_topics())
 
@@ -403,16 +398,12 @@ class _Run:
                     "set another domain_id"
                 )
 
-    def _unresolved(self) -> int:
-        """Messages whose result is open, at all receivers together."""
-        return self.recorder.ledger.unresolved() + self.further.unresolved()
-
     def _report(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
-        self._check_recorders()
+        self.records.check()
+        self.links.check()
         if on_progress is not None:
-            sent, delivered = self.recorder.progress()
-            domains = (self.directions[0].input.domain_id, self.directions[0].output.domain_id)
-            now = Progress(time.monotonic() - begin, self.scenario.duration_s, sent, delivered, domains)
+            sent, delivered = self.records.recorder.progress()
+            now = Progress(self.clock() - begin, self.scenario.duration_s, sent, delivered, self.links.graphs)
             self.progress_guard(on_progress, now)
 
     def _incomplete(self) -> list[str]:
@@ -423,12 +414,10 @@ class _Run:
         return [*self.run_observers.incomplete(), *self.listener.incomplete()]
 
     def _counters(self) -> dict[str, Any]:
-        forward, *back = (way.counters() for way in self.directions)
         heard = {} if self.listener is None else dict(self.listener.received)
         unheard = {} if self.listener is None else self.listener.lost()
         return {
-            **forward,
-            **({"back": back[0]} if back else {}),
+            **self.links.counters(),
             "listener": heard,
             **({"listener_lost": unheard} if unheard else {}),
         }

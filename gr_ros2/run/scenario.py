@@ -34,7 +34,7 @@ from gr_ros2.settings.config import (
     build,
     replaced,
 )
-from gr_ros2.settings.fields import Auto
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
 from gr_ros2.settings.registry import Registry, check_outputs
 from gr_ros2.sim.sim_settings import SimSettings
@@ -110,8 +110,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     :param reports: the way back for reports alone (version 1); null = there is none
     :param receivers: channels of further receivers of the same sender; what is not set in one is as in ``channel``, but
         for the seed
-    :param robots: robots that all send and receive, in simulated time; a number stands for as many that differ in
-        their names alone
+    :param robots: robots that all send and receive, in real time each with a link and a ROS graph of
+        its own; a number stands for as many that differ in their names alone
     :param duplex: full = each robot sends on a channel of its own, and hears while it sends; half = all use one
         channel: who sends hears nothing meanwhile, and packets that overlap at a receiver disturb each other
     :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
@@ -154,8 +154,6 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError("reports: version 0 has none, and with back they go along; set reports to null")
         if self.receivers and self.back is not None:
             raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
-        if self.duplex == "half" and not self.simulated:
-            raise ValueError("duplex = 'half': one channel for all is simulated only; set time to packets or samples")
         if self.medium != "exclusive" and self.duplex != "half":
             raise ValueError(f"medium = {self.medium!r}: each robot has a channel of its own; set duplex: half")
         if self.airtime.rule is not None and self.time == "unthrottled":
@@ -176,8 +174,6 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             return
         if self.gains_db is not None:
             raise ValueError("gains_db: levels follow from positions; leave it out, or set channel.from: settings")
-        if not self.simulated:
-            raise ValueError(f"channel.from = 'positions': time = {self.time!r}; set time to packets or samples")
         if not PHY.load(self.phy.name).has_samples:
             raise ValueError(
                 f"channel.from = 'positions': phy {self.phy.name} has no samples, so no level; choose another"
@@ -196,10 +192,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
                 raise ValueError("gains_db: lie between robots; set robots, or channel.snr_db instead")
             return
         if not self.simulated:
-            raise ValueError(
-                f"robots: time = {self.time!r}; they share a simulated medium: set packets or samples, or run gr-ros2 "
-                "medium and a gr-ros2 link for each robot"
-            )
+            self._check_live_robots()
         if self.source != "sim" or self.back is not None or self.reports is not None or self.receivers:
             raise ValueError("robots: they all send and receive; set source to sim, leave back, reports, receivers out")
         count = len(self.robots)
@@ -211,6 +204,28 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
         matrix = self.gains_db
         if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
             raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
+
+    def _check_live_robots(self) -> None:
+        """Whether the robots fit the medium that carries them in real time."""
+        if self.time != "real" or self.duplex != "half":
+            raise ValueError(
+                f"robots: time = {self.time!r} with duplex = {self.duplex!r}; robots with links of their own share one "
+                "channel at its pace: set time: real and duplex: half, or time to packets or samples"
+            )
+        if not PHY.load(self.phy.name).has_samples:
+            raise ValueError(
+                f"robots: phy {self.phy.name} has no samples, which they share in real time; choose another"
+            )
+        if not self.version:
+            raise ValueError("robots: in real time they need version 1; set version to 1, or time to packets")
+        if self.channel.loses_packets:
+            raise ValueError("channel: bursts cross as samples, so none is dropped whole; leave these settings out")
+        own = [robot.ros_source.domain_id for robot in self.robots]
+        graphs = [domain for domain in own if domain != AUTO or not self.own_domains]
+        if len(set(graphs)) < len(graphs):
+            raise ValueError(
+                "robots: each has a ROS graph of its own; set own_domains: true, or another domain_id for each"
+            )
 
     def _check_back(self, back: Back) -> None:
         if self.source != "sim":

@@ -382,9 +382,7 @@ class Robot:
         if self._clock is not None:
             self._clock.due(now)
             credits = self._clock.grants(now)
-            if credits and self._clock.held:
-                self.endpoint.pace.paused()
-            self.endpoint.pace.credit(credits)
+            self.endpoint.pace.credit(credits, inf if credits and self._clock.held else None)
         while self._coming is not None and self._coming.t <= now:
             self.endpoint.messages.submit(self._coming.topic_id, self._coming.payload, now)
             if not self._until:

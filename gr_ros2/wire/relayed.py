@@ -11,6 +11,8 @@ byte 10       if A: the robot for which it is
 then          the message
 ```
 
+A message of topic 242 is *carried*: in front stands one byte more, the robot that is to take it on, and A is 1.
+
 Invariants: reading raises nothing but a named WireError; every value has one encoding.
 """
 
@@ -77,6 +79,29 @@ def write_relayed(message: Relayed) -> bytes:
         return head + bytes((dst_id,)) * addressed + payload
     except (struct_error, ValueError) as error:
         raise EncodeError(f"{message.describe()}: a field is out of range ({error})") from error
+
+
+def write_carried(taker: int, message: Relayed) -> bytes:
+    """The bytes of a carried message.
+
+    :param taker: the robot that is to take it on
+    :raises EncodeError: a field out of range
+    """
+    if not 0 <= taker < BROADCAST or message.dst_id == BROADCAST:
+        raise EncodeError(f"{message.describe()}, taken on by robot {taker}: it is for no single robot")
+    return bytes((taker,)) + write_relayed(message)
+
+
+def read_carried(data: bytes) -> tuple[int, Relayed]:
+    """The robot that is to take a carried message on, and the message.
+
+    :raises EntryBoundsError: it is cut off
+    :raises EntryKindError: a topic or robot that does not exist, or it is for no single robot
+    """
+    message = read_relayed(data[1:])
+    if data[0] == BROADCAST or message.dst_id == BROADCAST:
+        raise EntryKindError(f"a carried message to robot {message.dst_id} over robot {data[0]}")
+    return data[0], message
 
 
 def read_relayed(data: bytes) -> Relayed:

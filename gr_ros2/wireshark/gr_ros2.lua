@@ -106,6 +106,7 @@ local f = {
     newest_start = ProtoField.uint8("gr_ros2.newest.start", "Its boot number, low 8 bits", base.HEX),
     newest_topic_id = ProtoField.uint8("gr_ros2.newest.topic_id", "Topic id"),
     newest_number = ProtoField.uint16("gr_ros2.newest.number", "Its packet, low 16 bits"),
+    relayed_taker = ProtoField.uint8("gr_ros2.relayed.taker", "Taken on by robot"),
     relayed_origin = ProtoField.uint8("gr_ros2.relayed.origin", "Robot that made the message"),
     relayed_start = ProtoField.uint16("gr_ros2.relayed.start", "Its boot number, low 16 bits", base.HEX),
     relayed_number = ProtoField.uint32("gr_ros2.relayed.number", "Its packet in which the message began"),
@@ -538,7 +539,11 @@ local function show_table(tree, range, rows)
 end
 
 -- Whose message it is that stands in a message of another robot.
-local function dissect_relayed(buffer, entry, at, after)
+local function dissect_relayed(buffer, entry, id, at, after)
+    if id == CARRIED_TOPIC and after > at then
+        entry:add(f.relayed_taker, buffer(at, 1))
+        at = at + 1
+    end
     if after < at + RELAYED_LEN then
         return
     end
@@ -623,7 +628,7 @@ local function dissect_part(buffer, tree, packet, at, limit)
         entry:add(f.payload, buffer(at, after - at))
     end
     if id >= RELAYED_TOPIC and offset == 0 then
-        dissect_relayed(buffer, entry, at, after)
+        dissect_relayed(buffer, entry, id, at, after)
     end
     if id == TABLE_TOPIC and packet.first_time and after > at then
         packet.frame.rows = keep_fragment(

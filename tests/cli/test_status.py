@@ -104,7 +104,7 @@ def test_in_a_terminal_a_link_shows_a_table_and_plain_lines_elsewhere(ends: Ends
 
 def test_a_running_link_tells_what_it_does(ends: Ends) -> None:
     first = ends.link(1)
-    ends.link(2)
+    second = ends.link(2)
     wait_for(ends.heard, "the other end")
     pid = str(first.pid)
     (peer,) = json.loads(ends.run("peers", "--json", "--pid", pid).stdout)
@@ -120,6 +120,12 @@ def test_a_running_link_tells_what_it_does(ends: Ends) -> None:
     assert (told["asked"], told["lost_there"], told["about"]["packet_len"]) == (5, 0, 220)
     assert told["answered"] >= 4
     assert told["round_trip_s"]["p50"] <= told["round_trip_s"]["p99"]
+    second.send_signal(signal.SIGINT)
+    second.wait(PATIENCE_S)
+    gone = ends.run("ping", "2", "--json", "--count", "2", "--interval", "0.2", "--pid", pid)
+    assert (gone.returncode, json.loads(gone.stdout)["answered"]) == (1, 0), (
+        "the answers of the ping before do not count"
+    )
 
 
 def test_two_ends_that_match_and_two_that_do_not(ends: Ends) -> None:

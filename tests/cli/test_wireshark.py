@@ -24,7 +24,7 @@ from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.relayed import read_relayed
 from gr_ros2.wire.v0 import V0, PacketV0, with_crc
-from gr_ros2.wire.v1 import Header, crc, session_crc, write_header
+from gr_ros2.wire.v1 import CARRIED_TOPIC, Header, crc, session_crc, write_header
 from gr_ros2.wire.v1 import decode as read
 from tests.cli.test_packet import hello
 from tests.link.test_reader import talk
@@ -190,7 +190,9 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
             assert bytes.fromhex(hidden.replace(":", "")) in data[:-8]
             continue
         parts = [entry for entry in entries if "payload" in entry]
-        relayed = [read_relayed(bytes.fromhex(part["payload"])) for part in parts if part["topic_id"] > 240]
+        over = [(part["topic_id"], bytes.fromhex(part["payload"])) for part in parts if part["topic_id"] > 240]
+        assert numbers("relayed.taker") == [content[0] for topic_id, content in over if topic_id == CARRIED_TOPIC]
+        relayed = [read_relayed(content[topic_id == CARRIED_TOPIC :]) for topic_id, content in over]
         for field in ("origin", "start", "number", "place", "topic_id", "coded", "hops"):
             assert numbers(f"relayed.{field}") == [getattr(message, field) for message in relayed], field
         assert numbers("topic_id") == [entry["topic_id"] for entry in parts]

@@ -10,6 +10,7 @@ import pmt
 from gnuradio import gr
 
 from gr_ros2.link import ReceiverEvent, SenderEvent
+from gr_ros2.phy.pdus import credited
 
 
 class Hears:
@@ -68,4 +69,4 @@ class Probe(gr.basic_block):
 
     def _count(self, message: Any) -> None:
         self.granted.append(message)
-        self.credits += pmt.to_long(message) if pmt.is_integer(message) else 1
+        self.credits += credited(message)[0]

@@ -18,8 +18,10 @@ from gnuradio import gr
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Accepted, Missed, Refused, SenderEvent, SentPacket
+from gr_ros2.link.slowness import Slowness
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.phy.pdus import credit_of
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0
@@ -205,10 +207,11 @@ def test_a_credit_that_says_since_when_the_air_is_free_tells_a_slow_computer(rig
     source.use_credit()
     rig.start(credit=True)
     free = source.clock()
-    rig.probe.message_port_pub(pmt.intern("credit"), pmt.from_double(free))
+    rig.probe.message_port_pub(pmt.intern("credit"), credit_of(1, free))
     wait_for(lambda: not source._end.pace.out_of_credit, "the credit")
-    assert not source._end.pace.behind(free + 0.1)
-    assert source._end.pace.behind(free + 1.0) != backpressure
+    slowness = Slowness(source._end.pace)
+    assert not slowness.behind(free + 0.1)
+    assert slowness.behind(free + 1.0) != backpressure
 
 
 def test_events_reach_the_observer_in_order(rig: Rig) -> None:

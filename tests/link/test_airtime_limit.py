@@ -130,11 +130,12 @@ def test_a_full_disk_stops_sending_when_the_reservation_is_used_up_and_no_earlie
         limit.spend(1.0, 0.06)
         passed += 1
     assert 2 <= passed <= 12
-    assert limit.unsaved == 1
+    assert (limit.unsaved, limit.stored) == (1, False)
     assert limit.again(1.0) is not None
     disk.full = False
     assert not limit.reserve(1.5, 0.06), "the disk is not asked with every packet"
     assert limit.reserve(2.1, 0.06)
+    assert limit.stored
 
 
 def test_a_burst_ends_with_a_pause() -> None:

@@ -66,7 +66,7 @@ def overloaded(source: Robot, airtime: float, seconds: float = 8.0) -> dict[int,
             for topic_id in source.topics or ():
                 source.end.messages.submit(topic_id.topic_id, tick.to_bytes(4, "big").ljust(45, b"."), now)
         if tick % 5 == 0:
-            source.end.pace.credit(1, ready=free)
+            source.end.pace.credit(1, free)
             sent = source.end.next_packet(now)
             free = now + airtime
             for part in () if sent is None else sent.packet.entries:
@@ -103,14 +103,14 @@ def test_an_air_that_is_too_slow_drops_at_the_bound_of_the_queue() -> None:
 def test_a_burst_after_which_nothing_comes_leaves_whole_however_slow_the_computer_is() -> None:
     source = robot()
     overloaded(source, airtime=0.005, seconds=3.0)
-    assert source.end.pace.behind(3.0)
+    assert source.end._sending.behind(3.0)
     leave(source, 4.0)
     before = source.end.sent.refused.copy()
     left = 0
     for number in range(50):
         source.end.messages.submit(0, b"%d" % number, 20.0)
     for turn in range(200):
-        source.end.pace.credit(1, ready=0.0)
+        source.end.pace.credit(1, 0.0)
         sent = source.end.next_packet(20.0 + turn / 20)
         left += 0 if sent is None else sum(isinstance(part, Part) for part in sent.packet.entries)
     assert left >= 50
@@ -120,7 +120,7 @@ def test_a_burst_after_which_nothing_comes_leaves_whole_however_slow_the_compute
 def test_a_sending_thread_that_does_not_run_is_a_computer_that_is_too_slow() -> None:
     source = robot()
     leave(source, 0.0)
-    source.end.pace.credit(1, ready=0.0)
+    source.end.pace.credit(1, 0.0)
     for tick in range(200):
         source.end.messages.submit(0, bytes(45), 1.0 + tick / 50)
     assert set(refused(source.end)) == {"overload"}
@@ -131,7 +131,7 @@ def test_a_robot_that_nobody_hears_is_not_too_slow() -> None:
     rows = [Topic(0, "t", "std_msgs/msg/String", TopicOptions(queue="fifo"))]
     source = Robot(1, Registry(rows), hears=True, beacon_s=1.0)
     leave(source, 0.0)
-    source.end.pace.credit(1, ready=0.0)
+    source.end.pace.credit(1, 0.0)
     for tick in range(200):
         source.end.messages.submit(0, bytes(45), 5.0 + tick / 50)
     assert set(refused(source.end)) == {"queue_bound"}

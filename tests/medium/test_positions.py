@@ -163,7 +163,10 @@ def test_a_recording_tells_places_by_its_odometry() -> None:
         ),
         (["channel={from: positions}", "gains_db=-100"], "gains_db: levels follow from positions"),
         (["channel={from: positions}", "phy={name: direct}"], "phy direct has no samples, so no level"),
-        (["channel={from: positions}", "robots=0", "time=real", "duplex=full"], "time = 'real'; set time to packets"),
+        (
+            ["channel={from: positions}", "robots=0", "time=real", "duplex=full"],
+            "time = 'real' has that for robots alone",
+        ),
         (["channel={from: positions}", "sim.robots=1"], "/robot_2 is none of the 1 simulated robots, so nobody knows"),
     ],
 )

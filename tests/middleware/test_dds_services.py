@@ -139,8 +139,7 @@ def test_services_of_another_rmw_are_found_and_known_to_be_out_of_reach(graph: D
     (requests, asks), (replies, answers) = dds_service(SERVICE, ADD)
     fast = bytes((1, 15)) + bytes(14)
     ends = [DiscoveredEndpoint(fast, fast, *names, SERVICE_QOS) for names in ((replies, answers), (requests, asks))]
-    with graph._lock:
-        for found, end in zip(graph._found.values(), ends, strict=True):  # publications, then subscriptions
-            found[end.key] = end
+    for end, publishers in zip(ends, (True, False), strict=True):
+        graph._others.change([(end.key, end)], publishers=publishers)
     assert graph.discover_services() == {SERVICE: ADD}
     assert graph.uncallable() == {SERVICE}

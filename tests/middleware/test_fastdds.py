@@ -222,7 +222,7 @@ def test_a_type_has_the_hash_that_the_graph_gives_it(middleware: DdsMiddleware, 
     with DdsMiddleware(domain_id=domain(2), node_name="watching") as watching:
 
         def told() -> list[str]:
-            found = [e for endpoints in watching._found.values() for e in endpoints.values()]
+            found = watching._others.publishers("/out")
             return [ros_graph.announced_hash(e.user_data) for e in found if e.key == publisher.writer.guid]
 
         wait_for(told, "our publisher")

@@ -10,12 +10,11 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-import pmt
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.flowgraph import Flowgraph
-from gr_ros2.phy.pdus import pdu_of
+from gr_ros2.phy.pdus import credited, pdu_of
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 
@@ -66,7 +65,7 @@ def test_a_credit_says_since_when_the_air_is_free(top: Flowgraph) -> None:
     begin = time.monotonic()
     probe.post(b"x")
     wait_for(lambda: probe.credits == 2, "the next credit")
-    first, second = (pmt.to_double(message) for message in probe.granted)
+    first, second = (credited(message)[1] for message in probe.granted)
     assert first == -inf
     assert second >= begin + 0.02
 
@@ -87,6 +86,13 @@ def test_a_packet_that_passes_late_is_measured(top: Flowgraph) -> None:
     ((due, happened),) = gate.lateness.moments
     assert happened - due == gate.lateness.worst >= 0.99
     assert list(gate.passed_at) == [happened]
+
+
+def test_on_a_clock_that_stands_still_its_thread_does_not_count_as_stuck(top: Flowgraph) -> None:
+    gate = AirtimeGate(0.5, clock=lambda: 0.0)
+    wire(top, gate).post(bytes(1))
+    wait_for(lambda: gate.backlog, "a packet on the air")
+    assert gate.stalled_s() == 0.0
 
 
 def test_when_packets_passed_is_not_kept_unless_asked_for(top: Flowgraph) -> None:

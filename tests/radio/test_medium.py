@@ -158,19 +158,26 @@ def test_in_lock_step_a_robot_that_stands_still_stops_the_time(medium: Start, tm
             other.kill()
 
 
-def test_the_clock_of_a_link_follows_the_medium_and_never_goes_back() -> None:
-    clock = MediumClock()
-    begin = clock()
+def test_the_clock_of_a_link_follows_the_medium_and_never_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MediumClock, "_OFFSETS", {})
+    times = [50.0]
+    clock = MediumClock(lambda: times[0])
     clock.tick(1, 100.0)
-    assert clock() == begin
+    assert clock() == 50.0
     clock.tick(1, 100.25)
-    assert clock() == pytest.approx(begin + 0.25)
+    assert clock() == pytest.approx(50.25)
     assert clock.there(clock.here(100.1)) == pytest.approx(100.1)
+    times[0] = 50.5  # another link of this process comes later, and has the same clock
+    other = MediumClock(lambda: times[0])
+    clock.tick(1, 101.0)
+    other.tick(1, 101.0)
+    assert clock() == other() == pytest.approx(51.0)
     clock.tick(2, 0.0)  # another process, whose time begins anew
-    clock.tick(2, 0.5)
-    assert clock() == pytest.approx(begin + 0.75)
+    assert clock() == pytest.approx(51.0)
+    clock.tick(2, 1.0)
+    assert clock() == pytest.approx(51.5)
     clock.tick(2, 1e12)
-    assert clock() <= begin + 2.0
+    assert clock() <= 52.5
 
 
 @pytest.mark.parametrize(

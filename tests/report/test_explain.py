@@ -86,6 +86,15 @@ def test_a_computer_that_was_late_is_named_first(tmp_path: Path) -> None:
     )
 
 
+def test_robots_that_a_computer_carries_slower_than_real_time_are_named_first(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    config = {**run.result.config, "robots": [{}] * 9}
+    slow = replace(run.result, config=config, counters={"medium": {"slow_s": run.result.duration_s}})
+    assert explanation(slow, run.trace)[0].startswith("The computer carried 9 robots at 50% of real time: ")
+    slightly = replace(slow, counters={"medium": {"slow_s": 0.009 * run.result.duration_s}})
+    assert explanation(slightly, run.trace) == explanation(run.result, run.trace)
+
+
 def test_nothing_is_said_of_a_computer_that_kept_up(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     in_time = replace(run.result, lateness=replace(LATE, moments=0, share=0.0))

@@ -86,7 +86,6 @@ def test_without_gains_the_snr_is_that_of_the_channel() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("time=real", "set time to packets or samples"),
         ("robots=1", "two or more"),
         ("robots=[{}, {ros_source: {namespace: /robot_1}}]", "each with its own"),
         ("gains_db=[[1, 2]]", "2 robots need 2 rows of 2 numbers"),

@@ -220,7 +220,7 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
 
 
 def read_relayed(content: bytes) -> dict[str, object]:
-    """A message of topic 241 or 242."""
+    """A message of topic 241."""
     if len(content) < 10 or (content[9] & 64 and len(content) < 11):
         raise Refused("entry_bounds")
     begin = 11 if content[9] & 64 else 10
@@ -238,6 +238,14 @@ def read_relayed(content: bytes) -> dict[str, object]:
         "coded": content[9] >= 128,
         "dst_id": to,
     }
+
+
+def read_carried(content: bytes) -> dict[str, object]:
+    """A message of topic 242."""
+    message = read_relayed(content[1:])
+    if content[0] == 255 or message["dst_id"] == 255:
+        raise Refused("entry_kind")
+    return {"taker": content[0], **message}
 
 
 def read_medium_access(data: bytes) -> dict[str, object]:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import EncodeError, WireError
-from gr_ros2.wire.relayed import MOST_HOPS, Relayed, read_relayed, write_relayed
+from gr_ros2.wire.relayed import MOST_HOPS, Relayed, read_carried, read_relayed, write_carried, write_relayed
 
 U8 = st.integers(0, 255)
 ID = st.integers(0, 254)
@@ -37,6 +37,26 @@ def test_any_bytes(data: bytes) -> None:
     except WireError:
         return
     assert write_relayed(message) == data
+
+
+@given(ID, MESSAGES.filter(lambda message: message.dst_id != 255))
+def test_round_trip_of_carried_messages(taker: int, message: Relayed) -> None:
+    assert read_carried(write_carried(taker, message)) == (taker, message)
+
+
+@given(st.binary(max_size=20))
+def test_any_bytes_for_a_carried_message(data: bytes) -> None:
+    try:
+        taker, message = read_carried(data)
+    except WireError:
+        return
+    assert write_carried(taker, message) == data
+
+
+@pytest.mark.parametrize(("taker", "dst_id"), [(255, 9), (-1, 9), (3, 255)])
+def test_a_carried_message_names_two_robots(taker: int, dst_id: int) -> None:
+    with pytest.raises(EncodeError):
+        write_carried(taker, Relayed(7, 0xCAFE, 70_000, 1, 3, 2, b"goal", dst_id=dst_id))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.mac_block import read_block
-from gr_ros2.wire.relayed import read_relayed, write_relayed
+from gr_ros2.wire.relayed import read_carried, read_relayed, write_carried, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, read_table
 from tests.link.v1.air import KEY, Air, Robot, registry
 from tests.wire import second_decoder as second
@@ -86,6 +86,26 @@ def test_messages_of_other_robots_to_refuse(case: dict[str, Any]) -> None:
         read_relayed(data)
     with pytest.raises(second.Refused) as theirs:
         second.read_relayed(data)
+    assert ours.value.kind == str(theirs.value) == case["error"]
+
+
+@named("carried")
+def test_carried_messages(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    taker, ours = read_carried(data)
+    assert write_carried(taker, ours) == data
+    fields = {name: value for name, value in case.items() if name != "hex"}
+    ours_too = {"taker": taker, **ours._asdict(), "payload": ours.payload.hex()}
+    assert ours_too == second.read_carried(data) == fields
+
+
+@named("refused_carried")
+def test_carried_messages_to_refuse(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    with pytest.raises(WireError) as ours:
+        read_carried(data)
+    with pytest.raises(second.Refused) as theirs:
+        second.read_carried(data)
     assert ours.value.kind == str(theirs.value) == case["error"]
 
 

@@ -139,8 +139,15 @@ class RepairDecoder:
             pivot += shift
             left >>= shift * 8
             held = rows.get(pivot)
-            if held is None:
+            if held is None or left < 256:
                 break
+            size = (left.bit_length() + 7) >> 3
+            if size < len(held[0]):  # equations that reach less far determine packets sooner
+                factor = TIMES[INVERSE[left & 255]]
+                sides = left.to_bytes(size, "little"), right.to_bytes(room, "little")
+                rows[pivot] = sides[0].translate(factor), sides[1].translate(factor)
+                left, right = (int.from_bytes(side, "little") for side in held)
+                held, self._grown = rows[pivot], True
             factor = TIMES[left & 255]
             left ^= int.from_bytes(held[0].translate(factor), "little")
             right ^= int.from_bytes(held[1].translate(factor), "little")

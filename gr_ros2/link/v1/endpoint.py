@@ -22,6 +22,7 @@ from gr_ros2.link.endpoint import HeardRobot, check_live
 from gr_ros2.link.events import Delivered, Lost, ReceivedPacket, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs, RateController
+from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
@@ -127,8 +128,20 @@ class EndpointV1:
             hold=hold,
             relaying=self._receiving.relaying,
         )
-        if self._receiving.relaying is not None:
-            messages.relayed_left = self._receiving.relaying.left
+        relaying = self._receiving.relaying
+        if relaying is not None:
+            relaying.custody = messages.custody = Custody(
+                (settings.src_id, boot),
+                messages.sent,
+                window.packets,
+                window.peers,
+                gains=relaying.gains,
+                room=room,
+                most=settings.max_source_bytes,
+                dropped=self.received.dropped,
+                drop=messages.drop,
+            )
+            messages.relayed_left, relaying.found = relaying.left, messages.found
         self._receiving.tell(self._sending, messages, window, rate)
         self.pace, self.pings = self._sending.pace, self._sending.pings
 

@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
-from gr_ros2.link.events import Announced, Delivered, Lost
+from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met
 from gr_ros2.link.ledger_rows import ROWS, LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
@@ -34,9 +34,9 @@ from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire.control import Control
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC, EntryV1, Part, read_body
+from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, TABLE_TOPIC, EntryV1, Part, read_body
 
-Events = list[Delivered | Lost | Announced]
+Events = list[Delivered | Lost | Announced | Met | Gone]
 
 _PACKET_COST, _EQUATION_COST = 250, 350
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
@@ -253,6 +253,9 @@ class Inbox:
         """Whether a latched message, named in a hello at a packet number, is neither here, nor a newer one of its
         topic, nor arriving."""
         topic_id, value = mark
+        row = self.announced.topics.get(topic_id)
+        if row is not None and row.dst_id not in (BROADCAST, self._own):
+            return False
         here = value in self.marks.get(topic_id, ()) or self._last.get(topic_id, (-1, -1))[0] > number
         return not here and not self._reassembly.growing(topic_id, now - 1.0)
 
@@ -260,7 +263,10 @@ class Inbox:
         """Deliver the messages that waited for what is here or given up now; everything that happened since the last
         call."""
         for ready in self.order.settle(self._now):
-            self._deliver(ready, self.announced.topics[ready.topic_id])
+            if ready.topic_id == CARRIED_TOPIC:
+                self._of_another(ready)
+            else:
+                self._deliver(ready, self.announced.topics[ready.topic_id])
         events, self._events = self._events, []
         return events
 
@@ -326,7 +332,10 @@ class Inbox:
     def _arrived(self, ready: Ready) -> None:
         """A message is complete."""
         if ready.topic_id > TABLE_TOPIC:
-            self._of_another(ready)
+            if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
+                self.order.wait(ready)
+            else:
+                self._of_another(ready)
             return
         if self._relaying is not None:
             self._relaying.direct(self.src_id, self.boot, ready, self._now)
@@ -434,7 +443,7 @@ class Inbox:
             return
         if topics is None:
             return
-        self._give_up(self.order.without(self.announced.topics), LedgerRow.UNKNOWN_TOPIC)
+        self._give_up(self.order.without({*self.announced.topics, CARRIED_TOPIC}), LedgerRow.UNKNOWN_TOPIC)
         self._events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
             self._arrived(ready)

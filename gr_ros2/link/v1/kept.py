@@ -97,6 +97,7 @@ class KeptMessages:
                 again = Message(
                     kept.serial, topic_id, kept.payload, qos, now, topic.weight, repeat=True, coded=kept.coded
                 )
+                again.dst_id = topic.dst_id
                 self._admit(topic, again)
             self._stats.repeats += 1
 

@@ -19,15 +19,16 @@ from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.kept import KeptMessages
 from gr_ros2.link.v1.lifetime import WORTH
 from gr_ros2.link.v1.packing import ENTRY, Message, Packing
-from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
+from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopic, SentTopics
 from gr_ros2.settings.config import QueuePolicy
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry
-from gr_ros2.wire.v1 import MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOPIC
+from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOPIC
 
 Observer = Callable[[Accepted | Refused | Missed], None]
 
@@ -87,9 +88,13 @@ class Outbox:
         """The queue of messages of other robots, where they are relayed."""
         self.relayed_left: Callable[[float], None] = lambda _: None
         """Called when one of them has left whole."""
+        self.custody: Custody | None = None
+        """Carries messages over other robots, where they are relayed."""
         if settings.relay:
             self.relayed = self.sent.relay()
-            self.packing.turns.join(RELAYED_TOPIC)
+            self.sent.carry()
+            for topic_id in (RELAYED_TOPIC, CARRIED_TOPIC, LONG_CARRIED):
+                self.packing.turns.join(topic_id)
         if topics:
             self.sent.add(topics)
             self._tabulate()
@@ -139,13 +144,15 @@ class Outbox:
             if self._observer is not None:
                 self._observer(Missed(topic_id, new))
 
-    def submit(self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf) -> None:
+    def submit(
+        self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf, dst_id: int | Auto = AUTO
+    ) -> None:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         topic = self.sent.get(topic_id)
         if topic is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         if self._owner.submitted(topic_id, now) and topic.is_stream:
-            self._drop(list(topic.queue.shed(now)))
+            self.drop(list(topic.queue.shed(now)))
         self.packing.turns.join(topic_id)
         serial = self._serial
         self._serial += 1
@@ -161,6 +168,7 @@ class Outbox:
             return
         coded = codec is not None
         message = Message(serial, topic_id, payload, topic.qos, now, topic.weight, lifespan_s, coded=coded)
+        message.dst_id = topic.dst_id if dst_id == AUTO else dst_id
         self.kept.keep(topic, message)
         self._admit(topic, message)
 
@@ -202,7 +210,7 @@ class Outbox:
         """
         for queue in self.sent.deadlines:
             if queue:
-                self._drop(list(queue.expire(now, interval, LEAD_S, self._room - ENTRY)))
+                self.drop(list(queue.expire(now, interval, LEAD_S, self._room - ENTRY)))
 
     def _tabulate(self) -> bool:
         """Make the table of topics; returns whether it has changed."""
@@ -210,7 +218,7 @@ class Outbox:
 
     def _admit(self, topic: SentTopic, message: Message) -> None:
         if dropped := topic.queue.admit(message, self.depth(message.topic_id)):
-            self._drop(dropped)
+            self.drop(dropped)
 
     def _left(self, message: Message, now: float) -> None:
         """A message has left whole."""
@@ -226,8 +234,17 @@ class Outbox:
         self.kept.left(message, now, reported=self.reported)
         if message.topic_id == RELAYED_TOPIC:
             self.relayed_left(now)
+        elif self.custody is not None and message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):
+            self.custody.left(message)
 
-    def _drop(self, dropped: list[Dropped]) -> None:
+    def found(self, robot: int, now: float) -> None:
+        """A robot is reached over others for the first time: what is kept for it is sent. It cannot ask."""
+        for topic in self.sent.named():
+            if topic.dst_id == robot and topic.kept:
+                self.kept.ask(topic.topic.topic_id, now)
+
+    def drop(self, dropped: list[Dropped]) -> None:
+        """These messages are not sent, or not again."""
         for item in dropped:
             item.message.index = max(item.message.index, 1)
             if isinstance(item.message, Message):

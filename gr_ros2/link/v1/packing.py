@@ -26,7 +26,7 @@ from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.sent_topics import SentTopics
 from gr_ros2.wire import QOS_LATENCY
-from gr_ros2.wire.v1 import EntryV1, Part, fit
+from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, EntryV1, Part, fit
 
 SHARE = 2
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
@@ -42,12 +42,18 @@ ENTRY = 3
 
 @dataclass(slots=True, eq=False)
 class Message(Outgoing):
-    """A message to be sent. ``begin``: packet in which it began; ``place``: its place among the entries there."""
+    """A message to be sent. ``begin``: packet in which it began; ``place``: its place among the entries there.
+
+    :param dst_id: the robot for which it is, 255 for all
+    :param carried: its topic and key at the robot that made it, while it is carried over others
+    """
 
     lifetime: Lifetime = field(default_factory=Lifetime)
     begin: int = 0
     place: int = 0
     coded: bool = False
+    dst_id: int = BROADCAST
+    carried: tuple[int, Key] | None = None
 
 
 @dataclass(slots=True)
@@ -178,10 +184,11 @@ class Packing:
             lifetime.awaited = len(topic.queue) > 1
             payload = message.take(taken)
             last, begin = message.offset == len(message.payload), message.begin
-            parts.append(Part(topic_id, payload, number - begin if offset else 0, offset, last, message.coded))
-            key = Key(self._boot, begin, message.place)
+            on_air = min(topic_id, CARRIED_TOPIC)
+            parts.append(Part(on_air, payload, number - begin if offset else 0, offset, last, message.coded))
+            of, key = message.carried or (topic_id, Key(self._boot, begin, message.place))
             total = message.index if last else 0
-            sent.append(SentEntry(message.serial, topic_id, key, message.index - 1, total, message.repeat))
+            sent.append(SentEntry(message.serial, of, key, message.index - 1, total, message.repeat))
             lifetimes.append(lifetime)
             if RANK[message.qos] < RANK[qos]:
                 qos = message.qos
@@ -190,7 +197,7 @@ class Packing:
                 lifetime.left = True
                 topic.queue.popleft()
                 topic.newest = max(topic.newest, message.submitted)
-                stats.sent[topic_id] += not message.repeat
+                stats.sent[of] += not message.repeat
                 self._left(message, now)
         # On a shared channel a topic that goes along in a packet has had a turn: fresh messages are in every packet.
         self.turns.sent([message.topic_id for message, _ in picks] if self._shares else [self._holder])

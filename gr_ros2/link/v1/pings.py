@@ -28,6 +28,7 @@ class RoundTrips:
     """What came of the questions to one robot.
 
     :ivar asked: questions that have left
+    :ivar earlier: those of them that do not count any more
     :ivar answered: answers that have come
     :ivar arrived: questions that have arrived there, from the first that was answered to the newest; None before it
     :ivar round_trips: s from a question's leaving to its answer's arrival, the newest ``KEPT``
@@ -47,6 +48,7 @@ class RoundTrips:
     snr_there_db: float | None = None
     about: About | None = None
     not_before: float = -inf
+    earlier: int = 0
     _left: dict[int, float] = field(default_factory=dict)
     _shortest: float = inf
     _counted: int = 0
@@ -92,7 +94,7 @@ class RoundTrips:
         took, about = sorted(self.round_trips), self.about
         told = None if about is None else {**about._asdict(), "text": about.text.decode("utf-8", "replace")}
         return {
-            "asked": self.asked,
+            "asked": self.asked - self.earlier,
             "answered": self.answered,
             "lost_there": self.lost_there,
             "lost_back": self.lost_back,
@@ -148,8 +150,10 @@ class Pings:
         """See :class:`gr_ros2.link.endpoint.Questions`."""
         self.about = About(packet_len, phy, key, text.encode())
 
-    def put(self, robot: int, now: float) -> dict[str, Any]:
+    def put(self, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
         """See :class:`gr_ros2.link.endpoint.Questions`."""
+        if anew and (before := self.asked.get(robot)) is not None:  # numbers go on, so that no late answer counts
+            self.asked[robot] = RoundTrips(before.asked, earlier=before.asked, about=before.about)
         return self.ask(robot, now, wants_about=True).summary()
 
     def ask(self, robot: int, now: float, *, wants_about: bool = False) -> RoundTrips:

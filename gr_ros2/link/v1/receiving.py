@@ -123,7 +123,10 @@ class ReceivingSide:
             self._forget(gone.src_id)
             gone.inbox.order.told = False
             self._report_all(gone.inbox.handle_timeout(now))
-            self._events.append(Gone(gone.src_id, gone.boot))
+            if self.relaying is None or not self.relaying.reaches(gone.src_id, gone.boot, now):
+                self._events.append(Gone(gone.src_id, gone.boot))
+        if self.relaying is not None:
+            self._events += self.relaying.handle_timeout(now)
         for neighbour in self.neighbours:
             neighbour.timeout = None
         self._messages.reported = bool(self._window.peers)
@@ -134,6 +137,8 @@ class ReceivingSide:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
         # Asked after each packet, so only its sender is looked at anew.
         times = [n.timeout if n.timeout is not None else self._timeout(n) for n in self.neighbours]
+        if self.relaying is not None and (at := self.relaying.next_timeout()) is not None:
+            times.append(at)
         soonest = min(times, default=inf)
         return None if soonest == inf else soonest
 
@@ -284,6 +289,8 @@ class ReceivingSide:
         loss, now = report.loss / 128, self._now
         self._window.peers.report(sender, number, report.arrived, settled=report.settled, loss=loss, now=now)
         self._sending.repairs.reported()
+        if self.relaying is not None:
+            self.relaying.custody.reported(sender)
         self._messages.reported = True
         if self._rate is not None and report.snr_db is not None:
             self._rate.report(sender, report.snr_db, loss, now)
@@ -291,6 +298,8 @@ class ReceivingSide:
     def _forget(self, src_id: int) -> None:
         """A receiver is gone, or has started again."""
         self._window.peers.forget(src_id)
+        if self.relaying is not None:
+            self.relaying.custody.gone(src_id)
         if not self._window.peers:
             self._sending.hellos.hurry(self._now)
         if self._rate is not None:

@@ -4,8 +4,11 @@ A robot that is not heard directly is *far*: its table of topics and its message
 like a message, as topic 240 of its origin behind the full boot number; whoever hears the origin itself sends it on
 under the number that the origin has reached, again every ``TABLE_S``.
 
-Invariants: a message is delivered once, whether it comes directly or over others; of the topics that are relayed the
-newest message counts; memory is bounded by ``MOST_FAR`` robots and the topics that they announce.
+Messages of reliable topics for one robot, and calls, are carried to it (``custody``); of all others the newest of each
+topic is relayed.
+
+Invariants: a message is delivered once, whether it comes directly or over others; memory is bounded by ``MOST_FAR``
+robots and the topics that they announce.
 """
 
 from __future__ import annotations
@@ -15,16 +18,21 @@ from collections.abc import Callable
 from math import inf
 
 from gr_ros2.core.errors import WireError
+from gr_ros2.link.events import Gone, Met
+from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.inbox import Events, Inbox
 from gr_ros2.link.v1.neighbours import Neighbours
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.packing import Message
 from gr_ros2.link.v1.sent_topics import SentTopic
 from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.relay.routes import STALE_S
+from gr_ros2.settings.registry import CALLS_TYPE
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import NOBODY, Block
-from gr_ros2.wire.relayed import MOST_HOPS, RELAYED_LEN, Relayed, read_relayed, write_relayed
-from gr_ros2.wire.v1 import BROADCAST, RELAYED_TOPIC, TABLE_TOPIC
+from gr_ros2.wire.relayed import MOST_HOPS, RELAYED_LEN, Relayed, read_carried, read_relayed, write_relayed
+from gr_ros2.wire.table import write_table
+from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
 
 TABLE_S = 5.0
 """s after which the table of a robot that is heard is worth sending on again: some may have come since."""
@@ -49,11 +57,16 @@ class Relaying:
         """Messages sent on, by origin and topic id."""
         self.far: dict[int, Inbox] = {}
         self.gains = Gains(src_id)
+        self.custody: Custody
+        self._here: dict[int, tuple[int, float]] = {}
+        """Robots that are reached over others: boot number, and when something of them last came, s."""
         self._neighbours, self._dropped = neighbours, dropped
         self._newest: dict[Stream, Relayed] = {}
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
         self._chosen: Stream | None = None
+        self.found: Callable[[int, float], None] = lambda _, __: None
+        """Called with a robot that is reached over others for the first time."""
         self._make_inbox: Callable[[int, int], Inbox]
 
     def tell(self, make_inbox: Callable[[int, int], Inbox]) -> None:
@@ -69,8 +82,11 @@ class Relaying:
         """
         names = () if block is None else [name for name in block.names if name != NOBODY]
         self.gains.neighbour(src_id, now, names, 0 if block is None else block.heard)
-        boot, table, at = self._tables.get(src_id, (0, b"", now))
+        self.custody.routes.note(src_id, src_id, 0, now)
         neighbour = self._neighbours.get(src_id)
+        boot, table, at = self._tables.get(src_id, (0, b"", now))
+        if neighbour is not None and not neighbour.hello.digest and boot != neighbour.boot:
+            boot, table, at = neighbour.boot, write_table(()), -inf  # others learn that it is there, and where
         if table and neighbour is not None and now - at > TABLE_S:
             self._table(src_id, boot, table, neighbour.inbox.newest, now)
 
@@ -86,17 +102,30 @@ class Relaying:
             if self._tables.get(src_id, (0, b"", 0.0))[:2] != (boot, ready.payload):
                 self._table(src_id, boot, ready.payload, number, now)
             return
+        if self._carried(src_id, ready.topic_id):
+            return
         message = Relayed(src_id, boot & 0xFFFF, number, place, ready.topic_id, 0, ready.payload, ready.coded)
         self._take(src_id, message, now)
 
     def receive(self, via: int, ready: Ready, now: float) -> Events:
         """A message of another robot has come over one that is heard."""
+        taker = BROADCAST
         try:
-            message = read_relayed(ready.payload)
+            if ready.topic_id == CARRIED_TOPIC:
+                taker, message = read_carried(ready.payload)
+            else:
+                message = read_relayed(ready.payload)
         except WireError as error:
             self._dropped[error.kind] += 1
             return []
-        if not self._take(via, message, now):
+        if message.origin != self.src_id:
+            self.custody.routes.note(message.origin, via, message.hops, now)
+        if taker != BROADCAST:
+            if message.dst_id != self.src_id:
+                if taker == self.src_id:
+                    self.custody.take(message, via, now)
+                return []
+        elif not self._take(via, message, now):
             self._dropped["relayed_before"] += 1
             return []
         self.hops[message.origin] = message.hops
@@ -109,7 +138,42 @@ class Relaying:
             self._dropped["unknown_origin"] += 1
             return []
         order = message.number, message.place
-        return inbox.relayed(Ready(message.topic_id, order, message.payload, -1, message.coded, False), now)
+        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False)
+        return self._reached(inbox, now) + inbox.relayed(ready, now)
+
+    def _reached(self, inbox: Inbox, now: float) -> Events:
+        """Something of a robot came over others."""
+        neighbour = self._neighbours.get(inbox.src_id)
+        known = neighbour is not None and not neighbour.gone
+        met = not known and self._here.get(inbox.src_id, (-1, 0.0))[0] != inbox.boot
+        self._here[inbox.src_id] = inbox.boot, now
+        return [Met(inbox.src_id, inbox.boot, hears=False)] if met else []
+
+    def reaches(self, src_id: int, boot: int, now: float) -> bool:
+        """Whether a start of a robot is reached over others."""
+        known, at = self._here.get(src_id, (-1, -inf))
+        return known == boot and now < at + STALE_S
+
+    def handle_timeout(self, now: float) -> Events:
+        """Give up robots of which nothing comes any more."""
+        events: Events = []
+        for src_id, (boot, at) in list(self._here.items()):
+            if now >= at + STALE_S:
+                del self._here[src_id]
+                neighbour = self._neighbours.get(src_id)
+                if neighbour is None or neighbour.gone:
+                    events.append(Gone(src_id, boot))
+        return events
+
+    def next_timeout(self) -> float | None:
+        """When ``handle_timeout`` has something to do."""
+        return min((at + STALE_S for _, at in self._here.values()), default=None)
+
+    def _carried(self, src_id: int, topic_id: int) -> bool:
+        """Whether a robot's messages of a topic are handed on to the one for which they are."""
+        neighbour = self._neighbours.get(src_id)
+        row = None if neighbour is None else neighbour.inbox.announced.topics.get(topic_id)
+        return row is not None and row.reliable and (row.dst_id != BROADCAST or row.type_name == CALLS_TYPE)
 
     def _take(self, via: int, message: Relayed, now: float) -> bool:
         stream = Stream(message.origin, message.start, message.topic_id)
@@ -139,8 +203,9 @@ class Relaying:
                 self._dropped["max_sources"] += 1
                 return []
             inbox = self.far[message.origin] = self._make_inbox(message.origin, boot)
+            self.found(message.origin, now)
         ready = Ready(TABLE_TOPIC, (message.number, message.place), message.payload[_BOOT_LEN:], -1, False, False)
-        return inbox.relayed(ready, now)
+        return self._reached(inbox, now) + inbox.relayed(ready, now)
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
         """Where messages of a start of a robot come together, directly or over others."""
@@ -161,8 +226,7 @@ class Relaying:
         """
         if topic.queue and topic.queue[0].started:
             return
-        while topic.queue:
-            topic.queue.popleft()
+        topic.queue.clear()
         self._chosen, gain = self.gains.best(now, self._cost)
         if self._chosen is None:
             return

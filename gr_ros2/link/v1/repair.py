@@ -134,7 +134,7 @@ class RepairWindow:
         """A repair from which peers learn that a packet is not repaired any more; None if there is none."""
         self.peers.told()
         if self._shared is not None:
-            return self._for_all(now, lacking=False)
+            return self._for_all(now, number, lacking=False)
         self.packets.retire(now)
         window = self._combining.around(number, now)
         return self._combination(window, now) if window else None
@@ -157,17 +157,18 @@ class RepairWindow:
             return None
         again = self.peers.urgent(now)
         if again is not None:
-            return self._for_all(now) if len(self.peers.all) > 1 else self._again(again, now)
+            return self._for_all(now, again.number) if len(self.peers.all) > 1 else self._again(again, now)
         return self._for_all(now) if self._shared.due else None
 
-    def _for_all(self, now: float, *, lacking: bool = True) -> Repair | None:
+    def _for_all(self, now: float, lost: int = -1, *, lacking: bool = True) -> Repair | None:
         """A combination of all that is alive.
 
+        :param lost: a packet that it contains, -1 for none
         :param lacking: whether it counts as bringing one packet back to each peer
         """
         assert self._shared is not None
-        window = self._shared.window(now)
-        self._shared.combined(now)
+        window = self._shared.window(now, lost)
+        self._shared.combined()
         self.peers.told()
         if lacking:
             self.peers.served(window)

@@ -17,6 +17,9 @@ from gr_ros2.wire.v1 import EntryV1
 
 REPORTS, AT_ONCE = 0.05, 8
 """On a channel that many share: most of the bytes of all packets that reports take, and most reports in one packet."""
+WAITS_S = 10.0
+"""s after which a report that only confirms goes before newer ones of what is missed. Of two neighbours of which one
+always misses something, the other is never told otherwise what has arrived, and repairs it for ever."""
 LENGTH_LEN = 1
 """Bytes by which the last fragment of a packet grows when a report follows it: it cannot leave out its length then."""
 MASK_LEN = MAP // 8
@@ -50,7 +53,7 @@ class ReportSlots:
         due = [report for n in self._neighbours if (report := n.inbox.reports).due(now) <= now]
         if self._shares:
             self._allowed = min(self._allowed + REPORTS * self._packet_len, AT_ONCE * REPORT_LEN)
-            due.sort(key=lambda report: (not report.lacks, report.reported_at))
+            due.sort(key=lambda r: (not r.lacks and now < r.reported_at + WAITS_S, r.reported_at))
             del due[int(self._allowed / REPORT_LEN) :]
             size = sum(report.size for report in due)
             self._allowed -= size

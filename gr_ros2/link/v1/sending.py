@@ -11,6 +11,7 @@ from math import inf
 
 from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
+from gr_ros2.link.slowness import Slowness
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
@@ -59,6 +60,7 @@ class SendingSide:
         self.settings = settings
         self._relaying = relaying
         self.pace = Pace(settings.packet_rate)
+        self._slowness = Slowness(self.pace)
         self.hellos = hellos
         self.pings = Pings()
         self.repairs = RepairSlots(settings, self.pace, window, writer=writer, hold=hold)
@@ -100,10 +102,11 @@ class SendingSide:
         room = self._writer.room
         if self._relaying is not None and messages.relayed is not None:
             self._relaying.offer(messages.relayed, now)
+            self._relaying.custody.offer(now)
             room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
         filling = packing.fill(self._window.packets.newest + 1, room - reports.reserved, now)
         if filling is not None:
-            self.pace.waited(filling.since, now)
+            self._slowness.waited(filling.since, now)
             reports.add(filling.parts, room - filling.used, due, now)
             if self._relaying is not None:
                 filling.parts += self._relaying.gains.tells()
@@ -116,7 +119,7 @@ class SendingSide:
 
     def behind(self, now: float) -> bool:
         """Whether messages that wait do so because the computer is too slow."""
-        return self.pace.behind(now) and not self._alone(now)
+        return self._slowness.behind(now) and not self._alone(now)
 
     def next_departure(self, now: float) -> float:
         """When ``packet`` may have something, s; without regard to credits."""

@@ -13,7 +13,10 @@ from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import BROADCAST, RELAYED_TOPIC, TABLE_TOPIC
+from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
+
+LONG_CARRIED = CARRIED_TOPIC + 1
+"""The queue of carried messages that take several packets: short ones do not wait for them."""
 
 
 @dataclass(slots=True, eq=False)
@@ -63,6 +66,12 @@ class SentTopic:
         return 1 if depth == AUTO else depth
 
     @property
+    def dst_id(self) -> int:
+        """The robot for which its messages are, 255 for all."""
+        to = self.topic.options.to
+        return BROADCAST if to == AUTO else to
+
+    @property
     def in_order(self) -> bool:
         """Whether its messages are delivered in order, each after all earlier ones."""
         wanted = self.topic.options.reliability
@@ -95,7 +104,7 @@ class SentTopic:
             min(self.kept_depth if self.kept else depth, 255),
             codec,
             fresh,
-            BROADCAST if options.to == AUTO else options.to,
+            self.dst_id,
         )
 
 
@@ -135,12 +144,18 @@ class SentTopics(dict[int, SentTopic]):
         self[RELAYED_TOPIC] = SentTopic(topic, TopicQueue("latest"), qos_class(topic.options), 1.0, latched=False)
         return self[RELAYED_TOPIC]
 
+    def carry(self) -> None:
+        """Carry messages over other robots too."""
+        for topic_id in (CARRIED_TOPIC, LONG_CARRIED):
+            topic = Topic(topic_id, "", "")
+            self[topic_id] = SentTopic(topic, TopicQueue("fifo"), qos_class(topic.options), 1.0, latched=False)
+
     def find_deadlines(self) -> None:
         """Note which queues have a deadline."""
         self.deadlines = [topic.queue for topic in self.values() if topic.queue.deadline_s]
 
     def named(self) -> Iterator[SentTopic]:
-        """All topics, without the table of topics and messages of other robots."""
+        """All topics, without the table of topics and what is sent over others."""
         return (topic for topic_id, topic in self.items() if topic_id < TABLE_TOPIC)
 
     def table(self) -> list[AnnouncedTopic]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from math import inf
 
-from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.link.v1.lifetime import GROUP, Lifetime
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.unreported import MOST_LOSS
 from gr_ros2.wire.v1 import MAX_WINDOW
@@ -26,7 +26,7 @@ class SharedRepairs:
     """What one sender on a shared channel knows of its repairs.
 
     :param packets: what has left and may be repaired
-    :ivar within: whether a message in order goes on in later packets
+    :ivar within: whether a message in order goes on in later packets, and is not that long that repairs must not wait
     """
 
     def __init__(self, packets: SentPackets) -> None:
@@ -34,10 +34,12 @@ class SharedRepairs:
         self._packets = packets
         self._ordered = -1
         """The newest packet with a part of a message in order."""
+        self._begun = 0
+        """Packets of a message in order that goes on."""
         self._since = 0
         """New packets since the last combination."""
         self._told_at = -inf
-        """When that left, s: it says what is not repaired any more."""
+        """When one over the oldest packet left, s: it says what is not repaired any more."""
         self._owed = 0.0
 
     def sent(self, number: int, lifetimes: tuple[Lifetime, ...], loss: float) -> None:
@@ -49,7 +51,8 @@ class SharedRepairs:
         ordered = [lifetime for lifetime in lifetimes if lifetime.in_order]
         if ordered:
             self._ordered = number
-            self.within = not all(lifetime.left for lifetime in ordered)
+            self._begun = 0 if all(lifetime.left for lifetime in ordered) else self._begun + 1
+            self.within = 0 < self._begun < GROUP
             loss = min(loss, MOST_LOSS)
             self._owed += loss / (1 - loss)
 
@@ -65,20 +68,25 @@ class SharedRepairs:
         """
         return not self.within and (self._since > 0 or idle)
 
-    def combined(self, now: float) -> None:
+    def combined(self) -> None:
         """A combination leaves."""
         self._since = 0
-        self._told_at = now
         self._owed = max(self._owed - 1, 0.0)
 
-    def window(self, now: float) -> list[Sent]:
-        """All that is alive up to the newest packet in order, newest first."""
+    def window(self, now: float, lost: int) -> list[Sent]:
+        """All that is alive up to the newest packet in order, newest first; what is around a packet that is older.
+
+        :param lost: that packet; -1 for none
+        """
         packets = self._packets
         packets.retire(now)
         window: list[Sent] = []
-        for newest in (self._ordered, packets.newest):  # where all in order is confirmed, it says at least that
+        ordered = self._ordered if lost < 0 else min(self._ordered, max(lost, packets.oldest) + MAX_WINDOW // 2)
+        for newest in (ordered, packets.newest):  # where all in order is confirmed, it says at least that
             first = max(packets.oldest, newest - MAX_WINDOW + 1)
             window = window or list(packets.live(first, newest, now))[::-1]
+        if not window or window[-1].number == packets.oldest:
+            self._told_at = now
         for record in window:
             record.at = now
             record.combined += 1

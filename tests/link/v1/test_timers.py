@@ -73,6 +73,8 @@ def test_what_is_due_next_is_later(
                     departure = robot.end.next_departure()
                     assert departure is None or departure > now, "next_departure"
                     due.append(slot if out or departure is None else departure)
+                else:
+                    due.append(slot)  # one more packet waits than has left
                 timeout = robot.end.next_timeout()
                 assert timeout is None or timeout > now, "next_timeout"
                 due.append(inf if timeout is None else timeout)

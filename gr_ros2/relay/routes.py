@@ -1,0 +1,46 @@
+"""Over which robot a message comes nearer to another one.
+
+Every message of another robot says how many have sent it on, so whoever carries it stands so far from its origin. A
+robot hands a message for that origin to the one that stands nearest and hears it.
+
+Invariants: sans-IO, the caller passes in times; memory is bounded by the ids.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+STALE_S = 15.0
+"""s for which a distance counts: tables are relayed every 5 s at least, and two may be lost."""
+
+
+class Routes:
+    """The distances of the robots that are heard from all others."""
+
+    def __init__(self) -> None:
+        self._ways: dict[int, dict[int, tuple[int, float]]] = {}
+        """By robot, and by the one that is heard: how many stand between them, this one included, and when that was
+        last so, s."""
+
+    def note(self, robot: int, via: int, hops: int, now: float) -> None:
+        """A message of a robot has come over another one.
+
+        :param hops: robots that have sent it on; 0 where ``via`` has made it
+        """
+        ways = self._ways.setdefault(robot, {})
+        before, at = ways.get(via, (hops, now))
+        if hops <= before or now > at + STALE_S:  # a detour says nothing about the shortest way
+            ways[via] = hops, now
+
+    def over(self, robot: int, now: float, usable: Callable[[int], bool]) -> int | None:
+        """The robot to which a message for ``robot`` is to be handed; None if no way is known.
+
+        :param usable: whether a robot may be taken
+        """
+        ways = self._ways.get(robot, {}).items()
+        open_ways = [(hops, via) for via, (hops, at) in ways if now <= at + STALE_S and usable(via)]
+        return min(open_ways)[1] if open_ways else None
+
+    def hops(self, robot: int, now: float) -> int | None:
+        """Robots between this one and another; 0 if it is heard, None if nothing is known."""
+        return min((hops for hops, at in self._ways.get(robot, {}).values() if now <= at + STALE_S), default=None)

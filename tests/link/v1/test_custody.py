@@ -1,0 +1,169 @@
+"""Messages for one robot that is not heard: they arrive whole, once and in order, over robots that keep them."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+
+from gr_ros2.calls import Answer, Calls, Offer, Request, Service
+from gr_ros2.link.events import Delivered, Gone, Met
+from gr_ros2.link.v1 import custody
+from gr_ros2.link.v1.custody import Custody
+from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry
+from tests.link.v1.air import Robot, registry
+from tests.link.v1.test_relaying import ODOM, Line, robot
+
+LAST = 4
+
+
+def named(last: int = LAST, **options: Any) -> Registry:
+    return registry(odom=TopicOptions(queue="latest"), goal=TopicOptions(to=last, **options), map=TopicOptions(to=last))
+
+
+def custody_of(one: Robot) -> Custody:
+    assert one.end.messages.custody is not None
+    return one.end.messages.custody
+
+
+def line_of(*robots: Robot, loss: float = 0.1) -> Line:
+    """Robots that know each other."""
+    line = Line(*robots, loss=loss)
+    line.run(12)
+    return line
+
+
+def until(line: Line, seconds: float, condition: Any) -> None:
+    end = line.now + seconds
+    while not condition() and line.now < end:
+        line.run(1)
+    assert condition()
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_goals_arrive_in_order_and_once_beside_a_map_of_many_packets(mode: SealMode) -> None:
+    line = line_of(robot(1, mode, named()), *(robot(src_id, mode) for src_id in (2, 3, LAST)))
+    whole = random.Random(1).randbytes(2500)
+    first, last = line.robots[0], line.robots[-1]
+    first.end.messages.submit(2, whole, line.now)
+    goals = [b"goal %d" % n for n in range(20)]
+    for goal in goals:
+        first.end.messages.submit(1, goal, line.now)
+        line.run(1)
+    until(line, 120, lambda: whole in last.delivered(1) and goals[-1] in last.delivered(1))
+    assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
+    assert last.delivered(1).count(whole) == 1
+    assert not any(payload in one.delivered(1) for one in line.robots[1:3] for payload in (*goals, whole))
+    until(line, 60, lambda: not any(len(custody_of(one)) for one in line.robots))
+    assert all(not custody_of(one).held_bytes for one in line.robots)
+
+
+def test_calls_cross_three_hops_and_are_answered() -> None:
+    rows = ODOM.with_calls()
+    line = line_of(*(robot(src_id, topics=rows) for src_id in range(1, LAST + 1)))
+    first, last = line.robots[0], line.robots[-1]
+    for robot_ in (first, last):
+        robot_.end.messages.offer(1, offered=True)
+    line.run(8)
+    one, two = Calls(1, first.boot), Calls(LAST, last.boot)
+    service, offers = Service(LAST, last.boot, 5, "/add"), {5: Offer("/add")}
+    answered, seen, made = 0, [0, 0], 0
+    end = line.now + 160
+    while line.now < end and answered < 100:
+        if made < 100:
+            frame = one.call(service, made, b"%d" % made, deadline_s=30.0, now=line.now)
+            assert frame is not None
+            first.end.messages.submit(1, frame.data, line.now, frame.lifespan_s, frame.robot)
+            made += 1
+        line.run(1)
+        for place, robot_ in enumerate((last, first)):
+            events, seen[place] = robot_.events[seen[place] :], len(robot_.events)
+            for event in events:
+                if not isinstance(event, Delivered) or event.topic_id != 1:
+                    continue
+                if robot_ is last:
+                    request = two.receive((1, first.boot), event.payload, offers, line.now)
+                    assert isinstance(request, Request)
+                    reply = two.reply(request.ticket, request.payload + b"!", line.now)
+                    assert reply is not None
+                    last.end.messages.submit(1, reply.data, line.now, reply.lifespan_s, reply.robot)
+                else:
+                    answer = one.receive((LAST, last.boot), event.payload, {}, line.now)
+                    answered += isinstance(answer, Answer) and answer.payload == b"%d!" % answer.token  # type: ignore[str-bytes-safe]
+    assert answered >= 99
+
+
+def test_a_robot_over_others_is_met_and_is_gone_when_nothing_of_it_comes() -> None:
+    line = line_of(*(robot(src_id) for src_id in (1, 2, 3)), loss=0.0)
+    first, last = line.robots[0], line.robots[2]
+    assert [event.boot for event in first.events if isinstance(event, Met) and event.src_id == 3] == [last.boot]
+    line.robots.pop()
+    line.run(30)
+    assert [event.boot for event in first.events if isinstance(event, Gone) and event.src_id == 3] == [last.boot]
+
+
+def test_what_the_next_robot_has_not_taken_goes_over_another_one() -> None:
+    """1 hears 2 and 3, which hear 4; 2 leaves in the middle of the map."""
+    line = line_of(robot(1, topics=named()), *(robot(src_id) for src_id in (2, 3, LAST)), loss=0.0)
+    heard = {0: [1, 2], 1: [0, 3], 2: [0, 3], 3: [1, 2]}
+    line.near = lambda one: heard[one]  # type: ignore[method-assign]
+    line.run(20)
+    whole = random.Random(1).randbytes(6000)
+    line.robots[0].end.messages.submit(2, whole, line.now)
+    line.run(3)
+    assert len(custody_of(line.robots[0])) == 1
+    (taker,) = {held.taker for held in custody_of(line.robots[0])._held.values()}
+    gone = taker - 1
+    heard.update({gone: [], 0: [3 - gone], 3: [3 - gone]})
+    until(line, 90, lambda: whole in line.robots[-1].delivered(1))
+    assert line.robots[-1].delivered(1).count(whole) == 1
+
+
+def test_a_kept_message_is_sent_to_a_robot_that_comes_within_reach_of_others() -> None:
+    rows = registry(odom=TopicOptions(queue="latest"), map=TopicOptions(to=LAST, durability="transient_local"))
+    line = Line(robot(1, topics=rows), *(robot(src_id) for src_id in (2, 3)))
+    line.run(8)
+    line.robots[0].end.messages.submit(1, b"the map", line.now)
+    line.run(8)
+    line.robots.append(robot(LAST))
+    until(line, 60, lambda: b"the map" in line.robots[-1].delivered(1))
+
+
+def test_without_the_key_nobody_takes_messages_on_or_hands_them_over() -> None:
+    line = line_of(robot(1, "encrypt", named()), robot(2, "encrypt"), robot(3), robot(LAST, "encrypt"), loss=0.0)
+    line.robots[0].end.messages.submit(1, b"go", line.now)
+    line.run(20)
+    assert not line.robots[-1].delivered(1)
+    forged = line_of(robot(1, topics=named(3)), robot(2, "encrypt"), robot(3, "encrypt"), loss=0.0)
+    forged.robots[0].end.messages.submit(1, b"go", forged.now)
+    forged.run(20)
+    assert not forged.robots[2].delivered(1)
+    assert not len(custody_of(forged.robots[1]))
+
+
+def test_what_is_held_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The way ends at 3: it holds what it took for 4, and the oldest is lost."""
+    monkeypatch.setattr(custody, "MOST_HELD", 5)
+    line = line_of(robot(1, topics=named()), *(robot(src_id) for src_id in (2, 3, LAST)), loss=0.0)
+    line.near = lambda one: [other for other in (one - 1, one + 1) if 0 <= other < 3 and one < 3]  # type: ignore[method-assign]
+    for n in range(12):
+        line.robots[0].end.messages.submit(1, b"goal %d" % n, line.now)
+        line.run(0.6)
+    line.run(10)
+    held = custody_of(line.robots[2])
+    assert len(held) <= 5
+    assert line.robots[2].end.received.dropped["custody_full"] + len(held) >= 5
+
+
+def test_a_message_with_a_deadline_is_not_handed_on_after_it() -> None:
+    rows = named(queue="deadline", deadline_s=4.0)
+    line = line_of(robot(1, topics=rows), *(robot(src_id) for src_id in (2, 3, LAST)), loss=0.0)
+    line.near = lambda one: []  # type: ignore[method-assign]  # noqa: ARG005
+    for n in range(20):
+        line.robots[0].end.messages.submit(1, b"goal %d" % n, line.now)
+    line.run(15)
+    assert not len(custody_of(line.robots[0]))
+    assert line.robots[0].end.sent.refused[1, "stale"]
