@@ -207,11 +207,8 @@ def simulate(
 
 
 def coupled(scenario: Scenario) -> Scenario:
-    """What is forecast together: all robots where they share a channel, else the first direction alone."""
-    ways = scenario.directions()
-    if len(ways) > 1:
-        return scenario if scenario.duplex == "half" else ways[0]
-    return replace(scenario, receivers=())
+    """What is forecast together: all robots that send, with one receiver where only one does."""
+    return scenario if len(scenario.directions()) > 1 else replace(scenario, receivers=())
 
 
 _OfSender = Received | Delivered | Lost

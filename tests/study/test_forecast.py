@@ -54,6 +54,12 @@ def test_a_plan_keeps_the_limit_of_airtime(limit: str, share: float) -> None:
     assert kept.load > 5 * free.load
 
 
+@pytest.mark.slow
+def test_what_to_cut_is_known_where_a_topic_finds_no_place_at_all() -> None:
+    cuts = planner("six-topics-paced", "airtime=eu868", duration=20.0).cuts()
+    assert cuts[-1].load <= 1
+
+
 def test_what_fits_is_said_to_fit() -> None:
     fits = planner("paper-ofdm-paced", "ros_source.repair='off'").forecast()
     assert fits.load == pytest.approx(fits.used, rel=0.08)

@@ -165,6 +165,9 @@ class ReceivingSide:
             if opened is None:
                 return
             opened.neighbour.timeout = None
+            if not self._for_us(header):
+                self.stats.dropped["not_for_us"] += 1
+                return
             if arrival.snr_db is not None and opened.new:
                 opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
             proved = self._use(arrival, opened, now)
@@ -191,7 +194,7 @@ class ReceivingSide:
             self.neighbours.check_own(data, header)
             self.stats.dropped["own"] += 1
             return None
-        if header.dst_id not in (BROADCAST, own) and own != NOBODY:
+        if self._access is None and not self._for_us(header):  # where it is shared, all have to know whose slot it is
             self.stats.dropped["not_for_us"] += 1
             return None
         if header.sealed and not self._sealed:
@@ -199,6 +202,10 @@ class ReceivingSide:
         if self._sealed and not header.sealed:
             raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
         return self.neighbours.open(data, header, now)
+
+    def _for_us(self, header: Header) -> bool:
+        own = self._settings.src_id
+        return header.dst_id in (BROADCAST, own) or own == NOBODY
 
     def _use(self, arrival: ReceivedPacket, opened: Opened, now: float) -> bool:
         """Take an opened packet; returns whether packets that were kept until a proof can be taken now."""
@@ -258,7 +265,7 @@ class ReceivingSide:
             self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
         self._forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
-        if hears:
+        if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
             self._window.peers.meet(neighbour.src_id, now)
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)
