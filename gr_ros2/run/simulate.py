@@ -54,7 +54,7 @@ _REMEMBERED_S = 60.0
 """Simulated messages of runs up to this long are cached: 5 MB for two robots with all their topics."""
 
 
-class Offer(Protocol):
+class Upcoming(Protocol):
     """A message for the source. ``payload`` is asked for at ``t``, so it may depend on what came before."""
 
     @property
@@ -244,7 +244,7 @@ class Simulation:
         registry: Registry,
         phys: Sequence[Phy],
         *,
-        messages: Sequence[Iterator[Offer]] | None = None,
+        messages: Sequence[Iterator[Upcoming]] | None = None,
         codec: MessageCodec | None = None,
         ideal: bool = False,
     ) -> None:
@@ -254,7 +254,7 @@ class Simulation:
                 "be simulated; set time to real, samples or packets"
             )
         ways = scenario.directions()
-        coming: list[Iterator[Offer]] = list(messages or offered_by(ways, registry))
+        coming: list[Iterator[Upcoming]] = list(messages or offered_by(ways, registry))
         shared = scenario.duplex == "half"
         any_length = all(phy.any_length for phy in phys)
         start = start_of_run(
@@ -342,7 +342,7 @@ class Robot:
         events: list[SenderEvent],
         src_id: int,
         airtime: Airtime,
-        messages: Iterator[Offer],
+        messages: Iterator[Upcoming],
         start_s: float = 0.0,
         busy: bool = False,
     ) -> None:

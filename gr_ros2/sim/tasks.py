@@ -27,7 +27,7 @@ Command = tuple[float, float]
 """Speed in m/s and turn rate in rad/s."""
 
 
-class Heard(NamedTuple):
+class LastHeard(NamedTuple):
     """The newest odometry of another robot that has come out of the link.
 
     :param made_s: s, when it was measured
@@ -59,7 +59,7 @@ class Task:
         """Where a robot starts."""
         raise NotImplementedError
 
-    def command(self, number: int, now: float, own: State, heard: Mapping[int, Heard]) -> Command:
+    def command(self, number: int, now: float, own: State, heard: Mapping[int, LastHeard]) -> Command:
         """What a robot does from now on; asked ten times a second.
 
         :param heard: what its link has delivered, by robot
@@ -92,7 +92,7 @@ class Formation(Task):
     def start(self, number: int) -> State:
         return State(*self._place(number, State(0.0, 0.0, 0.0, 0.0, 0.0)), 0.0, 0.0, 0.0)
 
-    def command(self, number: int, now: float, own: State, heard: Mapping[int, Heard]) -> Command:
+    def command(self, number: int, now: float, own: State, heard: Mapping[int, LastHeard]) -> Command:
         if not number:
             return 1 + 0.5 * math.sin(0.7 * now), 0.8 * math.sin(0.45 * now + self._phase)
         if 0 not in heard:
@@ -136,7 +136,7 @@ class Rendezvous(Task):
         place = self.rng.uniform(0, self.SIDE_M), self.rng.uniform(0, self.SIDE_M)
         return State(*place, self.rng.uniform(-math.pi, math.pi), 0.0, 0.0)
 
-    def command(self, number: int, now: float, own: State, heard: Mapping[int, Heard]) -> Command:  # noqa: ARG002
+    def command(self, number: int, now: float, own: State, heard: Mapping[int, LastHeard]) -> Command:  # noqa: ARG002
         if not heard:
             return 0.0, 0.0
         places = [own, *(other.state for other in heard.values())]
@@ -195,7 +195,7 @@ class TaskRobots:
     def __init__(self, task: Task, settings: SimSettings) -> None:
         self._task, self._settings, self._tick = task, settings, 0
         self._states = [task.start(number) for number in range(task.robots)]
-        self._heard: list[dict[int, Heard]] = [{} for _ in self._states]
+        self._heard: list[dict[int, LastHeard]] = [{} for _ in self._states]
         world = World(settings.size_m, 0, np.random.default_rng(0))
         start_ns = round(settings.start_time_s * 1e9)
         self._sensors = [Sensors(settings, world, n + 1, state, start_ns) for n, state in enumerate(self._states)]
@@ -221,7 +221,7 @@ class TaskRobots:
         before = self._heard[robot].get(sender)
         made_s = made_ns * 1e-9 - self._settings.start_time_s
         if before is None or made_s > before.made_s:
-            self._heard[robot][sender] = Heard(made_s, state)
+            self._heard[robot][sender] = LastHeard(made_s, state)
 
     def odometry(self, robot: int, now: float) -> bytes:
         """What a robot sends at a time: its place and velocity."""

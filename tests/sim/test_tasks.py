@@ -12,7 +12,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.sim.motion import State
 from gr_ros2.sim.sensors import read_odometry
 from gr_ros2.sim.sim_settings import SimSettings
-from gr_ros2.sim.tasks import Command, Formation, Heard, Rendezvous, Task, TaskRobots, make_task, towards
+from gr_ros2.sim.tasks import Command, Formation, LastHeard, Rendezvous, Task, TaskRobots, make_task, towards
 
 QUIET = SimSettings(odom_linear_noise=0, odom_angular_noise=0, odom_rate=10)
 
@@ -23,7 +23,7 @@ class OnlyAhead(Task):
     def start(self, number: int) -> State:
         return State(0.0, 3.0 * number, 0.0, 0.0, 0.0)
 
-    def command(self, number: int, now: float, own: State, heard: Mapping[int, Heard]) -> Command:  # noqa: ARG002
+    def command(self, number: int, now: float, own: State, heard: Mapping[int, LastHeard]) -> Command:  # noqa: ARG002
         return float(number), 0.0
 
 
@@ -48,7 +48,7 @@ def test_an_odometry_says_where_its_robot_was() -> None:
 
 
 def test_a_robot_heard_before_is_where_it_would_be_now() -> None:
-    heard = Heard(10.0, State(1.0, 2.0, math.pi / 2, 2.0, 0.0))
+    heard = LastHeard(10.0, State(1.0, 2.0, math.pi / 2, 2.0, 0.0))
     assert heard.at(10.25)[:2] == pytest.approx((1.0, 2.5))
     assert heard.at(9.0)[:2] == (1.0, 2.0)
 
