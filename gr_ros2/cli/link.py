@@ -268,7 +268,7 @@ def status_line(stats: Mapping[str, Any]) -> str:
     if airtime := airtime_words(stats["airtime"]):
         parts.append(airtime)
     if sink["packet_loss_est"]:
-        parts.append(f"about {sink['packet_loss_est']} packets lost")
+        parts.append(f"packets lost: about {sink['packet_loss_est']}")
     if stats["phy"]["snr_db"] is not None:
         parts.append(f"SNR {stats['phy']['snr_db']:.1f} dB")
     parts += [f"{name} is {t['type']} now" for name, t in source["topics"].items() if t["types"] > 1]

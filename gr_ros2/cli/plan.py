@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gr_ros2.cli.params import SCENARIO, set_option
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.ledger_rows import ARRIVED, LedgerRow
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.study.forecast import Advice, Cut, Effect, Forecast, Planner
 from gr_ros2.study.traffic import is_bag, link_values, of_recording, recorded_graph
@@ -89,8 +89,7 @@ def _tell(planner: Planner, advise: bool) -> None:
     )
     console.print(_table(forecast))
     console.print(_verdict(forecast), soft_wrap=True)
-    if forecast.air:
-        console.print(_air(forecast), soft_wrap=True)
+    console.print(forecast.in_use, soft_wrap=True)
     if (half_m := planner.range_m(0.5)) is not None:
         console.print(
             f"The link ends at {half_m:.0f} m: half of the packets arrive there, and {_MOST:.0%} of them up to "
@@ -144,8 +143,6 @@ def _table(forecast: Forecast) -> Table:
 
 
 def _verdict(forecast: Forecast) -> str:
-    per_message = _number(forecast.air_bytes_per_message, 1, ".0f")
-    fits = "it fits"
     if forecast.load > 1:
         heaviest = max(forecast.topics, key=lambda topic: topic.load)
         what = "most of it" if heaviest.load > forecast.load / 2 else "the heaviest topic"
@@ -154,23 +151,34 @@ def _verdict(forecast: Forecast) -> str:
         fits = (
             f"the air has room for it, but only {arrives:.0%} of the messages arrive, since packets are lost or collide"
         )
-    return (
-        f"Load {forecast.load:.0%}: {fits}. With repair and reports {forecast.used:.0%} of the airtime is used, "
-        f"{forecast.pad:.0%} of it for padding; {per_message} bytes on the air per message delivered."
-    )
+    elif (replaced := _replaced(forecast)) > 1 - _GOOD:
+        fits = (
+            f"it fits only just: {replaced:.0%} of the messages wait until a newer one replaces them, since repair "
+            "and reports take air too"
+        )
+    else:
+        fits = "it fits"
+    per_message = _number(forecast.air_bytes_per_message, 1, ".0f")
+    return f"Load {forecast.load:.0%}: {fits}. {per_message} bytes on the air per message delivered."
 
 
 def _arrives(forecast: Forecast) -> float:
     """Share of all messages that arrive, 0..1, without those that newer ones replaced before they left."""
+    left = 1 - _share(forecast, LedgerRow.SUPERSEDED)
+    return _share(forecast, *ARRIVED) / left if left else 1.0
+
+
+def _replaced(forecast: Forecast) -> float:
+    """Share of the messages that are to be sent which newer ones replace for want of air, 0..1."""
+    wanted = sum(topic.wanted_hz for topic in forecast.topics)
+    return sum(max(topic.wanted_hz - topic.rate_hz, 0.0) for topic in forecast.topics) / wanted if wanted else 0.0
+
+
+def _share(forecast: Forecast, *rows: LedgerRow) -> float:
+    """Share of all messages that end in these rows of the ledger, 0..1."""
     results = [topic.result for topic in forecast.topics]
-    left = sum(result.sent - result.ledger.get(LedgerRow.SUPERSEDED.value, 0) for result in results)
-    return sum(result.delivered for result in results) / left if left else 1.0
-
-
-def _air(forecast: Forecast) -> str:
-    """Packets per message, by purpose."""
-    spent = ", ".join(f"{packets:.2f} {kind}" for kind, packets in forecast.air.items())
-    return f"{sum(forecast.air.values()):.2f} packets per message sent: {spent}."
+    sent = sum(result.sent for result in results)
+    return sum(result.ledger.get(row.value, 0) for result in results for row in rows) / sent if sent else 0.0
 
 
 def _line(advice: Advice) -> str:

@@ -25,12 +25,27 @@ from gr_ros2.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2.record.result import Result
 from gr_ros2.report.explain import explanation, lateness_lines
 from gr_ros2.report.repetitions import repetition_grid
-from gr_ros2.report.table import as_table, ledger_table, notes, packets_line, paper_grid, paper_results, summary_table
+from gr_ros2.report.table import (
+    as_table,
+    ledger_table,
+    notes,
+    packets_line,
+    paper_grid,
+    paper_results,
+    summary_table,
+    team_grid,
+)
 from gr_ros2.run import runner
 from gr_ros2.run.observers import RunObserver
 from gr_ros2.run.outcome import Outcome
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.settings.fields import AUTO
+
+_NEXT = """
+Next:  gr-ros2 demo --dashboard    the same live in a browser, with sliders for noise and loss
+       gr-ros2 plan demo           the forecast; --set phy.sample_rate=100e3 asks about a slower radio
+       gr-ros2 doctor              what this machine has and lacks for a link of your own
+       gr-ros2 link --help         your own robot's topics, live"""
 
 _options = [
     click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),
@@ -73,7 +88,9 @@ def demo(wire: str, robots: int | None, overrides: tuple[str, ...], **options: A
             raise click.UsageError("--robots: version 0 says nothing about slots; leave --wire out")
         return _run("demo-team", overrides=(f"robots={robots}", *overrides), **options)
     older = () if wire == "1" else ("version=0", "reports=null")
-    return _run("demo", overrides=(*older, *overrides), **options)
+    status = _run("demo", overrides=(*older, *overrides), **options)
+    make_console().print(_NEXT, soft_wrap=True)
+    return status
 
 
 def _run(
@@ -113,8 +130,8 @@ def _run(
 def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.Progress], None]:
     """A function that shows the progress of a run."""
     how_long = f"{scenario.duration_s:g} s" if scenario.duration_s else "its recording"
-    if scenario.simulated:
-        bar.console.print(f"{title}: {how_long} of simulated time, as fast as it can be computed", soft_wrap=True)
+    clock = "simulated time, as fast as it can be computed" if scenario.simulated else "real time"
+    bar.console.print(f"{title}: {scenario.description or 'an experiment'}; {how_long} of {clock}", soft_wrap=True)
     task = bar.add_task(title, total=scenario.duration_s or None, sent=0, delivered=0)
     shown = time.monotonic()
     begun = False
@@ -137,10 +154,10 @@ def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.
 
 
 def _graphs(graphs: Iterable[tuple[str, int | None]]) -> Iterator[str]:
-    """Where other programs can join in, a line each."""
+    """How other programs join in, a line each."""
     for what, domain in graphs:
         if domain is not None:
-            yield f"ROS_DOMAIN_ID={domain} ROS_LOCALHOST_ONLY=1: {what}\n"
+            yield f"ROS_DOMAIN_ID={domain} ROS_LOCALHOST_ONLY=1 ros2 topic list   # {what}\n"
 
 
 def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path, drawn: bool | None) -> None:
@@ -190,28 +207,37 @@ def _bar(console: Console) -> Progress:
 
 
 def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
+    """What came of it first, then the tables, then why."""
     result = outcome.result
-    for line in lateness_lines(result):  # first, since all that follows depends on it
+    late = lateness_lines(result)
+    for line in late:  # first, since all that follows depends on it
         console.print(line, style="bold red", soft_wrap=True)
-    phy = result.phy
-    if phy["sample_rate"]:
-        chosen = ""
-        if scenario.phy.sample_rate == AUTO:
-            chosen = f" ({scenario.phy.headroom:.0%} of what the messages need uncompressed, none sharing a packet)"
-        console.print(
-            f"{phy['name']}: {phy['sample_rate']:,.0f} samples/s{chosen}; a full packet of {scenario.packet_len} B "
-            f"takes {phy['airtime_s'] * 1e3:.2f} ms; runs on {phy['runs_on']}",
-            soft_wrap=True,
-        )
-    console.print(f"{packets_line(result)}\n", soft_wrap=True)
+    arrived, *why = explanation(result, outcome.trace)[len(late) :]
+    console.print(f"{arrived}\n", style="bold", soft_wrap=True)
     if paper_results([result]):
         console.print(as_table(paper_grid([result])))
     console.print(summary_table([result]))
     console.print(ledger_table(result))
+    if team := team_grid(outcome.result):
+        console.print(as_table(team))
     for path in outcome.trace.paths():
         title = f"{path.topic} sent (blue), {path.published_as} received (red), m"
         console.print(Text.from_ansi(path_text(path.sent, path.received, title)), soft_wrap=True)
-    late = set(lateness_lines(result))
-    for line in (*explanation(result, outcome.trace), *notes(result)):
-        if line not in late:
-            console.print(line)
+    for line in (*notes(result), *why, packets_line(result), *_radio(scenario, result)):
+        console.print(line, soft_wrap=True)
+
+
+def _radio(scenario: Scenario, result: Result) -> Iterator[str]:
+    """The PHY and what a packet takes on it."""
+    phy = result.phy
+    if not phy["sample_rate"]:
+        return
+    chosen = ""
+    if scenario.phy.sample_rate == AUTO:
+        chosen = (
+            f", chosen to carry {scenario.phy.headroom:.0%} of the messages uncompressed, each in packets of its own"
+        )
+    yield (
+        f"Radio: {phy['name']} at {phy['sample_rate']:,.0f} samples/s{chosen}; a full packet of {scenario.packet_len} "
+        f"B takes {phy['airtime_s'] * 1e3:.2f} ms."
+    )

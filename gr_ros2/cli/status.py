@@ -58,7 +58,7 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
     for peer in peers:
         table.add_row(
             str(peer["robot"]),
-            "silent" if peer["silent"] else "heard",
+            "silent" if peer["silent"] else f"over {peer['over']}, hop {peer['hops']}" if peer["hops"] else "heard",
             _seconds(peer["heard_s"]),
             _decibels(peer["snr_db"]),
             f"{peer['loss']:.1%}",

@@ -42,6 +42,7 @@ from gr_ros2.dashboard.tables import (
     heard_html,
     packets_html,
     paths_html,
+    state_text,
     team_html,
     tiles_html,
     topics_html,
@@ -55,14 +56,11 @@ AHEAD = 3
 """When a viewer is this number of pictures behind, it gets no new one."""
 
 _TEMPLATES = Path(__file__).parent / "templates"
-_SENT, _RECEIVED = "#1f5fbf", "#d62728"
+_SENT, _RECEIVED = "#3b82d6", "#d62728"
+"""Of lines that are seen on a bright and on a dark page."""
 _SOFT = "#7a8a9a"
-"""Grey that can be read on a bright and on a dark page."""
+"""Of lines beside them. Words have the page's own grey, see ``page.js``."""
 _DEFAULT_SNR_DB = 20.0
-_HIDE = """
-for (const card of document.querySelectorAll("[data-card]"))
-    card.hidden = pulse.empty.split(" ").includes(card.dataset.card);
-"""
 _SENDS, _SILENT = "stop sending", "sending is off: send again"
 
 
@@ -73,6 +71,8 @@ class PictureCounter(DataModel):  # type: ignore[misc]
     seen = Int(0)
     empty = String("")
     """Cards that have nothing to show, separated by spaces."""
+    said = String("")
+    """State and alarms, which a screen reader says when they change."""
 
 
 class LivePage:
@@ -86,8 +86,7 @@ class LivePage:
         self._monitor = monitor
         self._counter = PictureCounter(name="pulse")
         self._counter.js_on_change("drawn", CustomJS(args={"pulse": self._counter}, code="pulse.seen = pulse.drawn"))
-        self._counter.js_on_change("empty", CustomJS(args={"pulse": self._counter}, code=_HIDE))
-        style = InlineStyleSheet(css=(_TEMPLATES / "parts.css").read_text("utf-8"))
+        self._style = style = InlineStyleSheet(css=(_TEMPLATES / "parts.css").read_text("utf-8"))
         self._html = {
             name: Div(name=name, stylesheets=[style], sizing_mode="stretch_width", disable_math=True)
             for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "packets", "note")
@@ -158,6 +157,7 @@ class LivePage:
         self._draw_radio(radio)
         self._show_channel(radio)
         self._counter.empty = " ".join(_empty_cards(snapshot, radio))
+        self._counter.said = ". ".join((state_text(snapshot), *snapshot.alarms))
         self._counter.drawn += 1
 
     def _draw_series(self, snapshot: Snapshot) -> None:
@@ -365,6 +365,14 @@ class LivePage:
             "page.html.j2"
         )
         document.template_variables["instance"] = instance
+        for widget in (self._pause, self._silence, self._noise, self._snr, self._offset, self._loss):
+            widget.stylesheets = [self._style]
+        words = [*(axis for plot in plots for axis in plot.axis), air.legend[0]]
+        readable = CustomJS(
+            args={"pulse": self._counter, "pause": self._pause, "words": words},
+            code=(_TEMPLATES / "page.js").read_text("utf-8"),
+        )
+        document.js_on_event(DocumentReady, readable)
         document.js_on_event(ConnectionLost, CustomJS(code="window.viewerLost = true"))
 
 

@@ -15,7 +15,7 @@ from gr_ros2.dashboard.views import PacketView, Snapshot, SpanView, TopicView
 from gr_ros2.link.events import AirKind
 from gr_ros2.link.ledger_rows import LedgerRow, row_order
 from gr_ros2.record.team import PairView
-from gr_ros2.report.colours import COLOURS, row_colour
+from gr_ros2.report.colours import COLOURS, ink_on, row_colour
 from gr_ros2.wire import BROADCAST
 
 Number = float | int | None
@@ -39,7 +39,7 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
     time = f"{snapshot.elapsed_s:.1f} s" + (f" of {snapshot.duration_s:g} s" if snapshot.duration_s else "")
     sent_now, received_now = snapshot.packets_now
     refused = sum(count for name, count in snapshot.packets.items() if name.startswith("rejected_"))
-    phase = _STATES.get(snapshot.state, _PHASES[snapshot.phase])
+    phase = state_text(snapshot)
     tiles = [
         _tile("phase", phase, snapshot.name or "no run", css=f"phase {snapshot.phase} {snapshot.state}"),
         _tile("elapsed", time, "time"),
@@ -62,10 +62,15 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
     return f'<div class="tiles">{"".join([*tiles, *_repair_tiles(snapshot)])}</div>'
 
 
+def state_text(snapshot: Snapshot) -> str:
+    """The state of the run or link in words."""
+    return _STATES.get(snapshot.state, _PHASES[snapshot.phase])
+
+
 def alarms_html(snapshot: Snapshot) -> str:
-    """What is wrong now; a screen reader says it when it changes."""
+    """What is wrong now."""
     lines = "".join(f"<li>{escape(alarm)}</li>" for alarm in snapshot.alarms)
-    return f'<div role="status" aria-live="polite">{f"<ul class=alarms>{lines}</ul>" if lines else ""}</div>'
+    return f"<ul class=alarms>{lines}</ul>" if lines else ""
 
 
 def heard_html(snapshot: Snapshot) -> str:
@@ -208,7 +213,7 @@ def _topic_row(topic: TopicView, rows: list[str]) -> str:
             cells += f'<td{first} data-field="{name}"{data}>{write(value)}</td>'
     bar = "".join(
         f'<i data-row="{escape(row)}" data-value="{count}" title="{escape(row)}: {count}" '
-        f'style="flex:{count};background:{row_colour(row)}">{count if count * 12 > topic.sent else ""}</i>'
+        f'style="flex:{count};{_filled(row_colour(row))}">{count if count * 12 > topic.sent else ""}</i>'
         for row in rows
         if (count := topic.ledger.get(row, 0))
     )
@@ -216,6 +221,10 @@ def _topic_row(topic: TopicView, rows: list[str]) -> str:
         f'<tr data-topic="{escape(topic.name)}"><td class="name"><i style="background:{colour(topic.colour)}"></i>'
         f'{escape(topic.name)}</td>{cells}<td class="first ledger"><div class="bar">{bar}</div></td></tr>'
     )
+
+
+def _filled(ink: str) -> str:
+    return f"background:{ink};color:{ink_on(ink)}"
 
 
 def paths_html(snapshot: Snapshot) -> str:
@@ -271,5 +280,5 @@ def _packet(packet: PacketView) -> str:
 
 
 def _span(span: SpanView) -> str:
-    fill = f";background:{colour(span.colour)}" if span.text else ""
+    fill = f";{_filled(colour(span.colour))}" if span.text else ""
     return f'<i class="{span.kind}" style="flex:{span.size}{fill}">{escape(span.text)}</i>'

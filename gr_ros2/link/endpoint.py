@@ -159,6 +159,8 @@ class HeardRobot:
     :param snr_db: SNR of its newest packets, dB; None if it is not measured packet by packet
     :param loss: share of its packets that were lost lately, 0..1
     :param topics: number of topics and services that it has announced
+    :param hops: robots that have sent its newest message on; 0 where it is heard itself
+    :param over: where it is not heard: the neighbour over which it is reached, None if no way is known
     """
 
     robot: int
@@ -169,6 +171,8 @@ class HeardRobot:
     snr_db: float | None
     loss: float
     topics: int
+    hops: int = 0
+    over: int | None = None
 
 
 class Questions(Protocol):

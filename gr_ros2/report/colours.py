@@ -24,3 +24,14 @@ OUTCOME_COLOURS = {"heard by all": "#0072b2", "not by all": "#e69f00", "overlapp
 def row_colour(row: str) -> str:
     """The colour of a ledger row. A row that this version does not know also has a fixed colour."""
     return ROWS[row].colour if row in ROWS else COLOURS[sum(row.encode()) % len(COLOURS)]
+
+
+def ink_on(background: str) -> str:
+    """Black or white, whichever has more contrast on a colour, by WCAG 2.
+
+    :param background: #rrggbb
+    """
+    channels = (int(background[start : start + 2], 16) / 255 for start in (1, 3, 5))
+    linear = (value / 12.92 if value <= 0.03928 else ((value + 0.055) / 1.055) ** 2.4 for value in channels)
+    luminance = sum(weight * value for weight, value in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    return "#000000" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "#ffffff"

@@ -7,7 +7,7 @@ left out.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from gr_ros2.report.table import milliseconds
 _KINDS = {"new": "new messages", "repair": "repair", "report": "reports", "hello": "hellos"}
 _BEHIND = 0.01
 """A link falls behind if its latency grows by more than this share of the run. Otherwise its queues just fluctuate."""
+_ABOVE = 1.05
+"""More airtime than this part of the time means that several sent at once."""
 _SLOW = 0.01
 """A clock that lags behind real time by more than this share of the run is named."""
 _UNSEEN = 0.0005
@@ -38,7 +40,7 @@ def explanation(result: Result, trace: Trace) -> list[str]:
         *air_lines(result),
         *_capacity(result, trace, packets),
         *_packets(result, packets),
-        *_in_flight(trace, packets),
+        *_in_flight(result, trace, packets),
         *_trend(result, trace),
     ]
 
@@ -84,7 +86,7 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     if passed - came:
         text += f", {passed - came:,} were lost on the way"
     if len(t_sent) - passed:
-        text += f", {len(t_sent) - passed:,} had not come out of the PHY by the end"
+        text += f", {len(t_sent) - passed:,} left after the last that arrived (lost, or in the PHY at the end)"
     yield text + "."
     wanted, complete, whole = _fragments(packets, passed)
     if wanted > 1.05 and came < passed:
@@ -97,36 +99,44 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
 
 
 def air_lines(result: Result) -> Iterator[str]:
-    """How busy the air was, and with what."""
+    """Which part of the time the air was in use, and for what."""
     senders: dict[str, dict[str, float]] = result.phy.get("airtime_of_senders_s") or {}
     span = result.phy.get("air_span_s")
-    if not senders or not span or result.config.get("time") == "unthrottled":
-        return
-    spent: Counter[str] = Counter()
-    for kinds in senders.values():
-        spent.update(kinds)
-    shared = result.config.get("duplex") == "half" or len(senders) == 1
-    if shared:
-        yield f"The air was busy {_busy(spent, span)}."
-    elif len(senders) <= _CHANNELS:
+    if senders and span and result.config.get("time") != "unthrottled":
         sending = {str(topic.src_id) for topic in result.topics}
-        back = [src_id for src_id in senders if src_id not in sending]
-        names = {src_id: f"the channel back from receiver {number}" for number, src_id in enumerate(back, 1)}
-        if len(back) == 1:
-            names[back[0]] = "the channel back"
-        each = (
-            f"{names.get(src_id, f'the channel of robot {src_id}')} {_busy(kinds, span)}"
-            for src_id, kinds in senders.items()
-        )
-        yield f"How busy the air was: {'; '.join(each)}."
-    else:
-        yield f"The air was busy, on an average robot's channel, {_busy(spent, span * len(senders))}."
+        yield air_line(senders, span, sending, shared=result.config.get("duplex") == "half")
+
+
+def air_line(senders: Mapping[str, Mapping[str, float]], span: float, sending: Container[str], *, shared: bool) -> str:
+    """Which part of the time the air is in use, and for what.
+
+    :param senders: s of airtime, by source id and kind of packet
+    :param span: s from the first packet to the end of the last
+    :param sending: source ids that send messages; others only report
+    :param shared: whether all use one channel
+    """
+    together: Counter[str] = Counter()
+    for kinds in senders.values():
+        together.update(kinds)
+    if shared or len(senders) == 1:
+        return f"Air in use: {_busy(together, span)}."
+    if len(senders) > _CHANNELS:
+        return f"Air in use, on an average robot's channel: {_busy(together, span * len(senders))}."
+    back = [src_id for src_id in senders if src_id not in sending]
+    names = {src_id: f"the channel back from receiver {number}" for number, src_id in enumerate(back, 1)}
+    if len(back) == 1:
+        names[back[0]] = "the channel back"
+    each = (
+        f"{names.get(src_id, f'the channel of robot {src_id}')} {_busy(kinds, span)}"
+        for src_id, kinds in senders.items()
+    )
+    return f"Air in use: {'; '.join(each)}."
 
 
 def _busy(kinds: Mapping[str, float], span: float) -> str:
-    """Share of the time, with its parts where there are several."""
+    """Share of the time, with its parts where there are several. Above 1 where robots send at the same time."""
     share = sum(kinds.values()) / span
-    text = f"{_percent(min(share, 1.0))} of the time"
+    text = f"{_percent(min(share, 1.0))} of the time" + (", often by several at once" if share > _ABOVE else "")
     by_share = sorted(kinds.items(), key=lambda kind: -kind[1])
     parts = [
         (_KINDS.get(kind, kind), part) for kind, spent in by_share if (part := spent / span) > _UNSEEN or part == share
@@ -136,7 +146,7 @@ def _busy(kinds: Mapping[str, float], span: float) -> str:
     return f"{text}, with {parts[0][0]}" if parts else text
 
 
-def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
+def _in_flight(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     """Where the messages in flight were at the end."""
     left: dict[tuple[int, int], int] = {}
     for src_id, serial, total in _messages_sent(packets)[0]:
@@ -153,8 +163,9 @@ def _in_flight(trace: Trace, packets: Packets) -> Iterator[str]:
                 under_way += 1
             else:
                 gone += 1
+    waited = "waited in the PHY, on the air or for repair" if air_uses(result) else "waited in the PHY or on the air"
     where = {
-        "had left the source whole and waited in the PHY or on the air": gone,
+        f"had left the source whole and {waited}": gone,
         "had left in part": under_way,
         "had not left the source's queue": waiting,
     }
@@ -178,11 +189,12 @@ def _trend(result: Result, trace: Trace) -> Iterator[str]:
         )
 
 
-def lateness_lines(result: Result) -> Iterator[str]:
-    """Whether the computer kept up with the run's clock: one sentence where it did not."""
+def lateness_lines(result: Result) -> list[str]:
+    """Whether the computer kept up with the run's clock: a sentence where it did not."""
+    lines = []
     slow_s = result.counters.get("medium", {}).get("slow_s", 0.0)
     if slow_s > _SLOW * result.duration_s:
-        yield (
+        lines.append(
             f"The computer carried {len(result.config['robots'])} robots at "
             f"{_percent(result.duration_s / (result.duration_s + slow_s))} of real time: "
             f"{_seconds(result.duration_s)} on their clock took {_seconds(slow_s)} longer. Nothing is lost by it, but "
@@ -190,21 +202,20 @@ def lateness_lines(result: Result) -> Iterator[str]:
         )
     late = result.lateness
     if late is None or not late.moments:
-        return
-    part, worst = max(late.worst_s.items(), key=lambda item: item[1])
-    others = ", ".join(f"{name} {_seconds(value)}" for name, value in late.worst_s.items() if name != part)
+        return lines
+    parts = sorted(late.worst_s.items(), key=lambda item: -item[1])
+    worst = ", ".join(f"{name} {_seconds(value)}" for name, value in parts)
     times = "once" if late.moments == 1 else f"{late.moments:,} times"
     text = (
-        f"The computer did not keep up with the clock: it was up to {_seconds(worst)} late "
-        f"({part}{'; ' + others if others else ''}), {times} by {milliseconds(LATE_S)} ms or more, "
-        f"{_percent(min(late.share, 1.0))} of the run"
+        f"The computer did not keep up with the clock: {times} it was {LATE_S * 1e3:.0f} ms late or more, for "
+        f"{_percent(min(late.share, 1.0))} of the run (at most: {worst}); latencies include that"
     )
     if late.lost:
         text += (
             f"; {_percent(late.lost_after / late.lost)} of the losses follow such moments, as do "
             f"{_percent(late.sent_after / late.sent)} of all messages"
         )
-    yield text + "."
+    return [*lines, f"{text}."]
 
 
 def _entries_per_message(packets: Packets, topic: str) -> float:

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.result import Result, TopicResult, air_uses
+from gr_ros2.record.team_numbers import TEAM_VALUES, team_numbers
 
 _DASH = "–"
 PAPER = "the paper"
@@ -44,23 +45,26 @@ _TABLE_6 = ("Duration [s]", "Sent", "Recv", "PDR", "Goodput [B/s]")
 
 
 def summary_grid(results: Sequence[Result]) -> Grid:
-    """One line per topic: config, duration, sent, received, PDR and goodput as in the paper's table 6, and latency."""
+    """One line per topic: sent, received, PDR and goodput as in the paper's table 6, and latency. Of several runs also
+    their names and durations."""
+    several = len(results) > 1
+    table_6 = slice(None) if several else slice(1, None)
     return Grid(
         "Delivery and latency",
-        ("Config", "Topic", *_TABLE_6, "p50 [ms]", "p95 [ms]", "p99 [ms]"),
+        (*(("Config",) if several else ()), "Topic", *_TABLE_6[table_6], "p50 [ms]", "p95 [ms]", "p99 [ms]"),
         tuple(
             tuple(
                 (
-                    result.scenario,
+                    *((result.scenario,) if several else ()),
                     name,
-                    *_table_6(result, topic),
+                    *_table_6(result, topic)[table_6],
                     *(milliseconds(value) for value in (topic.latency_s.p50, topic.latency_s.p95, topic.latency_s.p99)),
                 )
                 for name, topic in _at_every_receiver(result)
             )
             for result in results
         ),
-        texts=2,
+        texts=2 if several else 1,
     )
 
 
@@ -77,6 +81,13 @@ def paper_grid(results: Sequence[Result]) -> Grid:
         ]
         sections.append((theirs, *ours))
     return Grid("Table 6 of the paper, and odometry here", ("Config", "Run", *_TABLE_6), tuple(sections), texts=2)
+
+
+def team_grid(result: Result) -> Grid | None:
+    """What all robots of a run together achieved; None where there are none."""
+    numbers = team_numbers(result)
+    lines = tuple((TEAM_VALUES.get(name, name), f"{value:.3g}") for name, value in numbers.items() if value is not None)
+    return Grid("The team", ("Number", "value"), (lines,)) if lines else None
 
 
 def ledger_grid(result: Result) -> Grid:
@@ -162,7 +173,7 @@ def packets_line(result: Result) -> str:
         for name, count in result.packets.items()
         if name in ("sent", "received") or (count and not name.startswith("air_"))
     ]
-    return f"packets: {', '.join(counts)}"
+    return f"Packets of every kind: {', '.join(counts)}."
 
 
 def paper_results(results: Sequence[Result]) -> list[Result]:
@@ -173,8 +184,8 @@ def paper_results(results: Sequence[Result]) -> list[Result]:
 def _path_note(topic: TopicResult) -> str:
     rms = number(topic.rms_error_m, "{:.3f} m")
     return (
-        f"{topic.topic}: the received path runs {topic.path_error_m:.3f} m beside the sent path; at equal times the "
-        f"positions are {rms} apart (RMS)"
+        f"{topic.topic}: the received path deviates from the sent path by {topic.path_error_m:.3f} m; at equal "
+        f"times the positions are {rms} apart (RMS)."
     )
 
 

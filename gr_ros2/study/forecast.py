@@ -27,6 +27,7 @@ from gr_ros2.medium.loss_table import LossCurve
 from gr_ros2.medium.positions import Positions
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
+from gr_ros2.report.explain import air_line
 from gr_ros2.run.load import make_phys, source_names
 from gr_ros2.run.robots import surroundings
 from gr_ros2.run.scenario import Scenario
@@ -63,8 +64,10 @@ class TopicForecast:
     """One topic.
 
     :param offered_hz: messages/s given to the source
+    :param wanted_hz: of those the messages/s that its ``max_rate`` lets pass
     :param message_bytes: mean, serialized
     :param air_bytes: mean per message on the air, coded where the link compresses, without headers
+    :param src_id: of the robot that sends it
     :param load: part of the airtime allowed, to all robots that share it, that all its messages would take, at the mean
         cost of those sent
     :param share: part of the airtime of the packets that left the source; above 1 is possible where the source is not
@@ -73,7 +76,9 @@ class TopicForecast:
     """
 
     topic: str
+    src_id: int
     offered_hz: float
+    wanted_hz: float
     message_bytes: float
     air_bytes: float
     load: float
@@ -88,10 +93,11 @@ class Forecast:
 
     :param airtime_s: of one packet
     :param capacity: packets/s the radio carries
-    :param used: part of the airtime that is used, 0..1
-    :param allowed: part of the airtime that may be used, 0..1; loads are parts of this
+    :param used: part of the airtime that is used, 0..1; of the busiest channel, where each robot has its own
     :param air_bytes_per_message: packet bytes on the air per message delivered, PAD and headers included
     :param pad: part of the packets' bytes that is PAD
+    :param allowed: part of the airtime that may be used, 0..1; loads are parts of this
+    :param shared: whether all robots use one channel
     """
 
     packet_len: int
@@ -101,14 +107,20 @@ class Forecast:
     air_bytes_per_message: float | None
     pad: float
     allowed: float
+    shared: bool
     topics: tuple[TopicForecast, ...]
     air: Mapping[str, float] = field(default_factory=dict)
     """Packets per message sent, by their purpose: new messages, repair, reports, hellos."""
+    in_use: str = ""
+    """Which part of the time the air is in use, and for what: a sentence as in the report of a run."""
 
     @property
     def load(self) -> float:
-        """Part of the airtime allowed that all messages would take; above 1 they do not fit."""
-        return sum(topic.load for topic in self.topics)
+        """Part of the airtime allowed that all messages would take, on the busiest channel; above 1 they do not fit."""
+        channels: Counter[int] = Counter()
+        for topic in self.topics:
+            channels[0 if self.shared else topic.src_id] += topic.load  # type: ignore[assignment]
+        return max(channels.values(), default=0.0)
 
 
 @dataclass(frozen=True)
@@ -176,6 +188,13 @@ class Advice:
         weight = sum(effect.weight for effect in self.effects)
         gains = [effect.weight * np.log(effect.age_s[0] / effect.age_s[1]) for effect in self.effects]
         return float(sum(gains) / weight) if weight else 0.0
+
+    @property
+    def more(self) -> float:
+        """By how much the share of messages that arrive rises: weighted mean over the topics, 0 where none does."""
+        weight = sum(effect.weight for effect in self.effects)
+        rises = [effect.weight * (effect.pdr[1] - effect.pdr[0]) for effect in self.effects if effect.more]
+        return sum(rises) / weight if weight else 0.0
 
     @property
     def worth_it(self) -> bool:
@@ -258,7 +277,7 @@ class Planner:
 
     def advice(self) -> list[Advice]:
         """Single changes that make topics younger or save airtime. Changes that make no topic worse come first; within
-        each group the best comes first.
+        each group those after which more arrives, then the best.
 
         Each change is tried on the first seconds of the traffic, and compared with the present settings on the same
         seconds.
@@ -267,7 +286,7 @@ class Planner:
         now = self._forecast(base)
         tried = [self._compared(setting, now, self._forecast(variant)) for setting, variant in self._variants(base)]
         proposed = [advice for advice in tried if advice.worth_it]
-        return sorted(proposed, key=lambda advice: (not advice.harmless, -advice.gain, advice.forecast.used))
+        return sorted(proposed, key=lambda advice: (not advice.harmless, -advice.more, -advice.gain, advice.used[1]))
 
     def _compared(self, setting: str, now: Forecast, then: Forecast) -> Advice:
         """The effect of a change on each topic."""
@@ -291,7 +310,7 @@ class Planner:
             yield "ros_source.packet_rate=auto", _sending(base, lambda own: replace(own, packet_rate=AUTO))
         for packet_len in self._packet_lens():
             yield f"packet_len={packet_len}", _with_packet_len(base, packet_len)
-        if len(base.directions()) > 1 and base.medium == "exclusive":
+        if base.duplex == "half" and len(base.directions()) > 1 and base.medium == "exclusive":
             yield "medium=slots", replace(base, medium="slots")
 
     def _packet_lens(self) -> list[int]:
@@ -342,18 +361,19 @@ class Planner:
         return cuts
 
     def _demand(self, forecast: Forecast) -> tuple[dict[str, float], dict[str, float]]:
-        """Messages/s that a robot offers, and the load of all robots, by rows of the registry."""
+        """Messages/s that a robot offers, and the load of its channel, by rows of the registry."""
         rows: dict[str, list[TopicForecast]] = {}
         for topic in forecast.topics:
             if topic.load:
                 rows.setdefault(self._rows[topic.topic], []).append(topic)
         offered = {row: fmean(topic.offered_hz for topic in topics) for row, topics in rows.items()}
-        return offered, {row: sum(topic.load for topic in topics) for row, topics in rows.items()}
+        together = sum if forecast.shared else max
+        return offered, {row: together(topic.load for topic in topics) for row, topics in rows.items()}
 
     def _fair_rates(self, topics: Mapping[str, tuple[float, float]]) -> dict[str, float]:
         """Messages/s of the topics that have to be cut, 0 for those that are left out.
 
-        :param topics: by row of the registry: load of all robots, and messages/s of each
+        :param topics: by row of the registry: load of a channel, and messages/s of each robot
         """
         kept = dict(topics)
         while True:
@@ -415,7 +435,8 @@ class Planner:
         airtime = phy.airtime()
         codec = self._codec(scenario.ros_source.compresses)
         rule = scenario.airtime.rule
-        allowed = 1.0 if rule is None else min(1.0, len(ways) * sustained(rule))
+        shared = scenario.duplex == "half"
+        allowed = 1.0 if rule is None else min(1.0, (len(ways) if shared else 1) * sustained(rule))
         duration = scenario.duration_s or self._messages[0][-1].t
         topic_ids: dict[tuple[int, str], int] = {}
         rates_hz: dict[tuple[int, int], float] = {}
@@ -432,15 +453,17 @@ class Planner:
                 payloads[src_id, message.topic_id].append(message.payload)
         shares: Counter[tuple[int, int]] = Counter()
         padded = sent_bytes = 0
-        spent = 0.0
+        senders: dict[str, Counter[str]] = {}
+        begun, ended = np.inf, 0.0
 
         wire = scenario.ros_source.wire_format
 
         def share(sent: SentPacket) -> None:
-            nonlocal padded, sent_bytes, spent
+            nonlocal padded, sent_bytes, begun, ended
             own_airtime = phy.airtime(len(sent.data))
-            spent += own_airtime
+            senders.setdefault(str(sent.identity.src_id), Counter())[sent.kind] += own_airtime  # type: ignore[assignment]
             sent_bytes += len(sent.data)
+            begun, ended = min(begun, sent.now), max(ended, sent.now + own_airtime)
             layout = wire.layout(sent.packet, scenario.packet_len, len(sent.data))
             padded += sum(span.size for span in layout if span.kind == "pad")
             whole = sum(span.size for span in layout if span.entry is not None)
@@ -468,26 +491,33 @@ class Planner:
             topics.append(
                 TopicForecast(
                     topic=result.topic,
+                    src_id=result.src_id,
                     offered_hz=len(mine) / duration,
+                    wanted_hz=(wanted_hz := min(len(mine) / duration, rates_hz[key])),
                     message_bytes=float(np.mean([len(payload) for payload in mine])) if mine else 0.0,
                     air_bytes=float(np.mean(sizes)) if mine else 0.0,
-                    load=cost * min(len(mine) / duration, rates_hz[key]) / allowed,
+                    load=cost * wanted_hz / allowed,
                     share=shares[key] / duration,
                     rate_hz=result.delivered / duration,
                     result=result,
                 )
             )
         delivered = sum(topic.result.delivered for topic in topics)
+        spent = [float(kinds.total()) for kinds in senders.values()]
+        span = max(ended - begun, airtime)
+        sending = {str(way.ros_source.src_id()) for way in ways}
         return Forecast(
             packet_len=scenario.packet_len,
             airtime_s=airtime,
             capacity=allowed / airtime,
-            used=min(spent / duration, 1.0),
+            used=min((sum(spent) if shared else max(spent, default=0.0)) / span, 1.0),
             air_bytes_per_message=sent_bytes / delivered if delivered else None,
             pad=padded / sent_bytes if sent_bytes else 0.0,
             allowed=allowed,
+            shared=shared,
             topics=tuple(topics),
             air=_air(run),
+            in_use=air_line(senders, span, sending, shared=shared) if senders else "",
         )
 
 

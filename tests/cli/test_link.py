@@ -154,7 +154,9 @@ def test_two_robots_in_one_line_each(tmp_path: Path) -> None:
 def test_what_passes_is_told_always_and_the_rest_where_there_is_any() -> None:
     quiet = "12 s; sent 8 messages in 90 packets; received 5 messages in 60 packets"
     assert status_line(stats(None)) == quiet
-    assert status_line(stats(17.26, missing=3, damaged=2)) == (quiet + "; about 3 packets lost; SNR 17.3 dB; 2 damaged")
+    assert status_line(stats(17.26, missing=3, damaged=2)) == (
+        quiet + "; packets lost: about 3; SNR 17.3 dB; 2 damaged"
+    )
     assert status_line(stats(None, lost=6, unpublished=4)) == (
         quiet + "; 6 messages lost on the ROS graph before they were sent; 4 messages not published"
     )

@@ -53,6 +53,41 @@ look(document);
 """Bokeh's models live in shadow roots."""
 
 
+FOCUSED = """
+let node = document.activeElement;
+while (node.shadowRoot?.activeElement) node = node.shadowRoot.activeElement;
+const ring = getComputedStyle(node), name = node.getAttribute("aria-label") || node.innerText;
+return [name, ring.outlineStyle, ring.outlineWidth, node === document.body];
+"""
+"""The element with the keyboard's focus: its name, and the ring around it."""
+PALE = """
+const parts = text => text.match(/[\\d.]+/g).map(Number);
+const light = rgb => rgb.slice(0, 3).map(v => (v /= 255) <= .03928 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4)
+    .reduce((sum, v, place) => sum + v * [.2126, .7152, .0722][place], 0);
+const above = node => node.parentElement ?? node.getRootNode().host;
+const behind = node => {
+    for (; node; node = above(node)) {
+        const rgba = parts(getComputedStyle(node).backgroundColor);
+        if (rgba.length < 4 || rgba[3] > .5) return rgba;
+    }
+    return [255, 255, 255];
+};
+const pale = [];
+const look = root => {
+    for (const node of root.querySelectorAll("*")) {
+        if (node.shadowRoot) look(node.shadowRoot);
+        const says = [...node.childNodes].some(child => child.nodeType === 3 && child.textContent.trim());
+        if (!says || ["STYLE", "SCRIPT", "TITLE"].includes(node.tagName) || !node.checkVisibility()) continue;
+        const [one, other] = [light(parts(getComputedStyle(node).color)), light(behind(node))];
+        if ((Math.max(one, other) + .05) / (Math.min(one, other) + .05) < 4.5) pale.push(node.outerHTML.slice(0, 120));
+    }
+};
+look(document);
+return pale;
+"""
+"""Texts with less contrast than WCAG 2 asks of small text."""
+
+
 class Viewer:
     """One browser."""
 
@@ -98,6 +133,11 @@ class Viewer:
     def button(self, label: str) -> Any:
         (found,) = (one for one in self.run(f"{FIND} return found", ".bk-btn") if one.text == label)
         return found
+
+    def scheme(self, name: str) -> None:
+        """Bright or dark, as the system is set."""
+        features = {"features": [{"name": "prefers-color-scheme", "value": name}]}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", features)
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
         wait_for(condition, what)
@@ -270,18 +310,50 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
         assert viewer.numbers()["sent"] - before < 20 * 5
         viewer.button("Pause").click()
         viewer.wait(lambda: viewer.numbers()["sent"] > before + 20, "numbers that move again")
-        viewer.driver.execute_cdp_cmd(
-            "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
-        )
-        viewer.driver.set_window_size(400, 1600)
-        viewer.wait(lambda: viewer.run("return document.documentElement.scrollWidth <= innerWidth"), "a phone's width")
+        viewer.scheme("dark")
+        phone = {"width": 360, "height": 1600, "deviceScaleFactor": 1, "mobile": True}
+        viewer.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", phone)
+        wide = "return [document.documentElement.scrollWidth, innerWidth]"
+        viewer.wait(lambda: viewer.run(wide) == [360, 360], "a phone's width")
         assert viewer.run("return getComputedStyle(document.body).backgroundColor") == "rgb(20, 24, 29)"
         picture("phone-dark")
         stop(process, tmp_path / "out")
-        viewer.driver.set_window_size(1500, 1600)
+        viewer.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         viewer.wait(viewer.gone, "the page to notice that the program has ended")
         picture("ended")
     assert not viewer.text(".alarms li")
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_it_can_be_used_with_a_keyboard_and_a_screen_reader_and_read_in_both_modes(
+    viewer: Viewer, tmp_path: Path
+) -> None:
+    with program(tmp_path / "out", 0, "version=1", "reports={}") as (_, url):
+        viewer.driver.get(url)
+        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 20, "deliveries")
+        stops = []
+        while True:
+            webdriver.ActionChains(viewer.driver).send_keys(Keys.TAB).perform()
+            name, *ring, over = viewer.run(FOCUSED)
+            if over:
+                break
+            assert ring == ["solid", "3px"], name
+            stops.append(name)
+        sliders = ["SNR in the sampled band [dB]", "carrier offset [1/1000 of the sample rate]", "packets lost [%]"]
+        assert stops == ["Pause", "stop sending", "noise", *sliders]
+        assert viewer.button("Pause").get_attribute("aria-pressed") == "false"
+        viewer.button("Pause").send_keys(Keys.SPACE)
+        viewer.wait(lambda: viewer.button("Pause").get_attribute("aria-pressed") == "true", "a pressed toggle")
+        viewer.button("Pause").send_keys(Keys.SPACE)
+        for scheme in ("light", "dark"):
+            viewer.scheme(scheme)
+            viewer.wait(lambda: viewer.run(PALE) == [], f"texts that can be read on a {scheme} page")
+        # A screen reader says what is in an element that stays and has the role of a status.
+        viewer.slide(LOSS, Keys.END)
+        viewer.wait(
+            lambda: "heard" in viewer.run("return document.querySelector('[role=status]').textContent"), "alarm"
+        )
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ def test_both_directions_deliver_everything_and_are_told_apart(tmp_path: Path) -
     assert result.counters["source"]["packets"] + result.counters["back"]["source"]["packets"] == result.packets["sent"]
     write_report(read_runs([tmp_path]), tmp_path)
     page = (tmp_path / "report.html").read_text()
-    assert re.search(r"How busy the air was: the channel of robot 1 \d+%.*; the channel of robot 2 \d+%", page)
+    assert re.search(r"Air in use: the channel of robot 1 \d+%.*; the channel of robot 2 \d+%", page)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
 from types import ModuleType
@@ -428,8 +428,9 @@ def test_the_first_example_shows_its_robots_topics_and_what_the_sliders_do(tmp_p
 
 
 @pytest.fixture(scope="module")
-def drawings() -> dict[str, list[tuple[str, tuple[float, float, float, float]]]]:
-    """Name and rectangle of every block of every example, px, as GNU Radio Companion draws them."""
+def drawings() -> dict[str, Any]:
+    """Name and rectangle of every block of every example, px, as GNU Radio Companion draws them; and of every wire the
+    blocks at its ends, and the points of its two lines and of the Bezier curve between them."""
     pytest.importorskip("gi", reason="needs GTK; Debian: apt-get install gir1.2-gtk-3.0")
     if not shutil.which("xvfb-run"):
         pytest.skip("needs a screen; Debian: apt-get install xvfb")
@@ -438,7 +439,7 @@ def drawings() -> dict[str, list[tuple[str, tuple[float, float, float, float]]]]
         ["xvfb-run", "-a", sys.executable, "-c", DRAW, *map(str, EXAMPLES)], env=environ, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    found: dict[str, list[tuple[str, tuple[float, float, float, float]]]] = json.loads(done.stdout.splitlines()[-1])
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
 
@@ -471,10 +472,18 @@ for path in sys.argv[1:]:
     for block in graph.blocks:
         block.create_labels()
         block.create_shapes()
-    found[path] = [
+    blocks = [
         [block.name, [*block.coordinate, block.coordinate[0] + block.width, block.coordinate[1] + block.height]]
         for block in graph.blocks
     ]
+    wires = []
+    for wire in graph.connections:
+        wire.create_shapes()
+        start, end = wire.source_port.connector_coordinate_absolute, wire.sink_port.connector_coordinate_absolute
+        places = [start, *([x + a, y + b] for (x, y), (a, b) in zip((start, start, end, end, end), wire._rel_points))]
+        ends = [wire.source_block.name, wire.sink_block.name]
+        wires.append([ends, places])
+    found[path] = [blocks, wires]
 print(json.dumps(found))
 """
 
@@ -482,7 +491,7 @@ print(json.dumps(found))
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_no_block_of_an_example_is_drawn_over_another(path: Path, drawings: dict[str, Any]) -> None:
-    blocks = drawings[str(path)]
+    blocks, _ = drawings[str(path)]
     assert len(blocks) > 3
     over = [
         f"{one} and {other}"
@@ -491,3 +500,31 @@ def test_no_block_of_an_example_is_drawn_over_another(path: Path, drawings: dict
         if a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
     ]
     assert over == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_every_wire_of_an_example_can_be_followed(path: Path, drawings: dict[str, Any]) -> None:
+    blocks, wires = drawings[str(path)]
+    assert wires
+    under = {
+        f"{' to '.join(ends)} under {name}"
+        for ends, points in wires
+        for name, (left, top, right, bottom) in blocks
+        for x, y in _places(points)
+        if left + 2 < x < right - 2 and top + 2 < y < bottom - 2
+    }
+    assert under == set()
+
+
+Point = tuple[float, float]
+
+
+def _places(wire: Sequence[Point]) -> Iterator[Point]:
+    """Places along a wire: its ends, and the Bezier curve between two short lines."""
+    start, *curve, end = wire
+    yield from (start, end)
+    for t in (step / 60 for step in range(61)):
+        weights = ((1 - t) ** 3, 3 * (1 - t) ** 2 * t, 3 * (1 - t) * t**2, t**3)
+        x, y = (sum(w * point[axis] for w, point in zip(weights, curve, strict=True)) for axis in (0, 1))
+        yield x, y

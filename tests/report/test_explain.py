@@ -26,10 +26,10 @@ def test_sentences_are_computed_from_the_run(tmp_path: Path) -> None:
         "2 (4%) too large for the packet length, 6 (12%) still in flight at the end."
     )
     # 74 packets of 10 ms; the last of them left 3.62 s after the first
-    assert air == f"The air was busy {0.74 / 3.63:.0%} of the time, with new messages."
+    assert air == f"Air in use: {0.74 / 3.63:.0%} of the time, with new messages."
     assert packets == (
         "Of 74 packets with messages, 58 (78%) arrived, 8 were lost on the way, "
-        "8 had not come out of the PHY by the end."
+        "8 left after the last that arrived (lost, or in the PHY at the end)."
     )
     assert "of 41 messages that left whole 33 (80%) arrived complete" in fragments
     assert in_flight == (
@@ -76,13 +76,14 @@ def test_a_computer_that_was_late_is_named_first(tmp_path: Path) -> None:
     run = make_run(tmp_path)
     late = replace(run.result, lateness=LATE)
     assert explanation(late, run.trace)[0] == (
-        "The computer did not keep up with the clock: it was up to 240 ms late (threads; gate 60.0 ms, modem 12.0 ms), "
-        "3 times by 50.0 ms or more, 4% of the run; 31% of the losses follow such moments, as do 10% of all messages."
+        "The computer did not keep up with the clock: 3 times it was 50 ms late or more, for 4% of the run (at most: "
+        "threads 240 ms, gate 60.0 ms, modem 12.0 ms); latencies include that; 31% of the losses follow such moments, "
+        "as do 10% of all messages."
     )
     without = replace(late, lateness=replace(LATE, lost=0, lost_after=0, moments=1, worst_s={"threads": 0.24}))
     assert explanation(without, run.trace)[0] == (
-        "The computer did not keep up with the clock: it was up to 240 ms late (threads), once by 50.0 ms or more, "
-        "4% of the run."
+        "The computer did not keep up with the clock: once it was 50 ms late or more, for 4% of the run (at most: "
+        "threads 240 ms); latencies include that."
     )
 
 

@@ -53,7 +53,7 @@ def test_twenty_robots_have_a_table_each(tmp_path: Path) -> None:
     assert sum(topic.delivered for topic in result.topics) > 0
     again = read_result(write_result(result, tmp_path / "result.json"))
     assert again.receivers == result.receivers
-    assert "/robot_3/odom at /robot_2" in [line[1] for line in summary_grid([again]).sections[0]]
+    assert "/robot_3/odom at /robot_2" in [line[0] for line in summary_grid([again]).sections[0]]
 
 
 def levels(around: Surroundings) -> list[list[tuple[int, float]]]:

@@ -91,7 +91,7 @@ def test_every_receiver_has_losses_of_its_own(tmp_path: Path) -> None:
     assert repaired[2] > 1.3 * repaired[0]
     again = read_result(write_result(result, tmp_path / "result.json"))
     assert again.receivers == result.receivers
-    names = [line[1] for line in summary_grid([again]).sections[0]]
+    names = [line[0] for line in summary_grid([again]).sections[0]]
     assert names == ["/robot_1/odom", "/robot_1/odom at receiver 2", "/robot_1/odom at receiver 3"]
     assert [line[0] for line in ledger_grid(again).sections[0]] == names
 

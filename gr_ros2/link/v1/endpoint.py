@@ -193,7 +193,10 @@ class EndpointV1:
 
     def peers(self, now: float) -> list[HeardRobot]:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""
-        return [
+        relaying = self._receiving.relaying
+        far = [] if relaying is None else relaying.robots(now, sealed=self.keys.sealed)
+        over = {robot.robot for robot in far}
+        return far + [
             HeardRobot(
                 neighbour.src_id,
                 now - neighbour.heard,
@@ -205,6 +208,7 @@ class EndpointV1:
                 len(neighbour.inbox.announced.topics),
             )
             for neighbour in self.neighbours
+            if neighbour.src_id not in over
         ]
 
     def knows(self, src_id: int) -> bool:

@@ -127,17 +127,26 @@ class ReceivingSide:
                 self._events.append(Gone(gone.src_id, gone.boot))
         if self.relaying is not None:
             self._events += self.relaying.handle_timeout(now)
+        for neighbour in self.neighbours:
+            neighbour.timeout = None
         self._messages.reported = bool(self._window.peers)
         events, self._events = self._events, []
         return events
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
-        times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
-        times += [n.heard + self._give_up_s for n in self.neighbours if not n.gone]
+        # Asked after each packet, so only its sender is looked at anew.
+        times = [n.timeout if n.timeout is not None else self._timeout(n) for n in self.neighbours]
         if self.relaying is not None and (at := self.relaying.next_timeout()) is not None:
             times.append(at)
-        return min(times, default=None)
+        soonest = min(times, default=inf)
+        return None if soonest == inf else soonest
+
+    def _timeout(self, neighbour: Neighbour) -> float:
+        waits = neighbour.inbox.next_timeout()
+        gone = inf if neighbour.gone else neighbour.heard + self._give_up_s
+        neighbour.timeout = gone if waits is None else min(waits, gone)
+        return neighbour.timeout
 
     def unpublished(self, event: Delivered) -> Lost:
         """Count a message that was delivered but not published on the ROS graph. A latched message may come again."""
@@ -154,6 +163,10 @@ class ReceivingSide:
             if opened is None or opened.new:  # what was here before says nothing about now
                 self._note_slot(header, arrival, now, trusted=opened is not None)
             if opened is None:
+                return
+            opened.neighbour.timeout = None
+            if not self._for_us(header):
+                self.stats.dropped["not_for_us"] += 1
                 return
             if arrival.snr_db is not None and opened.new:
                 opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
@@ -181,7 +194,7 @@ class ReceivingSide:
             self.neighbours.check_own(data, header)
             self.stats.dropped["own"] += 1
             return None
-        if header.dst_id not in (BROADCAST, own) and own != NOBODY:
+        if self._access is None and not self._for_us(header):  # where it is shared, all have to know whose slot it is
             self.stats.dropped["not_for_us"] += 1
             return None
         if header.sealed and not self._sealed:
@@ -189,6 +202,10 @@ class ReceivingSide:
         if self._sealed and not header.sealed:
             raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
         return self.neighbours.open(data, header, now)
+
+    def _for_us(self, header: Header) -> bool:
+        own = self._settings.src_id
+        return header.dst_id in (BROADCAST, own) or own == NOBODY
 
     def _use(self, arrival: ReceivedPacket, opened: Opened, now: float) -> bool:
         """Take an opened packet; returns whether packets that were kept until a proof can be taken now."""
@@ -248,7 +265,7 @@ class ReceivingSide:
             self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
         self._forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
-        if hears:
+        if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
             self._window.peers.meet(neighbour.src_id, now)
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from math import inf
 
 from gr_ros2.core.errors import WireError
+from gr_ros2.link.endpoint import HeardRobot
 from gr_ros2.link.events import Gone, Met
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.inbox import Events, Inbox
@@ -153,6 +154,20 @@ class Relaying:
         """Whether a start of a robot is reached over others."""
         known, at = self._here.get(src_id, (-1, -inf))
         return known == boot and now < at + STALE_S
+
+    def robots(self, now: float, *, sealed: bool) -> list[HeardRobot]:
+        """The robots that are not heard, but reached over others.
+
+        :param sealed: whether packets are sealed
+        """
+        found = []
+        for src_id, (boot, at) in self._here.items():
+            neighbour, inbox = self._neighbours.get(src_id), self._inbox(src_id, boot & 0xFFFF)
+            if inbox is not None and (neighbour is None or neighbour.gone):
+                hops, over = self.hops.get(src_id, 0), self.custody.routes.over(src_id, now, lambda _: True)
+                topics = len(inbox.announced.topics)
+                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, topics, hops, over))
+        return found
 
     def handle_timeout(self, now: float) -> Events:
         """Give up robots of which nothing comes any more."""

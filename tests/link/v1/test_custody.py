@@ -100,8 +100,10 @@ def test_a_robot_over_others_is_met_and_is_gone_when_nothing_of_it_comes() -> No
     line = line_of(*(robot(src_id) for src_id in (1, 2, 3)), loss=0.0)
     first, last = line.robots[0], line.robots[2]
     assert [event.boot for event in first.events if isinstance(event, Met) and event.src_id == 3] == [last.boot]
+    assert [(one.robot, one.hops, one.over) for one in first.end.peers(line.now)] == [(3, 1, 2), (2, 0, None)]
     line.robots.pop()
     line.run(30)
+    assert [one.robot for one in first.end.peers(line.now)] == [2]
     assert [event.boot for event in first.events if isinstance(event, Gone) and event.src_id == 3] == [last.boot]
 
 

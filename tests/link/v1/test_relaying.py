@@ -96,3 +96,26 @@ def test_a_topic_for_one_robot_comes_out_at_that_one_only_also_over_hops() -> No
     line.run(20)
     assert [len(one.delivered(1)) > 5 for one in line.robots] == [False, False, False, True]
     assert line.robots[1].end.received.lost[1, 0, "not_for_us"] > 5
+
+
+def test_packets_for_others_keep_their_slots_and_are_confirmed_by_that_robot_only() -> None:
+    """1 and 2 address each other, 3 and 4 all."""
+    addressed = {1: 2, 2: 1}
+    everybody = [
+        robot(src_id, topics=registry(goal=TopicOptions()), relay=False, dst_id=addressed.get(src_id, 255))
+        for src_id in (1, 2, 3, 4)
+    ]
+    line = Line(*everybody, loss=0.1)
+    line.near = lambda one: [other for other in range(4) if other != one]  # type: ignore[method-assign]
+    line.run(30)
+    said = [payload for src_id, payload in line.said if src_id == 1]
+    got = everybody[1].delivered(1)
+    assert got == said[: len(got)] and len(said) - len(got) < 5
+    for one in everybody:
+        assert isinstance(one.access, Slots)
+        assert not one.access.unheard(line.now)
+        assert one.access._robots.keys() == {1, 2, 3, 4} - {one.src_id}
+    assert not everybody[2].delivered(1)
+    assert everybody[2].delivered(4)
+    assert everybody[0].end.window.peers.all.keys() == {2}
+    assert everybody[2].end.received.dropped["not_for_us"] > 100
