@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 PAGE = "docs/four-robots.md"
 SHORTER = ("--duration", "20")
 """Instead of a minute: what the page says holds for it as well."""
-NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets")
+NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets", "live")
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +63,13 @@ def test_the_demo_fades_behind_obstacles_and_shows_it(walked: Path) -> None:
     assert all(team.beliefs.values())
     page = (walked / "demo" / "report.html").read_text("utf-8")
     assert "The channel while the robots enter" in page
+
+
+def test_in_real_time_each_robot_hears_the_others(walked: Path) -> None:
+    found, team = of(walked, "live")
+    assert len(found) == 12
+    assert share(found) >= 0.95
+    assert set(team.ways) == {1, 2, 3, 4}
 
 
 def test_in_slots_all_arrives_and_otherwise_little(walked: Path) -> None:
