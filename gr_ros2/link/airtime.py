@@ -8,7 +8,8 @@ of them. The lead can follow what the source was measured to need (:class:`Compo
 clock: ``now`` is seconds, monotonic. With a limit (:mod:`gr_ros2.link.airtime_limit`)
 a credit is granted only when the limit lets a longest packet begin, and a packet that comes without one and would
 have to wait for the limit is refused. While sending is switched off, nothing passes and no credit is granted. With
-``listens``, one packet at a time is queued or promised, and it waits until nobody else sends.
+``listens``, one packet at a time is queued or promised, and it waits until nobody else sends. While the device is not
+``ready``, packets wait too.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ LEAD_S = 0.005
 """s before the channel is free; a source needs this time to compose and hand over the next packet."""
 LEAST_LEAD_S = 0.001
 """s of lead at least where it is measured: a thread that sleeps wakes up as late as this now and then."""
+READY_S = 0.02
+"""s after which a device that was not ready is asked again."""
 MEASURED = 64
 """Packets whose composing times decide over the lead. The longest of so many is exceeded by one packet in 65, which
 then begins late by a part of a millisecond. On an idle computer: median 0.4 ms, 1 % above 1.4 ms. A lead of 5 ms keeps
@@ -77,12 +80,13 @@ class AirtimeClock(Generic[T]):
     :param timed: the device itself waits for the time that a packet asks for, which then leaves ``lead`` before it
     :param listens: called when a packet is about to leave; returns s after which to listen again because somebody else
         sends, 0 if the channel is clear. None: nobody listens
+    :param ready: called when a packet is about to leave; returns whether the device takes it. None: always
     :raises ConfigError: for a negative airtime, lead or ahead
     :ivar refused: packets that were refused, by reason: ``airtime_limit`` or ``transmit_off``; others may be
         counted here too
     :ivar used: s of airtime of all packets taken
     :ivar deferred: how often a packet did not leave because somebody else was sending
-    :ivar held: whether the credits given last had been held back by the limit or the switch
+    :ivar held: whether the credits given last had been held back by the limit, the switch or the device
     """
 
     def __init__(
@@ -95,6 +99,7 @@ class AirtimeClock(Generic[T]):
         measured: bool = False,
         timed: bool = False,
         listens: Callable[[], float] | None = None,
+        ready: Callable[[], bool] | None = None,
     ) -> None:
         if not airtime >= 0:
             raise ConfigError(f"airtime = {airtime} s: must be 0 or more")
@@ -107,7 +112,7 @@ class AirtimeClock(Generic[T]):
         self._composing = ComposingTime(lead) if measured else None
         self._ahead = ahead
         self._timed = timed
-        self._listens = listens
+        self._listens, self._ready = listens, ready
         self._most = OUTSTANDING if listens is None else 1
         self.deferred = 0
         self._free = float("-inf")
@@ -120,7 +125,7 @@ class AirtimeClock(Generic[T]):
         self.used = 0.0
         self.held = False
         self._holding = False
-        """Whether the limit or the switch has held back the next credit."""
+        """Whether the limit, the switch or the device has held back the next credit."""
 
     def offer(self, packet: T, now: float, airtime: float | None = None, leave_at: float | None = None) -> float | None:
         """A packet arrives; it uses a credit if one is open.
@@ -213,9 +218,12 @@ class AirtimeClock(Generic[T]):
 
     def _is_clear(self, now: float) -> bool:
         """Whether the first packet may leave; if not, all packets are put off."""
-        wait = 0.0 if self._listens is None else self._listens()
-        if wait > 0:
+        wait = 0.0
+        if self._ready is not None and not self._ready():
+            wait, self._holding = READY_S, True
+        elif self._listens is not None and (wait := self._listens()) > 0:
             self.deferred += 1
+        if wait > 0:
             later = now + wait - self._queue[0][0]
             self._queue = deque((leaves + later, begin + later, packet) for leaves, begin, packet in self._queue)
             self._free += later

@@ -31,7 +31,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
     :param lead: s before the channel is free at which a credit is given at the earliest
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
-    :param timed, listens: see :class:`AirtimeClock`
+    :param timed, listens, ready: see :class:`AirtimeClock`
     :param admits: whether a packet with these bytes may be sent at all; others count as refused, `not_sealed`
     :param clock: s, monotonic
     :param times: store when each packet passed; off by default, since a link that runs without end would store too many
@@ -50,6 +50,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         limit: AirtimeLimit | None = None,
         timed: bool = False,
         listens: Callable[[], float] | None = None,
+        ready: Callable[[], bool] | None = None,
         admits: Callable[[bytes], bool] | None = None,
         times: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -57,7 +58,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
         self._clock: AirtimeClock[Any] = AirtimeClock(
-            airtime, lead, ahead, limit, measured=True, timed=timed, listens=listens
+            airtime, lead, ahead, limit, measured=True, timed=timed, listens=listens, ready=ready
         )
         self._admits = admits
         self._now = clock

@@ -149,6 +149,12 @@ class FrontEnd(ABC):
         this robot sends, or hears itself."""
         return None
 
+    @property
+    def ready(self) -> Callable[[], bool] | None:
+        """Returns whether the device is there; packets wait for it. None where it always is, or its absence ends the
+        flowgraph."""
+        return None
+
     def airtime(self, packet_len: int | None = None, mcs: int = 0) -> float:
         """Time from the start of one packet to the earliest start of the next, s.
 

@@ -174,6 +174,10 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
         """Whether its thread runs, or is not meant to."""
         return self._stopped.is_set() or self._thread.alive
 
+    def connected(self) -> bool:
+        """Whether there is a connection now."""
+        return self._connection is not None
+
     def close(self) -> None:
         """Close the connection. The block has stopped, or never ran. Idempotent."""
         self._disconnect()
@@ -286,6 +290,10 @@ class PacketFrontEnd(FrontEnd):
     @property
     def packets(self) -> Any:
         return self._port
+
+    @property
+    def ready(self) -> Callable[[], bool]:
+        return self._port.connected
 
     def check(self, now: float) -> None:  # noqa: ARG002 - it does not depend on time
         if not self._port.alive:

@@ -89,6 +89,7 @@ class Radio(PacketPath, HierBlock):
             limit=limit,
             timed=front_end.clock_offset is not None,
             listens=_Listener(front_end) if listens else None,
+            ready=front_end.ready,
             admits=admits,
             clock=front_end.clock,
         )

@@ -259,3 +259,20 @@ def test_credits_that_the_switch_or_the_limit_held_back_are_known() -> None:
         limited.due(again)
         now = max(again, now + 1e-6)
     assert held == [False, True, True, True, True]
+
+
+def test_packets_wait_for_a_device_that_is_away_and_none_is_asked_for_meanwhile() -> None:
+    there = True
+    clock: AirtimeClock[str] = AirtimeClock(1.0, ready=lambda: there)
+    assert clock.grants(0.0) == 1
+    clock.offer("a", 0.0)
+    there = False
+    for now in range(1, 20):
+        assert clock.due(now) == []
+        assert clock.grants(now) == 0
+        assert now < (clock.next_timeout(now) or 0.0) < now + 0.1
+    there = True
+    assert packets(clock.due(20.0)) == ["a"]
+    assert clock.grants(20.0) == 1
+    assert clock.held, "that this came late says nothing of the pace"
+    assert clock.deferred == 0
