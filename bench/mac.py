@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import random
+import resource
 import time
 from collections.abc import Callable, Sequence
 from statistics import mean
@@ -14,6 +15,9 @@ from statistics import mean
 from bench.mac_rivals import Csma, Sotdma
 from bench.rows import Row
 from gr_ros2.mac import Aloha, Slots
+from gr_ros2.run.load import make_phys
+from gr_ros2.run.scenario import load_scenario
+from gr_ros2.run.simulate import Simulation, offered_by
 from gr_ros2.run.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 
 AIRTIME_S = 1 / 75
@@ -195,7 +199,7 @@ def changes() -> list[Row]:
 
 
 def scale() -> list[Row]:
-    """255 robots that each hear about ten, and the cost of a packet heard."""
+    """255 robots that each hear about ten."""
     config = SwarmConfig()
     made = Swarm(slots, HearingGraph(at_random(255, 0.125, 1), config), config, t1=100)
     began = time.process_time()
@@ -204,9 +208,29 @@ def scale() -> list[Row]:
     sent = made.sent
     return [
         Row("255 robots: s for 150,000 packets", seconds * 150_000 / sent, "s", "≤", 60, note=f"{sent:,} packets"),
+        Row("255 robots: memory", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6, "GB", "≤", 2, "{:.2f}"),
     ]
+
+
+def energy() -> list[Row]:
+    """Processor time of all that a robot does in simulated time, the medium included, per packet that it hears."""
+    rows = []
+    for robots, most in ((5, 0), (20, 0.15), (60, 0)):
+        sizes = [f"robots={robots}", f"sim.robots={robots}", f"ros_sink.max_sources={robots}"]
+        scenario = load_scenario("twenty-robots", [*sizes, "sim.size_m=100"])
+        registry, ways = scenario.load_registry(), scenario.directions()
+        messages = [iter(list(way)) for way in offered_by(ways, registry)]  # the simulator is no part of it
+        run = Simulation(scenario, registry, make_phys(ways, registry), messages=messages)
+        began = time.process_time()
+        for _ in run.events():
+            pass
+        spent = 1000 * (time.process_time() - began)
+        heard = sum(robot.endpoint.received.packets for robot in run.robots)
+        what, note = f"{robots} robots: ms of a core per packet heard", f"{heard:,} packets heard"
+        rows.append(Row(what, spent / heard, "ms", "≤" if most else None, most, "{:.3f}", note))
+    return rows
 
 
 def mac() -> list[Row]:
     """All of it."""
-    return [*cells(), *hidden(), *changes(), *scale()]
+    return [*cells(), *hidden(), *changes(), *scale(), *energy()]

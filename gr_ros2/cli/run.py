@@ -25,7 +25,16 @@ from gr_ros2.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2.record.result import Result
 from gr_ros2.report.explain import explanation, lateness_lines
 from gr_ros2.report.repetitions import repetition_grid
-from gr_ros2.report.table import as_table, ledger_table, notes, packets_line, paper_grid, paper_results, summary_table
+from gr_ros2.report.table import (
+    as_table,
+    ledger_table,
+    notes,
+    packets_line,
+    paper_grid,
+    paper_results,
+    summary_table,
+    team_grid,
+)
 from gr_ros2.run import runner
 from gr_ros2.run.observers import RunObserver
 from gr_ros2.run.outcome import Outcome
@@ -209,6 +218,8 @@ def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
         console.print(as_table(paper_grid([result])))
     console.print(summary_table([result]))
     console.print(ledger_table(result))
+    if team := team_grid(outcome.result):
+        console.print(as_table(team))
     for path in outcome.trace.paths():
         title = f"{path.topic} sent (blue), {path.published_as} received (red), m"
         console.print(Text.from_ansi(path_text(path.sent, path.received, title)), soft_wrap=True)

@@ -138,11 +138,15 @@ class PacketMedium(Medium):
         arrived, busy = alone, np.zeros(len(alone), bool)
         snrs = sinrs = heard.snr_db if levels is heard.levels else _in_db(levels, heard.noise)
         if others:
-            pdr, worst = self._disturbed(reach, sent, levels, clear, others)
             deaf = np.array(self._deaf(reach, sent, others), int)
             busy = (heard.ids[:, None] == deaf).any(1)
-            sinrs = _in_db(levels, heard.noise + worst)
-            arrived = alone & (chances < pdr) & ~busy
+            # Interference is of interest where the packet would arrive without it.
+            places = np.flatnonzero(alone & ~busy)
+            pdr, worst = self._disturbed(reach, sent, (places, levels[places], clear[places]), others)
+            sinrs = snrs.copy()
+            sinrs[places] = _in_db(levels[places], heard.noise[places] + worst)
+            arrived = np.zeros(len(alone), bool)
+            arrived[places] = chances[places] < pdr
         if not arrived.all():
             self.lost.add("phy", sent.sender, heard.ids[~alone & ~busy])
             self.lost.add("collision", sent.sender, heard.ids[alone & ~arrived & ~busy])
@@ -207,12 +211,18 @@ class PacketMedium(Medium):
         return curve
 
     def _disturbed(
-        self, reach: _Reach, sent: Transmission, levels: Floats, clear: Floats, others: Sequence[Transmission]
+        self, reach: _Reach, sent: Transmission, at: tuple[Ints, Floats, Floats], others: Sequence[Transmission]
     ) -> tuple[Floats, Floats]:
-        """PDR of a packet that others overlap, and the power of those others where they were strongest."""
-        heard = reach.heard
+        """PDR of a packet that others overlap, and the power of those others where they were strongest.
+
+        :param at: places of the receivers in question, their levels, and their PDRs without interference
+        """
+        places, levels, clear = at
+        if not len(places):
+            return clear, levels
+        ids = reach.heard.ids[places]
         bursts = [(other.start, self._end(other)) for other in others]
-        powers = [self.around.hearers(other.sender, sent.start).at[heard.ids] for other in others]
+        powers = [self.around.hearers(other.sender, sent.start).at[ids] for other in others]
         begin_s, end_s = sent.start, self._end(sent)
         edges = {min(max(edge, begin_s), end_s) for burst in bursts for edge in burst}
         pdr, worst = clear.copy(), np.zeros(len(levels))
@@ -226,7 +236,7 @@ class PacketMedium(Medium):
             if len(hit):
                 share = (end - begin) / (end_s - begin_s)
                 offset = share - 1 if begin == begin_s else 1 - share
-                pdr[hit] *= self._survival(reach, sent, hit, levels[hit], power[hit], offset=offset)
+                pdr[hit] *= self._survival(reach, sent, places[hit], levels[hit], power[hit], offset=offset)
         return pdr, worst
 
     def _survival(

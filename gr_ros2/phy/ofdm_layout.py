@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -124,7 +124,7 @@ class OfdmLayout:
         """The scrambling sequence for the bits of the header; zeros if scrambling is off, and after its 32 bits."""
         return _register(_HEADER_SEED if self.scramble else 0, len(self.data[0]))
 
-    @property
+    @cached_property
     def pilots(self) -> tuple[tuple[int, ...], ...]:
         """Pilot carriers."""
         if self.pilot_places is not None:
@@ -137,7 +137,7 @@ class OfdmLayout:
         """Outermost carrier used, on either side."""
         return 26 * self.fft_len // 64 if self.edge is None else self.edge
 
-    @property
+    @cached_property
     def data(self) -> tuple[tuple[int, ...], ...]:
         """Data carriers: all up to the edge, without pilots and the middle carrier."""
         edge = self.outermost

@@ -144,6 +144,7 @@ class Result:
     :param incomplete: other outputs of the run that are not complete, such as a capture on a full disk: one line each,
         with the reason and how much is missing. The numbers of this result are complete in any case.
     :param receivers: further receivers of the same sender
+    :param task: how well robots did what they were to do together, by the names that the task gives
     """
 
     scenario: str
@@ -159,6 +160,7 @@ class Result:
     lateness: LatenessResult | None = None
     incomplete: tuple[str, ...] = ()
     receivers: tuple[ReceiverResult, ...] = ()
+    task: dict[str, _Number | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,17 @@ from gr_ros2.record.trace import Messages, Trace, read_trace, write_csv
 from gr_ros2.report.explain import explanation
 from gr_ros2.report.figures import air_figure, latency_figure, ledger_figure, path_figure, save_figure
 from gr_ros2.report.snr_map import map_of
-from gr_ros2.report.table import PAPER, Grid, air_grid, ledger_grid, notes, paper_grid, paper_results, summary_grid
+from gr_ros2.report.table import (
+    PAPER,
+    Grid,
+    air_grid,
+    ledger_grid,
+    notes,
+    paper_grid,
+    paper_results,
+    summary_grid,
+    team_grid,
+)
 from gr_ros2.report.team_figures import belief_figure, hearing_figure, strip_figure
 from gr_ros2.report.timelines import Deliveries, age_figure, airtime_figure, delivery_figure, packets_figure
 
@@ -226,7 +236,7 @@ def _run_section(run: Run, out: Path, prefix: str, several: bool) -> Section:
         heading=run.label if several else "What happened",
         lead=lead_of(run) if several else "",
         sentences=[*explanation(result, run.trace), *notes(result)],
-        grids=[grid for grid in (ledger_grid(result), air_grid(result)) if grid is not None],
+        grids=[grid for grid in (team_grid(result), ledger_grid(result), air_grid(result)) if grid is not None],
         pictures=_draw(run, out, prefix),
         details=settings,
     )

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.result import Result, TopicResult, air_uses
+from gr_ros2.record.team_numbers import TEAM_VALUES, team_numbers
 
 _DASH = "–"
 PAPER = "the paper"
@@ -80,6 +81,13 @@ def paper_grid(results: Sequence[Result]) -> Grid:
         ]
         sections.append((theirs, *ours))
     return Grid("Table 6 of the paper, and odometry here", ("Config", "Run", *_TABLE_6), tuple(sections), texts=2)
+
+
+def team_grid(result: Result) -> Grid | None:
+    """What all robots of a run together achieved; None where there are none."""
+    numbers = team_numbers(result)
+    lines = tuple((TEAM_VALUES.get(name, name), f"{value:.3g}") for name, value in numbers.items() if value is not None)
+    return Grid("The team", ("Number", "value"), (lines,)) if lines else None
 
 
 def ledger_grid(result: Result) -> Grid:

@@ -117,6 +117,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
         each other, null where nothing arrives. Level and noise then follow from transmit power, noise figure and
         ``phy.sample_rate``; null = ``channel.snr_db`` between all
+    :param task: what the robots do on what they hear of each other: `formation`, `rendezvous`, or `module:Class`, a
+        subclass of :class:`gr_ros2.sim.tasks.Task`; '' = each drives its own ways
     :param own_domains: ends whose ``domain_id`` is auto are on ROS domains that no other program of this computer uses;
         false = they are on ROS_DOMAIN_ID
     :param seed: of the simulator, the channel and the sender
@@ -131,6 +133,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     robots: Annotated[tuple[RobotConfig, ...], Field(max_length=BROADCAST)] = ()
     duplex: Literal["full", "half"] = "full"
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
+    task: str = ""
     localhost_only: bool | Auto = True
     own_domains: bool = True
 
@@ -179,6 +182,11 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError("channel.walls_db: a recording has no world to count walls in; leave it out")
 
     def _check_robots(self) -> None:
+        if self.task and (not self.robots or self.time != "packets" or self.channel.from_positions):
+            raise ValueError(
+                f"task = {self.task!r}: robots act on what they hear in simulated time at packets, on channels that do "
+                "not follow from positions; set robots, time: packets and gains_db"
+            )
         if not self.robots:
             if self.gains_db is not None:
                 raise ValueError("gains_db: lie between robots; set robots, or channel.snr_db instead")
@@ -234,7 +242,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     def directions(self) -> tuple[Scenario, ...]:
         """The one-way scenarios that this scenario consists of, one for each robot that offers messages."""
         if self.robots:
-            alone = replace(self, robots=(), gains_db=None)
+            alone = replace(self, robots=(), gains_db=None, task="")
             return tuple(replace(alone, ros_source=robot.ros_source) for robot in self.robots)
         if self.back is None:
             return (self,)
@@ -314,7 +322,9 @@ def _robot(values: Mapping[str, Any], given: Any, number: int, shared: Mapping[s
     if not isinstance(block, Mapping) or not isinstance(values.get("ros_source", {}), Mapping):
         return given  # build() says what is wrong with it
     kept = {key: value for key, value in values.get("ros_source", {}).items() if key not in _OWN_KEYS}
-    source = {**kept, "namespace": f"/robot_{number}", **block}
+    # The ids 0..254 are enough for 255 robots if the last one has the first id.
+    last = {"robot_id": 0} if number == BROADCAST else {}
+    source = {**kept, "namespace": f"/robot_{number}", **last, **block}
     block = with_shared({"ros_source": source}, shared, f"{prefix}robots[{number - 1}].")["ros_source"]
     return {**given, "ros_source": block}
 

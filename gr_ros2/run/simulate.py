@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import inf
-from typing import Any
+from typing import Any, Protocol
 
 from gr_ros2.core.errors import BagError, ConfigError, RunError
 from gr_ros2.gr.ends import EndpointSetup, make_endpoint
@@ -52,6 +52,19 @@ STARTED_S = 1.0
 """s within which the robots of a run begin to send. Hellos of robots that begin together would collide for ever."""
 _REMEMBERED_S = 60.0
 """Simulated messages of runs up to this long are cached: 5 MB for two robots with all their topics."""
+
+
+class Upcoming(Protocol):
+    """A message for the source. ``payload`` is asked for at ``t``, so it may depend on what came before."""
+
+    @property
+    def t(self) -> float: ...
+
+    @property
+    def topic_id(self) -> int: ...
+
+    @property
+    def payload(self) -> bytes: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +244,7 @@ class Simulation:
         registry: Registry,
         phys: Sequence[Phy],
         *,
-        messages: Sequence[Iterator[Offered]] | None = None,
+        messages: Sequence[Iterator[Upcoming]] | None = None,
         codec: MessageCodec | None = None,
         ideal: bool = False,
     ) -> None:
@@ -241,7 +254,7 @@ class Simulation:
                 "be simulated; set time to real, samples or packets"
             )
         ways = scenario.directions()
-        coming = list(messages or offered_by(ways, registry))
+        coming: list[Iterator[Upcoming]] = list(messages or offered_by(ways, registry))
         shared = scenario.duplex == "half"
         any_length = all(phy.any_length for phy in phys)
         start = start_of_run(
@@ -329,7 +342,7 @@ class Robot:
         events: list[SenderEvent],
         src_id: int,
         airtime: Airtime,
-        messages: Iterator[Offered],
+        messages: Iterator[Upcoming],
         start_s: float = 0.0,
         busy: bool = False,
     ) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gr_ros2.core.guard import Guard
+from gr_ros2.link import Delivered
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import make_phys, published_names, recording, source_names
 from gr_ros2.run.observers import RunObservers
@@ -24,6 +25,7 @@ from gr_ros2.run.recorders import RunRecords
 from gr_ros2.run.robots import ears_of
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import Simulation, pass_on
+from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.registry import Registry
 
 _REPORT_S = 0.05
@@ -64,7 +66,8 @@ def run_simulated(
             for way in ways:
                 ids, names = source_names(way, registry).values(), published_names(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
-        run = Simulation(scenario, registry, phys)
+        tasks = TaskRun(scenario, ways, registry) if scenario.task else None
+        run = Simulation(scenario, registry, phys, messages=None if tasks is None else tasks.messages())
         run_observers = run_observers or RunObservers(threaded=False)
         records = RunRecords(
             scenario,
@@ -79,7 +82,9 @@ def run_simulated(
         run_observers.run_started(records.live_run(clock))
         reported, progress = 0.0, Guard("progress")
         for timed_event in run.events():
-            clock.now, robot, _ = timed_event
+            clock.now, robot, event = timed_event
+            if tasks is not None and isinstance(event, Delivered):
+                tasks.delivered(robot.number, event, clock.now)
             pass_on(seen[robot.number], timed_event)
             records.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
@@ -96,6 +101,7 @@ def run_simulated(
         channels=1 if run.medium.shared else len(ways),
         began=began,
         incomplete=tuple(run_observers.incomplete()),
+        task={} if tasks is None else tasks.numbers(),
         counters={**there, **back, "listener": {} if bag is None else dict(bag.written)},
     )
 

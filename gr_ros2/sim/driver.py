@@ -52,6 +52,8 @@ class Driver:
         """State at the latest tick."""
         self.reserved: Floats = np.array([[x, y]], dtype=np.float64)
         """Points (n, 2) the robot would pass if it braked now."""
+        self.box = _box(self.reserved)
+        """The least and greatest x and y of those."""
 
     def drive(self, others: Sequence[Driver]) -> State:
         """Choose the command for the next period.
@@ -62,13 +64,13 @@ class Driver:
         speeds, turns = self._commands()
         paths = stopping_paths(self.state, speeds, turns, self._brake_ticks)
         cost = self._cost(target, speeds, turns)
-        gap = self._world.clearance(paths).min(axis=1) - self._wall_gap
+        gap = self._world.clearance(paths, self._wall_gap + _COMFORT_WALL_M).min(axis=1) - self._wall_gap
         safe = gap >= 0
         cost = cost + np.maximum(0.0, 1.0 - gap / _COMFORT_WALL_M)
-        low, high = paths.min(axis=(0, 1)), paths.max(axis=(0, 1))
+        left, low, right, high = _box(paths, self._robot_gap + _COMFORT_M)
         for other in others:
-            apart = np.maximum(other.reserved.min(axis=0) - high, low - other.reserved.max(axis=0))
-            if apart.max() > self._robot_gap + _COMFORT_M:
+            from_x, from_y, to_x, to_y = other.box
+            if from_x > right or from_y > high or to_x < left or to_y < low:
                 continue  # its path is so far from all of these that it changes neither safety nor cost
             dx = paths[:, :, 0, None] - other.reserved[:, 0]
             dy = paths[:, :, 1, None] - other.reserved[:, 1]
@@ -79,6 +81,7 @@ class Driver:
             best = int(np.where(safe, cost, np.inf).argmin())
             now = self.state.towards(float(speeds[best]), float(turns[best]))
             self.reserved = paths[best]
+            self.box = _box(self.reserved)
         else:
             # Follow the rest of the path reserved before. It has been clear since the tick that chose it.
             now = self.state.towards(*self.state.braking())
@@ -153,3 +156,9 @@ class Driver:
             return min((math.hypot(*(first - other.reserved[0])) for other in others), default=0.0)
 
         self._route = max(routes, key=room)
+
+
+def _box(points: Floats, margin: float = 0.0) -> tuple[float, float, float, float]:
+    """The least x and y and the greatest x and y of points, and so many m around them."""
+    (left, low), (right, high) = points.reshape(-1, 2).min(0).tolist(), points.reshape(-1, 2).max(0).tolist()
+    return left - margin, low - margin, right + margin, high + margin

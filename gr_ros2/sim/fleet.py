@@ -55,7 +55,7 @@ class Fleet:
         self.robot_ids = tuple(range(1, settings.robots + 1))
         rng = np.random.default_rng([settings.seed, 0])
         self.world = World(settings.size_m, settings.obstacles, rng)
-        roadmap = Roadmap(self.world, RADIUS + 0.25, rng)
+        roadmap = Roadmap(self.world, RADIUS + 0.25, rng, settings.robots)
         self._drivers = [
             Driver(self.world, roadmap, node, settings.max_speed, np.random.default_rng([settings.seed, 1, robot_id]))
             for robot_id, node in zip(self.robot_ids, self._places(roadmap, rng), strict=True)

@@ -15,19 +15,20 @@ Places = NDArray[np.int_]
 
 _NEIGHBOUR_M = 6.0
 _SPACING_M = 1.1
-_SAMPLES = 400
+_SAMPLES, _SAMPLES_PER_ROBOT = 400, 4
 
 
 class Roadmap:
     """Random places at least a metre apart, joined if the line between them is clear.
 
     :param clearance: distance from the centre of a robot to anything, m
+    :param robots: number of robots that start on it
     """
 
-    def __init__(self, world: World, clearance: float, rng: np.random.Generator) -> None:
+    def __init__(self, world: World, clearance: float, rng: np.random.Generator, robots: int = 1) -> None:
         self._world = world
         self.clearance = clearance
-        samples = rng.uniform(clearance, world.size - clearance, (_SAMPLES, 2))
+        samples = rng.uniform(clearance, world.size - clearance, (max(_SAMPLES, _SAMPLES_PER_ROBOT * robots), 2))
         places: list[Floats] = []
         for sample in samples[world.clearance(samples) >= clearance]:
             if not places or np.hypot(*(np.array(places) - sample).T).min() >= _SPACING_M:

@@ -77,6 +77,10 @@ class Sensors:
         message = getattr(self, f"_{topic}")(t, state, others)
         return bytes(_STORE.serialize_cdr(message, ALL_TYPES[topic]))
 
+    def localize(self, t: float, state: State) -> None:
+        """Let the odometry go on from the true place, which it drifts away from otherwise."""
+        self._believed, self._odom_t = (state.x, state.y, state.heading), t
+
     def _time(self, t: float) -> Any:
         ns = self._start_ns + round(t * 1e9)
         return _TIME(sec=ns // 1_000_000_000, nanosec=ns % 1_000_000_000)
@@ -186,6 +190,15 @@ def _rtcm_frame(number: int, rest: bytes) -> bytes:
         for _ in range(8):
             crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
     return frame + (crc & 0xFFFFFF).to_bytes(3, "big")
+
+
+def read_odometry(payload: bytes) -> tuple[int, State]:
+    """The stamp in ns of a serialized odometry of a robot on the ground, and what it says."""
+    message: Any = _STORE.deserialize_cdr(payload, TYPES["odom"])
+    stamp, pose, twist = message.header.stamp, message.pose.pose, message.twist.twist
+    heading = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
+    state = State(pose.position.x, pose.position.y, heading, twist.linear.x, twist.angular.z)
+    return stamp.sec * 1_000_000_000 + stamp.nanosec, state
 
 
 def _twist(speed: float, turn: float) -> Any:

@@ -46,7 +46,7 @@ class SimSettings(Populated, Seeded):
     :param transforms: robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries
     """
 
-    robots: Annotated[int, Field(ge=1, le=64)] = 2
+    robots: Annotated[int, Field(ge=1, le=255)] = 2
     size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
     obstacles: Annotated[int, Field(ge=0, le=100)] = 12
     max_speed: Annotated[float, Field(ge=0.1, le=2)] = 1.0

@@ -8,6 +8,7 @@ reached. Nothing here changes after construction.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,22 +52,32 @@ class World:
         self.circles: Floats = np.array(circles, dtype=np.float64).reshape(-1, 3)
         """Rows x, y, radius."""
         self._cos, self._sin = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
+        around = np.column_stack([self.boxes[:, :2], np.hypot(self.boxes[:, 2], self.boxes[:, 3])])
+        self._bounds = self.circles, around
+        """Circles around all pillars, and around all boxes."""
 
-    def clearance(self, points: Floats) -> Floats:
+    def clearance(self, points: Floats, reach: float = math.inf) -> Floats:
         """Distance from each point to the nearest wall or obstacle, negative inside one.
 
         :param points: array of shape (..., 2)
+        :param reach: m, beyond which no distance matters: obstacles that are farther from all points may be left out
         :returns: array of shape (...)
         """
         x, y = points[..., 0].ravel(), points[..., 1].ravel()
         nearest = np.minimum(np.minimum(x, self.size - x), np.minimum(y, self.size - y))
-        if len(self.circles):
-            centre_x, centre_y, radius = self.circles.T[:, :, None]
+        near_circles: Any = slice(None)
+        near_boxes: Any = slice(None)
+        if reach < math.inf:
+            box = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+            near_circles, near_boxes = (_within(box, centres, reach) for centres in self._bounds)
+        circles, boxes = self.circles[near_circles], self.boxes[near_boxes]
+        if len(circles):
+            centre_x, centre_y, radius = circles.T[:, :, None]
             dx, dy = x - centre_x, y - centre_y
             nearest = np.minimum(nearest, (np.sqrt(dx * dx + dy * dy) - radius).min(axis=0))
-        if len(self.boxes):
-            centre_x, centre_y, half_x, half_y, _ = self.boxes.T[:, :, None]
-            cos, sin = self._cos[:, None], self._sin[:, None]
+        if len(boxes):
+            centre_x, centre_y, half_x, half_y, _ = boxes.T[:, :, None]
+            cos, sin = self._cos[near_boxes, None], self._sin[near_boxes, None]
             dx, dy = x - centre_x, y - centre_y
             out_x = np.abs(dx * cos + dy * sin) - half_x
             out_y = np.abs(dy * cos - dx * sin) - half_y
@@ -157,3 +168,10 @@ class World:
         grid = np.stack(np.meshgrid(centres, centres), axis=-1)
         clearance = np.stack([self.clearance(row) for row in grid])  # row by row, to save memory
         return np.where(clearance < resolution / 2, 100, 0).astype(np.int8)
+
+
+def _within(box: tuple[Floats, Floats], circles: Floats, reach: float) -> NDArray[np.bool_]:
+    """Which circles are not farther than ``reach`` from a rectangle with its least and its greatest corner."""
+    low, high = box
+    away = circles[:, :2] - np.clip(circles[:, :2], low, high)
+    return np.asarray(np.hypot(*away.T) <= circles[:, 2] + reach)

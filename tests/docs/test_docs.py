@@ -78,6 +78,8 @@ ONLY_PARSED = {
     ("docs/how-to/sweeps.md", "gr-ros2 sweep mine.yaml --scheduler tcp://HOST:8786"): "needs a Dask cluster",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep pdr-vs-snr"): "takes minutes; tests/study runs the built-in sweeps' cells",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep rate-vs-snr"): "the same",
+    ("docs/how-to/teams.md", "gr-ros2 sweep formation"): "takes minutes; tests/study runs the built-in sweeps' cells",
+    ("docs/how-to/teams.md", "gr-ros2 sweep rendezvous"): "the same",
     ("docs/how-to/experiments.md", "gr-ros2 plan my_link.yaml --graph"): "needs a robot; tests/cli/test_plan.py",
     ("docs/how-to/experiments.md", "gr-ros2 ablate paper-ofdm-paced"): "takes minutes; tests/cli/test_ablate.py",
     **{

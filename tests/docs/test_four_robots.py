@@ -22,18 +22,18 @@ pytestmark = pytest.mark.slow
 PAGE = "docs/four-robots.md"
 SHORTER = ("--duration", "20")
 """Instead of a minute: what the page says holds for it as well."""
-NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets")
+NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets", "live")
 
 
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which somebody has done all of it."""
+    """A folder in which somebody has done all of it in simulated time; tests/run/test_team.py runs in real time."""
     return once(tmp_path_factory, "four-robots", walk)
 
 
 def walk(folder: Path) -> None:
     lines = [line for block in blocks("sh") if block.page == PAGE for line in commands(block)]
-    runs = [line for line in lines if line[1] in ("demo", "run")]
+    runs = [line for line in lines if line[1] in ("demo", "run") and "time=real" not in line]
     assert len(runs) == len(NAMES)
     for words in runs:
         drawn = () if words[1] == "demo" else ("--no-report",)
@@ -63,6 +63,13 @@ def test_the_demo_fades_behind_obstacles_and_shows_it(walked: Path) -> None:
     assert all(team.beliefs.values())
     page = (walked / "demo" / "report.html").read_text("utf-8")
     assert "The channel while the robots enter" in page
+
+
+def test_in_real_time_each_robot_hears_the_others(walked: Path) -> None:
+    found, team = of(walked, "live")
+    assert len(found) == 12
+    assert share(found) >= 0.95
+    assert set(team.ways) == {1, 2, 3, 4}
 
 
 def test_in_slots_all_arrives_and_otherwise_little(walked: Path) -> None:

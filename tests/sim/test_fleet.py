@@ -232,3 +232,8 @@ def test_corrections_are_whole_frames_and_change_nothing_else(messages: list[Sim
         numbers.append(int.from_bytes(frames[3:5], "big") >> 4)
         frames = frames[size:]
     assert (numbers, frames) == ([1074, 1084, 1094, 1124], b"")
+
+
+def test_the_largest_team_finds_room_to_start() -> None:
+    fleet = Fleet(SimSettings(robots=255, size_m=100, obstacles=10))
+    assert len({fleet.state(number, 0.0)[:2] for number in fleet.robot_ids}) == 255

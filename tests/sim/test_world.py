@@ -69,3 +69,11 @@ def test_the_map_shows_walls_and_obstacles(world: World, cells: int) -> None:
         assert grid[int((y - origin) / resolution), int((x - origin) / resolution)] == 100
     assert (grid[0] == 100).all()
     assert (grid[:, -1] == 100).all()
+
+
+def test_obstacles_out_of_reach_change_no_distance_within_it(world: World) -> None:
+    rng = np.random.default_rng(3)
+    for middle in rng.uniform(1, world.size - 1, (50, 2)):
+        points = middle + rng.uniform(-1, 1, (7, 3, 2))
+        exact, near = world.clearance(points), world.clearance(points, 0.5)
+        assert np.array_equal(np.minimum(exact, 0.5), np.minimum(near, 0.5))

@@ -85,6 +85,9 @@ class Neighbour:
     """When each topic was requested."""
     echo: tuple[bytes, int] | None = None
     """The end of its newest hello, and the number that this robot had reached then."""
+    timeout: float | None = None
+    """When something of it is to be given up, s; infinite for never, None while nobody has looked since its newest
+    packet. Only what it sends can bring this forward."""
 
     @property
     def encrypts(self) -> bool:

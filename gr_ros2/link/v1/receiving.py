@@ -127,17 +127,26 @@ class ReceivingSide:
                 self._events.append(Gone(gone.src_id, gone.boot))
         if self.relaying is not None:
             self._events += self.relaying.handle_timeout(now)
+        for neighbour in self.neighbours:
+            neighbour.timeout = None
         self._messages.reported = bool(self._window.peers)
         events, self._events = self._events, []
         return events
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
-        times = [at for neighbour in self.neighbours if (at := neighbour.inbox.next_timeout()) is not None]
-        times += [n.heard + self._give_up_s for n in self.neighbours if not n.gone]
+        # Asked after each packet, so only its sender is looked at anew.
+        times = [n.timeout if n.timeout is not None else self._timeout(n) for n in self.neighbours]
         if self.relaying is not None and (at := self.relaying.next_timeout()) is not None:
             times.append(at)
-        return min(times, default=None)
+        soonest = min(times, default=inf)
+        return None if soonest == inf else soonest
+
+    def _timeout(self, neighbour: Neighbour) -> float:
+        waits = neighbour.inbox.next_timeout()
+        gone = inf if neighbour.gone else neighbour.heard + self._give_up_s
+        neighbour.timeout = gone if waits is None else min(waits, gone)
+        return neighbour.timeout
 
     def unpublished(self, event: Delivered) -> Lost:
         """Count a message that was delivered but not published on the ROS graph. A latched message may come again."""
@@ -155,6 +164,7 @@ class ReceivingSide:
                 self._note_slot(header, arrival, now, trusted=opened is not None)
             if opened is None:
                 return
+            opened.neighbour.timeout = None
             if not self._for_us(header):
                 self.stats.dropped["not_for_us"] += 1
                 return

@@ -19,6 +19,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import Phy
+from gr_ros2.record.team_numbers import TEAM_VALUES
 from gr_ros2.run.load import make_phy, source_names
 from gr_ros2.run.scenario import Experiment, Scenario, Time, dump, load_scenario
 from gr_ros2.settings.config import ScenarioChannel, Text, build, read_yaml, replaced
@@ -43,10 +44,11 @@ VALUES = {
     "rms_error_m": "RMS error [m]",
     "airtime_per_message_s": "airtime per message delivered [s]",
     "airtime_per_byte_s": "airtime per byte delivered [s]",
+    **TEAM_VALUES,
 }
 """The numbers that a figure can show: column of the table -> label of an axis."""
 
-OF_THE_LINK = (PDR, "goodput_Bps", "airtime_per_message_s", "airtime_per_byte_s")
+OF_THE_LINK = (PDR, "goodput_Bps", "airtime_per_message_s", "airtime_per_byte_s", *TEAM_VALUES)
 """The numbers that exist for all topics together."""
 
 Overrides = Mapping[str, Any]

@@ -19,6 +19,7 @@ import pyarrow.parquet as pa_parquet
 from gr_ros2.core.files import write_whole
 from gr_ros2.record.result import Result, topic_numbers
 from gr_ros2.record.statistics import Estimate, average, share
+from gr_ros2.record.team_numbers import team_numbers
 from gr_ros2.record.trace import write_csv
 from gr_ros2.study.sweep.definition import PDR, VALUES, SweepCell, SweepPlan
 
@@ -65,7 +66,8 @@ def rows_of(plan: SweepPlan, results: Results) -> list[dict[str, Any]]:
             link = {name: result.phy.get(name) for name in _OF_THE_RUN}
             link.update({f"packets_{name}": count for name, count in result.packets.items()})
             topics = [topic_numbers(topic, ledger) for topic in result.topics]
-            rows += [{**common, **topic, **link, "wall_s": result.wall_s} for topic in (_together(topics), *topics)]
+            together = {**_together(topics), **team_numbers(result)}
+            rows += [{**common, **topic, **link, "wall_s": result.wall_s} for topic in (together, *topics)]
     return rows
 
 

@@ -1,0 +1,251 @@
+"""What robots do together on what they hear of each other: tasks, and robots whose motion follows from them.
+
+A task is where robots start, what each does next, and how well all of them do. Two are built in; another one is a class
+of a user's module, ``task: module:Class``.
+
+Invariants: no clock, thread or global generator; a robot knows its own place exactly, and of the others what its
+link has delivered; messages are taken and made in the order of time; equal deliveries give equal motion.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.sim.motion import ACCELERATION, MAX_TURN, TICK, TURN_ACCELERATION, State
+from gr_ros2.sim.sensors import Sensors, read_odometry
+from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2.sim.world import World
+
+Command = tuple[float, float]
+"""Speed in m/s and turn rate in rad/s."""
+
+
+class LastHeard(NamedTuple):
+    """The newest odometry of another robot that has come out of the link.
+
+    :param made_s: s, when it was measured
+    :param state: place, heading, speed and turn rate then
+    """
+
+    made_s: float
+    state: State
+
+    def at(self, now: float) -> State:
+        """Where that robot is now if it has kept its speed and turn rate."""
+        state, left = self.state, max(0.0, now - self.made_s)
+        while left > 0:
+            state, left = state.after(min(left, TICK)), left - TICK
+        return state
+
+
+class Task:
+    """What robots are to do. Subclasses say how.
+
+    :param robots: how many there are; they are numbered from 0
+    :param rng: for their places
+    """
+
+    def __init__(self, robots: int, rng: random.Random) -> None:
+        self.robots, self.rng = robots, rng
+
+    def start(self, number: int) -> State:
+        """Where a robot starts."""
+        raise NotImplementedError
+
+    def command(self, number: int, now: float, own: State, heard: Mapping[int, LastHeard]) -> Command:
+        """What a robot does from now on; asked ten times a second.
+
+        :param heard: what its link has delivered, by robot
+        """
+        raise NotImplementedError
+
+    def watch(self, now: float, states: Sequence[State]) -> None:
+        """See where all robots really are; called ten times a second."""
+
+    def numbers(self) -> dict[str, float | None]:
+        """How well it went, for the result."""
+        return {}
+
+
+class Formation(Task):
+    """Robot 0 drives a winding way, now faster, now slower. The others keep their places around it, which do not turn
+    with it: rows of three, 3 m apart.
+
+    Result: ``formation_error_m``, the mean distance of the followers from their places beside the leader's true place,
+    from ``SETTLED_S`` on.
+    """
+
+    SETTLED_S, GAP_M, MOST = 10.0, 3.0, 2.5
+
+    def __init__(self, robots: int, rng: random.Random) -> None:
+        super().__init__(robots, rng)
+        self._phase = rng.uniform(0, 2 * math.pi)
+        self._errors: list[float] = []
+
+    def start(self, number: int) -> State:
+        return State(*self._place(number, State(0.0, 0.0, 0.0, 0.0, 0.0)), 0.0, 0.0, 0.0)
+
+    def command(self, number: int, now: float, own: State, heard: Mapping[int, LastHeard]) -> Command:
+        if not number:
+            return 1 + 0.5 * math.sin(0.7 * now), 0.8 * math.sin(0.45 * now + self._phase)
+        if 0 not in heard:
+            return 0.0, 0.0
+        leader = heard[0].at(now)
+        # The place has the leader's velocity; what is missing to it is made up for within a second.
+        x, y = self._place(number, leader)
+        ahead_x = leader.speed * math.cos(leader.heading) + x - own.x
+        ahead_y = leader.speed * math.sin(leader.heading) + y - own.y
+        return towards(own, ahead_x, ahead_y, self.MOST)
+
+    def watch(self, now: float, states: Sequence[State]) -> None:
+        if now >= self.SETTLED_S:
+            for number, state in enumerate(states[1:], 1):
+                x, y = self._place(number, states[0])
+                self._errors.append(math.hypot(state.x - x, state.y - y))
+
+    def numbers(self) -> dict[str, float | None]:
+        return {"formation_error_m": sum(self._errors) / len(self._errors) if self._errors else None}
+
+    def _place(self, number: int, leader: State) -> tuple[float, float]:
+        row, column = divmod(number + 2, 3)
+        return leader.x - self.GAP_M * row * bool(number), leader.y + self.GAP_M * (column - 1) * bool(number)
+
+
+class Rendezvous(Task):
+    """Robots that start anywhere in a square meet: each drives to the middle of all that it knows of, itself included.
+
+    Result: ``time_to_meet_s``, when the last of them was within ``MEET_M`` of the middle of all; the duration so far
+    where they have not met (``met`` is 0 then).
+    """
+
+    SIDE_M, MEET_M, SPEED = 60.0, 2.0, 2.0
+
+    def __init__(self, robots: int, rng: random.Random) -> None:
+        super().__init__(robots, rng)
+        self._met: float | None = None
+        self._now = 0.0
+
+    def start(self, number: int) -> State:  # noqa: ARG002
+        place = self.rng.uniform(0, self.SIDE_M), self.rng.uniform(0, self.SIDE_M)
+        return State(*place, self.rng.uniform(-math.pi, math.pi), 0.0, 0.0)
+
+    def command(self, number: int, now: float, own: State, heard: Mapping[int, LastHeard]) -> Command:  # noqa: ARG002
+        if not heard:
+            return 0.0, 0.0
+        places = [own, *(other.state for other in heard.values())]
+        x, y = (sum(place[axis] for place in places) / len(places) for axis in (0, 1))
+        return towards(own, x - own.x, y - own.y, self.SPEED)
+
+    def watch(self, now: float, states: Sequence[State]) -> None:
+        self._now = now
+        x, y = (sum(state[axis] for state in states) / len(states) for axis in (0, 1))
+        if self._met is None and all(math.hypot(one.x - x, one.y - y) <= self.MEET_M for one in states):
+            self._met = now
+
+    def numbers(self) -> dict[str, float | None]:
+        return {"time_to_meet_s": self._now if self._met is None else self._met, "met": float(self._met is not None)}
+
+
+BUILT_IN = {"formation": Formation, "rendezvous": Rendezvous}
+
+
+def towards(own: State, x: float, y: float, most: float) -> Command:
+    """The command that makes a robot's velocity (x, y) as far as it can, m/s.
+
+    :param most: m/s
+    """
+    wanted = math.hypot(x, y)
+    if wanted < 1e-3:
+        return 0.0, 0.0
+    off = math.remainder(math.atan2(y, x) - own.heading, 2 * math.pi)
+    return min(wanted, most) * max(0.0, math.cos(off)), max(-MAX_TURN, min(MAX_TURN, 2 * off))
+
+
+def make_task(name: str, robots: int, seed: int) -> Task:
+    """A task by its name, or ``module:Class``.
+
+    :raises ConfigError: where there is none of that name; says what went wrong
+    """
+    module, colon, attribute = name.partition(":")
+    kind: Any = BUILT_IN.get(name)
+    if kind is None and colon:
+        try:
+            kind = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"task = {name!r}: {error}; put the module on PYTHONPATH") from error
+    if not (isinstance(kind, type) and issubclass(kind, Task)):
+        known = ", ".join(BUILT_IN)
+        raise ConfigError(f"task = {name!r}: is no task; known are {known}, and module:Class, a subclass of Task")
+    return kind(robots, random.Random(f"task {seed}"))
+
+
+class TaskRobots:
+    """Robots on an open plane, moved by a task, and their odometry.
+
+    :param settings: rate and noise of the odometry, and the seed
+    """
+
+    def __init__(self, task: Task, settings: SimSettings) -> None:
+        self._task, self._settings, self._tick = task, settings, 0
+        self._states = [task.start(number) for number in range(task.robots)]
+        self._heard: list[dict[int, LastHeard]] = [{} for _ in self._states]
+        world = World(settings.size_m, 0, np.random.default_rng(0))
+        start_ns = round(settings.start_time_s * 1e9)
+        self._sensors = [Sensors(settings, world, n + 1, state, start_ns) for n, state in enumerate(self._states)]
+        self._decide()
+
+    def advance(self, now: float) -> None:
+        """Move all robots to a time. What they have heard before it has been taken."""
+        while (self._tick + 1) * TICK <= now + 1e-9:
+            self._states = [state.after(TICK) for state in self._states]
+            self._tick += 1
+            self._decide()
+
+    def _decide(self) -> None:
+        now, states, task = self._tick * TICK, self._states, self._task
+        task.watch(now, states)
+        commands = [task.command(n, now, own, self._heard[n]) for n, own in enumerate(states)]
+        self._states = [_towards(own, *command) for own, command in zip(states, commands, strict=True)]
+
+    def heard(self, robot: int, sender: int, odometry: bytes, now: float) -> None:
+        """A robot's link has delivered the odometry of another one."""
+        self.advance(now)
+        made_ns, state = read_odometry(odometry)
+        before = self._heard[robot].get(sender)
+        made_s = made_ns * 1e-9 - self._settings.start_time_s
+        if before is None or made_s > before.made_s:
+            self._heard[robot][sender] = LastHeard(made_s, state)
+
+    def odometry(self, robot: int, now: float) -> bytes:
+        """What a robot sends at a time: its place and velocity."""
+        self.advance(now)
+        state = self._states[robot].after(min(TICK, max(0.0, now - self._tick * TICK)))
+        self._sensors[robot].localize(now, state)
+        return self._sensors[robot].read("odom", now, state, ())
+
+    def times(self, robot: int, duration_s: float) -> Iterator[float]:
+        """When a robot measures its odometry, s."""
+        rate, phase = self._settings.odom_rate, random.Random(f"phase {self._settings.seed} {robot}").random()
+        count = 0
+        while (at := (count + phase) / rate) < duration_s:
+            yield at
+            count += 1
+
+    def numbers(self) -> dict[str, float | None]:
+        """See :meth:`Task.numbers`."""
+        return self._task.numbers()
+
+
+def _towards(own: State, speed: float, turn: float) -> State:
+    """A robot that follows a command as far as it can within a period."""
+    reach, turn_reach = ACCELERATION * TICK, TURN_ACCELERATION * TICK
+    speed = max(own.speed - reach, min(own.speed + reach, speed))
+    turn = max(own.turn - turn_reach, min(own.turn + turn_reach, turn))
+    return own.towards(speed, turn)
