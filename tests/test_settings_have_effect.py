@@ -291,7 +291,7 @@ effects(
     duration_s=run("duration_s=3"),
     drain_s=run("drain_s=0", "ros_source.packet_rate=0"),
     sim=run("sim.odom_rate=20"),
-    task=run("task=rendezvous", scenario="formation"),
+    task=Elsewhere("tests/run/test_task_run.py"),
     reports=run("reports={}", LOSSY),
     airtime=run("airtime=eu869.4"),
 )
