@@ -45,6 +45,7 @@ BENCHMARKS = {
     "mac": "bench.mac",
     "shared": "bench.shared",
     "relay": "bench.relay",
+    "carried": "bench.relay",
     "reliable": "bench.reliable",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
