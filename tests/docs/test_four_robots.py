@@ -27,13 +27,13 @@ NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets", "live")
 
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which somebody has done all of it in simulated time; tests/run/test_team.py runs in real time."""
+    """A folder in which somebody has done all of it."""
     return once(tmp_path_factory, "four-robots", walk)
 
 
 def walk(folder: Path) -> None:
     lines = [line for block in blocks("sh") if block.page == PAGE for line in commands(block)]
-    runs = [line for line in lines if line[1] in ("demo", "run") and "time=real" not in line]
+    runs = [line for line in lines if line[1] in ("demo", "run")]
     assert len(runs) == len(NAMES)
     for words in runs:
         drawn = () if words[1] == "demo" else ("--no-report",)
