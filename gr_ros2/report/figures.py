@@ -26,6 +26,8 @@ SENT_EVERY = 50
 
 _SENT, _RECEIVED = "#1f5fbf", "#d62728"
 
+_MOST_INSIDE, _COLUMNS = 12, 3
+"""Number of curves whose names find room inside the axes; those of more stand below, in so many columns."""
 _RASTER_ABOVE = 20_000
 """Number of points above which a line is stored as a bitmap in the SVG. Otherwise the file would become too large."""
 _DPI = 150
@@ -81,11 +83,12 @@ def latency_figure(curves: Mapping[str, Sequence[float]]) -> Figure:
 
     :param curves: name -> latencies in s, all samples or evenly spaced quantiles; empty ones are left out
     """
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    drawn = {name: np.sort(np.asarray(values, dtype=float)) * 1000 for name, values in curves.items() if len(values)}
+    below = -(-len(drawn) // _COLUMNS) if len(drawn) > _MOST_INSIDE else 0
+    figure = Figure(figsize=(6.4, 4.2 + 0.2 * below), layout="constrained")
     axes = figure.add_subplot(
         title="End-to-end latency", xlabel="latency [ms]", ylabel="share of delivered messages", ylim=(0, 1.02)
     )
-    drawn = {name: np.sort(np.asarray(values, dtype=float)) * 1000 for name, values in curves.items() if len(values)}
     for (name, values), colour in zip(drawn.items(), cycle(COLOURS)):
         axes.plot(
             values,
@@ -101,7 +104,9 @@ def latency_figure(curves: Mapping[str, Sequence[float]]) -> Figure:
     if lowest > 0 and highest / lowest > 50:
         axes.set_xscale("log")
     axes.grid(alpha=0.3)
-    if drawn:
+    if below:
+        figure.legend(loc="outside lower center", ncols=_COLUMNS, fontsize="small", frameon=False)
+    elif drawn:
         axes.legend(fontsize="small", loc="lower right")
     else:
         axes.text(0.5, 0.5, "nothing was delivered", ha="center", transform=axes.transAxes)

@@ -72,4 +72,6 @@ def belief_figure(team: Team) -> Figure:
 
 def _legend(figure: Figure, team: Team) -> None:
     handles = [Patch(color=COLOURS[n % len(COLOURS)], label=f"robot {robot}") for n, robot in enumerate(team.robots)]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize="small", frameon=False)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=min(len(handles), 8), fontsize="small", frameon=False
+    )
