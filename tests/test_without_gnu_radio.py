@@ -57,7 +57,7 @@ def test_a_replay_by_packets(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("demo", "--out", "run"), "this needs GNU Radio 3.10"),
+        (("demo", "--out", "run"), "phy 'ofdm' needs GNU Radio 3.10 (apt install gnuradio)"),
         (("race", "--help"), "this needs GNU Radio 3.10"),
         (("plan", "demo"), "phy 'ofdm' needs GNU Radio 3.10 (apt install gnuradio)"),
         (("link", "--robot", "1", "--radio", "udp", "--listen", "0", "--peer", "127.0.0.1:9"), "GNU Radio 3.10"),

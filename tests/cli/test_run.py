@@ -34,7 +34,7 @@ def test_one_repetition_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (tmp_path / "result.json").is_file()
     assert not (tmp_path / "repetitions.json").exists()
     out = capsys.readouterr().out
-    assert "paper-direct: 1 s of simulated time" in out
+    assert "; 1 s of simulated time, " in out.splitlines()[0]
     assert "Where every sent message went" in out
 
 
