@@ -160,7 +160,7 @@ from gr_ros2.phy.pdus import AirPacket, packets_of, pdu_to_send
 from gr_ros2.radio.radio import make_radio
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
-radio = make_radio("psk", 64, 1e6, "soapy", args=sys.argv[1], frequency=433e6, transmit=True)
+radio = make_radio("psk", 64, 1e6, "soapy", args=sys.argv[1], frequency=433e6, transmit=True, open=True)
 probe, top = Probe(), Flowgraph("t", "t")
 top.msg_connect(probe, "pdus", radio, "pdus")
 top.msg_connect(radio, "pdus", probe, "pdus")
