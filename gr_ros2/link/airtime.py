@@ -45,10 +45,11 @@ class ComposingTime:
     than a lead could hide.
 
     :param most: s, and what holds before so many packets came
+    :ivar longest: s
     """
 
     def __init__(self, most: float) -> None:
-        self._most = most
+        self._most = self.longest = most
         self._took = deque([most] * MEASURED, MEASURED)
         self._granted: deque[float] = deque(maxlen=OUTSTANDING)
 
@@ -61,11 +62,7 @@ class ComposingTime:
         took = now - self._granted.popleft() if self._granted else inf
         if took <= self._most:
             self._took.append(took)
-
-    @property
-    def longest(self) -> float:
-        """s."""
-        return min(max(LEAST_LEAD_S, *self._took), self._most)
+            self.longest = min(max(LEAST_LEAD_S, *self._took), self._most)
 
 
 class AirtimeClock(Generic[T]):

@@ -7,6 +7,7 @@ number that does not apply is None.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
 
 from gr_ros2.record.result import Result
 
@@ -38,7 +39,6 @@ def team_numbers(result: Result) -> dict[str, float | None]:
     each: Counter[int] = Counter()
     for topic in pairs:
         each[topic.src_id] += topic.delivered
-    squares = len(each) * sum(count * count for count in each.values())
     sent = sum(topic.sent for topic in pairs)
     airtimes = {src_id: sum(kinds.values()) for _, phy in ends for src_id, kinds in _senders(phy).items()}
     return {
@@ -46,10 +46,16 @@ def team_numbers(result: Result) -> dict[str, float | None]:
         "pair_age_mean_s": sum(ages) / len(ages) if ages else None,
         "pair_age_peak_s": max(peaks, default=None),
         "pairs_unheard": float(len(pairs) - len(ages)),
-        "jain": each.total() ** 2 / squares if squares else None,
+        "jain": jain(each.values()),
         "air_use": sum(airtimes.values()) / result.duration_s if airtimes and result.duration_s else None,
         **result.task,
     }
+
+
+def jain(counts: Collection[int]) -> float | None:
+    """Jain's index of fairness: 1 where all counts are equal, 1 / n where one of n has all; None where all are 0."""
+    squares = len(counts) * sum(count * count for count in counts)
+    return sum(counts) ** 2 / squares if squares else None
 
 
 def _senders(phy: dict[str, dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:

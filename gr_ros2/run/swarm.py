@@ -21,6 +21,7 @@ from gr_ros2.mac import read_block
 from gr_ros2.medium.base import Hearers, Medium, Path, Reception, Surroundings, Transmission
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
+from gr_ros2.record.team_numbers import jain
 from gr_ros2.relay.traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.run.simulate import EventLoop
 from gr_ros2.settings.config import ChannelConfig
@@ -326,5 +327,4 @@ class Swarm:
     @property
     def jain(self) -> float:
         """Jain's index of the messages that the others have received of each robot."""
-        each = [sum(got) for got in self.got]
-        return sum(each) ** 2 / (len(each) * sum(n * n for n in each)) if any(each) else 0.0
+        return jain([sum(got) for got in self.got]) or 0.0
