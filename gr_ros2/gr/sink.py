@@ -27,7 +27,7 @@ from gr_ros2.gr.outputs import Outputs
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.link import Delivered, Received, ReceivedPacket, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
@@ -39,7 +39,7 @@ from gr_ros2.settings.registry import Registry, Topic, check_outputs
 
 _SHORTEST_WAIT_S = 1e-3
 _COUNTED = (
-    *("not_a_pair", "not_u8", LedgerRow.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
+    *("not_a_pair", "not_u8", Fate.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
 

@@ -26,7 +26,7 @@ from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.gr.subscriptions import Subscriptions
 from gr_ros2.link import Refused, SenderEvent, SentPacket
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware
@@ -315,7 +315,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._said.add((event.topic_id, event.reason))
             registry = self.subscriptions.registry
             name = registry[event.topic_id].name if event.topic_id < len(registry) else "of calls"
-            level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends
+            level = logging.INFO if event.reason == Fate.SUPERSEDED else logging.WARNING  # as `latest` intends
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
             self._guard(self._observer.sender_event, self.src_id, event)

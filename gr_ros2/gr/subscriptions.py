@@ -14,7 +14,7 @@ from typing import Any
 
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.middleware import Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
@@ -110,7 +110,7 @@ class Subscriptions:
                 "type": topic.type_name,
                 "types": len(rows[topic.name]),
                 "submitted": sum(stats.submitted[row] for row in rows[topic.name]),
-                LedgerRow.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
+                Fate.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
                 "sent": sum(stats.sent[row] for row in rows[topic.name]),
                 "queued": sum(queued[row] for row in rows[topic.name]),
                 "queue": self._messages.queue(topic.topic_id)[0],

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from zlib import crc32
 
 from gr_ros2.core.errors import CodecError
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.wire.table import AnnouncedTopic, read_table
@@ -86,7 +86,7 @@ class AnnouncedTopics:
     def decode(self, ready: Ready) -> bytes:
         """The payload of a message.
 
-        :raises CodecError: it cannot be decoded; ``row`` names the row of the ledger
+        :raises CodecError: it cannot be decoded; ``fate`` names the fate of the message
         """
         if not ready.coded:
             return ready.payload
@@ -94,9 +94,9 @@ class AnnouncedTopics:
             raise CodecError("coded, and no codec is configured here")
         return self._codec.decode(ready.topic_id, ready.payload)
 
-    def unknown(self, ready: Ready) -> LedgerRow:
-        """The row of the ledger of a message that is given up because its table did not arrive."""
-        return LedgerRow.UNKNOWN_DICTIONARY if ready.topic_id in self.topics else LedgerRow.UNKNOWN_TOPIC
+    def unknown(self, ready: Ready) -> Fate:
+        """The fate of a message that is given up because its table did not arrive."""
+        return Fate.UNKNOWN_DICTIONARY if ready.topic_id in self.topics else Fate.UNKNOWN_TOPIC
 
     def _know(self, topics: tuple[AnnouncedTopic, ...]) -> None:
         self.topics = {topic.topic_id: topic for topic in topics}

@@ -17,7 +17,7 @@ from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.announced import AnnouncedTopics
@@ -228,7 +228,7 @@ class Inbox:
         self._now = now
         events = self._settled()
         for partial in self._reassembly.expired(now, _INCOMPLETE_S):
-            self._lose(partial, LedgerRow.EXPIRED)
+            self._lose(partial, Fate.EXPIRED)
         expired, self._events = self._events, []
         return events + expired
 
@@ -239,7 +239,7 @@ class Inbox:
             return ordered
         return waiting + _INCOMPLETE_S if ordered is None else min(ordered, waiting + _INCOMPLETE_S)
 
-    def close(self, reason: LedgerRow) -> Events:
+    def close(self, reason: Fate) -> Events:
         """Give up everything that is not delivered."""
         for partial in self._reassembly.clear():
             self._lose(partial, reason)
@@ -319,12 +319,12 @@ class Inbox:
             return
         whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
         for partial in self._reassembly.overflowing():
-            self._lose(partial, LedgerRow.MEMORY)
+            self._lose(partial, Fate.MEMORY)
         if whole is None:
             return
         payload = whole.payload()
         if payload is None:
-            self._lose(whole, LedgerRow.DAMAGED)
+            self._lose(whole, Fate.DAMAGED)
             return
         order = (whole.begin, whole.place)
         self._arrived(Ready(whole.topic_id, order, payload, qos, whole.coded, whole.repaired))
@@ -386,13 +386,13 @@ class Inbox:
     def _deliver(self, ready: Ready, topic: AnnouncedTopic) -> None:
         topic_id, order = ready.topic_id, ready.order
         if topic.dst_id not in (BROADCAST, self._own) and self._own != NOBODY:
-            self._give_up([ready], LedgerRow.NOT_FOR_US)
+            self._give_up([ready], Fate.NOT_FOR_US)
             return
         if self.sealed_after is not None and self._old(order[0], topic):
-            self._give_up([ready], LedgerRow.NOT_FRESH)
+            self._give_up([ready], Fate.NOT_FRESH)
             return
         if topic.fresh and self._late(order[0], topic):
-            self._give_up([ready], LedgerRow.LATE)
+            self._give_up([ready], Fate.LATE)
             return
         if order <= self._last.get(topic_id, (-1, -1)) and (topic_id, order) in self._over:
             self._stats.repeats += 1
@@ -412,7 +412,7 @@ class Inbox:
         try:
             payload = self.announced.decode(ready)
         except CodecError as error:
-            self._give_up([ready], ROWS[error.row])
+            self._give_up([ready], FATES[error.fate])
             return
         qos = ready.qos if ready.qos >= 0 else topic.qos
         key = Key(self.boot, *order)
@@ -443,20 +443,20 @@ class Inbox:
             return
         if topics is None:
             return
-        self._give_up(self.order.without({*self.announced.topics, CARRIED_TOPIC}), LedgerRow.UNKNOWN_TOPIC)
+        self._give_up(self.order.without({*self.announced.topics, CARRIED_TOPIC}), Fate.UNKNOWN_TOPIC)
         self._events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
             self._arrived(ready)
 
-    def _lose(self, partial: PartialMessage, reason: LedgerRow) -> None:
+    def _lose(self, partial: PartialMessage, reason: Fate) -> None:
         key = Key(self.boot, partial.begin, partial.place)
         self._events.append(Lost(self.src_id, partial.topic_id, reason, key))
 
-    def _give_up(self, messages: Iterable[Ready], reason: LedgerRow) -> None:
+    def _give_up(self, messages: Iterable[Ready], reason: Fate) -> None:
         for ready in messages:
             self._events.append(Lost(self.src_id, ready.topic_id, reason, Key(self.boot, *ready.order)))
 
 
-def _passed_over(topic: AnnouncedTopic) -> LedgerRow:
-    """The ledger row of a message that is not delivered because a later one of its topic was."""
-    return LedgerRow.GIVEN_UP if topic.reliable else LedgerRow.OVERTAKEN
+def _passed_over(topic: AnnouncedTopic) -> Fate:
+    """The fate of a message that is not delivered because a later one of its topic was."""
+    return Fate.GIVEN_UP if topic.reliable else Fate.OVERTAKEN

@@ -3,7 +3,7 @@
 Which of them goes into the next packet says ``packing``, how long it is worth repairing ``lifetime``, and what is kept
 for robots that join late ``kept``.
 
-Invariant: every message ends in being sent or in a Refused with its row.
+Invariant: every message is sent or ends in a Refused with its fate.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.events import Accepted, Missed, Refused
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
@@ -164,7 +164,7 @@ class Outbox:
         if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
-            self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         coded = codec is not None
         message = Message(serial, topic_id, payload, topic.qos, now, topic.weight, lifespan_s, coded=coded)
@@ -250,9 +250,9 @@ class Outbox:
             if isinstance(item.message, Message):
                 item.message.lifetime.end()
             if not item.message.repeat:
-                self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
+                self._refuse(item.message.serial, item.message.topic_id, item.fate, item.detail)
 
-    def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
+    def _refuse(self, serial: int, topic_id: int, reason: Fate, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
         if self._observer is not None:
             self._observer(Refused(serial, topic_id, reason, detail))

@@ -21,7 +21,7 @@ from gr_ros2.link.events import (
     ReceiverEvent,
     Rejected,
 )
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import RateController
 from gr_ros2.link.stats import ReceiverStats
@@ -153,8 +153,8 @@ class ReceivingSide:
         neighbour = self.neighbours.get(event.src_id)
         if neighbour is not None:
             neighbour.inbox.marks.pop(event.topic_id, None)
-        self.stats.lost[event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED.value] += 1
-        return Lost(event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED, event.key)
+        self.stats.lost[event.src_id, event.topic_id, Fate.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, Fate.PUBLISH_FAILED, event.key)
 
     def _receive(self, arrival: ReceivedPacket, now: float) -> None:
         try:
@@ -262,7 +262,7 @@ class ReceivingSide:
         """A robot is heard for the first time, or is heard again."""
         neighbour = opened.neighbour
         if opened.replaced is not None:
-            self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
+            self._report_all(opened.replaced.inbox.close(Fate.SENDER_RESTARTED))
         self._forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):

@@ -11,7 +11,7 @@ import pytest
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered, Gone, Rejected
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Seal, SealMode, subkey
 from gr_ros2.link.v1.unreported import MEETING_S
@@ -418,7 +418,7 @@ def test_what_was_withheld_for_long_is_not_executed() -> None:
         two.receive(data, air.now)
     air.run(5.0)
     assert not any(payload.startswith(b"late") for payload in two.delivered())
-    assert two.end.received.lost[1, 0, LedgerRow.NOT_FRESH.value] > 50
+    assert two.end.received.lost[1, 0, Fate.NOT_FRESH.value] > 50
     assert any(payload.startswith(b"line") for payload in two.delivered())  # nobody said that it must be fresh
 
 
@@ -454,4 +454,4 @@ def test_what_is_fresh_is_taken(loss: float) -> None:
         one.end.messages.submit(0, b"go %d" % number, air.now)
         air.run(0.1)
     assert len(two.delivered()) >= 599
-    assert not two.end.received.lost[1, 0, LedgerRow.NOT_FRESH.value]
+    assert not two.end.received.lost[1, 0, Fate.NOT_FRESH.value]
