@@ -119,10 +119,10 @@ def _looked_at(look: Dissection, data: bytes, reader: Reader, registry: Registry
     elif repair.mask:
         kind = "repair"
         count, first = repair.mask.bit_count(), look.number - repair.mask.bit_length() + 1
-        what = f"row {repair.row}, of {count} packets in {first}..{look.number}"
+        what = f"repair id {repair.repair_id}, of {count} packets in {first}..{look.number}"
         what += ", nothing older is worth repairing" if repair.oldest else ""
     else:
-        kind, what = "control", f"at number {look.number}, row {repair.row}"
+        kind, what = "control", f"at number {look.number}, repair id {repair.repair_id}"
     if look.hidden:
         content = f"{len(look.hidden)} bytes encrypted: {_preview(look.hidden)}"
     elif repair is not None and repair.mask:

@@ -21,14 +21,14 @@ class PacketId(NamedTuple):
 
     :param boot: number of the sender's start; 0 with version 0, which has none
     :param number: full number of the packet; with version 0 the number on the wire, which comes round
-    :param row: distinguishes the packets that have one number: a packet of messages and its repairs; with version 0,
+    :param repair_id: tells packets apart that have one number: a packet of messages and its repairs; with version 0,
         whose numbers come round, a checksum of its bytes
     """
 
     src_id: int
     boot: int
     number: int
-    row: int
+    repair_id: int
 
 
 class ReceivedPacket(NamedTuple):

@@ -5,7 +5,7 @@
 
 Invariants: every submitted message is accepted once; it then leaves whole or is refused with a named reason;
 ``receive`` never raises, whatever the bytes; packets leave only when the pace (rate or credit) allows; each number is
-sent once, and each row once per number; there is no clock, no randomness and no IO here: the caller passes in the time,
+sent once, and each repair id once per number; there is no clock, randomness or IO here: the caller passes in the time,
 the boot number and the stored state.
 """
 

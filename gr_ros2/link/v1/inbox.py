@@ -195,7 +195,7 @@ class Inbox:
         return number not in self.decoder and number >= self.decoder.floor
 
     def repair(
-        self, number: int, mask: int, row: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
+        self, number: int, mask: int, repair_id: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
     ) -> Events:
         """Take a repair; only one that was not here before calls for a report."""
         self.reports.unreported += new
@@ -205,7 +205,7 @@ class Inbox:
         if oldest:
             self.order.repaired_from(number - window + 1)
         redundant = self.decoder.counts["redundant"]
-        for found in self.decoder.repair(number, mask, row, combined):
+        for found in self.decoder.repair(number, mask, repair_id, combined):
             self._recovered(found)
         if self.decoder.counts["redundant"] > redundant:
             self.reports.repaired_in_vain()

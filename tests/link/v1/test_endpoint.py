@@ -462,7 +462,7 @@ def test_a_lifespan_ends_repair_and_message() -> None:
     assert two.delivered() == []
 
 
-def test_more_repairs_than_rows_move_on_to_the_next_number() -> None:
+def test_more_repairs_than_repair_ids_move_on_to_the_next_number() -> None:
     one, two = Robot(1, registry(), repair="idle"), Robot(2)
     air = Air(one, two)
     air.run(0.5)
