@@ -292,6 +292,7 @@ effects(
     drain_s=run("drain_s=0", "ros_source.packet_rate=0"),
     sim=run("sim.odom_rate=20"),
     task=Elsewhere("tests/run/test_task_run.py"),
+    controller=Elsewhere("tests/run/test_task_run.py"),
     reports=run("reports={}", LOSSY),
     airtime=run("airtime=eu869.4"),
 )
