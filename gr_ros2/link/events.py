@@ -113,7 +113,7 @@ class Announced(NamedTuple):
     """A robot's table of topics has arrived. It gives the meaning of the topic ids of the following messages."""
 
     src_id: int
-    rows: tuple[AnnouncedTopic, ...]
+    topics: tuple[AnnouncedTopic, ...]
 
 
 ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced

@@ -248,7 +248,7 @@ class Reader:
             payload = whole and whole.payload()
             if payload:
                 found = read_table(payload)
-        topics = {row.topic_id: row for row in found}
+        topics = {topic.topic_id: topic for topic in found}
         if not found or self.topics.get(src_id) == topics:
             return ()
         self.topics[src_id] = topics

@@ -22,7 +22,7 @@ from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.relayed import read_carried, read_relayed, write_carried, write_relayed
-from gr_ros2.wire.table import AnnouncedTopic, read_table
+from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 from tests.link.v1.air import KEY, Air, Robot, registry
 from tests.wire import second_decoder as second
 
@@ -116,12 +116,12 @@ def test_kept_messages() -> None:
         1,
         40,
         Settings(2, packet_len=64),
-        topics=(AnnouncedTopic(0, "map", "std_msgs/msg/String", latched=True),),
         decoder_for=None,
         marks={},
         stats=ReceiverStats(),
         control=lambda _: None,
     )
+    inbox.announced.take(write_table((AnnouncedTopic(0, "map", "std_msgs/msg/String", latched=True),)))
     found = []
     for number, payload in enumerate(received, 1):
         part = v1.Part(0, payload)

@@ -93,7 +93,6 @@ class Inbox:
 
     :param first: number of the first packet that may be needed
     :param room: bytes of its longest body
-    :param topics: its topics, where they are known beforehand
     :param decoder_for: makes the decoder for its messages from its table of topics
     :param marks: CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as
         many as its depth
@@ -113,7 +112,6 @@ class Inbox:
         room: int,
         settings: Settings,
         *,
-        topics: tuple[AnnouncedTopic, ...],
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
         marks: dict[int, tuple[int, ...]],
         stats: ReceiverStats,
@@ -146,7 +144,7 @@ class Inbox:
         self._commands, self._deadlines = settings.commands, settings.deadlines
         self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
         """Numbers that its packets have reached, and when, s."""
-        self.announced = AnnouncedTopics(topics, decoder_for, bounds.unknown)
+        self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
         self._last: dict[int, tuple[int, int]] = {}
         """The newest message that was delivered, by topic."""
         self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
@@ -253,8 +251,8 @@ class Inbox:
         """Whether a latched message, named in a hello at a packet number, is neither here, nor a newer one of its
         topic, nor arriving."""
         topic_id, value = mark
-        row = self.announced.topics.get(topic_id)
-        if row is not None and row.dst_id not in (BROADCAST, self._own):
+        topic = self.announced.topics.get(topic_id)
+        if topic is not None and topic.dst_id not in (BROADCAST, self._own):
             return False
         here = value in self.marks.get(topic_id, ()) or self._last.get(topic_id, (-1, -1))[0] > number
         return not here and not self._reassembly.growing(topic_id, now - 1.0)

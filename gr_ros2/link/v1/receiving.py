@@ -59,7 +59,6 @@ GIVE_UP_S = 10.0
 class ReceivingSide:
     """The receiving half of one robot.
 
-    :param rows: topics of robots that announce none
     :param decoder_for: makes the decoder for a robot's messages from its table of topics
     :param heard: what ``save`` stored before this start
     :param access: is told what is heard on a channel that others share
@@ -74,7 +73,6 @@ class ReceivingSide:
         boot: int,
         keys: Keys,
         *,
-        rows: tuple[AnnouncedTopic, ...],
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
         access: Access | None = None,
         heard: Mapping[int, tuple[int, int]],
@@ -86,7 +84,6 @@ class ReceivingSide:
         self._boot = boot
         self._sealed = keys.sealed
         self._give_up_s = GIVE_UP_S / settings.airtime_share
-        self._rows = rows
         self._decoder_for = decoder_for
         self._marks: dict[int, dict[int, tuple[int, ...]]] = {}
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
@@ -321,7 +318,6 @@ class ReceivingSide:
             first,
             room,
             self._settings,
-            topics=self._rows,
             decoder_for=self._decoder_for,
             marks=self._marks.setdefault(src_id, {}),
             stats=self.stats,
