@@ -287,9 +287,12 @@ class Outputs:
         name = self.heard.name(key)
         for (src_id, _), other in list(self._outputs.items()):
             if src_id == key[0] and other is not output and other.publisher is not None and other.name == name:
-                self.release([other])  # the same topic with its type before
-                other.publisher.close()
-                other.publisher = None
+                self.release([other])  # the same topic with its type before, or for another robot
+                before, other.publisher = other.publisher, None
+                if (other.topic.type_name, other.topic.options) == (topic.type_name, topic.options):
+                    output.name, output.publisher = name, before
+                    return before
+                before.close()
         output.name = name
         publisher = output.publisher = self._graph.middleware.advertise(name, topic.type_name, qos)
         if self.running and self._graph.middleware.settling_s and not topic.latched:

@@ -176,16 +176,17 @@ class Registry(Sequence[Topic]):
         return cls(list(_topics(rows, path)), path)
 
     def extended(self, rows: Sequence[NewTopic]) -> Registry:
-        """These rows too, with the next numbers. A name may come again with another type, which it has from then on.
+        """These rows too, with the next numbers. A name may come again with another type or for another robot, which it
+        has from then on.
 
         :raises RegistryError: too many, or a row that is there already
         """
         topics = [Topic(number, *row) for number, row in enumerate(rows, len(self))]
         if len(self) + len(topics) > MAX_TOPICS:
             raise RegistryError(f"{len(self) + len(topics)} topics; a link carries at most {MAX_TOPICS}")
-        known = {(topic.name.lstrip("/"), topic.type_name) for topic in self}
+        known = {(topic.name.lstrip("/"), topic.type_name, topic.options.to) for topic in self}
         for topic in topics:
-            key = topic.name.lstrip("/"), topic.type_name
+            key = topic.name.lstrip("/"), topic.type_name, topic.options.to
             if key in known:
                 raise RegistryError(f"duplicate topic {topic.name!r}")
             known.add(key)

@@ -337,20 +337,25 @@ class Inbox:
             else:
                 self._of_another(ready)
             return
-        if self._relaying is not None:
+        here = ready.over is None
+        if self._relaying is not None and here:
             self._relaying.direct(self.src_id, self.boot, ready, self._now)
         if ready.topic_id == TABLE_TOPIC:
-            self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
+            if here:
+                self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
             self._table(ready.payload)
             return
         topic = self.announced.topic_of(ready)
         if topic is None:
-            for lost in self.announced.wait(ready):
-                self._give_up([lost], self.announced.unknown(lost))
-        elif topic.reliable and ready.order[0] > self.order.low:
+            self._await_table(ready)
+        elif topic.reliable and here and ready.order[0] > self.order.low:
             self.order.wait(ready)
         else:
             self._deliver(ready, topic)
+
+    def _await_table(self, ready: Ready) -> None:
+        for lost in self.announced.wait(ready):
+            self._give_up([lost], self.announced.unknown(lost))
 
     def _of_another(self, ready: Ready) -> None:
         """A message of another robot."""
@@ -363,16 +368,9 @@ class Inbox:
     def relayed(self, ready: Ready, now: float) -> Events:
         """Take a message of this robot that has come over another one."""
         self._now = now
-        if ready.topic_id == TABLE_TOPIC:
-            self._table(ready.payload)
-        else:
+        if ready.topic_id != TABLE_TOPIC:
             self._over.append((ready.topic_id, ready.order))
-            topic = self.announced.topic_of(ready)
-            if topic is not None:
-                self._deliver(ready, topic)
-            else:
-                for lost in self.announced.wait(ready):
-                    self._give_up([lost], self.announced.unknown(lost))
+        self._arrived(ready)
         events, self._events = self._events, []
         return events
 
@@ -416,7 +414,7 @@ class Inbox:
             return
         qos = ready.qos if ready.qos >= 0 else topic.qos
         key = Key(self.boot, *order)
-        self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired))
+        self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired, ready.hops, ready.over))
 
     def _old(self, number: int, topic: AnnouncedTopic) -> bool:
         """Whether a message may be older than its topic allows, because nothing proves that it is not."""
@@ -443,7 +441,8 @@ class Inbox:
             return
         if topics is None:
             return
-        self._give_up(self.order.without({*self.announced.topics, CARRIED_TOPIC}), LedgerRow.UNKNOWN_TOPIC)
+        for ready in self.order.without({*self.announced.topics, CARRIED_TOPIC}):
+            self._await_table(ready)  # an older table, which came over others, lacks rows of the newest one
         self._events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
             self._arrived(ready)

@@ -3,7 +3,8 @@
 Which of them goes into the next packet says ``packing``, how long it is worth repairing ``lifetime``, and what is kept
 for robots that join late ``kept``.
 
-Invariant: every message ends in being sent or in a Refused with its row.
+Invariants: every message ends in being sent or in a Refused with its row; a row of the table of topics is for the same
+robot as long as this start lasts, so that no older table of a receiver lets it deliver what is for another one.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any, Protocol
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.link.endpoint import check_live_options
 from gr_ros2.link.events import Accepted, Missed, Refused
 from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
@@ -25,9 +27,9 @@ from gr_ros2.link.v1.kept import KeptMessages
 from gr_ros2.link.v1.lifetime import WORTH
 from gr_ros2.link.v1.packing import ENTRY, Message, Packing
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopic, SentTopics
-from gr_ros2.settings.config import QueuePolicy
+from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.registry import NewTopic, Registry
+from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOPIC
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -135,6 +137,25 @@ class Outbox:
         if self._tabulate():
             self._owner.topics_changed()
         return self.queue(topic_id) != before
+
+    def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:
+        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
+        before = self.sent[topic_id]
+        name, type_name = before.topic.name, before.topic.type_name
+        check_live_options(name, before.topic.options, options)
+        meant = name, type_name, options.to
+        rows = [
+            row for row in self.sent.named() if (row.topic.name, row.topic.type_name, row.topic.options.to) == meant
+        ]
+        if not rows:
+            rows = [self.sent[self.add([(name, type_name, options)])[-1].topic_id]]
+        rows[0].publishers = before.publishers
+        rows[0].change(options)
+        self.sent.find_deadlines()
+        if self._tabulate() or rows[0] is not before:
+            self._owner.topics_changed(asked=True)
+        assert self.topics is not None
+        return self.topics, rows[0].topic
 
     def missed(self, topic_id: int, total: int) -> None:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""

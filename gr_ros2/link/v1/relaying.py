@@ -133,13 +133,13 @@ class Relaying:
         if message.dst_id not in (BROADCAST, self.src_id):
             return []
         if message.topic_id == TABLE_TOPIC:
-            return self._announced(message, now)
+            return self._announced(message, via, now)
         inbox = self._inbox(message.origin, message.start)
         if inbox is None:
             self._dropped["unknown_origin"] += 1
             return []
         order = message.number, message.place
-        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False)
+        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False, message.hops, via)
         return self._reached(inbox, now) + inbox.relayed(ready, now)
 
     def _reached(self, inbox: Inbox, now: float) -> Events:
@@ -202,7 +202,7 @@ class Relaying:
         payload = boot.to_bytes(_BOOT_LEN, "big") + table
         self._take(src_id, Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload), now)
 
-    def _announced(self, message: Relayed, now: float) -> Events:
+    def _announced(self, message: Relayed, via: int, now: float) -> Events:
         """The table of a far robot."""
         boot = int.from_bytes(message.payload[:_BOOT_LEN], "big")
         if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start:
@@ -219,7 +219,8 @@ class Relaying:
                 return []
             inbox = self.far[message.origin] = self._make_inbox(message.origin, boot)
             self.found(message.origin, now)
-        ready = Ready(TABLE_TOPIC, (message.number, message.place), message.payload[_BOOT_LEN:], -1, False, False)
+        order, table = (message.number, message.place), message.payload[_BOOT_LEN:]
+        ready = Ready(TABLE_TOPIC, order, table, -1, False, False, message.hops, via)
         return self._reached(inbox, now) + inbox.relayed(ready, now)
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
