@@ -62,7 +62,7 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
             "silent" if peer["silent"] else f"over {peer['over']}, hop {peer['hops']}" if peer["hops"] else "heard",
             _seconds(peer["heard_s"]),
             _decibels(peer["snr_db"]),
-            f"{peer['loss']:.1%}",
+            f"{peer['lost']} ({peer['loss']:.1%} lately)",
             str(peer["topics"]),
             "yes" if peer["sealed"] else "no",
         )

@@ -185,6 +185,7 @@ class HeardRobot:
     :param sealed: its packets are sealed
     :param snr_db: SNR of its newest packets, dB; None if it is not measured packet by packet
     :param loss: share of its packets that were lost lately, 0..1
+    :param lost: packets of it that were lost since it was first heard, repaired or not
     :param topics: number of topics and services that it has announced
     :param hops: robots that have sent its newest message on; 0 where it is heard itself
     :param over: where it is not heard: the neighbour over which it is reached, None if no way is known
@@ -197,6 +198,7 @@ class HeardRobot:
     sealed: bool
     snr_db: float | None
     loss: float
+    lost: int
     topics: int
     hops: int = 0
     over: int | None = None

@@ -180,7 +180,6 @@ class Inbox:
             return []
         self.counts["packets"] += 1
         late = number < decoder.newest
-        self._stats.packet_loss_est -= late
         self._advance(number, now, here=True)
         self.reports.arrived(late=late)
         for found in decoder.source(number, body[: self._room]):
@@ -288,8 +287,9 @@ class Inbox:
         self.decoder.advance(number)
         if gone:
             self.counts["missing"] += gone
-            self._stats.packet_loss_est += gone
-            self.reports.missed(gone, counts=newest >= self._first)
+            met = newest >= self._first  # what came before the first packet that was heard is not lost
+            self._stats.missed[self.src_id] += gone * met
+            self.reports.missed(gone, counts=met)
             self.order.missing(now, newest + 1, newest + gone)
 
     def _recovered(self, found: tuple[int, bytes]) -> None:

@@ -166,7 +166,7 @@ class Relaying:
             if inbox is not None and (neighbour is None or neighbour.gone):
                 hops, over = self.hops.get(src_id, 0), self.custody.routes.over(src_id, now, lambda _: True)
                 topics = len(inbox.announced.topics)
-                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, topics, hops, over))
+                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, 0, topics, hops, over))
         return found
 
     def handle_timeout(self, now: float) -> Events:
