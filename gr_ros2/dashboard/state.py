@@ -33,7 +33,7 @@ from gr_ros2.link.events import (
     SenderEvent,
     SentPacket,
 )
-from gr_ros2.link.ledger_rows import LedgerRow, arrived
+from gr_ros2.link.fates import Fate, arrived
 from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
@@ -81,12 +81,12 @@ class _Topic:
         self.belief = PathComparison(int(HISTORY_S / _PATH_STEP_S), _PATH_STEP_S)
         self.history: deque[tuple[float, float, float, float, float]] = deque(maxlen=history)
 
-    def rows(self) -> dict[str, int]:
-        """The ledger rows as far as the events alone show them. An observer of both ends uses the ledger instead."""
-        whole = {LedgerRow.DELIVERED.value: self.delivered - self.repaired, LedgerRow.REPAIRED.value: self.repaired}
-        rows = {row: count for row, count in {**whole, **self.ended}.items() if count}
-        rest = self.sent - sum(rows.values())
-        return {**rows, LedgerRow.IN_FLIGHT.value: rest} if rest > 0 else rows
+    def fates(self) -> dict[str, int]:
+        """The ledger fates as far as the events alone show them. An observer of both ends uses the ledger instead."""
+        whole = {Fate.DELIVERED.value: self.delivered - self.repaired, Fate.REPAIRED.value: self.repaired}
+        fates = {fate: count for fate, count in {**whole, **self.ended}.items() if count}
+        rest = self.sent - sum(fates.values())
+        return {**fates, Fate.IN_FLIGHT.value: rest} if rest > 0 else fates
 
 
 class _SourceWindow:
@@ -106,7 +106,7 @@ class DashboardState:
     :param packet_len: bytes of a packet
     :param name: name of the link
     :param duration_s: s during which messages will be submitted, 0 = unknown
-    :param ledger: gives the messages per ledger row, as an observer of both ends knows them; None uses the events alone
+    :param ledger: gives the messages per fate, as an observer of both ends knows them; None uses the events alone
     :param tick_s: s between two calls of :meth:`tick`, for the length of the history
     :param airtime: s that a packet of so many bytes takes; None where packets take no air, or it is not known
     :param received_as: absolute name under which a sender's topic comes out here, '' where it is not known
@@ -171,7 +171,7 @@ class DashboardState:
             elif isinstance(event, Missed):
                 topic = self._topic((src_id, event.topic_id))
                 topic.sent += event.count
-                topic.ended[LedgerRow.LOST_ON_GRAPH.value] += event.count
+                topic.ended[Fate.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, src_id, event)
 
@@ -181,9 +181,9 @@ class DashboardState:
             if isinstance(event, Delivered):
                 self._delivered(event, now)
             elif isinstance(event, Announced):
-                for row in event.rows:
-                    full_name = self._received_as(event.src_id, row.name)
-                    self._learn((event.src_id, row.topic_id), row.name, row.type_name, full_name)
+                for topic in event.topics:
+                    full_name = self._received_as(event.src_id, topic.name)
+                    self._learn((event.src_id, topic.topic_id), topic.name, topic.type_name, full_name)
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
                 if source is None or not source.messages.repeats(event):
@@ -329,8 +329,10 @@ class DashboardState:
         if final is not None:
             return _final_view(place, key, final)
         # The ledger has priority: it has taken every event, also those from before this state was made.
-        rows = topic.rows() if self._ledger is None else dict(ledger.get(key, {}))
-        sent, delivered = (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), arrived(rows))
+        fates = topic.fates() if self._ledger is None else dict(ledger.get(key, {}))
+        sent, delivered = (
+            (topic.sent, topic.delivered) if self._ledger is None else (sum(fates.values()), arrived(fates))
+        )
         seconds = min(elapsed, self._duration_s) if self._duration_s else elapsed
         latencies = np.sort(np.array(topic.latencies, dtype=float))
         age_now, age_mean, age_peak = topic.age.read(now) or (None, None, None)
@@ -352,7 +354,7 @@ class DashboardState:
             age_mean_s=age_mean,
             age_peak_s=age_peak,
             queued=queued.get(key),
-            ledger=rows,
+            ledger=fates,
         )
 
     def _series(self, place: int, key: Key) -> SeriesView:

@@ -26,7 +26,7 @@ class TopicView:
     :param latency_cdf_s: quantiles of the same latencies, at 0 %, 1 %, … 100 %
     :param age_now_s: s since the newest delivered message was submitted
     :param queued: messages waiting at the source
-    :param ledger: row -> messages; the rows add up to ``sent``
+    :param ledger: fate -> messages; the fates add up to ``sent``
     """
 
     name: str
@@ -185,9 +185,9 @@ class Snapshot:
     air: AirView | None = None
     team: TeamView | None = None
 
-    def in_row(self, row: str) -> int:
-        """Messages in a row of the ledger, over all topics."""
-        return sum(topic.ledger.get(row, 0) for topic in self.topics)
+    def in_fate(self, fate: str) -> int:
+        """Messages with this fate, over all topics."""
+        return sum(topic.ledger.get(fate, 0) for topic in self.topics)
 
     @property
     def pdr(self) -> float | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import DiagnosticsConfig
 
 Stats = Mapping[str, Any]
@@ -203,7 +203,7 @@ class LinkHealth:
                 refused[reason] = refused.get(reason, 0) + count
         status.values |= {f"messages dropped: {reason}": str(count) for reason, count in sorted(refused.items())}
         for name, topic in stats["source"]["topics"].items():
-            dropped = sum(topic["refused"].values()) + topic[LedgerRow.LOST_ON_GRAPH]
+            dropped = sum(topic["refused"].values()) + topic[Fate.LOST_ON_GRAPH]
             status.values[f"{name} (sent, dropped)"] = f"{topic['sent']}, {dropped}"
         return status
 
@@ -241,7 +241,7 @@ def _look(stats: Stats, now: float) -> _Look:
     sink = stats["sink"]
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
-    lost_on_graph = sum(topic[LedgerRow.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
+    lost_on_graph = sum(topic[Fate.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
     return _Look(
         now=now,
         sent=stats["packets"]["out"],
@@ -249,7 +249,7 @@ def _look(stats: Stats, now: float) -> _Look:
         missing=sink["packet_loss_est"],
         rejected=rejected,
         lost_on_graph=lost_on_graph,
-        unpublished=sink[LedgerRow.PUBLISH_FAILED],
+        unpublished=sink[Fate.PUBLISH_FAILED],
         topics=topics,
         front_end_passed=stats["front_end"]["passed"],
         front_end_lost=stats["front_end"]["lost"],

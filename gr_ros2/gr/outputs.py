@@ -23,7 +23,7 @@ from gr_ros2.gr.heard_topics import HeardTopics, Key
 from gr_ros2.gr.latency import Latencies, LatencyWindow
 from gr_ros2.link import Delivered, ReceiverEvent
 from gr_ros2.link.events import Announced
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.type_definitions import known
 from gr_ros2.middleware.type_descriptions import Described
@@ -124,10 +124,10 @@ class Outputs:
         """Take over the topics that a sender announces; returns those that can be published. A publisher whose topic
         has a new name or type is closed."""
         topics = []
-        for row in event.rows:
-            key = (event.src_id, row.topic_id)
+        for told in event.topics:
+            key = (event.src_id, told.topic_id)
             try:
-                topic = announced(row, self._config.topic_options)
+                topic = announced(told, self._config.topic_options)
                 name = topic.republished(self._config.namespace_format, event.src_id)
                 if topic.is_topic:
                     LOOP_GUARD.add_output(self._owner, self._graph, key, name)
@@ -236,9 +236,7 @@ class Outputs:
             publisher.publish(payload)
         except Exception as error:  # noqa: BLE001 - whatever the reason, nobody got the message
             named = f"topic id {key[1]} of robot {key[0]}"
-            self._failures.note(
-                LedgerRow.PUBLISH_FAILED.value, f"ros2_sink: a message of {named} was not published", error
-            )
+            self._failures.note(Fate.PUBLISH_FAILED.value, f"ros2_sink: a message of {named} was not published", error)
             with self._lock:
                 return self._end.unpublished(event)
         with self._lock:

@@ -1,6 +1,6 @@
 """What a ROS Source takes from its ROS graph: the topics, with the QoS of their publishers.
 
-Invariants: a callback of the middleware blocks only with ``backpressure``. Each type of a topic has a row of its own.
+Invariants: a callback of the middleware blocks only with ``backpressure``. Each type of a topic has its own topic id.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.link.endpoint import check_live_options
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.middleware import Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
@@ -33,7 +33,7 @@ class Subscriptions:
     :param live: endpoint that takes the messages
     :param clock: s, monotonic
     :param counters: counts ``held_back_at_close``, and what static transforms count
-    :ivar registry: all rows so far
+    :ivar registry: all topics so far
     :ivar options: the options of single topics, by name
     :ivar room: notified when a message that is held back may be submitted; uses the lock of ``live``
     :ivar subscribed: topics by their absolute names on the ROS graph, as they were subscribed. The mapping is replaced
@@ -63,7 +63,7 @@ class Subscriptions:
         static = [topic for topic in registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
-        self._rows: dict[int, int] = {}
+        self._moved: dict[int, int] = {}
         """Topic ids under which messages leave now, by those that were subscribed, where ``to`` has changed."""
         chosen = registry.chosen(config.topics) if registry else []
         self.subscribed = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_topic}
@@ -107,25 +107,25 @@ class Subscriptions:
         """The counters of each topic, by its name on the ROS graph. Called with the lock held."""
         self.take_losses()
         stats, queued = self._live.endpoint.sent, self._messages.queued()
-        rows: dict[str, list[int]] = {}
+        ids: dict[str, list[int]] = {}
         for topic in self.registry:
             if topic.is_topic:
-                rows.setdefault(topic.name, []).append(topic.topic_id)
-        now = {topic.topic_id: self._row(topic.topic_id) for topic in self.subscribed.values()}
+                ids.setdefault(topic.name, []).append(topic.topic_id)
+        now = {topic.topic_id: self._now(topic.topic_id) for topic in self.subscribed.values()}
         return {
             name: {
                 "topic_id": now[topic.topic_id],
                 "type": topic.type_name,
-                "types": len({self.registry[row].type_name for row in rows[topic.name]}),
-                "submitted": sum(stats.submitted[row] for row in rows[topic.name]),
-                LedgerRow.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
-                "sent": sum(stats.sent[row] for row in rows[topic.name]),
-                "queued": sum(queued[row] for row in rows[topic.name]),
+                "types": len({self.registry[topic_id].type_name for topic_id in ids[topic.name]}),
+                "submitted": sum(stats.submitted[topic_id] for topic_id in ids[topic.name]),
+                Fate.LOST_ON_GRAPH.value: sum(stats.missed[topic_id] for topic_id in ids[topic.name]),
+                "sent": sum(stats.sent[topic_id] for topic_id in ids[topic.name]),
+                "queued": sum(queued[topic_id] for topic_id in ids[topic.name]),
                 "queue": self._messages.queue(now[topic.topic_id])[0],
                 "queue_depth": self._messages.depth(now[topic.topic_id]),
                 "refused": {
-                    reason: sum(stats.refused[row, reason] for row in rows[topic.name])
-                    for reason in sorted({why for row, why in stats.refused if row in rows[topic.name]})
+                    reason: sum(stats.refused[topic_id, reason] for topic_id in ids[topic.name])
+                    for reason in sorted({why for topic_id, why in stats.refused if topic_id in ids[topic.name]})
                 },
             }
             for name, topic in self.subscribed.items()
@@ -161,16 +161,16 @@ class Subscriptions:
             self._change(topic_id, new)
         self.options = options
 
-    def add_services(self, rows: Mapping[str, NewTopic]) -> dict[str, Topic]:
+    def add_services(self, found: Mapping[str, NewTopic]) -> dict[str, Topic]:
         """Announce services, and the topics of actions.
 
-        :param rows: by names on the ROS graph
+        :param found: by names on the ROS graph
         :return: the services among them, by names on the ROS graph
         :raises ConfigError: for more than a link carries
         """
         with self._live.lock:
-            self.registry = self._messages.add(list(rows.values()))
-            added = dict(zip(rows, self.registry[-len(rows) :], strict=True))
+            self.registry = self._messages.add(list(found.values()))
+            added = dict(zip(found, self.registry[-len(found) :], strict=True))
             services = {name: topic for name, topic in added.items() if topic.is_service}
             topics = {name: topic for name, topic in added.items() if topic.is_topic}
             self.services = {**self.services, **services}
@@ -189,11 +189,11 @@ class Subscriptions:
         options, type_name = options_of(row_name, self.options), normalize_type(info.type_name)
         with self._live.lock:
             before = self.subscribed.get(info.topic)
-            rows = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
-            if not rows:
+            known = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
+            if not known:
                 self.registry = self._messages.add([(row_name, type_name, options)])
-                rows = [self.registry[-1]]
-            topic = rows[0]
+                known = [self.registry[-1]]
+            topic = known[0]
             self._change(topic.topic_id, options)
             self._adapt(topic, info.publishers)
             if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
@@ -212,13 +212,13 @@ class Subscriptions:
         """Whether a topic or service of the ROS graph has come by radio."""
         return any(LOOP_GUARD.returns(self._graph, name) for name in names)
 
-    def _row(self, topic_id: int) -> int:
-        """The row under which messages of a subscription leave now."""
-        return self._rows.get(topic_id, topic_id)
+    def _now(self, topic_id: int) -> int:
+        """The topic id under which messages of a subscription leave now."""
+        return self._moved.get(topic_id, topic_id)
 
     def _change(self, topic_id: int, options: TopicOptions) -> None:
-        self.registry, row = self._messages.change(self._row(topic_id), options)
-        self._rows[topic_id] = row.topic_id
+        self.registry, after = self._messages.change(self._now(topic_id), options)
+        self._moved[topic_id] = after.topic_id
 
     def _guard_loops(self) -> None:
         LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
@@ -237,13 +237,13 @@ class Subscriptions:
         subscription.follow(partial(self._follow, topic))
 
     def _unsubscribe(self, topic: Topic) -> None:
-        """Take no further messages of a row, and keep none for robots that join late."""
+        """Take no further messages of a topic id, and keep none for robots that join late."""
         subscriptions = dict(self._subscriptions)
         subscriptions.pop(topic.topic_id).close()
         with self._live.lock:
             self.take_losses()
             self._subscriptions = subscriptions
-            self._messages.forget_kept(self._row(topic.topic_id))
+            self._messages.forget_kept(self._now(topic.topic_id))
 
     def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
         """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
@@ -255,13 +255,13 @@ class Subscriptions:
             lifespan_s=qos.lifespan_s,
             period_s=qos.deadline_s,
         )
-        return self._messages.follow(self._row(topic.topic_id), publishers)
+        return self._messages.follow(self._now(topic.topic_id), publishers)
 
     def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
         with self._live.lock:
             changed = self._adapt(topic, offers)
-            policy, deadline_s = self._messages.queue(self._row(topic.topic_id))
+            policy, deadline_s = self._messages.queue(self._now(topic.topic_id))
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
             self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
@@ -269,7 +269,7 @@ class Subscriptions:
     def _take(self, topic_id: int, payload: bytes) -> None:
         """Accept a message of the ROS graph, in a thread of the middleware."""
         with self._live.lock:
-            while self._config.backpressure and not self._closed and not self._messages.room(self._row(topic_id)):
+            while self._config.backpressure and not self._closed and not self._messages.room(self._now(topic_id)):
                 self.room.wait()
             if self._closed:
                 self._counters["held_back_at_close"] += 1
@@ -280,5 +280,5 @@ class Subscriptions:
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._messages.submit(self._row(topic_id), whole or payload, self._clock())
+            self._messages.submit(self._now(topic_id), whole or payload, self._clock())
             self._live.wake()

@@ -83,10 +83,10 @@ class MessageSide(Protocol):
         :param total: since the start; the increase is reported to the observer
         """
 
-    def add(self, rows: Sequence[NewTopic]) -> Registry:
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
         """Send further topics from now on, all or none. Services among them are announced when they are offered.
 
-        A name may come again with another type: both rows stay, and the messages of each keep their type.
+        A name may come again with another type: both stay, and the messages of each keep their type.
 
         :return: everything that is sent; the new topics are the last ones
         :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
@@ -95,10 +95,10 @@ class MessageSide(Protocol):
     def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:
         """Give a topic other options from now on, in ``LIVE_OPTIONS``.
 
-        With another robot in ``to``, its messages leave under another row of the table, which is the same again for the
-        same robot. What was submitted before stays with the robot for which it was, and is sent on and repaired.
+        With another robot in ``to``, its messages leave under another topic id, which is the same again for the same
+        robot. What was submitted before stays with the robot for which it was, and is sent on and repaired.
 
-        :return: everything that is sent, and the row for the messages from now on
+        :return: everything that is sent, and the topic as which its messages are to be submitted from now on
         :raises ConfigError: too many topics, another option, or a version that has no such options
         """
 

@@ -206,7 +206,7 @@ class Recorder:
             rms_error_m=rms_error(t_sent, xy_sent, t_received, xy_received),
             left_out_sent=sent.left_out,
             left_out_received=received.left_out,
-            ledger=dict(sorted(book.rows.items())),
+            ledger=dict(sorted(book.fates.items())),
             hops={str(hops): count for hops, count in sorted(book.hops.items())},
             corrupt=book.corrupt,
             repeats_delivered=book.repeats_delivered,

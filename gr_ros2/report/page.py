@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from gr_ros2 import __version__
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.files import write_text, write_whole
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.record.repetitions import run_folders
 from gr_ros2.record.result import Result, air_uses, read_result, topic_numbers
 from gr_ros2.record.team import Team, read_team
@@ -291,7 +291,7 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
             ledger_figure({topic.topic: topic.ledger for topic in result.topics}),
             out,
             f"{prefix}ledger",
-            "The loss ledger: every sent message ends in exactly one row; in brackets how many were sent",
+            "The loss ledger: every sent message has exactly one fate; in brackets how many were sent",
         )
     )
     if uses := air_uses(result):
@@ -326,7 +326,7 @@ def _draw_team(team: Team, out: Path, prefix: str) -> list[Picture]:
 def write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
     """One line per run and topic with every number of ``result.json``, as CSV and Parquet."""
     lines: list[dict[str, Any]] = []
-    rows = sorted({row for run in runs for topic in run.result.topics for row in topic.ledger})
+    fates = sorted({fate for run in runs for topic in run.result.topics for fate in topic.ledger})
     for run in runs:
         result = run.result
         for topic in result.topics:
@@ -338,7 +338,7 @@ def write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
                         "interrupted": result.interrupted,
                         "phy": result.phy.get("name"),
                     },
-                    **topic_numbers(topic, rows),
+                    **topic_numbers(topic, fates),
                 }
             )
     table = pa.Table.from_pylist(lines)
@@ -355,7 +355,7 @@ def _check(run: Run) -> None:
         messages = counts.get((topic.topic, topic.src_id))
         sent, delivered = (len(messages.serial), int(messages.delivered.sum())) if messages is not None else (0, 0)
         # Messages that were lost before the link are only counted. They are not in the trace.
-        submitted = topic.sent - topic.ledger.get(LedgerRow.LOST_ON_GRAPH, 0)
+        submitted = topic.sent - topic.ledger.get(Fate.LOST_ON_GRAPH, 0)
         if (sent, delivered) != (submitted, topic.delivered):
             raise ConfigError(
                 f"{run.directory / 'messages.parquet'}: {topic.topic} has {sent} messages, {delivered} delivered, but "

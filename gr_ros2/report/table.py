@@ -12,7 +12,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.record.result import Result, TopicResult, air_uses
 from gr_ros2.record.team_numbers import TEAM_VALUES, team_numbers, team_pairs
 
@@ -113,13 +113,13 @@ def hops_grid(result: Result) -> Grid | None:
 
 
 def ledger_grid(result: Result) -> Grid:
-    """The ledger rows of the sent messages of each topic. Rows that are zero for every topic are left out."""
+    """The ledger fates of the sent messages of each topic. Fates that are zero for every topic are left out."""
     topics = list(_at_every_receiver(result))
-    found = {row for _, topic in topics for row, count in topic.ledger.items() if count}
-    first = [LedgerRow.DELIVERED, *(row for row in (LedgerRow.REPAIRED,) if row in found)]
-    rows = list(dict.fromkeys([*first, *sorted(found)]))
-    headings = ["first try" if row == LedgerRow.DELIVERED and LedgerRow.REPAIRED in found else row for row in rows]
-    lines = ((name, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for name, topic in topics)
+    found = {fate for _, topic in topics for fate, count in topic.ledger.items() if count}
+    first = [Fate.DELIVERED, *(fate for fate in (Fate.REPAIRED,) if fate in found)]
+    fates = list(dict.fromkeys([*first, *sorted(found)]))
+    headings = ["first try" if fate == Fate.DELIVERED and Fate.REPAIRED in found else fate for fate in fates]
+    lines = ((name, str(topic.sent), *(str(topic.ledger.get(fate, 0)) for fate in fates)) for name, topic in topics)
     return Grid("Where every sent message went", ("Topic", "sent", *headings), (tuple(lines),))
 
 

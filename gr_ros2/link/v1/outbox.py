@@ -3,8 +3,8 @@
 Which of them goes into the next packet says ``packing``, how long it is worth repairing ``lifetime``, and what is kept
 for robots that join late ``kept``.
 
-Invariants: every message ends in being sent or in a Refused with its row; a row of the table of topics is for the same
-robot as long as this start lasts, so that no older table of a receiver lets it deliver what is for another one.
+Invariants: every message is sent or ends in a Refused with its fate; a topic id is for the same robot as long as this
+start lasts, so that no older table of a receiver lets it deliver what is for another one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.endpoint import check_live_options
 from gr_ros2.link.events import Accepted, Missed, Refused
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
@@ -101,16 +101,16 @@ class Outbox:
             self.sent.add(topics)
             self._tabulate()
 
-    def add(self, rows: Sequence[NewTopic]) -> Registry:
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
         """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one learn of them from the next
         hello."""
-        together = (Registry.empty() if self.topics is None else self.topics).extended(rows)
-        topics = together[-len(rows) :] if rows else ()
+        together = (Registry.empty() if self.topics is None else self.topics).extended(topics)
+        added = together[-len(topics) :] if topics else ()
         if self._codec is not None:
-            for topic in topics:
+            for topic in added:
                 self._codec.add(topic)
         self.topics = together
-        self.sent.add(topics)
+        self.sent.add(added)
         self._tabulate()
         self._owner.topics_changed(added=True)
         return together
@@ -144,18 +144,17 @@ class Outbox:
         name, type_name = before.topic.name, before.topic.type_name
         check_live_options(name, before.topic.options, options)
         meant = name, type_name, options.to
-        rows = [
-            row for row in self.sent.named() if (row.topic.name, row.topic.type_name, row.topic.options.to) == meant
+        known = [
+            one for one in self.sent.named() if (one.topic.name, one.topic.type_name, one.topic.options.to) == meant
         ]
-        if not rows:
-            rows = [self.sent[self.add([(name, type_name, options)])[-1].topic_id]]
-        rows[0].publishers = before.publishers
-        rows[0].change(options)
+        after = known[0] if known else self.sent[self.add([(name, type_name, options)])[-1].topic_id]
+        after.publishers = before.publishers
+        after.change(options)
         self.sent.find_deadlines()
-        if self._tabulate() or rows[0] is not before:
+        if self._tabulate() or after is not before:
             self._owner.topics_changed(asked=True)
         assert self.topics is not None
-        return self.topics, rows[0].topic
+        return self.topics, after.topic
 
     def missed(self, topic_id: int, total: int) -> None:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
@@ -185,7 +184,7 @@ class Outbox:
         if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
-            self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         coded = codec is not None
         message = Message(serial, topic_id, payload, topic.qos, now, topic.weight, lifespan_s, coded=coded)
@@ -271,9 +270,9 @@ class Outbox:
             if isinstance(item.message, Message):
                 item.message.lifetime.end()
             if not item.message.repeat:
-                self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
+                self._refuse(item.message.serial, item.message.topic_id, item.fate, item.detail)
 
-    def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
+    def _refuse(self, serial: int, topic_id: int, reason: Fate, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
         if self._observer is not None:
             self._observer(Refused(serial, topic_id, reason, detail))
