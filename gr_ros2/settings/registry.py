@@ -176,8 +176,7 @@ class Registry(Sequence[Topic]):
         return cls(list(_topics(rows, path)), path)
 
     def extended(self, topics: Sequence[NewTopic]) -> Registry:
-        """These topics too, with the next numbers. A name may come again with another type or for another robot, and has
-        those from then on.
+        """These topics too, with the next numbers. A name may come again with another type or for another robot.
 
         :raises RegistryError: too many, or a topic that is there already
         """

@@ -335,18 +335,21 @@ class Inbox:
             else:
                 self._of_another(ready)
             return
-        here = ready.over is None
-        if self._relaying is not None and here:
+        if self._relaying is not None:
             self._relaying.direct(self.src_id, self.boot, ready, self._now)
         if ready.topic_id == TABLE_TOPIC:
-            if here:
-                self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
+            self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
             self._table(ready.payload)
             return
+        self._known(ready)
+
+    def _known(self, ready: Ready) -> None:
+        """Deliver a message as soon as its topic is known. One of a reliable topic waits for those before it, unless it
+        came over another robot."""
         topic = self.announced.topic_of(ready)
         if topic is None:
             self._await_table(ready)
-        elif topic.reliable and here and ready.order[0] > self.order.low:
+        elif topic.reliable and ready.over is None and ready.order[0] > self.order.low:
             self.order.wait(ready)
         else:
             self._deliver(ready, topic)
@@ -366,9 +369,11 @@ class Inbox:
     def relayed(self, ready: Ready, now: float) -> Events:
         """Take a message of this robot that has come over another one."""
         self._now = now
-        if ready.topic_id != TABLE_TOPIC:
+        if ready.topic_id == TABLE_TOPIC:
+            self._table(ready.payload)
+        else:
             self._over.append((ready.topic_id, ready.order))
-        self._arrived(ready)
+            self._known(ready)
         events, self._events = self._events, []
         return events
 
@@ -443,7 +448,7 @@ class Inbox:
             self._await_table(ready)  # an older table, which came over others, lacks topics of the newest one
         self._events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
-            self._arrived(ready)
+            self._known(ready)
 
     def _lose(self, partial: PartialMessage, reason: Fate) -> None:
         key = Key(self.boot, partial.begin, partial.place)
