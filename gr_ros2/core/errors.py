@@ -120,7 +120,7 @@ class VarintError(WireError):
 
 
 class WindowError(WireError):
-    """A repair whose window, mask and row contradict each other."""
+    """A repair whose window, mask and repair id contradict each other."""
 
     kind = "window"
 

@@ -179,9 +179,9 @@ class DashboardState:
             if isinstance(event, Delivered):
                 self._delivered(event, now)
             elif isinstance(event, Announced):
-                for row in event.rows:
-                    full_name = self._received_as(event.src_id, row.name)
-                    self._learn((event.src_id, row.topic_id), row.name, row.type_name, full_name)
+                for topic in event.topics:
+                    full_name = self._received_as(event.src_id, topic.name)
+                    self._learn((event.src_id, topic.topic_id), topic.name, topic.type_name, full_name)
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
                 if source is None or not source.messages.repeats(event):

@@ -122,10 +122,10 @@ class Outputs:
         """Take over the topics that a sender announces; returns those that can be published. A publisher whose topic
         has a new name or type is closed."""
         topics = []
-        for row in event.rows:
-            key = (event.src_id, row.topic_id)
+        for told in event.topics:
+            key = (event.src_id, told.topic_id)
             try:
-                topic = announced(row, self._config.topic_options)
+                topic = announced(told, self._config.topic_options)
                 name = topic.republished(self._config.namespace_format, event.src_id)
                 if topic.is_topic:
                     LOOP_GUARD.add_output(self._owner, self._graph, key, name)

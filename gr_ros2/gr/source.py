@@ -85,7 +85,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     ) -> None:
         super().__init__("ros2_source", None, None)
         self.config = settings(SourceConfig, values, registry, middleware)
-        rows = read_registry(registry, needed=not self.config.version)
+        topics = read_registry(registry, needed=not self.config.version)
         self.src_id = self.config.src_id()
         """The source id on the wire."""
         self._start = EndpointSetup()
@@ -94,7 +94,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             start = self._start = start_of(self.config, self.src_id, setup)
             rng = random.Random(seed)
             end = LiveEnd(
-                lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
+                lambda observer: make_endpoint(topics, self.config, None, start=start, rng=rng, observer=observer)
             )
         end.observer = self._observe
         self._live, self._end = end, end.endpoint
@@ -121,9 +121,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
-        rows = rows.with_options(self.config.topic_options)
+        topics = topics.with_options(self.config.topic_options)
         self.subscriptions = Subscriptions(
-            rows, self.config, self._graph, end, clock=clock, counters=self._counters, log=self._log
+            topics, self.config, self._graph, end, clock=clock, counters=self._counters, log=self._log
         )
         """What it sends."""
         self.found = FoundTopics(self.config, self.middleware, self.subscriptions, self._log)

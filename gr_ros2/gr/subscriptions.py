@@ -1,6 +1,6 @@
 """What a ROS Source takes from its ROS graph: the topics, with the QoS of their publishers.
 
-Invariants: a callback of the middleware blocks only with ``backpressure``. Each type of a topic has a row of its own.
+Invariants: a callback of the middleware blocks only with ``backpressure``. Each type of a topic has its own topic id.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Subscriptions:
     :param live: endpoint that takes the messages
     :param clock: s, monotonic
     :param counters: counts ``held_back_at_close``, and what static transforms count
-    :ivar registry: all rows so far
+    :ivar registry: all topics so far
     :ivar room: notified when a message that is held back may be submitted; uses the lock of ``live``
     :ivar subscribed: topics by their absolute names on the ROS graph. The mapping is replaced as a whole when a topic
         is added
@@ -100,24 +100,24 @@ class Subscriptions:
         """The counters of each topic, by its name on the ROS graph. Called with the lock held."""
         self.take_losses()
         stats, queued = self._live.endpoint.sent, self._messages.queued()
-        rows: dict[str, list[int]] = {}
+        ids: dict[str, list[int]] = {}
         for topic in self.registry:
             if topic.is_topic:
-                rows.setdefault(topic.name, []).append(topic.topic_id)
+                ids.setdefault(topic.name, []).append(topic.topic_id)
         return {
             name: {
                 "topic_id": topic.topic_id,
                 "type": topic.type_name,
-                "types": len(rows[topic.name]),
-                "submitted": sum(stats.submitted[row] for row in rows[topic.name]),
-                Fate.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
-                "sent": sum(stats.sent[row] for row in rows[topic.name]),
-                "queued": sum(queued[row] for row in rows[topic.name]),
+                "types": len(ids[topic.name]),
+                "submitted": sum(stats.submitted[topic_id] for topic_id in ids[topic.name]),
+                Fate.LOST_ON_GRAPH.value: sum(stats.missed[topic_id] for topic_id in ids[topic.name]),
+                "sent": sum(stats.sent[topic_id] for topic_id in ids[topic.name]),
+                "queued": sum(queued[topic_id] for topic_id in ids[topic.name]),
                 "queue": self._messages.queue(topic.topic_id)[0],
                 "queue_depth": self._messages.depth(topic.topic_id),
                 "refused": {
-                    reason: sum(stats.refused[row, reason] for row in rows[topic.name])
-                    for reason in sorted({why for row, why in stats.refused if row in rows[topic.name]})
+                    reason: sum(stats.refused[topic_id, reason] for topic_id in ids[topic.name])
+                    for reason in sorted({why for topic_id, why in stats.refused if topic_id in ids[topic.name]})
                 },
             }
             for name, topic in self.subscribed.items()
@@ -133,16 +133,16 @@ class Subscriptions:
             self._messages.learn(described.type_name, described.types)
             self._live.work.notify()
 
-    def add_services(self, rows: Mapping[str, NewTopic]) -> dict[str, Topic]:
+    def add_services(self, found: Mapping[str, NewTopic]) -> dict[str, Topic]:
         """Announce services, and the topics of actions.
 
-        :param rows: by names on the ROS graph
+        :param found: by names on the ROS graph
         :return: the services among them, by names on the ROS graph
         :raises ConfigError: for more than a link carries
         """
         with self._live.lock:
-            self.registry = self._messages.add(list(rows.values()))
-            added = dict(zip(rows, self.registry[-len(rows) :], strict=True))
+            self.registry = self._messages.add(list(found.values()))
+            added = dict(zip(found, self.registry[-len(found) :], strict=True))
             services = {name: topic for name, topic in added.items() if topic.is_service}
             topics = {name: topic for name, topic in added.items() if topic.is_topic}
             self.services = {**self.services, **services}
@@ -161,11 +161,11 @@ class Subscriptions:
         options, type_name = options_of(row_name, self._config.topic_options), normalize_type(info.type_name)
         with self._live.lock:
             before = self.subscribed.get(info.topic)
-            rows = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
-            if not rows:
+            known = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
+            if not known:
                 self.registry = self._messages.add([(row_name, type_name, options)])
-                rows = [self.registry[-1]]
-            (topic,) = rows
+                known = [self.registry[-1]]
+            (topic,) = known
             self._adapt(topic, info.publishers)
             if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
                 self._static[topic.topic_id] = StaticTransforms(self._counters)
@@ -200,7 +200,7 @@ class Subscriptions:
         subscription.follow(partial(self._follow, topic))
 
     def _unsubscribe(self, topic: Topic) -> None:
-        """Take no further messages of a row, and keep none for robots that join late."""
+        """Take no further messages of a topic id, and keep none for robots that join late."""
         subscriptions = dict(self._subscriptions)
         subscriptions.pop(topic.topic_id).close()
         with self._live.lock:

@@ -66,10 +66,10 @@ class MessageSide(Protocol):
         :param total: since the start; the increase is reported to the observer
         """
 
-    def add(self, rows: Sequence[NewTopic]) -> Registry:
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
         """Send further topics from now on, all or none. Services among them are announced when they are offered.
 
-        A name may come again with another type: both rows stay, and the messages of each keep their type.
+        A name may come again with another type: both stay, and the messages of each keep their type.
 
         :return: everything that is sent; the new topics are the last ones
         :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry

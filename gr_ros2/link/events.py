@@ -21,14 +21,14 @@ class PacketId(NamedTuple):
 
     :param boot: number of the sender's start; 0 with version 0, which has none
     :param number: full number of the packet; with version 0 the number on the wire, which comes round
-    :param row: distinguishes the packets that have one number: a packet of messages and its repairs; with version 0,
+    :param repair_id: tells packets apart that have one number: a packet of messages and its repairs; with version 0,
         whose numbers come round, a checksum of its bytes
     """
 
     src_id: int
     boot: int
     number: int
-    row: int
+    repair_id: int
 
 
 class ReceivedPacket(NamedTuple):
@@ -113,7 +113,7 @@ class Announced(NamedTuple):
     """A robot's table of topics has arrived. It gives the meaning of the topic ids of the following messages."""
 
     src_id: int
-    rows: tuple[AnnouncedTopic, ...]
+    topics: tuple[AnnouncedTopic, ...]
 
 
 ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced

@@ -153,12 +153,12 @@ class Sender:
             times.append(self._departure(plan))
         return max(min(times), self.pace.slot) if times else None
 
-    def add(self, rows: Sequence[NewTopic]) -> Registry:
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
         """Refuse: both ends of version 0 have the same registry.
 
         :raises ConfigError: always
         """
-        raise ConfigError(f"version 0 cannot announce {rows[0][0]!r}: give both ends the same registry")
+        raise ConfigError(f"version 0 cannot announce {topics[0][0]!r}: give both ends the same registry")
 
     def offer(self, topic_id: int, *, offered: bool) -> None:  # noqa: ARG002
         """Refuse: version 0 carries no services.

@@ -93,7 +93,6 @@ class Inbox:
 
     :param first: number of the first packet that may be needed
     :param room: bytes of its longest body
-    :param topics: its topics, where they are known beforehand
     :param decoder_for: makes the decoder for its messages from its table of topics
     :param marks: CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as
         many as its depth
@@ -113,7 +112,6 @@ class Inbox:
         room: int,
         settings: Settings,
         *,
-        topics: tuple[AnnouncedTopic, ...],
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
         marks: dict[int, tuple[int, ...]],
         stats: ReceiverStats,
@@ -146,7 +144,7 @@ class Inbox:
         self._commands, self._deadlines = settings.commands, settings.deadlines
         self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
         """Numbers that its packets have reached, and when, s."""
-        self.announced = AnnouncedTopics(topics, decoder_for, bounds.unknown)
+        self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
         self._last: dict[int, tuple[int, int]] = {}
         """The newest message that was delivered, by topic."""
         self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
@@ -195,7 +193,7 @@ class Inbox:
         return number not in self.decoder and number >= self.decoder.floor
 
     def repair(
-        self, number: int, mask: int, row: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
+        self, number: int, mask: int, repair_id: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
     ) -> Events:
         """Take a repair; only one that was not here before calls for a report."""
         self.reports.unreported += new
@@ -205,7 +203,7 @@ class Inbox:
         if oldest:
             self.order.repaired_from(number - window + 1)
         redundant = self.decoder.counts["redundant"]
-        for found in self.decoder.repair(number, mask, row, combined):
+        for found in self.decoder.repair(number, mask, repair_id, combined):
             self._recovered(found)
         if self.decoder.counts["redundant"] > redundant:
             self.reports.repaired_in_vain()
@@ -253,8 +251,8 @@ class Inbox:
         """Whether a latched message, named in a hello at a packet number, is neither here, nor a newer one of its
         topic, nor arriving."""
         topic_id, value = mark
-        row = self.announced.topics.get(topic_id)
-        if row is not None and row.dst_id not in (BROADCAST, self._own):
+        topic = self.announced.topics.get(topic_id)
+        if topic is not None and topic.dst_id not in (BROADCAST, self._own):
             return False
         here = value in self.marks.get(topic_id, ()) or self._last.get(topic_id, (-1, -1))[0] > number
         return not here and not self._reassembly.growing(topic_id, now - 1.0)

@@ -99,16 +99,16 @@ class Outbox:
             self.sent.add(topics)
             self._tabulate()
 
-    def add(self, rows: Sequence[NewTopic]) -> Registry:
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
         """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one learn of them from the next
         hello."""
-        together = (Registry.empty() if self.topics is None else self.topics).extended(rows)
-        topics = together[-len(rows) :] if rows else ()
+        together = (Registry.empty() if self.topics is None else self.topics).extended(topics)
+        added = together[-len(topics) :] if topics else ()
         if self._codec is not None:
-            for topic in topics:
+            for topic in added:
                 self._codec.add(topic)
         self.topics = together
-        self.sent.add(topics)
+        self.sent.add(added)
         self._tabulate()
         self._owner.topics_changed(added=True)
         return together

@@ -187,8 +187,8 @@ class Relaying:
     def _carried(self, src_id: int, topic_id: int) -> bool:
         """Whether a robot's messages of a topic are handed on to the one for which they are."""
         neighbour = self._neighbours.get(src_id)
-        row = None if neighbour is None else neighbour.inbox.announced.topics.get(topic_id)
-        return row is not None and row.reliable and (row.dst_id != BROADCAST or row.type_name == CALLS_TYPE)
+        topic = None if neighbour is None else neighbour.inbox.announced.topics.get(topic_id)
+        return topic is not None and topic.reliable and (topic.dst_id != BROADCAST or topic.type_name == CALLS_TYPE)
 
     def _take(self, via: int, message: Relayed, now: float) -> bool:
         stream = Stream(message.origin, message.start, message.topic_id)
