@@ -150,7 +150,7 @@ class RaceSender:
 
 
 @dataclass(frozen=True)
-class Stream:
+class RaceStream:
     """The messages of one program at another one. All times are s on one clock.
 
     :param t_sent: due time of each message, in the order of the recording
@@ -173,7 +173,7 @@ class Observed:
 
     began: float
     matched: bool
-    streams: Sequence[Stream]
+    streams: Sequence[RaceStream]
     air: LinkReport
     busy: float
 

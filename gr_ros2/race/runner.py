@@ -19,7 +19,7 @@ from gr_ros2.race.channel import RaceChannel
 from gr_ros2.race.contenders import Contender, chosen
 from gr_ros2.race.endpoints import Playback, RaceProgram, RaceTopic, Seat
 from gr_ros2.race.links import LinkReport, RaceIpLink, RaceRadio, RaceRosLink
-from gr_ros2.race.measure import Identity, Observed, RaceCell, RaceSender, Stream, measure
+from gr_ros2.race.measure import Identity, Observed, RaceCell, RaceSender, RaceStream, measure
 from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.race_settings import (
     PHY_NAME,
@@ -121,7 +121,7 @@ def _run_cell(settings: RaceSettings, sender: RaceSender, condition: Condition, 
         _drain(settings.drain_s, [listener], len(t_sent))
         report: LinkReport = air.call("report")
         (heard,) = listener.call("heard")
-        return Observed(began, matched, [Stream(sender.identity, t_sent, heard)], report, _busy())
+        return Observed(began, matched, [RaceStream(sender.identity, t_sent, heard)], report, _busy())
 
 
 def _run_team(
@@ -157,7 +157,7 @@ def _run_team(
         for receiver, robot in enumerate(robots):
             others = [number for number in range(count) if number != receiver]
             for number, heard in zip(others, robot.call("heard"), strict=True):
-                streams.append(Stream(senders[number].identity, t_sent[number], heard))
+                streams.append(RaceStream(senders[number].identity, t_sent[number], heard))
         return Observed(began, matched, streams, report, _busy())
 
 

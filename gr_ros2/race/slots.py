@@ -18,7 +18,7 @@ from gr_ros2.link import Delivered, SentPacket
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.race.contenders import Contender
 from gr_ros2.race.links import LinkLog, LinkReport
-from gr_ros2.race.measure import Observed, RaceSender, Stream
+from gr_ros2.race.measure import Observed, RaceSender, RaceStream
 from gr_ros2.race.race_settings import PHY_NAME, Condition, RaceSettings
 from gr_ros2.run.load import make_phys
 from gr_ros2.run.scenario import Scenario, scenario_from
@@ -48,7 +48,7 @@ def run_slots(
     run.play(begin)
     t_sent = [sender.sent(begin + sender.recording.phase_s) for sender in senders]
     streams = [
-        Stream(senders[origin].identity, t_sent[origin], heard) for (origin, _), heard in sorted(run.heard.items())
+        RaceStream(senders[origin].identity, t_sent[origin], heard) for (origin, _), heard in sorted(run.heard.items())
     ]
     busy = os.getloadavg()[0] / (os.cpu_count() or 1)
     return Observed(0.0, met < inf, streams, LinkReport(run.log, LinkLog(), run.drops), busy)

@@ -8,7 +8,7 @@ import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.race.links import LinkLog, LinkReport
-from gr_ros2.race.measure import Identity, Observed, Stream, by_condition, columns, measure, shown, winners
+from gr_ros2.race.measure import Identity, Observed, RaceStream, by_condition, columns, measure, shown, winners
 from gr_ros2.race.race_settings import RaceRecording
 from tests.race.support import cell
 from tests.race.test_race_settings import text
@@ -35,7 +35,7 @@ def log(*frames: tuple[float, int, float]) -> LinkLog:
 
 
 def observed(heard: list[tuple[float, bytes]], there: LinkLog | None = None, back: LinkLog | None = None) -> Observed:
-    stream = Stream(IDENTITY, [10.0, 11.0, 12.0, 13.0], heard)
+    stream = RaceStream(IDENTITY, [10.0, 11.0, 12.0, 13.0], heard)
     return Observed(9.0, True, [stream], LinkReport(there or log(), back or log(), {"on_air": 2, "queue_full": 0}), 0.3)
 
 
@@ -80,7 +80,7 @@ def test_a_team_has_the_numbers_of_all_its_pairs() -> None:
         "all_heard": pytest.approx(2.5),
     }
     assert {name: getattr(found, name) for name in expected} == expected
-    silent = Stream(IDENTITY, [10.0], [])
+    silent = RaceStream(IDENTITY, [10.0], [])
     assert measured(replace(one, streams=[*streams, silent]), robots=2).all_heard is None  # type: ignore[attr-defined]
 
 
