@@ -341,11 +341,18 @@ class Inbox:
             self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
             self._table(ready.payload)
             return
+        self._known(ready, ordered=True)
+
+    def _known(self, ready: Ready, *, ordered: bool) -> None:
+        """Deliver a message as soon as its topic is known.
+
+        :param ordered: whether one of a reliable topic waits for those before it: not if it came over another robot
+        """
         topic = self.announced.topic_of(ready)
         if topic is None:
             for lost in self.announced.wait(ready):
                 self._give_up([lost], self.announced.unknown(lost))
-        elif topic.reliable and ready.order[0] > self.order.low:
+        elif ordered and topic.reliable and ready.order[0] > self.order.low:
             self.order.wait(ready)
         else:
             self._deliver(ready, topic)
@@ -365,12 +372,7 @@ class Inbox:
             self._table(ready.payload)
         else:
             self._over.append((ready.topic_id, ready.order))
-            topic = self.announced.topic_of(ready)
-            if topic is not None:
-                self._deliver(ready, topic)
-            else:
-                for lost in self.announced.wait(ready):
-                    self._give_up([lost], self.announced.unknown(lost))
+            self._known(ready, ordered=False)
         events, self._events = self._events, []
         return events
 
@@ -444,7 +446,7 @@ class Inbox:
         self._give_up(self.order.without({*self.announced.topics, CARRIED_TOPIC}), Fate.UNKNOWN_TOPIC)
         self._events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
-            self._arrived(ready)
+            self._known(ready, ordered=(ready.topic_id, ready.order) not in self._over)
 
     def _lose(self, partial: PartialMessage, reason: Fate) -> None:
         key = Key(self.boot, partial.begin, partial.place)

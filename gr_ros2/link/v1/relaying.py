@@ -13,7 +13,7 @@ robots and the topics that they announce.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from math import inf
 
@@ -39,6 +39,8 @@ TABLE_S = 5.0
 """s after which the table of a robot that is heard is worth sending on again: some may have come since."""
 MOST_FAR = 64
 """Robots that are known over others only."""
+MOST_EARLY = 16
+"""Messages carried to this robot that wait for the table of their origin."""
 _BOOT_LEN = 8
 
 
@@ -65,6 +67,7 @@ class Relaying:
         self._newest: dict[Stream, Relayed] = {}
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
+        self._early = deque[Relayed](maxlen=MOST_EARLY)
         self._chosen: Stream | None = None
         self.found: Callable[[int, float], None] = lambda _, __: None
         """Called with a robot that is reached over others for the first time."""
@@ -135,9 +138,17 @@ class Relaying:
         if message.topic_id == TABLE_TOPIC:
             return self._announced(message, now)
         inbox = self._inbox(message.origin, message.start)
-        if inbox is None:
+        if inbox is not None:
+            return self._delivered(inbox, message, now)
+        if taker == BROADCAST:
             self._dropped["unknown_origin"] += 1
             return []
+        # Whoever has handed it on has forgotten it by now. It waits until the table of its origin is here.
+        self._dropped["unknown_origin"] += len(self._early) == MOST_EARLY
+        self._early.append(message)
+        return []
+
+    def _delivered(self, inbox: Inbox, message: Relayed, now: float) -> Events:
         order = message.number, message.place
         ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False)
         return self._reached(inbox, now) + inbox.relayed(ready, now)
@@ -219,8 +230,14 @@ class Relaying:
                 return []
             inbox = self.far[message.origin] = self._make_inbox(message.origin, boot)
             self.found(message.origin, now)
-        ready = Ready(TABLE_TOPIC, (message.number, message.place), message.payload[_BOOT_LEN:], -1, False, False)
-        return self._reached(inbox, now) + inbox.relayed(ready, now)
+        events = self._delivered(inbox, message._replace(payload=message.payload[_BOOT_LEN:]), now)
+        for early in [early for early in self._early if early.origin == message.origin]:
+            self._early.remove(early)
+            if early.start == message.start:
+                events = events + self._delivered(inbox, early, now)
+            else:
+                self._dropped["unknown_origin"] += 1
+        return events
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
         """Where messages of a start of a robot come together, directly or over others."""
