@@ -410,7 +410,7 @@ elsewhere(
     study_sweep_run="time",
     study_sweep_summaries="set y topic",
 )
-elsewhere("Race", race_race_settings="source duration_s packet_len sample_rate bag_topic peers loss load")
+elsewhere("Race", race_race_settings="robots source duration_s packet_len sample_rate bag_topic peers loss load")
 for name in ("match_s", "drain_s", "seed"):
     EFFECTS["Race", name] = Hardware("a race needs root: two network namespaces")
 elsewhere(
