@@ -331,7 +331,7 @@ effects(
     receivers=Elsewhere("tests/run/test_version1.py"),
 )
 for part in ("channel", "ros_source", "ros_sink"):
-    EFFECTS["Way back", part] = Elsewhere("tests/run/test_scenario.py")
+    EFFECTS["Reverse direction", part] = Elsewhere("tests/run/test_scenario.py")
 effects("Scenario", **dict.fromkeys(("robots", "duplex", "gains_db"), Elsewhere("tests/run/test_robots.py")))
 effects(
     "Scenario",
@@ -410,7 +410,7 @@ elsewhere(
     study_sweep_run="time",
     study_sweep_summaries="set y topic",
 )
-elsewhere("Race", race_race_settings="source duration_s packet_len sample_rate bag_topic peers loss load")
+elsewhere("Race", race_race_settings="robots source duration_s packet_len sample_rate bag_topic peers loss load")
 for name in ("match_s", "drain_s", "seed"):
     EFFECTS["Race", name] = Hardware("a race needs root: two network namespaces")
 elsewhere(

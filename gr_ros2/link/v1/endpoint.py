@@ -203,6 +203,7 @@ class EndpointV1:
                 neighbour.trailer.size == TAG_LEN,
                 neighbour.inbox.reports.snr.snr_db,
                 neighbour.inbox.reports.loss,
+                self.received.missed[neighbour.src_id],
                 len(neighbour.inbox.announced.topics),
             )
             for neighbour in self.neighbours
