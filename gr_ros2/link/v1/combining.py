@@ -55,7 +55,7 @@ class Combining:
         """The next window."""
         found: list[Sent] = []
         everybody = self._packets.everybody
-        before = -1
+        before, free = -1, GROUP
         for record in reversed(self._packets.records.values()):
             if record.number <= before:
                 break
@@ -69,7 +69,8 @@ class Combining:
             if not found:
                 before = record.number - MAX_WINDOW
             found.append(record)
-            if len(found) == GROUP:
+            free -= 1
+            if not free:
                 break
         if not self._packets.many(now):
             return found
