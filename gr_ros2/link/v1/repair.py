@@ -185,7 +185,7 @@ class RepairWindow:
         return record
 
     def _combination(self, window: list[Sent], now: float) -> Repair | None:
-        found = self._combining.combine(window, self.peers.proven)
+        found = self._combining.combine(window, self.peers.proven, now)
         if found is None:
             return None
         repair, combined = found
