@@ -11,7 +11,7 @@
     │   │   └── NoHelloError · NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
     │           NotStoredError · SameIdError
     │   └── EncodeError
-    ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``row`` names why
+    ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``fate`` names why
     │   └── UnknownDictionaryError · DamagedError
     ├── MiddlewareError (RuntimeError)  the ROS side failed
     │   ├── BagError                    a bag cannot be read or written
@@ -120,7 +120,7 @@ class VarintError(WireError):
 
 
 class WindowError(WireError):
-    """A repair whose window, mask and row contradict each other."""
+    """A repair whose window, mask and repair id contradict each other."""
 
     kind = "window"
 
@@ -192,21 +192,21 @@ class EncodeError(WireError):
 
 
 class CodecError(GrRos2Error, ValueError):
-    """A coded message that cannot be decoded here. ``row`` is the ledger row it ends in."""
+    """A coded message that cannot be decoded here. ``fate`` is what the ledger says of it."""
 
-    row = "unsupported"
+    fate = "unsupported"
 
 
 class UnknownDictionaryError(CodecError):
     """A message coded with a dictionary that is not available here, or with a different one of the same name."""
 
-    row = "unknown_dictionary"
+    fate = "unknown_dictionary"
 
 
 class DamagedError(CodecError):
     """Bytes that are not a coded message, or a message larger than the limit."""
 
-    row = "damaged"
+    fate = "damaged"
 
 
 class MiddlewareError(GrRos2Error, RuntimeError):

@@ -82,7 +82,7 @@ class RunMonitor:
             run.packet_len,
             name=run.name,
             duration_s=run.duration_s,
-            ledger=None if run.ledger is None else run.ledger.rows,
+            ledger=None if run.ledger is None else run.ledger.fates,
             tick_s=TICK_S,
             airtime=run.links[0].phy.airtime if run.links and run.links[0].phy.has_airtime else None,
             received_as=run.received_as,

@@ -203,5 +203,5 @@ class OfdmPhy(BurstPhy):
     def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
 
-    def receiver(self, own_process: bool = False) -> PacketReceiver:
-        return super().receiver(own_process) if self._stock is None else StockReceiver(self._stock)
+    def receiver(self) -> PacketReceiver:
+        return super().receiver() if self._stock is None else StockReceiver(self._stock)

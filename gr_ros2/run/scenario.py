@@ -119,6 +119,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
         ``phy.sample_rate``; null = ``channel.snr_db`` between all
     :param task: what the robots do on what they hear of each other: `formation`, `rendezvous`, or `module:Class`, a
         subclass of :class:`gr_ros2.sim.tasks.Task`; '' = each drives its own ways
+    :param controller: who drives the robots of a task. `task`: the task itself; `ros`: a node on the graph of each
+        robot, by ``cmd_vel`` (in real time)
     :param own_domains: ends whose ``domain_id`` is auto are on ROS domains that no other program of this computer uses;
         false = they are on ROS_DOMAIN_ID
     :param seed: of the simulator, the channel and the sender
@@ -134,6 +136,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     duplex: Literal["full", "half"] = "full"
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
     task: str = ""
+    controller: Literal["task", "ros"] = "task"
     localhost_only: bool | Auto = True
     own_domains: bool = True
 
@@ -182,10 +185,14 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError("channel.walls_db: a recording has no world to count walls in; leave it out")
 
     def _check_robots(self) -> None:
-        if self.task and (not self.robots or self.time != "packets" or self.channel.from_positions):
+        if self.task and (not self.robots or self.time == "samples" or self.channel.from_positions):
             raise ValueError(
-                f"task = {self.task!r}: robots act on what they hear in simulated time at packets, on channels that do "
-                "not follow from positions; set robots, time: packets and gains_db"
+                f"task = {self.task!r}: robots act on what they hear in real time or at packets, on channels that do "
+                "not follow from positions; set robots, time: real or packets, and gains_db"
+            )
+        if self.controller != "task" and (not self.task or self.time != "real"):
+            raise ValueError(
+                f"controller = {self.controller!r}: stands in for that of a task in real time; set task and time: real"
             )
         if not self.robots:
             if self.gains_db is not None:
@@ -242,7 +249,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     def directions(self) -> tuple[Scenario, ...]:
         """The one-way scenarios that this scenario consists of, one for each robot that offers messages."""
         if self.robots:
-            alone = replace(self, robots=(), gains_db=None, task="")
+            alone = replace(self, robots=(), gains_db=None, task="", controller="task")
             return tuple(replace(alone, ros_source=robot.ros_source) for robot in self.robots)
         if self.back is None:
             return (self,)

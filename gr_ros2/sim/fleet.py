@@ -82,6 +82,10 @@ class Fleet:
         """The fleet of these settings, which drives only once for all who ask where it is."""
         return Fleet(settings)
 
+    def namespace(self, robot_id: int) -> str:
+        """Where its topics are: ``/robot_1``."""
+        return f"/robot_{robot_id}"
+
     def topics(self) -> dict[str, str]:
         """Topic name without namespace -> type, in the order of the paper's table 4; corrections come last."""
         return dict(ALL_TYPES if self.settings.rtcm_rate else TYPES)
@@ -133,7 +137,7 @@ class Fleet:
                 heapq.heapreplace(schedule, (following, order, robot_id, count + 1, topic, rate, phase))
             else:
                 heapq.heappop(schedule)
-            name = f"/robot_{robot_id}/{topic}"
+            name = f"{self.namespace(robot_id)}/{topic}"
             if topics is not None and name not in topics:
                 continue
             state = self.state(robot_id, t)

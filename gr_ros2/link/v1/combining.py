@@ -28,13 +28,13 @@ class Repair(NamedTuple):
 
     :param number: the newest number of its window
     :param mask: bit i says that packet ``number - i`` is part of it
-    :param row: row of its coefficients
+    :param repair_id: says its coefficients
     :param oldest: no packet older than the window is alive
     """
 
     number: int
     mask: int
-    row: int
+    repair_id: int
     oldest: bool
     combined: bytes
 
@@ -133,10 +133,10 @@ class Combining:
                 window = [packets.records[number] for number in range(newest, first - 1, -1)]
         full = len(window) == size
         mask = (1 << size) - 1 if full else sum(1 << newest - record.number for record in window)
-        row = packets.take_row(newest)
-        assert row is not None
-        combined = combine([(record.number, record.body) for record in window], row)
-        return Repair(newest, mask, row, first == packets.oldest, combined), window
+        repair_id = packets.take_repair_id(newest)
+        assert repair_id is not None
+        combined = combine([(record.number, record.body) for record in window], repair_id)
+        return Repair(newest, mask, repair_id, first == packets.oldest, combined), window
 
     def _anchored(self, window: list[Sent], proven: int, now: float) -> list[Sent]:
         """The window, changed so that a repair can stand at its newest packet.

@@ -5,7 +5,7 @@
 
 Invariants: every submitted message is accepted once; it then leaves whole or is refused with a named reason;
 ``receive`` never raises, whatever the bytes; packets leave only when the pace (rate or credit) allows; each number is
-sent once, and each row once per number; there is no clock, no randomness and no IO here: the caller passes in the time,
+sent once, and each repair id once per number; there is no clock, randomness or IO here: the caller passes in the time,
 the boot number and the stored state.
 """
 
@@ -52,7 +52,6 @@ class EndpointV1:
     :param keys: keys that seal its packets
     :param codec: codes the messages sent
     :param decoder_for: makes the decoder for a robot's messages from its table of topics
-    :param rows: topics of robots that announce none
     :param heard: what ``save`` stored before this start
     :param save: stores up to which packet a robot was heard; needed if ``keys`` must keep replays out after a restart
     :param observer: called with every SenderEvent, in order
@@ -74,7 +73,6 @@ class EndpointV1:
         keys: Keys | None = None,
         codec: MessageCodec | None = None,
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None = None,
-        rows: tuple[AnnouncedTopic, ...] = (),
         heard: Mapping[int, tuple[int, int]] | None = None,
         save: Save | None = None,
         observer: Callable[[SenderEvent], None] | None = None,
@@ -102,7 +100,7 @@ class EndpointV1:
         self.messages = messages = Outbox(topics, settings, self, boot=boot, room=room, codec=codec, observer=observer)
         self.sent = messages.stats
         self._receiving = ReceivingSide(
-            settings, boot, keys, rows=rows, decoder_for=decoder_for, access=access, heard=heard or {}, save=save
+            settings, boot, keys, decoder_for=decoder_for, access=access, heard=heard or {}, save=save
         )
         self.received = self._receiving.stats
         self.neighbours = neighbours = self._receiving.neighbours
@@ -208,6 +206,7 @@ class EndpointV1:
                 neighbour.trailer.size == TAG_LEN,
                 neighbour.inbox.reports.snr.snr_db,
                 neighbour.inbox.reports.loss,
+                self.received.missed[neighbour.src_id],
                 len(neighbour.inbox.announced.topics),
             )
             for neighbour in self.neighbours

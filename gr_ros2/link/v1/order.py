@@ -32,6 +32,8 @@ class Ready:
 
     :param order: number of the packet in which it began, and its place among the entries there
     :param qos: QoS class of the packet that completed it; -1 if that packet was recovered
+    :param hops: robots that have sent it on
+    :param over: the last of them; None where it came from the robot that made it
     """
 
     topic_id: int
@@ -40,6 +42,8 @@ class Ready:
     qos: int
     coded: bool
     repaired: bool
+    hops: int = 0
+    over: int | None = None
 
 
 class Order:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
 from gr_ros2.link.v1.lifetime import Lifetimes
 from gr_ros2.settings.commands import is_command
+from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
 from gr_ros2.wire.table import AnnouncedTopic
@@ -83,6 +84,13 @@ class SentTopic:
         topic, self.publishers = self.topic, publishers
         self.latched = topic.latched or (publishers.latched and topic.options.durability == AUTO)
         self.queue.change(*queue_for(topic.options, publishers, command=self.command))
+
+    def change(self, options: TopicOptions) -> None:
+        """Use other options from now on, for the same robot."""
+        self.topic = replace(self.topic, options=options)
+        self.qos, self.weight = qos_class(options, command=self.command), options.weight
+        self.queue.limit(options.max_rate)
+        self.follow(self.publishers)
 
     def announced(self, codec: str) -> AnnouncedTopic:
         """Its row in the table.
