@@ -142,7 +142,7 @@ def run(
 ) -> tuple[list[Topic], Counter[str]]:
     """One scenario over a slotted channel: its topics, and the packets by what they were spent on.
 
-    :param back: whether receivers report, over a way back of the same loss
+    :param back: whether receivers report, over a reverse direction of the same loss
     """
     case = load(name, seconds)
     source, packet_len = case.scenario.ros_source, case.scenario.packet_len
