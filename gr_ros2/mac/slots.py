@@ -33,7 +33,6 @@ from gr_ros2.mac.slot_clock import SlotClock
 from gr_ros2.wire.mac_block import (
     LONGEST_AHEAD,
     MAP_SLOTS,
-    MOST_HEARD,
     NOBODY,
     SLOT_NUMBERS,
     Block,
@@ -244,7 +243,7 @@ class Slots:
             heard[src_id].named = self._turn(slot) if heard[src_id].named == _NEVER else slot
         first, second = [*names, NOBODY, NOBODY][:2]
         ahead = self._mine[0] - slot, self._mine[1] - self._mine[0]
-        load = min(self._load(oldest), MOST_HEARD)
+        load = self._load(oldest)
         short = Block(slot % SLOT_NUMBERS, ahead, load, (first, second))
         around = {load + self._weight, *(robot.heard + robot.weight for robot in heard.values())}
         if self._weight == 1 and self._named_at < oldest and len(around) == 1:
