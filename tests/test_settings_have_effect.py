@@ -331,7 +331,7 @@ effects(
     receivers=Elsewhere("tests/run/test_version1.py"),
 )
 for part in ("channel", "ros_source", "ros_sink"):
-    EFFECTS["Way back", part] = Elsewhere("tests/run/test_scenario.py")
+    EFFECTS["Reverse direction", part] = Elsewhere("tests/run/test_scenario.py")
 effects("Scenario", **dict.fromkeys(("robots", "duplex", "gains_db"), Elsewhere("tests/run/test_robots.py")))
 effects(
     "Scenario",

@@ -42,6 +42,7 @@ class CallFrame:
 
     @property
     def is_request(self) -> bool:
+        """Whether it is a request, and not a reply."""
         return self.service_id >= 0
 
 

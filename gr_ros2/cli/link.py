@@ -22,7 +22,7 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import BackendName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.ping import check
-from gr_ros2.cli.status import PING, STATUS, airtime_words, tables
+from gr_ros2.cli.status import PING, SET, STATUS, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.guard import Guard
@@ -129,6 +129,7 @@ def link(
         raise click.UsageError("--against needs --check")
     # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
+        from gr_ros2.radio.live_settings import LiveSettings
         from gr_ros2.radio.robot_link import RobotLink
         from gr_ros2.run.observers import RunObservers
 
@@ -145,9 +146,11 @@ def link(
             signal.signal(number, lambda *_, on=on: _switch(running, on))
         try:
             running.start()
+            live = LiveSettings(running.source, running.sink)
             answers |= {
                 STATUS: lambda _: {**running.stats(), "findings": running.findings()},
                 PING: lambda asks: running.ping(int(asks["robot"]), anew=bool(asks["anew"])),
+                SET: lambda asks: [live.change(name, value) for name, value in asks],
             }
             run_observers.run_started(_live(running))
             _show(console, running, duration)

@@ -90,6 +90,11 @@ def _tell(planner: Planner, advise: bool) -> None:
     console.print(_table(forecast))
     console.print(_verdict(forecast), soft_wrap=True)
     console.print(forecast.in_use, soft_wrap=True)
+    if task := planner.task:
+        console.print(
+            f"The robots drive their own ways here; gr-ros2 run says how well they do task {task!r} over this link.",
+            soft_wrap=True,
+        )
     if (half_m := planner.range_m(0.5)) is not None:
         console.print(
             f"The link ends at {half_m:.0f} m: half of the packets arrive there, and {_MOST:.0%} of them up to "

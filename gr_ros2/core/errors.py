@@ -8,7 +8,7 @@
     │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
     │   ├── EntryKindError · VarintError · WindowError · SourcesError
     │   ├── SealError
-    │   │   └── NoHelloError · NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
+    │   │   └── NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
     │           NotStoredError · SameIdError
     │   └── EncodeError
     ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``fate`` names why
@@ -129,12 +129,6 @@ class SealError(WireError):
     """A packet that may be intact, but that cannot be trusted here."""
 
     kind = "seal"
-
-
-class NoHelloError(SealError):
-    """A packet of a robot whose hello has not been received since that robot's last start."""
-
-    kind = "no_hello"
 
 
 class NoKeyError(SealError):

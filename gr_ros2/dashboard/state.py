@@ -8,7 +8,7 @@ Counts are exact during the run. When the result is known, every number comes fr
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from math import nan
 from threading import Lock
 from typing import get_args
@@ -145,7 +145,9 @@ class DashboardState:
         """s of air since the last tick, by what the packets were for."""
         self._air: deque[tuple[float, ...]] = deque(maxlen=self._history)
         self._robots: dict[int, tuple[float, int]] = {}
-        """When each robot was heard last, and packets received of it."""
+        """When each robot was heard last, itself or over others, and packets received of it."""
+        self._ways: dict[int, tuple[int, int | None]] = {}
+        """How many robots have sent the newest message of each robot on, and the last of them."""
         self._result: Result | None = None
         for key in topics:
             self._topic(key)
@@ -192,18 +194,15 @@ class DashboardState:
                 self._packets_received.add(now)
                 self._received.append((now, event))
                 if isinstance(event, Received):
-                    src_id = event.packet.src_id
-                    self._robots[src_id] = now, self._robots.get(src_id, (now, 0))[1] + 1
-                    if len(self._robots) > _ROBOTS:
-                        del self._robots[min(self._robots, key=lambda one: self._robots[one][0])]
+                    self._heard(event.packet.src_id, now, packets=1)
                 if isinstance(event, Rejected):
                     self._packets[f"rejected_{event.error.kind}"] += 1
                     self._packets["rejected"] += 1
 
-    def subscribed(self, src_id: int, topics: Mapping[str, Topic]) -> None:
-        """Take over what a source in this process subscribes, by absolute name. Topics may be added while it runs."""
+    def subscribed(self, src_id: int, topics: Iterable[tuple[str, Topic]]) -> None:
+        """Take over what a source in this process subscribes, with absolute names. More may come while it runs."""
         with self._lock:
-            for full_name, topic in topics.items():
+            for full_name, topic in topics:
                 self._learn((src_id, topic.topic_id), topic.name, topic.type_name, full_name)
 
     def finish(self, result: Result | None, *, failed: bool = False) -> None:
@@ -273,7 +272,8 @@ class DashboardState:
                 state=next(iter(alarms), "" if over or self._start is None else "up"),
                 alarms=tuple(text for texts in alarms.values() for text in texts),
                 heard=tuple(
-                    RobotView(src_id, now - last, count) for src_id, (last, count) in sorted(self._robots.items())
+                    RobotView(src_id, now - last, count, *self._ways.get(src_id, ()))
+                    for src_id, (last, count) in sorted(self._robots.items())
                 ),
                 air=AirView(past[:, 0], {} if self._airtime is None else busy, past[:, 1]),
                 packets_now=(
@@ -423,6 +423,11 @@ class DashboardState:
             source.last_serial = event.serial
             topic.sent += 1
 
+    def _heard(self, src_id: int, now: float, *, packets: int) -> None:
+        self._robots[src_id] = now, self._robots.get(src_id, (now, 0))[1] + packets
+        if len(self._robots) > _ROBOTS:
+            del self._robots[min(self._robots, key=lambda one: self._robots[one][0])]
+
     def _delivered(self, event: Delivered, now: float) -> None:
         key = (event.src_id, event.topic_id)
         source = self._sources.get(event.src_id)
@@ -433,6 +438,9 @@ class DashboardState:
                 source.messages.close(message)
             elif source.messages.repeats(event):
                 return
+        self._ways[event.src_id] = event.hops, event.over
+        if event.hops:
+            self._heard(event.src_id, now, packets=0)
         topic = self._topic(key)
         topic.delivered += 1
         topic.repaired += event.repaired

@@ -79,17 +79,18 @@ def heard_html(snapshot: Snapshot) -> str:
         return '<div class="note">no robot has been heard yet</div>'
     rows = "".join(
         f'<tr data-robot="{robot.src_id}"><th scope="row" class="name">robot {robot.src_id}</th>'
-        f'<td data-field="silent">{robot.silent_s:.1f}</td><td data-field="packets">{robot.packets:,}</td></tr>'
+        f'<td data-field="silent">{robot.silent_s:.1f}</td><td data-field="packets">{robot.packets:,}</td>'
+        f'<td data-field="way">{way_text(robot.hops, robot.over)}</td></tr>'
         for robot in snapshot.heard
     )
     return (
         '<table class="heard"><thead><tr><th scope="col" class="name">robot</th><th scope="col">heard [s ago]</th>'
-        f'<th scope="col">packets</th></tr></thead><tbody>{rows}</tbody></table>'
+        f'<th scope="col">packets</th><th scope="col">messages come</th></tr></thead><tbody>{rows}</tbody></table>'
     )
 
 
 def team_html(snapshot: Snapshot) -> str:
-    """Who hears whom: share of the packets of the last seconds, and SNR."""
+    """Who hears whom: share of the packets of the last seconds, and SNR; or over whom the other's messages come."""
     team = snapshot.team
     if team is None:
         return ""
@@ -104,9 +105,16 @@ def team_html(snapshot: Snapshot) -> str:
 
 
 def _hears(pair: PairView | None) -> str:
-    if pair is None or pair.share is None:
+    if pair is None or (pair.share is None and not pair.hops):
         return "–"
+    if pair.hops and not pair.share:
+        return way_text(pair.hops, pair.over)
     return f"{pair.share:.0%}" + ("" if pair.snr_db is None else f", {pair.snr_db:.0f} dB")
+
+
+def way_text(hops: int, over: int | None) -> str:
+    """How messages of a robot come: ``over 3, hop 2``, '' from the robot itself."""
+    return f"over {over}, hop {hops}" if hops else ""
 
 
 def _repair_tiles(snapshot: Snapshot) -> list[str]:

@@ -128,13 +128,17 @@ class PacketView:
 class RobotView:
     """A robot that was heard.
 
-    :param silent_s: s since its newest packet
+    :param silent_s: s since its newest packet, or since something of it came over others
     :param packets: received of it
+    :param hops: robots that have sent its newest message on
+    :param over: the last of them; None where it is heard itself
     """
 
     src_id: int
     silent_s: float
     packets: int
+    hops: int = 0
+    over: int | None = None
 
 
 @dataclass(frozen=True)

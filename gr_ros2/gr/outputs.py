@@ -42,6 +42,7 @@ class Output:
     :param opening: held while ``early`` is used
     :param published: number of messages
     :param delivered_at: time of the newest one, s
+    :param way: how many robots have sent it on, and the last of them
     """
 
     topic: Topic
@@ -52,6 +53,7 @@ class Output:
     published: int = 0
     delivered_at: float | None = None
     latency: LatencyWindow | None = None
+    way: tuple[int, int | None] = (0, None)
 
 
 class Outputs:
@@ -184,6 +186,8 @@ class Outputs:
             "latency_s": None,
             "recent_latency_s": None,
             "age_s": None if at is None else self._clock() - at + latency,
+            "hops": output.way[0],
+            "over": output.way[1],
         }
 
     def deliver(self, event: Delivered) -> None:
@@ -237,7 +241,7 @@ class Outputs:
                 return self._end.unpublished(event)
         with self._lock:
             output.published += 1
-            output.delivered_at = self._clock()
+            output.delivered_at, output.way = self._clock(), (event.hops, event.over)
             if self._latencies.has(topic.type_name):
                 self._measure(output, event.payload)
         if self._transforms is not None and topic.type_name == TF_TYPE:
@@ -285,9 +289,12 @@ class Outputs:
         name = self.heard.name(key)
         for (src_id, _), other in list(self._outputs.items()):
             if src_id == key[0] and other is not output and other.publisher is not None and other.name == name:
-                self.release([other])  # the same topic with its type before
-                other.publisher.close()
-                other.publisher = None
+                self.release([other])  # the same topic with its type before, or for another robot
+                before, other.publisher = other.publisher, None
+                if (other.topic.type_name, other.topic.options) == (topic.type_name, topic.options):
+                    output.name, output.publisher = name, before
+                    return before
+                before.close()
         output.name = name
         publisher = output.publisher = self._graph.middleware.advertise(name, topic.type_name, qos)
         if self.running and self._graph.middleware.settling_s and not topic.latched:

@@ -12,7 +12,7 @@ import random
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from typing import Any
 
@@ -121,7 +121,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
-        topics = topics.with_options(self.config.topic_options)
         self.subscriptions = Subscriptions(
             topics, self.config, self._graph, end, clock=clock, counters=self._counters, log=self._log
         )
@@ -243,6 +242,16 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def set_repeat_s(self, repeat_s: float) -> None:
         """Set the time between repeats of a transient-local topic, s; 0 is off."""
         self._reconfigure(repeat_s=repeat_s)
+
+    def set_topic_options(self, topic_options: Mapping[str, Any]) -> None:
+        """Set the options of single topics, of which those in :data:`gr_ros2.link.endpoint.LIVE_OPTIONS` may change. A
+        message is for the robot that ``to`` named when the ROS graph handed it over."""
+        with self._lock:
+            config = replaced(self.config, topic_options=topic_options)
+            self.subscriptions.change(config.topic_options)
+            self.config = config
+            self._live.wake()
+            self._room.notify_all()
 
     def set_debug(self, debug: bool) -> None:
         """Turn the readable log of headers, topic ids and entries on or off."""

@@ -65,7 +65,8 @@ class Rejected(NamedTuple):
 
 class Delivered(NamedTuple):
     """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: at least one of its
-    packets was lost at first and recovered later."""
+    packets was lost at first and recovered later; ``hops``: robots that have sent it on, and ``over``: the last of
+    them, None where there were none."""
 
     src_id: int
     topic_id: int
@@ -73,6 +74,8 @@ class Delivered(NamedTuple):
     qos: int
     key: Hashable = None
     repaired: bool = False
+    hops: int = 0
+    over: int | None = None
 
 
 class Lost(NamedTuple):

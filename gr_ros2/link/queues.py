@@ -72,7 +72,7 @@ class TopicQueue(deque[Outgoing]):
         self.deadline_s = deadline_s
         self._by_age = True
         """Whether no message becomes useless before an earlier one."""
-        self._interval = 1 / max_rate if max_rate else 0.0
+        self.limit(max_rate)
         self._opens = float("-inf")
         self.since = inf
         """When ``flush_timeout_s`` began to run: with the first message, or when a message started. A drop does not
@@ -86,6 +86,10 @@ class TopicQueue(deque[Outgoing]):
         self.deadline_s = deadline_s
         for message in self:
             message.expires = self._expiry(message)
+
+    def limit(self, max_rate: float) -> None:
+        """Let so many messages/s start from now on, 0 for any number."""
+        self._interval = 1 / max_rate if max_rate else 0.0
 
     def room(self, depth: int) -> bool:
         """Whether one more message fits without a drop. ``depth``: messages that may wait, 0 for unbounded."""

@@ -140,10 +140,10 @@ class Receiver:
         steady = placed.arrival is Arrival.NEXT
         if not steady:
             source.epoch += 1
-            self.stats.packet_loss_est += placed.missing or 0
+            self.stats.missed[src_id] += placed.missing or 0
             self.stats.unknown_gaps += placed.missing is None
             if placed.arrival is Arrival.LATE:
-                self.stats.packet_loss_est = max(self.stats.packet_loss_est - 1, 0)
+                self.stats.missed[src_id] = max(self.stats.missed[src_id] - 1, 0)
             elif placed.arrival is Arrival.RESET:
                 for topic in source.topics.values():
                     events += [self._given_up(partial, Fate.LOST_FRAGMENTS) for partial in topic.reset()]

@@ -22,9 +22,9 @@ from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
 from gr_ros2.link.schedule import PaperScheduler, Plan
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.settings.config import QueuePolicy, SourceConfig, replaced
+from gr_ros2.settings.config import QueuePolicy, SourceConfig, TopicOptions, replaced
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.registry import NewTopic, Registry
+from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 
@@ -159,6 +159,15 @@ class Sender:
         :raises ConfigError: always
         """
         raise ConfigError(f"version 0 cannot announce {topics[0][0]!r}: give both ends the same registry")
+
+    def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:  # noqa: ARG002
+        """Refuse: both ends of version 0 have the same options.
+
+        :raises ConfigError: always
+        """
+        raise ConfigError(
+            f"topic {self.registry[topic_id].name}: with version 0, its options change with a restart only"
+        )
 
     def offer(self, topic_id: int, *, offered: bool) -> None:  # noqa: ARG002
         """Refuse: version 0 carries no services.

@@ -51,6 +51,7 @@ class TopicLedger:
     :param corrupt: deliveries that match no message; a number above 0 indicates a serious fault
     :param repeats_delivered: deliveries of repeats whose message already had its fate
     :param fates: fate -> messages
+    :param hops: robots that have sent a message on -> messages delivered
     :param t_sent: s, time of submission; NaN for a message refused before it was queued
     :param t_delivered: s, time of delivery; NaN where it was not delivered
     :param size: serialized bytes; 0 where refused before it was queued
@@ -65,6 +66,7 @@ class TopicLedger:
     corrupt: int = 0
     repeats_delivered: int = 0
     fates: Counter[str] = field(default_factory=Counter)
+    hops: Counter[int] = field(default_factory=Counter)
     t_sent: array[float] = field(default_factory=lambda: array("d"))
     t_delivered: array[float] = field(default_factory=lambda: array("d"))
     size: array[int] = field(default_factory=lambda: array("L"))
@@ -116,7 +118,8 @@ class Ledger:
         self._lock = Lock()
         self._topics: dict[tuple[int, int], TopicLedger] = {}
         self._sources: dict[int, _SourceBook] = {}
-        self._unmatched: list[tuple[int, int, bytes, float]] = []
+        self._unmatched: list[tuple[Delivered, float]] = []
+        """Deliveries without a message so far, with the digest in place of the payload."""
         self._faults: list[str] = []
         self._finished = False
         self._received = 0
@@ -286,15 +289,18 @@ class Ledger:
         if source is not None:
             message = source.messages.find(event)
             if message is not None:
-                return self._deliver(source, message, now, Fate.REPAIRED if event.repaired else Fate.DELIVERED)
+                fate = Fate.REPAIRED if event.repaired else Fate.DELIVERED
+                return self._deliver(source, message, event, now, fate)
             if source.messages.repeats(event) and source.messages.repeated(event) is None:
                 self._topic(event.src_id, event.topic_id).repeats_delivered += 1
                 return None
-        self._unmatched.append((event.src_id, event.topic_id, digest_of(event.payload), now))
+        self._unmatched.append((event._replace(payload=digest_of(event.payload)), now))
         return None
 
-    def _deliver(self, source: _SourceBook, message: _OpenMessage, now: float, fate: Fate = Fate.DELIVERED) -> float:
-        self._topic(source.src_id, message.topic_id).t_delivered[message.position] = now
+    def _deliver(self, source: _SourceBook, message: _OpenMessage, event: Delivered, now: float, fate: Fate) -> float:
+        topic = self._topic(source.src_id, message.topic_id)
+        topic.t_delivered[message.position] = now
+        topic.hops[event.hops] += 1
         self._close(source, message, fate)
         return message.t_sent
 
@@ -322,13 +328,14 @@ class Ledger:
 
     def _match_late(self) -> None:
         """Match deliveries that had no message when they came: by their bytes only, with all messages still open."""
-        for src_id, topic_id, digest, now in self._unmatched:
-            source = self._sources.get(src_id)
-            message = next(iter(source.messages.alike(topic_id, digest)), None) if source is not None else None
+        for event, now in self._unmatched:
+            source = self._sources.get(event.src_id)
+            alike = [] if source is None else source.messages.alike(event.topic_id, event.payload)
+            message = next(iter(alike), None)
             if source is not None and message is not None:
-                self._deliver(source, message, now)
+                self._deliver(source, message, event, now, Fate.DELIVERED)
             else:
-                self._topic(src_id, topic_id).corrupt += 1
+                self._topic(event.src_id, event.topic_id).corrupt += 1
         self._unmatched.clear()
 
     def _check(self) -> None:

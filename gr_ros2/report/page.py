@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,6 +37,7 @@ from gr_ros2.report.table import (
     PAPER,
     Grid,
     air_grid,
+    hops_grid,
     ledger_grid,
     notes,
     paper_grid,
@@ -221,6 +222,7 @@ def lead_of(run: Run) -> str:
     return " · ".join(parts)
 
 
+_GRIDS: tuple[Callable[[Result], Grid | None], ...] = (team_grid, hops_grid, ledger_grid, air_grid)
 _LATENCY = "End-to-end latency: share of the delivered messages that took at most so long"
 
 
@@ -236,7 +238,7 @@ def _run_section(run: Run, out: Path, prefix: str, several: bool) -> Section:
         heading=run.label if several else "What happened",
         lead=lead_of(run) if several else "",
         sentences=[*explanation(result, run.trace), *notes(result)],
-        grids=[grid for grid in (team_grid(result), ledger_grid(result), air_grid(result)) if grid is not None],
+        grids=[grid for make in _GRIDS if (grid := make(result)) is not None],
         pictures=_draw(run, out, prefix),
         details=settings,
     )

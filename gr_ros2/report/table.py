@@ -14,7 +14,7 @@ from rich.table import Table
 
 from gr_ros2.link.fates import Fate
 from gr_ros2.record.result import Result, TopicResult, air_uses
-from gr_ros2.record.team_numbers import TEAM_VALUES, team_numbers
+from gr_ros2.record.team_numbers import TEAM_VALUES, team_numbers, team_pairs
 
 _DASH = "–"
 PAPER = "the paper"
@@ -88,6 +88,28 @@ def team_grid(result: Result) -> Grid | None:
     numbers = team_numbers(result)
     lines = tuple((TEAM_VALUES.get(name, name), f"{value:.3g}") for name, value in numbers.items() if value is not None)
     return Grid("The team", ("Number", "value"), (lines,)) if lines else None
+
+
+def hops_grid(result: Result) -> Grid | None:
+    """The pairs of a robot and a topic of another one, by how many robots sent most of its messages on; None where all
+    came from the robot itself."""
+    groups: dict[int, list[TopicResult]] = {}
+    for pair in team_pairs(result):
+        if pair.delivered:
+            most = max(pair.hops, key=lambda hops: pair.hops[hops], default="0")
+            groups.setdefault(int(most), []).append(pair)
+    if not any(groups):
+        return None
+    lines = []
+    for hops, pairs in sorted(groups.items()):
+        ages = [pair.age_s.mean for pair in pairs if pair.age_s.mean is not None]
+        peaks = [pair.age_s.peak for pair in pairs if pair.age_s.peak is not None]
+        sent, delivered = sum(pair.sent for pair in pairs), sum(pair.delivered for pair in pairs)
+        mean = sum(ages) / len(ages) if ages else None
+        texts = f"{delivered / sent:.3f}", number(mean, "{:.2f}"), number(max(peaks, default=None), "{:.2f}")
+        lines.append((str(hops) if hops else "0 (heard itself)", str(len(pairs)), str(delivered), *texts))
+    headings = ("Robots between", "pairs", "delivered", "PDR", "mean age [s]", "peak age [s]")
+    return Grid("By hops", headings, (tuple(lines),))
 
 
 def ledger_grid(result: Result) -> Grid:

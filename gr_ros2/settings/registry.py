@@ -176,16 +176,16 @@ class Registry(Sequence[Topic]):
         return cls(list(_topics(rows, path)), path)
 
     def extended(self, topics: Sequence[NewTopic]) -> Registry:
-        """These topics too, with the next numbers. A name may come again with another type, which it has from then on.
+        """These topics too, with the next numbers. A name may come again with another type or for another robot.
 
         :raises RegistryError: too many, or a topic that is there already
         """
         added = [Topic(number, *topic) for number, topic in enumerate(topics, len(self))]
         if len(self) + len(added) > MAX_TOPICS:
             raise RegistryError(f"{len(self) + len(added)} topics; a link carries at most {MAX_TOPICS}")
-        known = {(topic.name.lstrip("/"), topic.type_name) for topic in self}
+        known = {(topic.name.lstrip("/"), topic.type_name, topic.options.to) for topic in self}
         for topic in added:
-            key = topic.name.lstrip("/"), topic.type_name
+            key = topic.name.lstrip("/"), topic.type_name, topic.options.to
             if key in known:
                 raise RegistryError(f"duplicate topic {topic.name!r}")
             known.add(key)

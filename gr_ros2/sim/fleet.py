@@ -113,10 +113,6 @@ class Fleet:
         x, y, heading, speed = np.array([state[:4] for state in states]).T
         return np.stack([x, y], 1), np.stack([speed * np.cos(heading), speed * np.sin(heading)], 1)
 
-    def true_path(self, robot_id: int, times: Sequence[float] | Floats) -> Floats:
-        """Rows x, y at those times."""
-        return np.array([self.true_pose(robot_id, float(t))[:2] for t in times]).reshape(-1, 2)
-
     def messages(
         self, duration_s: float, start_time_s: float | None = None, topics: Collection[str] | None = None
     ) -> Iterator[SimMessage]:

@@ -178,7 +178,6 @@ class Inbox:
             return []
         self.counts["packets"] += 1
         late = number < decoder.newest
-        self._stats.packet_loss_est -= late
         self._advance(number, now, here=True)
         self.reports.arrived(late=late)
         for found in decoder.source(number, body[: self._room]):
@@ -286,8 +285,9 @@ class Inbox:
         self.decoder.advance(number)
         if gone:
             self.counts["missing"] += gone
-            self._stats.packet_loss_est += gone
-            self.reports.missed(gone, counts=newest >= self._first)
+            met = newest >= self._first  # what came before the first packet that was heard is not lost
+            self._stats.missed[self.src_id] += gone * met
+            self.reports.missed(gone, counts=met)
             self.order.missing(now, newest + 1, newest + gone)
 
     def _recovered(self, found: tuple[int, bytes]) -> None:
@@ -341,21 +341,22 @@ class Inbox:
             self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
             self._table(ready.payload)
             return
-        self._known(ready, ordered=True)
+        self._known(ready)
 
-    def _known(self, ready: Ready, *, ordered: bool) -> None:
-        """Deliver a message as soon as its topic is known.
-
-        :param ordered: whether one of a reliable topic waits for those before it: not if it came over another robot
-        """
+    def _known(self, ready: Ready) -> None:
+        """Deliver a message as soon as its topic is known. One of a reliable topic waits for those before it, unless it
+        came over another robot."""
         topic = self.announced.topic_of(ready)
         if topic is None:
-            for lost in self.announced.wait(ready):
-                self._give_up([lost], self.announced.unknown(lost))
-        elif ordered and topic.reliable and ready.order[0] > self.order.low:
+            self._await_table(ready)
+        elif topic.reliable and ready.over is None and ready.order[0] > self.order.low:
             self.order.wait(ready)
         else:
             self._deliver(ready, topic)
+
+    def _await_table(self, ready: Ready) -> None:
+        for lost in self.announced.wait(ready):
+            self._give_up([lost], self.announced.unknown(lost))
 
     def _of_another(self, ready: Ready) -> None:
         """A message of another robot."""
@@ -372,7 +373,7 @@ class Inbox:
             self._table(ready.payload)
         else:
             self._over.append((ready.topic_id, ready.order))
-            self._known(ready, ordered=False)
+            self._known(ready)
         events, self._events = self._events, []
         return events
 
@@ -394,11 +395,11 @@ class Inbox:
         if topic.fresh and self._late(order[0], topic):
             self._give_up([ready], Fate.LATE)
             return
-        if order <= self._last.get(topic_id, (-1, -1)) and (topic_id, order) in self._over:
-            self._stats.repeats += 1
-            return
         if order <= self._last.get(topic_id, (-1, -1)):
-            self._give_up([ready], _passed_over(topic))
+            if (topic_id, order) in self._over:
+                self._stats.repeats += 1
+            else:
+                self._give_up([ready], _passed_over(topic))
             return
         self._last[topic_id] = order
         for partial in self._reassembly.overtaken(topic_id, order[0]):
@@ -410,17 +411,17 @@ class Inbox:
                 return
             self.marks[topic_id] = (*marks, mark)[-max(topic.depth, 1) :]
         try:
-            payload = self.announced.decode(ready)
+            payload = self.announced.decode(ready) if ready.coded else ready.payload
         except CodecError as error:
             self._give_up([ready], FATES[error.fate])
             return
         qos = ready.qos if ready.qos >= 0 else topic.qos
         key = Key(self.boot, *order)
-        self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired))
+        self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired, ready.hops, ready.over))
 
     def _old(self, number: int, topic: AnnouncedTopic) -> bool:
         """Whether a message may be older than its topic allows, because nothing proves that it is not."""
-        most = self._max_ages.get(topic.name.lstrip("/"), self._max_age_s)
+        most = self._max_ages.get(topic.name.lstrip("/"), self._max_age_s) if self._max_ages else self._max_age_s
         if most == AUTO:
             most = MAX_AGE_S if topic.fresh else 0.0
         return most > 0 and self.sealed_after is not None and self._now - self.sealed_after(number) > most
@@ -443,10 +444,11 @@ class Inbox:
             return
         if topics is None:
             return
-        self._give_up(self.order.without({*self.announced.topics, CARRIED_TOPIC}), Fate.UNKNOWN_TOPIC)
+        for ready in self.order.without({*self.announced.topics, CARRIED_TOPIC}):
+            self._await_table(ready)  # an older table, which came over others, lacks topics of the newest one
         self._events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
-            self._known(ready, ordered=(ready.topic_id, ready.order) not in self._over)
+            self._known(ready)
 
     def _lose(self, partial: PartialMessage, reason: Fate) -> None:
         key = Key(self.boot, partial.begin, partial.place)

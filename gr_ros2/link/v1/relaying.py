@@ -67,7 +67,7 @@ class Relaying:
         self._newest: dict[Stream, Relayed] = {}
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
-        self._early = deque[Relayed](maxlen=MOST_EARLY)
+        self._early = deque[tuple[Relayed, int]](maxlen=MOST_EARLY)
         self._chosen: Stream | None = None
         self.found: Callable[[int, float], None] = lambda _, __: None
         """Called with a robot that is reached over others for the first time."""
@@ -136,21 +136,21 @@ class Relaying:
         if message.dst_id not in (BROADCAST, self.src_id):
             return []
         if message.topic_id == TABLE_TOPIC:
-            return self._announced(message, now)
+            return self._announced(message, via, now)
         inbox = self._inbox(message.origin, message.start)
         if inbox is not None:
-            return self._delivered(inbox, message, now)
+            return self._delivered(inbox, message, via, now)
         if taker == BROADCAST:
             self._dropped["unknown_origin"] += 1
             return []
         # Whoever has handed it on has forgotten it by now. It waits until the table of its origin is here.
         self._dropped["unknown_origin"] += len(self._early) == MOST_EARLY
-        self._early.append(message)
+        self._early.append((message, via))
         return []
 
-    def _delivered(self, inbox: Inbox, message: Relayed, now: float) -> Events:
+    def _delivered(self, inbox: Inbox, message: Relayed, via: int, now: float) -> Events:
         order = message.number, message.place
-        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False)
+        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False, message.hops, via)
         return self._reached(inbox, now) + inbox.relayed(ready, now)
 
     def _reached(self, inbox: Inbox, now: float) -> Events:
@@ -177,7 +177,7 @@ class Relaying:
             if inbox is not None and (neighbour is None or neighbour.gone):
                 hops, over = self.hops.get(src_id, 0), self.custody.routes.over(src_id, now, lambda _: True)
                 topics = len(inbox.announced.topics)
-                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, topics, hops, over))
+                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, 0, topics, hops, over))
         return found
 
     def handle_timeout(self, now: float) -> Events:
@@ -213,7 +213,7 @@ class Relaying:
         payload = boot.to_bytes(_BOOT_LEN, "big") + table
         self._take(src_id, Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload), now)
 
-    def _announced(self, message: Relayed, now: float) -> Events:
+    def _announced(self, message: Relayed, via: int, now: float) -> Events:
         """The table of a far robot."""
         boot = int.from_bytes(message.payload[:_BOOT_LEN], "big")
         if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start:
@@ -230,11 +230,11 @@ class Relaying:
                 return []
             inbox = self.far[message.origin] = self._make_inbox(message.origin, boot)
             self.found(message.origin, now)
-        events = self._delivered(inbox, message._replace(payload=message.payload[_BOOT_LEN:]), now)
-        for early in [early for early in self._early if early.origin == message.origin]:
+        events = self._delivered(inbox, message._replace(payload=message.payload[_BOOT_LEN:]), via, now)
+        for early in [early for early in self._early if early[0].origin == message.origin]:
             self._early.remove(early)
-            if early.start == message.start:
-                events = events + self._delivered(inbox, early, now)
+            if early[0].start == message.start:
+                events = events + self._delivered(inbox, *early, now)
             else:
                 self._dropped["unknown_origin"] += 1
         return events

@@ -600,3 +600,25 @@ def test_no_repair_leaves_before_the_sending_thread_is_told_to_look(loss: float)
                 repairs += 1
                 assert at is not None and at < air.now, "the slot in which it left"
     assert repairs > 100 * loss
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_lost_packets_are_those_since_a_robot_was_heard_the_same_in_total_and_by_robot(mode: SealMode) -> None:
+    one, two = Robot(1, registry(), mode=mode), Robot(2, registry(), mode=mode)
+    air = Air(one)
+    for number in range(200):
+        one.end.messages.submit(0, text(number), air.now)
+        air.step()
+    air.robots.append(two)
+    for number in range(200, 400):
+        one.end.messages.submit(0, text(number), air.now)
+        air.step()
+    assert len(two.delivered()) > 150
+    assert two.end.received.packet_loss_est == 0
+    air.lost = lambda _, receiver: receiver is two and air.rng.random() < 0.2
+    for number in range(400, 600):
+        one.end.messages.submit(0, text(number), air.now)
+        air.step()
+    (peer,) = two.end.peers(air.now)
+    assert peer.lost == two.end.received.packet_loss_est
+    assert 20 <= peer.lost <= 70
