@@ -8,8 +8,9 @@ robot that is heard, and each stream, an engine keeps the newest number that thi
 - *Belief.* A message that was sent was heard with probability ``BELIEF`` by each robot in range: by the own neighbours
   when this robot sent it, and by those neighbours that the sender names as heard when another robot sent it.
 
-The gain of sending a stream's newest message is the sum over the neighbours of how much younger it makes them, in s. A
-robot's *weight*, by which it shares the channel with others, is the sum of the gains of all streams over the largest.
+The gain of sending a stream's newest message is the sum over the neighbours of how much younger it makes them, in s.
+With the sum of the squares of all gains over the largest square, how many messages are worth as much as the best one is
+known. Each beyond the first adds ``WEIGHT`` to the robot's *weight*, by which it shares the channel with others.
 
 Invariants: sans-IO, the caller passes in times; the work for a message heard is bounded by the robots heard, and that
 for a choice by robots times streams; equal calls give equal choices; memory is bounded by ``MOST_STREAMS`` and the ids.
@@ -37,8 +38,10 @@ ARRIVALS = 16
 TOLD = 2
 """Streams of which a packet tells the newest number."""
 MOST_STREAMS = 4096
+WEIGHT = 2
+"""With 1, messages in a line of ten robots that hear three on both sides are 16 % older: most have weight 1."""
 SMOOTHING = 0.1
-"""Share by which the weight follows from one choice to the next."""
+"""Share by which this number follows from one choice to the next."""
 _HALF = 1 << 15
 
 
@@ -91,7 +94,7 @@ class Gains:
         """The same by what an entry ``Newest`` names."""
         self._heard: dict[int, _Heard] = {}
         self._turn = 0
-        self._weight = 1.0
+        self._worth = 1.0
         self._chosen_at = 0.0
 
     def has(self, stream: Stream) -> int:
@@ -168,18 +171,18 @@ class Gains:
         most = worth = total = 0.0
         for stream, state in self._streams.items():
             gain = self._gain(stream, state, neighbours)
-            total += gain
+            total += gain * gain
             if gain and gain * gain / cost(stream) > worth:
                 best, most, worth = stream, gain, gain * gain / cost(stream)
         own = len(neighbours) * (now - self._chosen_at)  # of a message made since the choice before
         self._chosen_at = now
-        self._weight += SMOOTHING * (max(total / max(most, own, 1e-9), 1.0) - self._weight)
+        self._worth += SMOOTHING * (max(total / max(most, own, 1e-9) ** 2, 1.0) - self._worth)
         return best, most
 
     @property
     def weight(self) -> int:
-        """Packets to send while others send one: messages of about the largest gain that wait, smoothed."""
-        return min(int(self._weight), MOST_WEIGHT)
+        """Packets to send while others send one."""
+        return min(int(1 + WEIGHT * (self._worth - 1)), MOST_WEIGHT)
 
     def neighbours(self, now: float) -> int:
         """Robots that are heard."""
