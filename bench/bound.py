@@ -1,7 +1,7 @@
 """The least mean age that a sender can reach with reports, in-order delivery and a given number of packets a message.
 
 *The link* is that of the scenario paper-ofdm-paced: odometry every 28.6 ms, packets of 13.1 ms, each lost with
-probability ``LOSS``, and reports of the same length and loss on a way back. A repair may follow the new packet (the
+probability ``LOSS``, and reports of the same length and loss in reverse. A repair may follow the new packet (the
 first one), and a second repair may follow when the report about the new packet is due. The second one delays the next
 message.
 

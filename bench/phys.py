@@ -141,7 +141,7 @@ def _bare(phy: Phy, many: int, few: int) -> tuple[float, float]:
     """Packets/s, and s for a single one, from Python block to Python block."""
     shorten_switch_interval()
     poster, taker, graph = _Poster(), _Taker(), gr.top_block()
-    transmitter, receiver = phy.transmitter(), phy.receiver(own_process=True)
+    transmitter, receiver = phy.transmitter(), phy.receiver()
     graph.msg_connect(poster, "out", transmitter, "pdus")
     graph.connect(transmitter, receiver)
     graph.msg_connect(receiver, "pdus", taker, "in")

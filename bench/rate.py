@@ -1,6 +1,6 @@
 """The adaptive rate of `ofdm` beside each of its rates alone, in simulated time: at constant SNRs, and where it fades.
 
-Messages fill one packet of 220 B each. The receiver reports over a way back of its own, whose reports come 5 ms after
+Messages fill one packet of 220 B each. The receiver reports on a channel of its own, whose reports come 5 ms after
 their airtime. An MCS alone is the same link with a table of this one MCS.
 """
 

@@ -38,7 +38,7 @@ def big(rng: random.Random) -> bytes:
 
 
 @dataclass
-class Talk:
+class Exchange:
     """What came of it.
 
     :ivar delays: s that each reliable message took to each other robot; infinite for one that did not arrive
@@ -54,7 +54,7 @@ class Talk:
 
 def talk(
     *, reliable: bool, seed: int = 1, robots: int = ROBOTS, loss: float = LOSS, packet_len: int = PACKET_LEN
-) -> Talk:
+) -> Exchange:
     """One run."""
     with tempfile.TemporaryDirectory() as folder:
         registry = Path(folder, "two.csv")
@@ -95,13 +95,13 @@ def _offered(number: int, robots: int, seed: int, *, reliable: bool) -> Iterator
         yield Offered(t, ODOM, message.payload)
 
 
-def _watched(run: Simulation, packet_len: int) -> Talk:
+def _watched(run: Simulation, packet_len: int) -> Exchange:
     made: dict[tuple[int, int], float] = {}
     named: dict[tuple[int, int, object], int] = {}
     waiting: dict[tuple[int, int], set[int]] = {}
     heard: dict[tuple[int, int], tuple[float, float, float]] = {}
     """Sender and receiver -> since when, what the newest message was made at, and the area under the age so far."""
-    found = Talk()
+    found = Exchange()
     spent = 0.0
     for now, robot, event in run.events():
         own = robot.src_id

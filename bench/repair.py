@@ -101,7 +101,7 @@ def run(
     """One sender and some receivers.
 
     :param size: bytes of a message
-    :param back: loss of the way back; None: there is none
+    :param back: loss of the reverse direction; None: there is none
     :param once: one message only
     :param tail: s after the last message
     :param delay: slots that reports take beside their own

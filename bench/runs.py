@@ -30,10 +30,10 @@ def _delivery(what: str, result: Result) -> list[Row]:
     sent = sum(topic.sent for topic in result.topics)
     delivered = sum(topic.delivered for topic in result.topics)
     lost = {
-        row: sum(topic.ledger.get(row, 0) for topic in result.topics)
+        fate: sum(topic.ledger.get(fate, 0) for topic in result.topics)
         for topic in result.topics
-        for row in topic.ledger
-        if row != "delivered"
+        for fate in topic.ledger
+        if fate != "delivered"
     }
     latency = result.topics[0].latency_s.p50
     note = f"{delivered} of {sent} messages, {result.packets['sent'] / result.duration_s:,.0f} packets/s"

@@ -64,7 +64,7 @@ def slow_computer() -> list[Row]:
     dropped: Counter[str] = Counter()
     for topic in slow.result.topics:
         dropped.update(topic.ledger)
-    fates = ", ".join(f"{count} {row}" for row, count in dropped.most_common())
+    fates = ", ".join(f"{count} {fate}" for fate, count in dropped.most_common())
     inside = max(topic.age_s.mean or 0.0 for topic in slow.result.topics if topic.sent > 1)
     had = f"in the link alone {inside:.2f} s; {slow.cores:.2f} of a core, {free.cores:.2f} are needed"
     what = "a third of the processor: "

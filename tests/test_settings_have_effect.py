@@ -20,7 +20,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ends import make_endpoint
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
-from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode
+from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
 from gr_ros2.radio.ax25 import ui_header
 from gr_ros2.radio.framing import Kiss
 from gr_ros2.run.scenario import load_scenario
@@ -81,7 +81,7 @@ def sealed() -> Outcomes:
         return sealed_as("encrypt"), sealed_as("authenticate")
 
     def sealed_as(mode: SealMode) -> bytes:
-        return Keys((bytes(32),), mode).own(1, 1).close(b"head", b"body", 1, SOURCE_ROW)
+        return Keys((bytes(32),), mode).own(1, 1).close(b"head", b"body", 1, NOT_A_REPAIR)
 
     return close
 
@@ -292,6 +292,7 @@ effects(
     drain_s=run("drain_s=0", "ros_source.packet_rate=0"),
     sim=run("sim.odom_rate=20"),
     task=Elsewhere("tests/run/test_task_run.py"),
+    controller=Elsewhere("tests/run/test_task_run.py"),
     reports=run("reports={}", LOSSY),
     airtime=run("airtime=eu869.4"),
 )
@@ -330,7 +331,7 @@ effects(
     receivers=Elsewhere("tests/run/test_version1.py"),
 )
 for part in ("channel", "ros_source", "ros_sink"):
-    EFFECTS["Way back", part] = Elsewhere("tests/run/test_scenario.py")
+    EFFECTS["Reverse direction", part] = Elsewhere("tests/run/test_scenario.py")
 effects("Scenario", **dict.fromkeys(("robots", "duplex", "gains_db"), Elsewhere("tests/run/test_robots.py")))
 effects(
     "Scenario",
@@ -409,7 +410,7 @@ elsewhere(
     study_sweep_run="time",
     study_sweep_summaries="set y topic",
 )
-elsewhere("Race", race_race_settings="source duration_s packet_len sample_rate bag_topic peers loss load")
+elsewhere("Race", race_race_settings="robots source duration_s packet_len sample_rate bag_topic peers loss load")
 for name in ("match_s", "drain_s", "seed"):
     EFFECTS["Race", name] = Hardware("a race needs root: two network namespaces")
 elsewhere(

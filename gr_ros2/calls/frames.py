@@ -1,4 +1,4 @@
-"""The bytes of a request and of a reply: messages of version 1 in a row of their own (docs/reference/wire-format.md).
+"""The bytes of a request and of a reply: messages of version 1 on a topic of their own (docs/reference/wire-format.md).
 
 Invariants: ``read_frame`` raises nothing but a named WireError; ``read_frame(write_frame(frame)) == frame``.
 """
@@ -42,6 +42,7 @@ class CallFrame:
 
     @property
     def is_request(self) -> bool:
+        """Whether it is a request, and not a reply."""
         return self.service_id >= 0
 
 

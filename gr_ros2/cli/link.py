@@ -19,10 +19,10 @@ from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
-from gr_ros2.cli.params import RowName, set_option
+from gr_ros2.cli.params import BackendName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.ping import check
-from gr_ros2.cli.status import PING, STATUS, airtime_words, tables
+from gr_ros2.cli.status import PING, SET, STATUS, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.guard import Guard
@@ -51,7 +51,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path), required=False)
 @click.option("--robot", type=click.IntRange(0, BROADCAST - 1), help="Without CONFIG: number of this robot.")
-@click.option("--radio", type=RowName(FRONT_ENDS, PRESETS), help="Without CONFIG: what carries the packets.")
+@click.option("--radio", type=BackendName(FRONT_ENDS, PRESETS), help="Without CONFIG: what carries the packets.")
 @_flag("listen", metavar="ADDRESS")
 @_flag("peer", metavar="ADDRESS", multiple=True)
 @_flag("device", metavar="ARGS")
@@ -61,7 +61,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @click.option(
     "--topics", metavar="NAMES", help="Without CONFIG: topics to send, 'auto', 'auto, -camera/*', 'odom map'."
 )
-@click.option("--middleware", type=RowName(MIDDLEWARE), help=f"Joins the ROS graph; default: {DEFAULT_MIDDLEWARE}.")
+@click.option("--middleware", type=BackendName(MIDDLEWARE), help=f"Joins the ROS graph; default: {DEFAULT_MIDDLEWARE}.")
 @click.option("--save", type=click.Path(dir_okay=False, path_type=Path), help="Without CONFIG: write it for next time.")
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
 @click.option("--transmit/--listen-only", default=None, help="A radio may send here, or only receives.")
@@ -129,6 +129,7 @@ def link(
         raise click.UsageError("--against needs --check")
     # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
+        from gr_ros2.radio.live_settings import LiveSettings
         from gr_ros2.radio.robot_link import RobotLink
         from gr_ros2.run.observers import RunObservers
 
@@ -145,9 +146,11 @@ def link(
             signal.signal(number, lambda *_, on=on: _switch(running, on))
         try:
             running.start()
+            live = LiveSettings(running.source, running.sink)
             answers |= {
                 STATUS: lambda _: {**running.stats(), "findings": running.findings()},
                 PING: lambda asks: running.ping(int(asks["robot"]), anew=bool(asks["anew"])),
+                SET: lambda asks: [live.change(name, value) for name, value in asks],
             }
             run_observers.run_started(_live(running))
             _show(console, running, duration)

@@ -45,6 +45,7 @@ COMMANDS: Commands = {
     "link": ("gr_ros2.cli.link:link", "One robot's end of a link, live: its ROS topics to the air and back."),
     "status": ("gr_ros2.cli.status:status", "What a running link does: who is heard, what crosses, what is dropped."),
     "peers": ("gr_ros2.cli.status:peers", "The robots that a running link hears."),
+    "set": ("gr_ros2.cli.status:set_live", "Change a setting of a running link, such as whom a topic is for."),
     "ping": ("gr_ros2.cli.ping:ping", "Ask another robot over the link: round trip, loss, SNR, clocks."),
     "medium": ("gr_ros2.cli.medium:medium", "One simulated channel for several links with front end zmq."),
     "doctor": ("gr_ros2.cli.doctor:doctor", "What this machine has and lacks for a link, and what mends it."),

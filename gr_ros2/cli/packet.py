@@ -119,10 +119,10 @@ def _looked_at(look: Dissection, data: bytes, reader: Reader, registry: Registry
     elif repair.mask:
         kind = "repair"
         count, first = repair.mask.bit_count(), look.number - repair.mask.bit_length() + 1
-        what = f"row {repair.row}, of {count} packets in {first}..{look.number}"
+        what = f"repair id {repair.repair_id}, of {count} packets in {first}..{look.number}"
         what += ", nothing older is worth repairing" if repair.oldest else ""
     else:
-        kind, what = "control", f"at number {look.number}, row {repair.row}"
+        kind, what = "control", f"at number {look.number}, repair id {repair.repair_id}"
     if look.hidden:
         content = f"{len(look.hidden)} bytes encrypted: {_preview(look.hidden)}"
     elif repair is not None and repair.mask:
@@ -138,20 +138,20 @@ def _looked_at(look: Dissection, data: bytes, reader: Reader, registry: Registry
         if message is None:
             yield f"  entry {index}: {entry.describe()}"
         else:
-            row = announced.get(message.topic_id)
-            text = _of_topic(message, row.name if row is not None else _name(message.topic_id, registry))
+            topic = announced.get(message.topic_id)
+            text = _of_topic(message, topic.name if topic is not None else _name(message.topic_id, registry))
             yield f"  entry {index}: {text}{', coded' if message.coded else ''}"
             relayed = look.relayed(index)
             if relayed is not None:
                 taker, of = relayed
                 way = "" if taker == BROADCAST else f", taken on by robot {taker}"
                 yield f"    relayed: {of.describe()}{way}"
-    for row in look.announced:
-        yield f"  announces {row.describe()}"
+    for topic in look.announced:
+        yield f"  announces {topic.describe()}"
 
 
 def _name(topic_id: int, registry: Registry | None) -> str | None:
-    """Name of a topic by its row in the registry; None without a registry."""
+    """Name of a topic by its topic in the registry; None without a registry."""
     if registry is None:
         return None
     return registry[topic_id].name if topic_id < len(registry) else "not in the registry"

@@ -58,16 +58,16 @@ class OrAuto(click.ParamType):
         return value if value == AUTO else self._other.convert(value, param, ctx)
 
 
-class RowName(Completed):
-    """A name in a table of back-ends, or of ``more``. It is checked later, when the row is loaded."""
+class BackendName(Completed):
+    """A name in a table of back-ends, or of ``more``. It is checked later, when the back-end is loaded."""
 
     name = "name"
 
     def __init__(self, table: BackendTable[Any], more: Mapping[str, Any] = MappingProxyType({})) -> None:
-        self._rows = {**table.own, **more}
+        self._backends = {**table.own, **more}
 
     def candidates(self) -> Iterable[CompletionItem]:
-        return (CompletionItem(name, help=row.summary) for name, row in self._rows.items())
+        return (CompletionItem(name, help=backend.summary) for name, backend in self._backends.items())
 
 
 class SettingParam(Completed):

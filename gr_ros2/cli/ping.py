@@ -15,10 +15,9 @@ from rich.live import Live
 
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.control_socket import request
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import set_option
-from gr_ros2.cli.status import PING, find_link, json_option, pid_option
+from gr_ros2.cli.status import PING, ask_link, find_link, json_option, pid_option
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import LinkConfig, load_link
@@ -103,7 +102,7 @@ def ping(
     chosen = find_link(pid)
 
     def ask(anew: bool) -> Mapping[str, Any]:
-        told: Mapping[str, Any] = request(chosen, {PING: {"robot": robot, "anew": anew}})[PING]
+        told: Mapping[str, Any] = ask_link(chosen, PING, {"robot": robot, "anew": anew})
         return told
 
     return _ping(ask, robot, count, interval, as_json=as_json)

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gr_ros2.cli.params import SCENARIO, set_option
-from gr_ros2.link.ledger_rows import ARRIVED, LedgerRow
+from gr_ros2.link.fates import ARRIVED, Fate
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.study.forecast import Advice, Cut, Effect, Forecast, Planner
 from gr_ros2.study.traffic import is_bag, link_values, of_recording, recorded_graph
@@ -90,6 +90,11 @@ def _tell(planner: Planner, advise: bool) -> None:
     console.print(_table(forecast))
     console.print(_verdict(forecast), soft_wrap=True)
     console.print(forecast.in_use, soft_wrap=True)
+    if task := planner.task:
+        console.print(
+            f"The robots drive their own ways here; gr-ros2 run says how well they do task {task!r} over this link.",
+            soft_wrap=True,
+        )
     if (half_m := planner.range_m(0.5)) is not None:
         console.print(
             f"The link ends at {half_m:.0f} m: half of the packets arrive there, and {_MOST:.0%} of them up to "
@@ -164,7 +169,7 @@ def _verdict(forecast: Forecast) -> str:
 
 def _arrives(forecast: Forecast) -> float:
     """Share of all messages that arrive, 0..1, without those that newer ones replaced before they left."""
-    left = 1 - _share(forecast, LedgerRow.SUPERSEDED)
+    left = 1 - _share(forecast, Fate.SUPERSEDED)
     return _share(forecast, *ARRIVED) / left if left else 1.0
 
 
@@ -174,11 +179,11 @@ def _replaced(forecast: Forecast) -> float:
     return sum(max(topic.wanted_hz - topic.rate_hz, 0.0) for topic in forecast.topics) / wanted if wanted else 0.0
 
 
-def _share(forecast: Forecast, *rows: LedgerRow) -> float:
-    """Share of all messages that end in these rows of the ledger, 0..1."""
+def _share(forecast: Forecast, *fates: Fate) -> float:
+    """Share of all messages with these fates, 0..1."""
     results = [topic.result for topic in forecast.topics]
     sent = sum(result.sent for result in results)
-    return sum(result.ledger.get(row.value, 0) for result in results for row in rows) / sent if sent else 0.0
+    return sum(result.ledger.get(fate.value, 0) for result in results for fate in fates) / sent if sent else 0.0
 
 
 def _line(advice: Advice) -> str:

@@ -18,19 +18,22 @@ from gr_ros2.report.table import as_table
 from gr_ros2.settings.config import build
 
 _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
+_TEAM = {"packet_len": 96, "loss": (0.05,)}
+"""Packets carry a block for medium access, and conditions are fewer because each takes longer."""
 
 
 @click.command()
 @click.option("--short", is_flag=True, help="5 s a contender, at load 200 % and loss 5 % unless told otherwise.")
+@click.option("--robots", type=int, metavar="N", help="2 to 10 robots on one channel, all to all; default one to one.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/race-TIME.")
-@click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20,40.")
+@click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20,40, of a team 5.")
 @click.option("--load", metavar="PERCENT,...", help="Of the link's capacity by the messages as they are; 50,200.")
 @click.option("--sample-rate", type=OrAuto(click.FLOAT), help="Samples/s instead of --load.")
 @click.option("--peers", metavar="NAME,...", help="Who races; default all.")
 @click.option("--source", help="sim, a simulated robot's odometry at 35 Hz, or bag:PATH.")
 @click.option("--topic", "bag_topic", help="Of the bag, where it has several.")
 @click.option("--duration", "duration_s", type=float, help="Seconds of the recording; default 15.")
-@click.option("--packet-len", type=int, help="Bytes of gr-ros2's longest packets; default 64.")
+@click.option("--packet-len", type=int, help="Bytes of gr-ros2's longest packets; default 64, of a team 96.")
 @click.option("--seed", type=int, help="Of robot, losses and sender.")
 def race(
     short: bool, out: Path | None, loss: str | None, load: str | None, peers: str | None, **options: object
@@ -43,7 +46,9 @@ def race(
         **options,
     }
     chosen = {name: value for name, value in given.items() if value is not None}
-    settings = build(RaceSettings, {**(_SHORT if short else {}), **chosen}, "race")
+    settings = build(
+        RaceSettings, {**(_TEAM if options["robots"] else {}), **(_SHORT if short else {}), **chosen}, "race"
+    )
     out = out or Path("results") / f"race-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())

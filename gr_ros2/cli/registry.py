@@ -33,7 +33,7 @@ _NO_MESSAGES = {"srv": "a service", "action": "an action"}
 """Middle part of a type name other than ``msg``, and what has such types."""
 _LATCHED = "durability"
 _QOS_COLUMNS = ("reliability", _LATCHED, "depth")
-_SHARED = [name for name, row in MIDDLEWARE.own.items() if row.scope == "shared"]
+_SHARED = [name for name, backend in MIDDLEWARE.own.items() if backend.scope == "shared"]
 
 
 @click.command()

@@ -27,6 +27,7 @@ from gr_ros2.report.explain import explanation, lateness_lines
 from gr_ros2.report.repetitions import repetition_grid
 from gr_ros2.report.table import (
     as_table,
+    hops_grid,
     ledger_table,
     notes,
     packets_line,
@@ -218,8 +219,9 @@ def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
         console.print(as_table(paper_grid([result])))
     console.print(summary_table([result]))
     console.print(ledger_table(result))
-    if team := team_grid(outcome.result):
-        console.print(as_table(team))
+    for grid in (team_grid(outcome.result), hops_grid(outcome.result)):
+        if grid is not None:
+            console.print(as_table(grid))
     for path in outcome.trace.paths():
         title = f"{path.topic} sent (blue), {path.published_as} received (red), m"
         console.print(Text.from_ansi(path_text(path.sent, path.received, title)), soft_wrap=True)

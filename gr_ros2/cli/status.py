@@ -16,8 +16,9 @@ from rich.table import Table
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.control_socket import request, running_programs
 from gr_ros2.core.errors import ConfigError, RunError
+from gr_ros2.settings.files import parse_override
 
-STATUS, PING = "status", "ping"
+STATUS, PING, SET = "status", "ping", "set"
 """Questions to the control socket of a link."""
 _EVERY_S = 0.5
 
@@ -61,7 +62,7 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
             "silent" if peer["silent"] else f"over {peer['over']}, hop {peer['hops']}" if peer["hops"] else "heard",
             _seconds(peer["heard_s"]),
             _decibels(peer["snr_db"]),
-            f"{peer['loss']:.1%}",
+            f"{peer['lost']} ({peer['loss']:.1%} lately)",
             str(peer["topics"]),
             "yes" if peer["sealed"] else "no",
         )
@@ -156,11 +157,20 @@ def status_of(pid: int) -> dict[str, Any]:
 
     :raises RunError: when it has ended, or is no link
     """
-    answer = request(pid, {STATUS: True})
-    if STATUS not in answer:
-        raise RunError(f"process {pid}: {answer.get('name', '?')} is no link")
-    found: dict[str, Any] = answer[STATUS]
+    found: dict[str, Any] = ask_link(pid, STATUS, True)
     return found
+
+
+def ask_link(pid: int, question: str, value: Any) -> Any:
+    """What a running link answers.
+
+    :param question: such as ``STATUS``
+    :raises RunError: when it has ended, refuses, or is no link
+    """
+    answer = request(pid, {question: value})
+    if question not in answer:
+        raise RunError(f"process {pid}: {answer.get('name', '?')} is no link")
+    return answer[question]
 
 
 def show_until(console: Console, look: Callable[[], Any], *, live: bool) -> None:
@@ -200,3 +210,16 @@ def peers(*, pid: int | None, as_json: bool) -> None:
         click.echo(json.dumps(found))
     else:
         make_console().print(peer_table(found), soft_wrap=True)
+
+
+@click.command("set")
+@click.argument("settings", nargs=-1, required=True, metavar="SETTING=VALUE...")
+@pid_option
+def set_live(*, settings: tuple[str, ...], pid: int | None) -> None:
+    """Change settings of a running link, such as ros_source.topic_options.goal.to=7: whom a topic is for.
+
+    The file of the link stays as it is. What cannot change while a link runs is refused, and what can is named.
+    """
+    changes = [(".".join(keys), value) for keys, value in map(parse_override, settings)]
+    for line in ask_link(find_link(pid), SET, changes):
+        click.echo(line)

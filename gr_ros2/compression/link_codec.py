@@ -138,7 +138,7 @@ class LinkCodec:
     def decode(self, topic_id: int, coded: bytes) -> bytes:
         """The message.
 
-        :raises CodecError: ``row`` is unknown_dictionary, damaged or unsupported (a codec we do not know)
+        :raises CodecError: ``fate`` is unknown_dictionary, damaged or unsupported (a codec we do not know)
         :raises KeyError: a topic id that it was not made for
         """
         return self._topics[topic_id].decode(coded)

@@ -28,6 +28,7 @@ _COMPRESSED_BLOCK = 2
 _EMPTY_BLOCK = bytes(3)
 """The header of a raw block of no bytes that is not the last."""
 _MAX_BLOCK = 1 << 21
+_LEVEL = 12
 
 
 class Zstd:
@@ -36,11 +37,11 @@ class Zstd:
     :param dictionary: a dictionary that both ends have, made by ``train``, or any bytes to refer to; b'' = none
     """
 
-    def __init__(self, dictionary: bytes = b"", level: int = 12) -> None:
+    def __init__(self, dictionary: bytes = b"") -> None:
         raw = not dictionary.startswith(_DICTIONARY_MAGIC)
         self._dictionary = zstd.ZstdDict(dictionary, is_raw=raw) if dictionary else None
         options: dict[int, int] = {
-            zstd.CompressionParameter.compression_level: level,
+            zstd.CompressionParameter.compression_level: _LEVEL,
             zstd.CompressionParameter.content_size_flag: 0,
             zstd.CompressionParameter.dict_id_flag: 0,
         }

@@ -1,7 +1,7 @@
 """Lazy tables of back-ends: name -> where its class lives and what must be installed for it.
 
-Invariants: nothing behind a row is imported until that row is chosen, so `import gr_ros2` works without GNU Radio, ROS
-2 or a DDS; other packages add rows by entry points; these are read only when a name is not in this package's table, or
+Invariants: nothing of a back-end is imported until it is chosen, so `import gr_ros2` works without GNU Radio, ROS
+2 or a DDS; other packages add back-ends by entry points, which are read only when a name is not in this table, or
 when all names are listed; a broken entry point fails only for the user who chooses it.
 """
 
@@ -22,7 +22,7 @@ from gr_ros2.core.errors import BackendMissingError, ConfigError
 
 @dataclass(frozen=True)
 class Backend:
-    """One row.
+    """One back-end.
 
     :param module: dotted name of the module
     :param attribute: the class in it
@@ -40,10 +40,10 @@ class Backend:
     imports: tuple[str, ...] = ()
 
 
-RowT = TypeVar("RowT", bound=Backend)
+BackendT = TypeVar("BackendT", bound=Backend)
 
 
-class BackendTable(Mapping[str, RowT], Generic[RowT]):
+class BackendTable(Mapping[str, BackendT], Generic[BackendT]):
     """A family of back-ends (middleware, PHY, …). CLI, YAML, GRC options and docs all read this table.
 
     Other packages add to it by entry points of the group ``gr_ros2.FAMILY``, in their ``pyproject.toml`` for instance::
@@ -51,26 +51,26 @@ class BackendTable(Mapping[str, RowT], Generic[RowT]):
         [project.entry-points."gr_ros2.phy"]
         ook = "my_package.ook:OokPhy"
 
-    The entry point names either the class (the row then has default values) or a row.
+    The entry point names either the class (the :class:`Backend` then has default values) or a Backend.
 
-    :param family: what errors call a row, and the last part of the group
-    :param rows: the rows of this package, by name; an entry point cannot replace them
-    :param kind: class of a row
+    :param family: what errors call a back-end, and the last part of the group
+    :param backends: those of this package, by name; an entry point cannot replace them
+    :param kind: class of a back-end
     """
 
-    def __init__(self, family: str, rows: Mapping[str, RowT], kind: type[RowT]) -> None:
+    def __init__(self, family: str, backends: Mapping[str, BackendT], kind: type[BackendT]) -> None:
         self.family = family
-        self.own: Mapping[str, RowT] = dict(rows)
-        """The rows of this package, without those of others."""
+        self.own: Mapping[str, BackendT] = dict(backends)
+        """Those of this package, without those of others."""
         self._kind = kind
 
-    def __getitem__(self, name: str) -> RowT:
-        """The row of a name.
+    def __getitem__(self, name: str) -> BackendT:
+        """The back-end of a name.
 
         :raises KeyError: for a name that is not in the table
         :raises BackendMissingError: when the entry point that has this name cannot be loaded
         """
-        return self.own[name] if name in self.own else self._row_of(self._others[name])
+        return self.own[name] if name in self.own else self._backend_of(self._others[name])
 
     def __iter__(self) -> Iterator[str]:
         yield from self.own
@@ -90,26 +90,26 @@ class BackendTable(Mapping[str, RowT], Generic[RowT]):
         """
         if name not in self:
             raise ConfigError(f"{self.family}: no {name!r}; known are {', '.join(self)}")
-        row = self[name]
-        return getattr(self._imported(name, row, row.module), row.attribute)
+        backend = self[name]
+        return getattr(self._imported(name, backend, backend.module), backend.attribute)
 
     def modules(self, name: str) -> tuple[Any, ...]:
-        """The modules that a row needs when it is used, see ``Backend.imports``.
+        """The modules that a back-end needs when it is used, see ``Backend.imports``.
 
         :param name: a name of the table
         :raises BackendMissingError: when one is not installed
         """
-        row = self[name]
-        return tuple(self._imported(name, row, module) for module in row.imports)
+        backend = self[name]
+        return tuple(self._imported(name, backend, module) for module in backend.imports)
 
-    def _imported(self, name: str, row: RowT, module: str) -> Any:
+    def _imported(self, name: str, backend: BackendT, module: str) -> Any:
         try:
             with uninterrupted():
                 return import_module(module)
         except ImportError as error:
-            if not row.requires:
+            if not backend.requires:
                 raise
-            raise BackendMissingError(f"{self.family} {name!r} needs {row.requires} ({error})") from error
+            raise BackendMissingError(f"{self.family} {name!r} needs {backend.requires} ({error})") from error
 
     @cached_property
     def _others(self) -> Mapping[str, EntryPoint]:
@@ -120,7 +120,7 @@ class BackendTable(Mapping[str, RowT], Generic[RowT]):
                 found.setdefault(entry.name, entry)
         return found
 
-    def _row_of(self, entry: EntryPoint) -> RowT:
+    def _backend_of(self, entry: EntryPoint) -> BackendT:
         package = "?" if entry.dist is None else entry.dist.metadata["Name"]
         try:
             with uninterrupted():

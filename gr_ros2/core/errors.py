@@ -8,10 +8,10 @@
     │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
     │   ├── EntryKindError · VarintError · WindowError · SourcesError
     │   ├── SealError
-    │   │   └── NoHelloError · NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
+    │   │   └── NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
     │           NotStoredError · SameIdError
     │   └── EncodeError
-    ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``row`` names why
+    ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``fate`` names why
     │   └── UnknownDictionaryError · DamagedError
     ├── MiddlewareError (RuntimeError)  the ROS side failed
     │   ├── BagError                    a bag cannot be read or written
@@ -120,7 +120,7 @@ class VarintError(WireError):
 
 
 class WindowError(WireError):
-    """A repair whose window, mask and row contradict each other."""
+    """A repair whose window, mask and repair id contradict each other."""
 
     kind = "window"
 
@@ -129,12 +129,6 @@ class SealError(WireError):
     """A packet that may be intact, but that cannot be trusted here."""
 
     kind = "seal"
-
-
-class NoHelloError(SealError):
-    """A packet of a robot whose hello has not been received since that robot's last start."""
-
-    kind = "no_hello"
 
 
 class NoKeyError(SealError):
@@ -192,21 +186,21 @@ class EncodeError(WireError):
 
 
 class CodecError(GrRos2Error, ValueError):
-    """A coded message that cannot be decoded here. ``row`` is the ledger row it ends in."""
+    """A coded message that cannot be decoded here. ``fate`` is what the ledger says of it."""
 
-    row = "unsupported"
+    fate = "unsupported"
 
 
 class UnknownDictionaryError(CodecError):
     """A message coded with a dictionary that is not available here, or with a different one of the same name."""
 
-    row = "unknown_dictionary"
+    fate = "unknown_dictionary"
 
 
 class DamagedError(CodecError):
     """Bytes that are not a coded message, or a message larger than the limit."""
 
-    row = "damaged"
+    fate = "damaged"
 
 
 class MiddlewareError(GrRos2Error, RuntimeError):

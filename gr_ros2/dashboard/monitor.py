@@ -82,7 +82,7 @@ class RunMonitor:
             run.packet_len,
             name=run.name,
             duration_s=run.duration_s,
-            ledger=None if run.ledger is None else run.ledger.rows,
+            ledger=None if run.ledger is None else run.ledger.fates,
             tick_s=TICK_S,
             airtime=run.links[0].phy.airtime if run.links and run.links[0].phy.has_airtime else None,
             received_as=run.received_as,
@@ -124,7 +124,7 @@ class RunMonitor:
 
     def _tick(self, run: LiveRun, state: DashboardState) -> None:
         for src_id, source in run.sources.items():
-            state.subscribed(src_id, source.subscriptions.subscribed)
+            state.subscribed(src_id, source.subscriptions.named())
         queued = {
             (src_id, topic["topic_id"]): topic["queued"]
             for src_id, source in run.sources.items()

@@ -8,7 +8,7 @@ Counts are exact during the run. When the result is known, every number comes fr
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from math import nan
 from threading import Lock
 from typing import get_args
@@ -33,7 +33,7 @@ from gr_ros2.link.events import (
     SenderEvent,
     SentPacket,
 )
-from gr_ros2.link.ledger_rows import LedgerRow, arrived
+from gr_ros2.link.fates import Fate, arrived
 from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.record.metrics import Latency, latency, latency_cdf
 from gr_ros2.record.positions import PositionReader, position_reader
@@ -81,12 +81,12 @@ class _Topic:
         self.belief = PathComparison(int(HISTORY_S / _PATH_STEP_S), _PATH_STEP_S)
         self.history: deque[tuple[float, float, float, float, float]] = deque(maxlen=history)
 
-    def rows(self) -> dict[str, int]:
-        """The ledger rows as far as the events alone show them. An observer of both ends uses the ledger instead."""
-        whole = {LedgerRow.DELIVERED.value: self.delivered - self.repaired, LedgerRow.REPAIRED.value: self.repaired}
-        rows = {row: count for row, count in {**whole, **self.ended}.items() if count}
-        rest = self.sent - sum(rows.values())
-        return {**rows, LedgerRow.IN_FLIGHT.value: rest} if rest > 0 else rows
+    def fates(self) -> dict[str, int]:
+        """The ledger fates as far as the events alone show them. An observer of both ends uses the ledger instead."""
+        whole = {Fate.DELIVERED.value: self.delivered - self.repaired, Fate.REPAIRED.value: self.repaired}
+        fates = {fate: count for fate, count in {**whole, **self.ended}.items() if count}
+        rest = self.sent - sum(fates.values())
+        return {**fates, Fate.IN_FLIGHT.value: rest} if rest > 0 else fates
 
 
 class _SourceWindow:
@@ -106,7 +106,7 @@ class DashboardState:
     :param packet_len: bytes of a packet
     :param name: name of the link
     :param duration_s: s during which messages will be submitted, 0 = unknown
-    :param ledger: gives the messages per ledger row, as an observer of both ends knows them; None uses the events alone
+    :param ledger: gives the messages per fate, as an observer of both ends knows them; None uses the events alone
     :param tick_s: s between two calls of :meth:`tick`, for the length of the history
     :param airtime: s that a packet of so many bytes takes; None where packets take no air, or it is not known
     :param received_as: absolute name under which a sender's topic comes out here, '' where it is not known
@@ -145,7 +145,9 @@ class DashboardState:
         """s of air since the last tick, by what the packets were for."""
         self._air: deque[tuple[float, ...]] = deque(maxlen=self._history)
         self._robots: dict[int, tuple[float, int]] = {}
-        """When each robot was heard last, and packets received of it."""
+        """When each robot was heard last, itself or over others, and packets received of it."""
+        self._ways: dict[int, tuple[int, int | None]] = {}
+        """How many robots have sent the newest message of each robot on, and the last of them."""
         self._result: Result | None = None
         for key in topics:
             self._topic(key)
@@ -169,7 +171,7 @@ class DashboardState:
             elif isinstance(event, Missed):
                 topic = self._topic((src_id, event.topic_id))
                 topic.sent += event.count
-                topic.ended[LedgerRow.LOST_ON_GRAPH.value] += event.count
+                topic.ended[Fate.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, src_id, event)
 
@@ -179,9 +181,9 @@ class DashboardState:
             if isinstance(event, Delivered):
                 self._delivered(event, now)
             elif isinstance(event, Announced):
-                for row in event.rows:
-                    full_name = self._received_as(event.src_id, row.name)
-                    self._learn((event.src_id, row.topic_id), row.name, row.type_name, full_name)
+                for topic in event.topics:
+                    full_name = self._received_as(event.src_id, topic.name)
+                    self._learn((event.src_id, topic.topic_id), topic.name, topic.type_name, full_name)
             elif isinstance(event, Lost):
                 source = self._sources.get(event.src_id)
                 if source is None or not source.messages.repeats(event):
@@ -192,18 +194,15 @@ class DashboardState:
                 self._packets_received.add(now)
                 self._received.append((now, event))
                 if isinstance(event, Received):
-                    src_id = event.packet.src_id
-                    self._robots[src_id] = now, self._robots.get(src_id, (now, 0))[1] + 1
-                    if len(self._robots) > _ROBOTS:
-                        del self._robots[min(self._robots, key=lambda one: self._robots[one][0])]
+                    self._heard(event.packet.src_id, now, packets=1)
                 if isinstance(event, Rejected):
                     self._packets[f"rejected_{event.error.kind}"] += 1
                     self._packets["rejected"] += 1
 
-    def subscribed(self, src_id: int, topics: Mapping[str, Topic]) -> None:
-        """Take over what a source in this process subscribes, by absolute name. Topics may be added while it runs."""
+    def subscribed(self, src_id: int, topics: Iterable[tuple[str, Topic]]) -> None:
+        """Take over what a source in this process subscribes, with absolute names. More may come while it runs."""
         with self._lock:
-            for full_name, topic in topics.items():
+            for full_name, topic in topics:
                 self._learn((src_id, topic.topic_id), topic.name, topic.type_name, full_name)
 
     def finish(self, result: Result | None, *, failed: bool = False) -> None:
@@ -273,7 +272,8 @@ class DashboardState:
                 state=next(iter(alarms), "" if over or self._start is None else "up"),
                 alarms=tuple(text for texts in alarms.values() for text in texts),
                 heard=tuple(
-                    RobotView(src_id, now - last, count) for src_id, (last, count) in sorted(self._robots.items())
+                    RobotView(src_id, now - last, count, *self._ways.get(src_id, ()))
+                    for src_id, (last, count) in sorted(self._robots.items())
                 ),
                 air=AirView(past[:, 0], {} if self._airtime is None else busy, past[:, 1]),
                 packets_now=(
@@ -329,8 +329,10 @@ class DashboardState:
         if final is not None:
             return _final_view(place, key, final)
         # The ledger has priority: it has taken every event, also those from before this state was made.
-        rows = topic.rows() if self._ledger is None else dict(ledger.get(key, {}))
-        sent, delivered = (topic.sent, topic.delivered) if self._ledger is None else (sum(rows.values()), arrived(rows))
+        fates = topic.fates() if self._ledger is None else dict(ledger.get(key, {}))
+        sent, delivered = (
+            (topic.sent, topic.delivered) if self._ledger is None else (sum(fates.values()), arrived(fates))
+        )
         seconds = min(elapsed, self._duration_s) if self._duration_s else elapsed
         latencies = np.sort(np.array(topic.latencies, dtype=float))
         age_now, age_mean, age_peak = topic.age.read(now) or (None, None, None)
@@ -352,7 +354,7 @@ class DashboardState:
             age_mean_s=age_mean,
             age_peak_s=age_peak,
             queued=queued.get(key),
-            ledger=rows,
+            ledger=fates,
         )
 
     def _series(self, place: int, key: Key) -> SeriesView:
@@ -421,6 +423,11 @@ class DashboardState:
             source.last_serial = event.serial
             topic.sent += 1
 
+    def _heard(self, src_id: int, now: float, *, packets: int) -> None:
+        self._robots[src_id] = now, self._robots.get(src_id, (now, 0))[1] + packets
+        if len(self._robots) > _ROBOTS:
+            del self._robots[min(self._robots, key=lambda one: self._robots[one][0])]
+
     def _delivered(self, event: Delivered, now: float) -> None:
         key = (event.src_id, event.topic_id)
         source = self._sources.get(event.src_id)
@@ -431,6 +438,9 @@ class DashboardState:
                 source.messages.close(message)
             elif source.messages.repeats(event):
                 return
+        self._ways[event.src_id] = event.hops, event.over
+        if event.hops:
+            self._heard(event.src_id, now, packets=0)
         topic = self._topic(key)
         topic.delivered += 1
         topic.repaired += event.repaired

@@ -13,9 +13,9 @@ from typing import get_args
 from gr_ros2.dashboard.packets import NO_COLOUR
 from gr_ros2.dashboard.views import PacketView, Snapshot, SpanView, TopicView
 from gr_ros2.link.events import AirKind
-from gr_ros2.link.ledger_rows import LedgerRow, row_order
+from gr_ros2.link.fates import Fate, fate_order
 from gr_ros2.record.team import PairView
-from gr_ros2.report.colours import COLOURS, ink_on, row_colour
+from gr_ros2.report.colours import COLOURS, fate_colour, ink_on
 from gr_ros2.wire import BROADCAST
 
 Number = float | int | None
@@ -79,17 +79,18 @@ def heard_html(snapshot: Snapshot) -> str:
         return '<div class="note">no robot has been heard yet</div>'
     rows = "".join(
         f'<tr data-robot="{robot.src_id}"><th scope="row" class="name">robot {robot.src_id}</th>'
-        f'<td data-field="silent">{robot.silent_s:.1f}</td><td data-field="packets">{robot.packets:,}</td></tr>'
+        f'<td data-field="silent">{robot.silent_s:.1f}</td><td data-field="packets">{robot.packets:,}</td>'
+        f'<td data-field="way">{way_text(robot.hops, robot.over)}</td></tr>'
         for robot in snapshot.heard
     )
     return (
         '<table class="heard"><thead><tr><th scope="col" class="name">robot</th><th scope="col">heard [s ago]</th>'
-        f'<th scope="col">packets</th></tr></thead><tbody>{rows}</tbody></table>'
+        f'<th scope="col">packets</th><th scope="col">messages come</th></tr></thead><tbody>{rows}</tbody></table>'
     )
 
 
 def team_html(snapshot: Snapshot) -> str:
-    """Who hears whom: share of the packets of the last seconds, and SNR."""
+    """Who hears whom: share of the packets of the last seconds, and SNR; or over whom the other's messages come."""
     team = snapshot.team
     if team is None:
         return ""
@@ -104,9 +105,16 @@ def team_html(snapshot: Snapshot) -> str:
 
 
 def _hears(pair: PairView | None) -> str:
-    if pair is None or pair.share is None:
+    if pair is None or (pair.share is None and not pair.hops):
         return "–"
+    if pair.hops and not pair.share:
+        return way_text(pair.hops, pair.over)
     return f"{pair.share:.0%}" + ("" if pair.snr_db is None else f", {pair.snr_db:.0f} dB")
+
+
+def way_text(hops: int, over: int | None) -> str:
+    """How messages of a robot come: ``over 3, hop 2``, '' from the robot itself."""
+    return f"over {over}, hop {hops}" if hops else ""
 
 
 def _repair_tiles(snapshot: Snapshot) -> list[str]:
@@ -114,7 +122,7 @@ def _repair_tiles(snapshot: Snapshot) -> list[str]:
     air = {kind: snapshot.packets[f"air_{kind}"] for kind in get_args(AirKind) if f"air_{kind}" in snapshot.packets}
     if not air:
         return []
-    repaired, given_up = snapshot.in_row(LedgerRow.REPAIRED), snapshot.in_row(LedgerRow.GIVEN_UP)
+    repaired, given_up = snapshot.in_fate(Fate.REPAIRED), snapshot.in_fate(Fate.GIVEN_UP)
     tiles = [
         _tile("repaired", f"{repaired:,}", "delivered after repair", repaired),
         _tile("given_up", f"{given_up:,}", "given up", given_up),
@@ -188,13 +196,13 @@ _GROUPS: tuple[tuple[str, tuple[_Column, ...]], ...] = (
 
 def topics_html(snapshot: Snapshot) -> str:
     """One line per topic, with the ledger as a bar."""
-    rows = row_order([topic.ledger for topic in snapshot.topics])
+    fates = fate_order([topic.ledger for topic in snapshot.topics])
     groups = "".join(f'<th scope="colgroup" colspan="{len(columns)}">{name}</th>' for name, columns in _GROUPS)
     heads = "".join(f'<th scope="col">{column[1]}</th>' for _, columns in _GROUPS for column in columns)
-    body = "".join(_topic_row(topic, rows) for topic in snapshot.topics)
+    body = "".join(_topic_row(topic, fates) for topic in snapshot.topics)
     legend = "".join(
-        f'<span class="key"><i style="background:{row_colour(row)}"></i>{escape(row.replace("_", " "))}</span>'
-        for row in rows
+        f'<span class="key"><i style="background:{fate_colour(fate)}"></i>{escape(fate.replace("_", " "))}</span>'
+        for fate in fates
     )
     return (
         f'<table class="topics"><thead><tr><th class="name" rowspan="2">topic</th>{groups}'
@@ -203,7 +211,7 @@ def topics_html(snapshot: Snapshot) -> str:
     )
 
 
-def _topic_row(topic: TopicView, rows: list[str]) -> str:
+def _topic_row(topic: TopicView, fates: list[str]) -> str:
     cells = ""
     for _, columns in _GROUPS:
         for place, (name, _head, read, write) in enumerate(columns):
@@ -212,10 +220,10 @@ def _topic_row(topic: TopicView, rows: list[str]) -> str:
             data = "" if value is None else f' data-value="{value!r}"'
             cells += f'<td{first} data-field="{name}"{data}>{write(value)}</td>'
     bar = "".join(
-        f'<i data-row="{escape(row)}" data-value="{count}" title="{escape(row)}: {count}" '
-        f'style="flex:{count};{_filled(row_colour(row))}">{count if count * 12 > topic.sent else ""}</i>'
-        for row in rows
-        if (count := topic.ledger.get(row, 0))
+        f'<i data-fate="{escape(fate)}" data-value="{count}" title="{escape(fate)}: {count}" '
+        f'style="flex:{count};{_filled(fate_colour(fate))}">{count if count * 12 > topic.sent else ""}</i>'
+        for fate in fates
+        if (count := topic.ledger.get(fate, 0))
     )
     return (
         f'<tr data-topic="{escape(topic.name)}"><td class="name"><i style="background:{colour(topic.colour)}"></i>'

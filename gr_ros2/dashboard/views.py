@@ -26,7 +26,7 @@ class TopicView:
     :param latency_cdf_s: quantiles of the same latencies, at 0 %, 1 %, … 100 %
     :param age_now_s: s since the newest delivered message was submitted
     :param queued: messages waiting at the source
-    :param ledger: row -> messages; the rows add up to ``sent``
+    :param ledger: fate -> messages; the fates add up to ``sent``
     """
 
     name: str
@@ -128,13 +128,17 @@ class PacketView:
 class RobotView:
     """A robot that was heard.
 
-    :param silent_s: s since its newest packet
+    :param silent_s: s since its newest packet, or since something of it came over others
     :param packets: received of it
+    :param hops: robots that have sent its newest message on
+    :param over: the last of them; None where it is heard itself
     """
 
     src_id: int
     silent_s: float
     packets: int
+    hops: int = 0
+    over: int | None = None
 
 
 @dataclass(frozen=True)
@@ -181,9 +185,9 @@ class Snapshot:
     air: AirView | None = None
     team: TeamView | None = None
 
-    def in_row(self, row: str) -> int:
-        """Messages in a row of the ledger, over all topics."""
-        return sum(topic.ledger.get(row, 0) for topic in self.topics)
+    def in_fate(self, fate: str) -> int:
+        """Messages with this fate, over all topics."""
+        return sum(topic.ledger.get(fate, 0) for topic in self.topics)
 
     @property
     def pdr(self) -> float | None:

@@ -14,18 +14,19 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 Point = tuple[float, float]
+_SLOTS = 20
+"""Slots in a window of :class:`Rate`; the window moves by one slot at a time; memory is one item per slot."""
 
 
 class Rate:
     """Number and bytes of the events in the last ``window_s`` seconds.
 
     :param window_s: length of the window, s
-    :param slots: number of slots in a window; the window moves by one slot at a time; memory is one item per slot
     """
 
-    def __init__(self, window_s: float, slots: int = 20) -> None:
-        self._slot_s = window_s / slots
-        self._slots: deque[tuple[int, int, int]] = deque(maxlen=slots + 1)
+    def __init__(self, window_s: float) -> None:
+        self._slot_s = window_s / _SLOTS
+        self._slots: deque[tuple[int, int, int]] = deque(maxlen=_SLOTS + 1)
 
     def add(self, now: float, size: int = 0) -> None:
         """Add one event of ``size`` bytes."""

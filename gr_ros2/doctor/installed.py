@@ -75,17 +75,17 @@ def kernels() -> Finding:
 
 def middleware() -> Iterator[Finding]:
     """The ROS graphs that can be joined."""
-    return _rows(MIDDLEWARE, needed=DEFAULT_MIDDLEWARE)
+    return _backends(MIDDLEWARE, needed=DEFAULT_MIDDLEWARE)
 
 
 def phys() -> Iterator[Finding]:
     """The physical layers that can be used."""
-    return _rows(PHY)
+    return _backends(PHY)
 
 
 def front_ends() -> Iterator[Finding]:
     """The radio front ends whose software is installed."""
-    return _rows(FRONT_ENDS)
+    return _backends(FRONT_ENDS)
 
 
 def companion() -> Finding:
@@ -105,7 +105,7 @@ def parts() -> Iterator[Finding]:
             yield Finding(module, "ok", f"for {purpose}")
 
 
-def _rows(table: BackendTable[Any], needed: str = "") -> Iterator[Finding]:
+def _backends(table: BackendTable[Any], needed: str = "") -> Iterator[Finding]:
     for name in table:
         what = f"{table.family} {name}"
         try:

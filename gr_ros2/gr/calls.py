@@ -50,7 +50,7 @@ class _Robot:
 class LiveCalls:
     """The services of both directions of one robot's link.
 
-    :param end: the endpoint, whose registry has a row for requests and replies behind those of the source
+    :param end: the endpoint, whose registry has a topic for requests and replies behind those of the source
     :param source, sink: the blocks whose graphs are joined
     :raises ConfigError: for a service on a graph that carries topics only
     """
@@ -59,7 +59,7 @@ class LiveCalls:
         self._end, self._messages = end.endpoint, end.endpoint.messages
         self._lock, self._work = end.lock, end.work
         self._engine = Calls(source.src_id, self._end.boot)
-        self._row = len(source.subscriptions.registry)
+        self._topic_id = len(source.subscriptions.registry)
         self._source, self._sink = source, sink
         self._clock = source.clock
         self._robots: dict[int, _Robot] = {}
@@ -108,7 +108,7 @@ class LiveCalls:
             self._engine.expire(self._clock())
             made, served = self._engine.waiting
             counters = self._engine.counters + self._counters
-            refused = {reason: n for (topic_id, reason), n in self._end.sent.refused.items() if topic_id == self._row}
+            refused = {why: n for (topic_id, why), n in self._end.sent.refused.items() if topic_id == self._topic_id}
             offered = sorted(offer.name for offer in self._offered.values())
         with self._changing:
             proxies = sorted(
@@ -157,7 +157,7 @@ class LiveCalls:
         with self._lock:
             if there:
                 self._offered[topic_id] = self._own[topic_id]
-                self._messages.offer(self._row, offered=True)
+                self._messages.offer(self._topic_id, offered=True)
             else:
                 self._offered.pop(topic_id, None)
             self._messages.offer(topic_id, offered=there)
@@ -204,7 +204,7 @@ class LiveCalls:
                         self._serve(src_id, topic)
                 if services:
                     with self._lock:
-                        self._messages.offer(self._row, offered=True)
+                        self._messages.offer(self._topic_id, offered=True)
 
     def _serve(self, src_id: int, topic: Topic) -> None:
         """Make a server of ours for a service of another robot."""
@@ -232,8 +232,8 @@ class LiveCalls:
 
     def _is_frame(self, event: Delivered) -> bool:
         with self._lock:
-            row = self._end.topics_of(event.src_id).get(event.topic_id)
-        return row is not None and row.type_name == CALLS_TYPE
+            topic = self._end.topics_of(event.src_id).get(event.topic_id)
+        return topic is not None and topic.type_name == CALLS_TYPE
 
     def _receive(self, event: Delivered) -> None:
         with self._lock:
@@ -252,7 +252,7 @@ class LiveCalls:
     def _send(self, frame: OutgoingFrame | None, now: float) -> None:
         """Send a frame. Called with the lock held."""
         if frame is not None:
-            self._messages.submit(self._row, frame.data, now, frame.lifespan_s, frame.robot)
+            self._messages.submit(self._topic_id, frame.data, now, frame.lifespan_s, frame.robot)
             self._work.notify()
 
     def _tell_first(self, counter: str, error: Exception) -> None:

@@ -144,7 +144,7 @@ def make_endpoint(
     :param sink: settings of the receiving half; None: it receives nothing
     :param start: for version 1 only
     :param codec: codec of all messages; None: made here
-    :param calls: whether services cross the link: the last row of the endpoint's registry is for requests and replies
+    :param calls: whether services cross the link: the last topic of the endpoint's registry is for requests and replies
     :raises ConfigError: for settings that contradict each other
     """
     if registry.services and not calls:
@@ -152,19 +152,19 @@ def make_endpoint(
             f"registry: {registry.services[0].name} is a service, which needs both directions of a link and version 1; "
             "take gr-ros2 link or RosLink"
         )
-    rows = registry if source is None else registry.with_options(source.topic_options)
+    topics = registry if source is None else registry.with_options(source.topic_options)
     end = source if source is not None else sink
     version = 1 if end is None else end.version
-    for topic in rows:
+    for topic in topics:
         try:
             refuse_without_effect(topic.options, version, f"topic {topic.name}: ")
         except ValueError as error:
             raise ConfigError(f"registry: {error}") from None
     if calls:
-        rows = rows.with_calls()
+        topics = topics.with_calls()
     to_air = None
     if source is not None and source.compresses:
-        to_air = codec or message_codec(source.dictionaries, rows)
+        to_air = codec or message_codec(source.dictionaries, topics)
     dictionaries = () if sink is None else sink.dictionaries
     if not version:
         if start is not None and start.mcs_table:
@@ -174,7 +174,7 @@ def make_endpoint(
     start = start or EndpointSetup()
     known = message_codec(dictionaries)
     return EndpointV1(
-        None if source is None or not rows else rows,
+        None if source is None or not topics else topics,
         settings_of(
             source,
             sink,
@@ -187,11 +187,11 @@ def make_endpoint(
         boot=start.boot,
         keys=start.keys,
         codec=to_air,
-        decoder_for=lambda rows: (
+        decoder_for=lambda topics: (
             codec
             or known.of(
-                [Topic(row.topic_id, row.name, row.type_name) for row in rows],
-                {row.topic_id: row.codec for row in rows},
+                [Topic(topic.topic_id, topic.name, topic.type_name) for topic in topics],
+                {topic.topic_id: topic.codec for topic in topics},
             )
         ),
         heard=start.heard,

@@ -128,7 +128,7 @@ class FoundTopics:
         for name, type_name in parts(row.name, row.kind).items():
             if not self.choice.leaves_out(name):
                 part = row_name + name.removeprefix(row.name)
-                rows[name] = part, type_name, options_of(part, self._config.topic_options)
+                rows[name] = part, type_name, options_of(part, self._subscriptions.options)
         if not any(is_service(type_name) for _, type_name, _ in rows.values()):
             raise ConfigError("topics leaves out all its services")
         services = self._subscriptions.add_services(rows)

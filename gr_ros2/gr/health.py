@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import DiagnosticsConfig
 
 Stats = Mapping[str, Any]
@@ -101,6 +101,8 @@ class LinkHealth:
         self._name = name
         self._looks: deque[_Look] = deque()
         self._heard_at: float | None = None
+        self._reached: dict[int, float] = {}
+        """When something of each robot came last, itself or over others, s."""
 
     def judge(self, stats: Stats, now: float) -> list[Status]:
         """The status of receiver, transmitter, front end (if it counts anything) and every topic received.
@@ -128,13 +130,20 @@ class LinkHealth:
         return [receiver, transmitter, *front_end, *topics]
 
     def links(self, stats: Stats, receiver: Status) -> dict[int, Status]:
-        """How the link to each robot is that was ever heard: ``up``, ``degraded`` or ``lost``.
+        """How the link to each robot is that was ever heard or reached over others: ``up``, ``degraded`` or ``lost``.
 
         :param receiver: as :meth:`judge` has it; what troubles it troubles all links
         """
-        limits, found = self._config, {}
-        for src_id, silence in stats["sink"]["silence_s"].items():
+        limits, found, now = self._config, {}, self._looks[-1].now
+        far = {peer["robot"]: peer for peer in stats["peers"] if peer["hops"]}
+        ages = [*stats["sink"]["silence_s"].items(), *((robot, peer["heard_s"]) for robot, peer in far.items())]
+        for src_id, age in ages:
+            self._reached[src_id] = max(self._reached.get(src_id, now - age), now - age)
+        for src_id, at in self._reached.items():
+            silence = now - at
             state = Status(f"gr_ros2/link_{src_id}", values={"age (s)": f"{silence:.2f}"})
+            if src_id in far:
+                state.values |= {"hops": str(far[src_id]["hops"]), "over robot": str(far[src_id]["over"])}
             if limits.silence_error_s and silence > limits.silence_error_s:
                 state.level, state.problems = Level.ERROR, ["lost"]
             elif receiver.level or (limits.silence_warn_s and silence > limits.silence_warn_s):
@@ -194,7 +203,7 @@ class LinkHealth:
                 refused[reason] = refused.get(reason, 0) + count
         status.values |= {f"messages dropped: {reason}": str(count) for reason, count in sorted(refused.items())}
         for name, topic in stats["source"]["topics"].items():
-            dropped = sum(topic["refused"].values()) + topic[LedgerRow.LOST_ON_GRAPH]
+            dropped = sum(topic["refused"].values()) + topic[Fate.LOST_ON_GRAPH]
             status.values[f"{name} (sent, dropped)"] = f"{topic['sent']}, {dropped}"
         return status
 
@@ -223,6 +232,8 @@ class LinkHealth:
             status.values["latency, 95 % (s)"] = f"{latency['p95']:.3g}"
         if topic["age_s"] is not None:
             status.judge("age", topic["age_s"], "s", limits.age_warn_s, limits.age_error_s)
+        if topic["hops"]:
+            status.values |= {"hops": str(topic["hops"]), "over robot": str(topic["over"])}
         return status
 
 
@@ -230,7 +241,7 @@ def _look(stats: Stats, now: float) -> _Look:
     sink = stats["sink"]
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
-    lost_on_graph = sum(topic[LedgerRow.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
+    lost_on_graph = sum(topic[Fate.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
     return _Look(
         now=now,
         sent=stats["packets"]["out"],
@@ -238,7 +249,7 @@ def _look(stats: Stats, now: float) -> _Look:
         missing=sink["packet_loss_est"],
         rejected=rejected,
         lost_on_graph=lost_on_graph,
-        unpublished=sink[LedgerRow.PUBLISH_FAILED],
+        unpublished=sink[Fate.PUBLISH_FAILED],
         topics=topics,
         front_end_passed=stats["front_end"]["passed"],
         front_end_lost=stats["front_end"]["lost"],

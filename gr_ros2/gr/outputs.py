@@ -23,7 +23,7 @@ from gr_ros2.gr.heard_topics import HeardTopics, Key
 from gr_ros2.gr.latency import Latencies, LatencyWindow
 from gr_ros2.link import Delivered, ReceiverEvent
 from gr_ros2.link.events import Announced
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.type_definitions import known
 from gr_ros2.middleware.type_descriptions import Described
@@ -42,6 +42,7 @@ class Output:
     :param opening: held while ``early`` is used
     :param published: number of messages
     :param delivered_at: time of the newest one, s
+    :param way: how many robots have sent it on, and the last of them
     """
 
     topic: Topic
@@ -52,6 +53,7 @@ class Output:
     published: int = 0
     delivered_at: float | None = None
     latency: LatencyWindow | None = None
+    way: tuple[int, int | None] = (0, None)
 
 
 class Outputs:
@@ -122,10 +124,10 @@ class Outputs:
         """Take over the topics that a sender announces; returns those that can be published. A publisher whose topic
         has a new name or type is closed."""
         topics = []
-        for row in event.rows:
-            key = (event.src_id, row.topic_id)
+        for told in event.topics:
+            key = (event.src_id, told.topic_id)
             try:
-                topic = announced(row, self._config.topic_options)
+                topic = announced(told, self._config.topic_options)
                 name = topic.republished(self._config.namespace_format, event.src_id)
                 if topic.is_topic:
                     LOOP_GUARD.add_output(self._owner, self._graph, key, name)
@@ -184,6 +186,8 @@ class Outputs:
             "latency_s": None,
             "recent_latency_s": None,
             "age_s": None if at is None else self._clock() - at + latency,
+            "hops": output.way[0],
+            "over": output.way[1],
         }
 
     def deliver(self, event: Delivered) -> None:
@@ -232,14 +236,12 @@ class Outputs:
             publisher.publish(payload)
         except Exception as error:  # noqa: BLE001 - whatever the reason, nobody got the message
             named = f"topic id {key[1]} of robot {key[0]}"
-            self._failures.note(
-                LedgerRow.PUBLISH_FAILED.value, f"ros2_sink: a message of {named} was not published", error
-            )
+            self._failures.note(Fate.PUBLISH_FAILED.value, f"ros2_sink: a message of {named} was not published", error)
             with self._lock:
                 return self._end.unpublished(event)
         with self._lock:
             output.published += 1
-            output.delivered_at = self._clock()
+            output.delivered_at, output.way = self._clock(), (event.hops, event.over)
             if self._latencies.has(topic.type_name):
                 self._measure(output, event.payload)
         if self._transforms is not None and topic.type_name == TF_TYPE:
@@ -287,9 +289,12 @@ class Outputs:
         name = self.heard.name(key)
         for (src_id, _), other in list(self._outputs.items()):
             if src_id == key[0] and other is not output and other.publisher is not None and other.name == name:
-                self.release([other])  # the same topic with its type before
-                other.publisher.close()
-                other.publisher = None
+                self.release([other])  # the same topic with its type before, or for another robot
+                before, other.publisher = other.publisher, None
+                if (other.topic.type_name, other.topic.options) == (topic.type_name, topic.options):
+                    output.name, output.publisher = name, before
+                    return before
+                before.close()
         output.name = name
         publisher = output.publisher = self._graph.middleware.advertise(name, topic.type_name, qos)
         if self.running and self._graph.middleware.settling_s and not topic.latched:

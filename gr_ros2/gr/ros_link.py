@@ -62,17 +62,17 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         seed: int | None = None,
     ) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
-        rows = read_registry(registry, needed=not source.version)
+        topics = read_registry(registry, needed=not source.version)
         start = self._start = start_of(source, source.src_id(), setup)
         rng = random.Random(seed)
-        calls = source.version != 0 and (len(rows) < MAX_TOPICS or bool(rows.services))
+        calls = source.version != 0 and (len(topics) < MAX_TOPICS or bool(topics.services))
         self.end = LiveEnd(
-            lambda hears: make_endpoint(rows, source, sink, start=start, rng=rng, observer=hears, calls=calls)
+            lambda hears: make_endpoint(topics, source, sink, start=start, rng=rng, observer=hears, calls=calls)
         )
         graphs: tuple[Any, Any] = middleware or (source.middleware, sink.middleware)
         common: dict[str, Any] = {"observer": observer, "clock": clock, "end": self.end}
-        self.source = RosSource(rows, middleware=graphs[0], **common, **own_settings(source))
-        self.sink = RosSink(rows, middleware=graphs[1], **common, **own_settings(sink))
+        self.source = RosSource(topics, middleware=graphs[0], **common, **own_settings(source))
+        self.sink = RosSink(topics, middleware=graphs[1], **common, **own_settings(sink))
         self.calls: LiveCalls | None = None
         """The services that cross the link; None with version 0, and where topics leave no room for calls."""
         if calls:

@@ -27,7 +27,7 @@ from gr_ros2.gr.outputs import Outputs
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.link import Delivered, Received, ReceivedPacket, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
@@ -39,7 +39,7 @@ from gr_ros2.settings.registry import Registry, Topic, check_outputs
 
 _SHORTEST_WAIT_S = 1e-3
 _COUNTED = (
-    *("not_a_pair", "not_u8", LedgerRow.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
+    *("not_a_pair", "not_u8", Fate.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
 
@@ -85,11 +85,11 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     ) -> None:
         super().__init__("ros2_sink", None, None)
         self.config = settings(SinkConfig, values, registry, middleware)
-        rows = read_registry(registry, needed=not self.config.version)
-        self.registry = rows
-        if rows:
-            check_outputs(rows, self.config)
-            self.registry = rows.with_options(self.config.topic_options, announced=self.config.version != 0)
+        topics = read_registry(registry, needed=not self.config.version)
+        self.registry = topics
+        if topics:
+            check_outputs(topics, self.config)
+            self.registry = topics.with_options(self.config.topic_options, announced=self.config.version != 0)
         self._start = EndpointSetup()
         if end is None:
             start = self._start = start_of(self.config, robot_of(None, self.config), EndpointSetup())
@@ -98,7 +98,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                     "ros2_sink: one way, a key keeps out what is forged or was heard before; what never came here is "
                     "taken from a recording, however old it is"
                 )
-            end = LiveEnd(lambda observer: make_endpoint(rows, None, self.config, start=start, observer=observer))
+            end = LiveEnd(lambda observer: make_endpoint(topics, None, self.config, start=start, observer=observer))
         self.live, self._end = end, end.endpoint
         self._calls: Services | None = None
         self._observer = observer
@@ -212,7 +212,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             summaries = {"latency_s": window.summary(), "recent_latency_s": window.summary(RECENT)}
             topics[key] |= {name: summary._asdict() for name, summary in summaries.items()}
         named: dict[str, dict[str, Any]] = {}
-        for key, topic in topics.items():  # of a topic that has changed its type, the newest row has the figures
+        for key, topic in topics.items():  # of a topic that has changed its type, the newest has the figures
             name = self.outputs.heard.name(key)
             if name in named:
                 topic["delivered"] += named[name]["delivered"]

@@ -12,7 +12,7 @@ import random
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from typing import Any
 
@@ -26,7 +26,7 @@ from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.gr.subscriptions import Subscriptions
 from gr_ros2.link import Refused, SenderEvent, SentPacket
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware
@@ -85,7 +85,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     ) -> None:
         super().__init__("ros2_source", None, None)
         self.config = settings(SourceConfig, values, registry, middleware)
-        rows = read_registry(registry, needed=not self.config.version)
+        topics = read_registry(registry, needed=not self.config.version)
         self.src_id = self.config.src_id()
         """The source id on the wire."""
         self._start = EndpointSetup()
@@ -94,7 +94,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             start = self._start = start_of(self.config, self.src_id, setup)
             rng = random.Random(seed)
             end = LiveEnd(
-                lambda observer: make_endpoint(rows, self.config, None, start=start, rng=rng, observer=observer)
+                lambda observer: make_endpoint(topics, self.config, None, start=start, rng=rng, observer=observer)
             )
         end.observer = self._observe
         self._live, self._end = end, end.endpoint
@@ -121,9 +121,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         node_name = f"gr_ros2_source_{self.src_id}"
         self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
         self._finalizer = weakref.finalize(self, self._graph.close)
-        rows = rows.with_options(self.config.topic_options)
         self.subscriptions = Subscriptions(
-            rows, self.config, self._graph, end, clock=clock, counters=self._counters, log=self._log
+            topics, self.config, self._graph, end, clock=clock, counters=self._counters, log=self._log
         )
         """What it sends."""
         self.found = FoundTopics(self.config, self.middleware, self.subscriptions, self._log)
@@ -244,6 +243,16 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """Set the time between repeats of a transient-local topic, s; 0 is off."""
         self._reconfigure(repeat_s=repeat_s)
 
+    def set_topic_options(self, topic_options: Mapping[str, Any]) -> None:
+        """Set the options of single topics, of which those in :data:`gr_ros2.link.endpoint.LIVE_OPTIONS` may change. A
+        message is for the robot that ``to`` named when the ROS graph handed it over."""
+        with self._lock:
+            config = replaced(self.config, topic_options=topic_options)
+            self.subscriptions.change(config.topic_options)
+            self.config = config
+            self._live.wake()
+            self._room.notify_all()
+
     def set_debug(self, debug: bool) -> None:
         """Turn the readable log of headers, topic ids and entries on or off."""
         with self._lock:
@@ -315,7 +324,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             self._said.add((event.topic_id, event.reason))
             registry = self.subscriptions.registry
             name = registry[event.topic_id].name if event.topic_id < len(registry) else "of calls"
-            level = logging.INFO if event.reason == LedgerRow.SUPERSEDED else logging.WARNING  # as `latest` intends
+            level = logging.INFO if event.reason == Fate.SUPERSEDED else logging.WARNING  # as `latest` intends
             self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
         if self._observer is not None:
             self._guard(self._observer.sender_event, self.src_id, event)

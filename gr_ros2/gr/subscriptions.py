@@ -1,6 +1,6 @@
 """What a ROS Source takes from its ROS graph: the topics, with the QoS of their publishers.
 
-Invariants: a callback of the middleware blocks only with ``backpressure``. Each type of a topic has a row of its own.
+Invariants: a callback of the middleware blocks only with ``backpressure``. Each type of a topic has its own topic id.
 """
 
 from __future__ import annotations
@@ -12,14 +12,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.endpoint import check_live_options
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.middleware import Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.middleware.type_descriptions import Described
-from gr_ros2.settings.config import SourceConfig
+from gr_ros2.settings.config import SourceConfig, TopicOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import NewTopic, Registry, Topic, normalize_type, options_of
 
@@ -27,14 +29,15 @@ from gr_ros2.settings.registry import NewTopic, Registry, Topic, normalize_type,
 class Subscriptions:
     """The topics that a source sends, and the services that it offers.
 
-    :param registry: what it sends and offers, from which ``config.topics`` chooses
+    :param registry: what it sends and offers, from which ``config.topics`` chooses, with its own options
     :param live: endpoint that takes the messages
     :param clock: s, monotonic
     :param counters: counts ``held_back_at_close``, and what static transforms count
-    :ivar registry: all rows so far
+    :ivar registry: all topics so far
+    :ivar options: the options of single topics, by name
     :ivar room: notified when a message that is held back may be submitted; uses the lock of ``live``
-    :ivar subscribed: topics by their absolute names on the ROS graph. The mapping is replaced as a whole when a topic
-        is added
+    :ivar subscribed: topics by their absolute names on the ROS graph, as they were subscribed. The mapping is replaced
+        as a whole when a topic is added
     :ivar services: the same for the services that other robots may call
     """
 
@@ -49,7 +52,9 @@ class Subscriptions:
         counters: Counter[str],
         log: logging.Logger,
     ) -> None:
-        self.registry = registry
+        self._given = registry
+        self.options: Mapping[str, TopicOptions] = config.topic_options
+        self.registry = registry = registry.with_options(self.options)
         self.room = threading.Condition(live.lock)
         self._config, self._graph, self._live = config, graph, live
         self._messages = live.endpoint.messages
@@ -58,6 +63,8 @@ class Subscriptions:
         static = [topic for topic in registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
+        self._moved: dict[int, int] = {}
+        """Topic ids under which messages leave now, by those that were subscribed, where ``to`` has changed."""
         chosen = registry.chosen(config.topics) if registry else []
         self.subscribed = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_topic}
         self.services = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_service}
@@ -100,28 +107,34 @@ class Subscriptions:
         """The counters of each topic, by its name on the ROS graph. Called with the lock held."""
         self.take_losses()
         stats, queued = self._live.endpoint.sent, self._messages.queued()
-        rows: dict[str, list[int]] = {}
+        ids: dict[str, list[int]] = {}
         for topic in self.registry:
             if topic.is_topic:
-                rows.setdefault(topic.name, []).append(topic.topic_id)
+                ids.setdefault(topic.name, []).append(topic.topic_id)
+        now = {topic.topic_id: self._now(topic.topic_id) for topic in self.subscribed.values()}
         return {
             name: {
-                "topic_id": topic.topic_id,
+                "topic_id": now[topic.topic_id],
                 "type": topic.type_name,
-                "types": len(rows[topic.name]),
-                "submitted": sum(stats.submitted[row] for row in rows[topic.name]),
-                LedgerRow.LOST_ON_GRAPH.value: sum(stats.missed[row] for row in rows[topic.name]),
-                "sent": sum(stats.sent[row] for row in rows[topic.name]),
-                "queued": sum(queued[row] for row in rows[topic.name]),
-                "queue": self._messages.queue(topic.topic_id)[0],
-                "queue_depth": self._messages.depth(topic.topic_id),
+                "types": len({self.registry[topic_id].type_name for topic_id in ids[topic.name]}),
+                "submitted": sum(stats.submitted[topic_id] for topic_id in ids[topic.name]),
+                Fate.LOST_ON_GRAPH.value: sum(stats.missed[topic_id] for topic_id in ids[topic.name]),
+                "sent": sum(stats.sent[topic_id] for topic_id in ids[topic.name]),
+                "queued": sum(queued[topic_id] for topic_id in ids[topic.name]),
+                "queue": self._messages.queue(now[topic.topic_id])[0],
+                "queue_depth": self._messages.depth(now[topic.topic_id]),
                 "refused": {
-                    reason: sum(stats.refused[row, reason] for row in rows[topic.name])
-                    for reason in sorted({why for row, why in stats.refused if row in rows[topic.name]})
+                    reason: sum(stats.refused[topic_id, reason] for topic_id in ids[topic.name])
+                    for reason in sorted({why for topic_id, why in stats.refused if topic_id in ids[topic.name]})
                 },
             }
             for name, topic in self.subscribed.items()
         }
+
+    def named(self) -> list[tuple[str, Topic]]:
+        """All topics so far, with their names on the ROS graph: one for each type, and for each robot it was for."""
+        names = {topic.name: name for name, topic in self.subscribed.items()}
+        return [(names[topic.name], topic) for topic in self.registry if topic.is_topic and topic.name in names]
 
     def types(self) -> list[tuple[str, str]]:
         """Name on the ROS graph and type of each topic."""
@@ -133,16 +146,36 @@ class Subscriptions:
             self._messages.learn(described.type_name, described.types)
             self._live.work.notify()
 
-    def add_services(self, rows: Mapping[str, NewTopic]) -> dict[str, Topic]:
+    def change(self, options: Mapping[str, TopicOptions]) -> None:
+        """Use other options of single topics from now on, all or none. Called with the lock held.
+
+        :raises ConfigError: for an option that cannot change, or one robot more than the table has rows for
+        """
+        before, after = self._given.with_options(self.options), self._given.with_options(options)
+        changed = {}
+        for topic in (*self.subscribed.values(), *self.services.values()):
+            given = topic.topic_id < len(after)
+            old = before[topic.topic_id].options if given else options_of(topic.name, self.options)
+            new = after[topic.topic_id].options if given else options_of(topic.name, options)
+            if new != old:
+                if topic.is_service:
+                    raise ConfigError(f"{topic.name}: the options of a service change with a restart only")
+                check_live_options(topic.name, old, new)
+                changed[topic.topic_id] = new
+        for topic_id, new in changed.items():
+            self._change(topic_id, new)
+        self.options = options
+
+    def add_services(self, found: Mapping[str, NewTopic]) -> dict[str, Topic]:
         """Announce services, and the topics of actions.
 
-        :param rows: by names on the ROS graph
+        :param found: by names on the ROS graph
         :return: the services among them, by names on the ROS graph
         :raises ConfigError: for more than a link carries
         """
         with self._live.lock:
-            self.registry = self._messages.add(list(rows.values()))
-            added = dict(zip(rows, self.registry[-len(rows) :], strict=True))
+            self.registry = self._messages.add(list(found.values()))
+            added = dict(zip(found, self.registry[-len(found) :], strict=True))
             services = {name: topic for name, topic in added.items() if topic.is_service}
             topics = {name: topic for name, topic in added.items() if topic.is_topic}
             self.services = {**self.services, **services}
@@ -158,14 +191,15 @@ class Subscriptions:
 
         :raises ConfigError: for a topic that cannot be sent, such as one more than a link carries
         """
-        options, type_name = options_of(row_name, self._config.topic_options), normalize_type(info.type_name)
+        options, type_name = options_of(row_name, self.options), normalize_type(info.type_name)
         with self._live.lock:
             before = self.subscribed.get(info.topic)
-            rows = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
-            if not rows:
+            known = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
+            if not known:
                 self.registry = self._messages.add([(row_name, type_name, options)])
-                rows = [self.registry[-1]]
-            (topic,) = rows
+                known = [self.registry[-1]]
+            topic = known[0]
+            self._change(topic.topic_id, options)
             self._adapt(topic, info.publishers)
             if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
                 self._static[topic.topic_id] = StaticTransforms(self._counters)
@@ -182,6 +216,14 @@ class Subscriptions:
     def returns(self, names: Iterable[str]) -> bool:
         """Whether a topic or service of the ROS graph has come by radio."""
         return any(LOOP_GUARD.returns(self._graph, name) for name in names)
+
+    def _now(self, topic_id: int) -> int:
+        """The topic id under which messages of a subscription leave now."""
+        return self._moved.get(topic_id, topic_id)
+
+    def _change(self, topic_id: int, options: TopicOptions) -> None:
+        self.registry, after = self._messages.change(self._now(topic_id), options)
+        self._moved[topic_id] = after.topic_id
 
     def _guard_loops(self) -> None:
         LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
@@ -200,13 +242,13 @@ class Subscriptions:
         subscription.follow(partial(self._follow, topic))
 
     def _unsubscribe(self, topic: Topic) -> None:
-        """Take no further messages of a row, and keep none for robots that join late."""
+        """Take no further messages of a topic id, and keep none for robots that join late."""
         subscriptions = dict(self._subscriptions)
         subscriptions.pop(topic.topic_id).close()
         with self._live.lock:
             self.take_losses()
             self._subscriptions = subscriptions
-            self._messages.forget_kept(topic.topic_id)
+            self._messages.forget_kept(self._now(topic.topic_id))
 
     def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
         """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
@@ -218,13 +260,13 @@ class Subscriptions:
             lifespan_s=qos.lifespan_s,
             period_s=qos.deadline_s,
         )
-        return self._messages.follow(topic.topic_id, publishers)
+        return self._messages.follow(self._now(topic.topic_id), publishers)
 
     def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
         with self._live.lock:
             changed = self._adapt(topic, offers)
-            policy, deadline_s = self._messages.queue(topic.topic_id)
+            policy, deadline_s = self._messages.queue(self._now(topic.topic_id))
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
             self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
@@ -232,7 +274,7 @@ class Subscriptions:
     def _take(self, topic_id: int, payload: bytes) -> None:
         """Accept a message of the ROS graph, in a thread of the middleware."""
         with self._live.lock:
-            while self._config.backpressure and not self._closed and not self._messages.room(topic_id):
+            while self._config.backpressure and not self._closed and not self._messages.room(self._now(topic_id)):
                 self.room.wait()
             if self._closed:
                 self._counters["held_back_at_close"] += 1
@@ -243,10 +285,5 @@ class Subscriptions:
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._messages.submit(topic_id, whole or payload, self._clock())
+            self._messages.submit(self._now(topic_id), whole or payload, self._clock())
             self._live.wake()
-
-    def _take_losses(self) -> None:
-        """Count the messages that the ROS graph lost before they arrived here. Called with the lock held."""
-        for topic_id, subscription in self._subscriptions.items():
-            self._messages.missed(topic_id, subscription.lost)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from math import inf
 from typing import Any, Protocol
 
@@ -26,9 +26,9 @@ from gr_ros2.link.rate import Mcs
 from gr_ros2.link.receiver import Receiver
 from gr_ros2.link.sender import Sender
 from gr_ros2.link.stats import ReceiverStats, SenderStats
-from gr_ros2.settings.config import QueuePolicy, SinkConfig, SourceConfig
+from gr_ros2.settings.config import QueuePolicy, SinkConfig, SourceConfig, TopicOptions
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.registry import NewTopic, Registry
+from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
 
 LIVE_SETTINGS = ("packet_rate", "dst_id", "repeat_s", "queue_depth")
@@ -43,6 +43,23 @@ def check_live(changes: Mapping[str, Any]) -> None:
     for name in changes:
         if name not in LIVE_SETTINGS:
             raise ConfigError(f"{name} cannot change while running; these can: {', '.join(LIVE_SETTINGS)}")
+
+
+LIVE_OPTIONS = ("to", "qos", "queue", "queue_depth", "deadline_s", "weight", "max_rate", "keep_s")
+"""Options of a topic that may change at run time, with version 1. The others are those of its subscription and of its
+codec, or of a sink."""
+
+
+def check_live_options(topic: str, before: TopicOptions, after: TopicOptions) -> None:
+    """Refuse to change other options of a topic than ``LIVE_OPTIONS``.
+
+    :raises ConfigError: naming topic and option, and those that can change
+    """
+    for option in fields(TopicOptions):
+        if option.name not in LIVE_OPTIONS and getattr(before, option.name) != getattr(after, option.name):
+            raise ConfigError(
+                f"topic {topic}: {option.name} cannot change while running; these can: {', '.join(LIVE_OPTIONS)}"
+            )
 
 
 class MessageSide(Protocol):
@@ -66,13 +83,23 @@ class MessageSide(Protocol):
         :param total: since the start; the increase is reported to the observer
         """
 
-    def add(self, rows: Sequence[NewTopic]) -> Registry:
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
         """Send further topics from now on, all or none. Services among them are announced when they are offered.
 
-        A name may come again with another type: both rows stay, and the messages of each keep their type.
+        A name may come again with another type: both stay, and the messages of each keep their type.
 
         :return: everything that is sent; the new topics are the last ones
         :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
+        """
+
+    def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:
+        """Give a topic other options from now on, in ``LIVE_OPTIONS``.
+
+        With another robot in ``to``, its messages leave under another topic id, which is the same again for the same
+        robot. What was submitted before stays with the robot for which it was, and is sent on and repaired.
+
+        :return: everything that is sent, and the topic as which its messages are to be submitted from now on
+        :raises ConfigError: too many topics, another option, or a version that has no such options
         """
 
     def offer(self, topic_id: int, *, offered: bool) -> None:
@@ -158,6 +185,7 @@ class HeardRobot:
     :param sealed: its packets are sealed
     :param snr_db: SNR of its newest packets, dB; None if it is not measured packet by packet
     :param loss: share of its packets that were lost lately, 0..1
+    :param lost: packets of it that were lost since it was first heard, repaired or not
     :param topics: number of topics and services that it has announced
     :param hops: robots that have sent its newest message on; 0 where it is heard itself
     :param over: where it is not heard: the neighbour over which it is reached, None if no way is known
@@ -170,6 +198,7 @@ class HeardRobot:
     sealed: bool
     snr_db: float | None
     loss: float
+    lost: int
     topics: int
     hops: int = 0
     over: int | None = None

@@ -21,14 +21,14 @@ class PacketId(NamedTuple):
 
     :param boot: number of the sender's start; 0 with version 0, which has none
     :param number: full number of the packet; with version 0 the number on the wire, which comes round
-    :param row: distinguishes the packets that have one number: a packet of messages and its repairs; with version 0,
+    :param repair_id: tells packets apart that have one number: a packet of messages and its repairs; with version 0,
         whose numbers come round, a checksum of its bytes
     """
 
     src_id: int
     boot: int
     number: int
-    row: int
+    repair_id: int
 
 
 class ReceivedPacket(NamedTuple):
@@ -65,7 +65,8 @@ class Rejected(NamedTuple):
 
 class Delivered(NamedTuple):
     """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: at least one of its
-    packets was lost at first and recovered later."""
+    packets was lost at first and recovered later; ``hops``: robots that have sent it on, and ``over``: the last of
+    them, None where there were none."""
 
     src_id: int
     topic_id: int
@@ -73,12 +74,14 @@ class Delivered(NamedTuple):
     qos: int
     key: Hashable = None
     repaired: bool = False
+    hops: int = 0
+    over: int | None = None
 
 
 class Lost(NamedTuple):
     """A message will not be delivered, although at least a part of it arrived.
 
-    ``reason`` is a :class:`gr_ros2.link.ledger_rows.LedgerRow`: ``lost_fragments`` (overtaken, contradicted, or after
+    ``reason`` is a :class:`gr_ros2.link.fates.Fate`: ``lost_fragments`` (overtaken, contradicted, or after
     an outage), ``expired`` (reassembly_timeout_s), ``memory`` (the oldest, when memory ran out), ``unsupported`` (C or
     E), ``given_up`` (not repaired in time), ``overtaken`` (a newer one was delivered before), ``unknown_topic`` (its
     topic is not announced or registered), ``sender_restarted``. If the message is complete but cannot be decoded, the
@@ -113,7 +116,7 @@ class Announced(NamedTuple):
     """A robot's table of topics has arrived. It gives the meaning of the topic ids of the following messages."""
 
     src_id: int
-    rows: tuple[AnnouncedTopic, ...]
+    topics: tuple[AnnouncedTopic, ...]
 
 
 ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced
@@ -136,7 +139,7 @@ class Accepted(NamedTuple):
 class Refused(NamedTuple):
     """A submitted message will not be sent, or not completely.
 
-    ``reason`` is a row too: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or
+    ``reason`` is a fate too: ``too_large``, ``queue_bound``, ``superseded``, ``stale``, ``cannot_complete``, or
     ``abandoned`` for a message whose first fragments have left.
     """
 
@@ -150,7 +153,7 @@ class Missed(NamedTuple):
     """Messages of a topic that the source's ROS graph lost before they were submitted, as far as the graph reports
     them.
 
-    They end in the ledger row ``lost_on_graph``. Nothing but their number is known: they have no serial and no time.
+    They have the fate ``lost_on_graph``. Nothing but their number is known: they have no serial and no time.
     """
 
     topic_id: int

@@ -43,5 +43,5 @@ class MessageCodec(Protocol):
     def decode(self, topic_id: int, coded: bytes) -> bytes:
         """The message.
 
-        :raises CodecError: unknown codec, dictionary not held, or damaged; its ``row`` is the ledger row
+        :raises CodecError: unknown codec, dictionary not held, or damaged; its ``fate`` is the ledger fate
         """

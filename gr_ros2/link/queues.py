@@ -1,7 +1,7 @@
 """The queues of the source, one per topic, and which messages they drop: whole messages, never fragments.
 
 Invariants: a message that is being sent is first in its queue, and no newer message replaces it; every dropped message
-is returned with its ledger row. Rows: ``superseded`` (latest: a newer one came), ``queue_bound`` (fifo: the oldest,
+is returned with its fate. Fates: ``superseded`` (latest: a newer one came), ``queue_bound`` (fifo: the oldest,
 when full), ``overload`` (fifo: the oldest, while the computer is too slow), ``stale`` (its deadline passed),
 ``cannot_complete`` (not started: even alone on the link it would be late), ``abandoned`` (started, and it would be
 late).
@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S
 from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO
@@ -29,10 +29,10 @@ s its oldest topic was 0.7 to 1.6 s old, with 0.25 s 0.8 s."""
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """A message that will not be sent: its ledger row, and why in words."""
+    """A message that will not be sent: its fate, and why in words."""
 
     message: Outgoing
-    row: LedgerRow
+    fate: Fate
     detail: str
 
 
@@ -72,7 +72,7 @@ class TopicQueue(deque[Outgoing]):
         self.deadline_s = deadline_s
         self._by_age = True
         """Whether no message becomes useless before an earlier one."""
-        self._interval = 1 / max_rate if max_rate else 0.0
+        self.limit(max_rate)
         self._opens = float("-inf")
         self.since = inf
         """When ``flush_timeout_s`` began to run: with the first message, or when a message started. A drop does not
@@ -87,6 +87,10 @@ class TopicQueue(deque[Outgoing]):
         for message in self:
             message.expires = self._expiry(message)
 
+    def limit(self, max_rate: float) -> None:
+        """Let so many messages/s start from now on, 0 for any number."""
+        self._interval = 1 / max_rate if max_rate else 0.0
+
     def room(self, depth: int) -> bool:
         """Whether one more message fits without a drop. ``depth``: messages that may wait, 0 for unbounded."""
         if self.policy == "latest":
@@ -100,11 +104,11 @@ class TopicQueue(deque[Outgoing]):
         dropped: list[Dropped] = []
         if self.policy == "latest":
             while self and not self[-1].started:
-                dropped.append(Dropped(self.pop(), LedgerRow.SUPERSEDED, "a newer message came before it could start"))
+                dropped.append(Dropped(self.pop(), Fate.SUPERSEDED, "a newer message came before it could start"))
         elif depth and len(self) >= depth:
             for victim in [waiting for waiting in self if not waiting.started][: len(self) - depth + 1]:
                 self.remove(victim)
-                dropped.append(Dropped(victim, LedgerRow.QUEUE_BOUND, f"{depth} messages were waiting"))
+                dropped.append(Dropped(victim, Fate.QUEUE_BOUND, f"{depth} messages were waiting"))
         message.expires = self._expiry(message)
         self._by_age = self._by_age and message.lifespan_s >= self.deadline_s
         self.append(message)
@@ -116,7 +120,7 @@ class TopicQueue(deque[Outgoing]):
             return
         for message in [waiting for waiting in self if now - waiting.submitted > STANDING_S and not waiting.started]:
             self.remove(message)
-            yield Dropped(message, LedgerRow.OVERLOAD, f"it waited for {STANDING_S:g} s and newer ones came")
+            yield Dropped(message, Fate.OVERLOAD, f"it waited for {STANDING_S:g} s and newer ones came")
 
     def expire(self, now: float, interval: float, lead: float, payload: int) -> Iterator[Dropped]:
         """Drop the messages that cannot be delivered in time, even if they had the link to themselves.
@@ -157,13 +161,13 @@ class TopicQueue(deque[Outgoing]):
     def _expiry(self, message: Outgoing) -> float:
         return message.submitted + min(self.deadline_s, message.lifespan_s) if self.deadline_s else inf
 
-    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[LedgerRow, str]:
+    def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[Fate, str]:
         limit = f"{min(self.deadline_s, message.lifespan_s) * 1e3:g} ms"
         if message.started:
-            return LedgerRow.ABANDONED, f"{message.remaining} bytes could not follow within {limit}"
+            return Fate.ABANDONED, f"{message.remaining} bytes could not follow within {limit}"
         if now >= message.expires:
-            return LedgerRow.STALE, f"it waited longer than {limit}"
-        return LedgerRow.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
+            return Fate.STALE, f"it waited longer than {limit}"
+        return Fate.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
 
 
 def qos_class(options: TopicOptions, *, command: bool = False) -> int:

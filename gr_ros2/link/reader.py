@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from gr_ros2.core.errors import CrcError, EntryKindError, TagError, WireError, WrongKeyError
 from gr_ros2.link.v1.endpoint_settings import MIN_PACKET_LEN
 from gr_ros2.link.v1.reassembly import Reassembly
-from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
+from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Trailer
 from gr_ros2.wire.control import ENCRYPTS, Hello
 from gr_ros2.wire.mac_block import Block, read_block
 from gr_ros2.wire.relayed import Relayed, read_carried, read_relayed
@@ -128,7 +128,7 @@ class Reader:
             if repair is None or not repair.clear:
                 return
             hello = self._hello(header, data[start:end])
-            trailers, _ = self._check_hello(header, hello, data, start, repair.row)
+            trailers, _ = self._check_hello(header, hello, data, start, repair.repair_id)
         except WireError:
             return
         starts = self._starts.setdefault(header.src_id, [])
@@ -147,7 +147,7 @@ class Reader:
         if repair is not None and repair.clear:
             hello = self._hello(header, data[start:end])
             number, body = _number(header, hello), data[start:end]
-            _, check = self._check_hello(header, hello, data, start, repair.row)
+            _, check = self._check_hello(header, hello, data, start, repair.repair_id)
             self._heard(header.src_id, hello.boot, number)
         else:
             number, opened, check = self._open(data, header, repair, start, end)
@@ -180,7 +180,7 @@ class Reader:
         return entries[0]
 
     def _check_hello(
-        self, header: Header, hello: Hello, data: bytes, start: int, row: int
+        self, header: Header, hello: Hello, data: bytes, start: int, repair_id: int
     ) -> tuple[list[Trailer], str]:
         """The trailer that opens the packets of a start, and the result of checking the hello's trailer, in words."""
         if header.sealed and self._keys is None:
@@ -193,7 +193,7 @@ class Reader:
         )
         for trailer in keys.candidates(header.src_id, hello.boot, encrypt=encrypt):
             try:
-                trailer.open(data[:start], data[start:], number, row, plain=True)
+                trailer.open(data[:start], data[start:], number, repair_id, plain=True)
                 return [trailer], "tag ok" if header.sealed else "CRC ok"
             except TagError:
                 continue
@@ -205,7 +205,7 @@ class Reader:
         self, data: bytes, header: Header, repair: RepairHeader | None, start: int, end: int
     ) -> tuple[int, bytes | None, str]:
         """Full packet number, body (None if it stays encrypted) and the result of the trailer check, in words."""
-        src_id, row = header.src_id, SOURCE_ROW if repair is None else repair.row
+        src_id, repair_id = header.src_id, NOT_A_REPAIR if repair is None else repair.repair_id
         starts = self._starts.get(src_id, [])
         if not starts:
             missing = f"no hello of robot {src_id} among these packets"
@@ -218,7 +218,7 @@ class Reader:
             number = starts[at].number(header.number)
             for trailer in starts[at].trailers:
                 try:
-                    body = trailer.open(data[:start], data[start:], number, row)
+                    body = trailer.open(data[:start], data[start:], number, repair_id)
                 except (CrcError, TagError) as error:
                     failed = failed or error
                     continue
@@ -248,7 +248,7 @@ class Reader:
             payload = whole and whole.payload()
             if payload:
                 found = read_table(payload)
-        topics = {row.topic_id: row for row in found}
+        topics = {topic.topic_id: topic for topic in found}
         if not found or self.topics.get(src_id) == topics:
             return ()
         self.topics[src_id] = topics

@@ -12,7 +12,7 @@ from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
 from gr_ros2.link.events import Delivered, Lost, PacketId, Received, ReceivedPacket, ReceiverEvent, Rejected
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.partials import Partial, Partials
 from gr_ros2.link.reassemble import Context, TopicReassembler
@@ -81,7 +81,7 @@ class Receiver:
         """Give up messages that have waited ``reassembly_timeout_s`` for their next fragment."""
         events: list[ReceiverEvent] = []
         while (at := self.next_timeout()) is not None and at <= now:
-            events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.EXPIRED))
+            events.append(self._given_up(self._partials.take(self._partials.oldest()), Fate.EXPIRED))
         return events
 
     def next_timeout(self) -> float | None:
@@ -96,8 +96,8 @@ class Receiver:
         source = self._sources.get(event.src_id)
         if source is not None and source.latched.get(event.topic_id) == event.payload:
             del source.latched[event.topic_id]
-        self.stats.lost[event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED.value] += 1
-        return Lost(event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED, event.key)
+        self.stats.lost[event.src_id, event.topic_id, Fate.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, Fate.PUBLISH_FAILED, event.key)
 
     def knows(self, src_id: int) -> bool:
         """Whether the state of a sender is held at present."""
@@ -140,13 +140,13 @@ class Receiver:
         steady = placed.arrival is Arrival.NEXT
         if not steady:
             source.epoch += 1
-            self.stats.packet_loss_est += placed.missing or 0
+            self.stats.missed[src_id] += placed.missing or 0
             self.stats.unknown_gaps += placed.missing is None
             if placed.arrival is Arrival.LATE:
-                self.stats.packet_loss_est = max(self.stats.packet_loss_est - 1, 0)
+                self.stats.missed[src_id] = max(self.stats.missed[src_id] - 1, 0)
             elif placed.arrival is Arrival.RESET:
                 for topic in source.topics.values():
-                    events += [self._given_up(partial, LedgerRow.LOST_FRAGMENTS) for partial in topic.reset()]
+                    events += [self._given_up(partial, Fate.LOST_FRAGMENTS) for partial in topic.reset()]
         flags = packet.compressed << 1 | packet.encrypted
         context = Context(placed.position, source.epoch, steady, flags, now)
         for entry in packet.entries:
@@ -161,27 +161,27 @@ class Receiver:
             message, ended = reassembler.accept(entry, context)
             self.stats.message_loss_est += reassembler.missed_ids - missed
             if ended:
-                events += [self._given_up(partial, LedgerRow.LOST_FRAGMENTS) for partial in ended]
+                events += [self._given_up(partial, Fate.LOST_FRAGMENTS) for partial in ended]
             if message is not None:
                 events += self._deliver(source, packet, entry.topic_id, entry.entry_id, message)
         source.epoch += placed.arrival is Arrival.LATE
         if not self._partials.size:
             return
         while self._partials.size_of(src_id) > self.config.max_source_bytes:
-            events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), LedgerRow.MEMORY))
+            events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), Fate.MEMORY))
         while self._partials.size > self.config.max_bytes:
-            events.append(self._given_up(self._partials.take(self._partials.oldest()), LedgerRow.MEMORY))
+            events.append(self._given_up(self._partials.take(self._partials.oldest()), Fate.MEMORY))
 
     def _deliver(
         self, source: _Source, packet: PacketV0, topic_id: int, entry_id: int, payload: bytes
     ) -> Iterable[ReceiverEvent]:
         if packet.encrypted or (packet.compressed and self._codec is None):
-            return [self._undone(packet, topic_id, entry_id, LedgerRow.UNSUPPORTED)]
+            return [self._undone(packet, topic_id, entry_id, Fate.UNSUPPORTED)]
         if packet.compressed and self._codec is not None:
             try:
                 payload = self._codec.decode(topic_id, payload)
             except CodecError as error:
-                return [self._undone(packet, topic_id, entry_id, ROWS[error.row])]
+                return [self._undone(packet, topic_id, entry_id, FATES[error.fate])]
         if topic_id in self._latched:
             if source.latched.get(topic_id) == payload:
                 self.stats.repeats += 1
@@ -190,13 +190,13 @@ class Receiver:
         self.stats.delivered[packet.src_id, topic_id] += 1
         return [Delivered(packet.src_id, topic_id, payload, packet.qos, entry_id)]
 
-    def _undone(self, packet: PacketV0, topic_id: int, entry_id: int, row: LedgerRow) -> Lost:
+    def _undone(self, packet: PacketV0, topic_id: int, entry_id: int, fate: Fate) -> Lost:
         """Record a complete message that cannot be decoded here."""
-        self.stats.lost[packet.src_id, topic_id, row.value] += 1
-        return Lost(packet.src_id, topic_id, row, entry_id)
+        self.stats.lost[packet.src_id, topic_id, fate.value] += 1
+        return Lost(packet.src_id, topic_id, fate, entry_id)
 
-    def _given_up(self, partial: Partial, row: LedgerRow) -> Lost:
+    def _given_up(self, partial: Partial, fate: Fate) -> Lost:
         """Record an incomplete message that is no longer held."""
-        self.stats.lost[partial.src_id, partial.topic_id, row.value] += 1
+        self.stats.lost[partial.src_id, partial.topic_id, fate.value] += 1
         self.stats.message_loss_est += 1
-        return Lost(partial.src_id, partial.topic_id, row, partial.entry_id)
+        return Lost(partial.src_id, partial.topic_id, fate, partial.entry_id)

@@ -15,16 +15,16 @@ from zlib import crc32
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Accepted, Missed, PacketId, Refused, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
 from gr_ros2.link.schedule import PaperScheduler, Plan
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.settings.config import QueuePolicy, SourceConfig, replaced
+from gr_ros2.settings.config import QueuePolicy, SourceConfig, TopicOptions, replaced
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.registry import NewTopic, Registry
+from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 
@@ -108,12 +108,12 @@ class Sender:
         if self._codec is not None:
             payload = self._codec.encode(topic_id, payload)
         if len(payload) > self._largest:
-            self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, self._too_large(len(payload)))
+            self._refuse(serial, topic_id, Fate.TOO_LARGE, self._too_large(len(payload)))
             return
         message = Outgoing(serial, topic_id, payload, self._classes[topic_id], now)
         for dropped in self._queues[topic_id].admit(message, self.depth(topic_id)):
             if not dropped.message.repeat:
-                self._refuse(dropped.message.serial, topic_id, dropped.row, dropped.detail)
+                self._refuse(dropped.message.serial, topic_id, dropped.fate, dropped.detail)
         self._stale = True
         if topic_id in self._keeps:
             self._latched[topic_id] = (serial, payload)
@@ -153,12 +153,21 @@ class Sender:
             times.append(self._departure(plan))
         return max(min(times), self.pace.slot) if times else None
 
-    def add(self, rows: Sequence[NewTopic]) -> Registry:
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
         """Refuse: both ends of version 0 have the same registry.
 
         :raises ConfigError: always
         """
-        raise ConfigError(f"version 0 cannot announce {rows[0][0]!r}: give both ends the same registry")
+        raise ConfigError(f"version 0 cannot announce {topics[0][0]!r}: give both ends the same registry")
+
+    def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:  # noqa: ARG002
+        """Refuse: both ends of version 0 have the same options.
+
+        :raises ConfigError: always
+        """
+        raise ConfigError(
+            f"topic {self.registry[topic_id].name}: with version 0, its options change with a restart only"
+        )
 
     def offer(self, topic_id: int, *, offered: bool) -> None:  # noqa: ARG002
         """Refuse: version 0 carries no services.
@@ -287,7 +296,7 @@ class Sender:
         remedy = f"packet_len {needed} would carry it" if needed else "no packet_len would carry it"
         return f"{size} bytes need over {V0.max_fragments} entries at packet_len {self.config.packet_len}; {remedy}"
 
-    def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
+    def _refuse(self, serial: int, topic_id: int, reason: Fate, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
         self._observe(Refused(serial, topic_id, reason, detail))
 

@@ -35,9 +35,9 @@ class ReceiverStats:
     ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, max_sources, unknown_topic, and
     early (kept until their sender had said how to open them); ``delivered`` by (src_id, topic_id); ``repaired``, those
     delivered messages of which a packet was lost at first; ``lost`` by (src_id, topic_id, reason). Two counters are
-    estimates: ``packet_loss_est`` from gaps in packet numbers, and ``message_loss_est`` from gaps in entry ids and
-    messages given up. ``unknown_gaps`` counts how often a sender restarted or was silent for long, so that the number
-    of lost packets is unknown.
+    estimates: ``missed``, the packets of each robot that were lost since it was heard, from gaps in their numbers,
+    repaired or not, and ``message_loss_est`` from gaps in entry ids and messages given up. ``unknown_gaps`` counts how
+    often a sender restarted or was silent for long, so that the number of lost packets is unknown.
     """
 
     packets: int = 0
@@ -47,6 +47,11 @@ class ReceiverStats:
     repaired: Counter[tuple[int, int]] = field(default_factory=Counter)
     lost: Counter[tuple[int, int, str]] = field(default_factory=Counter)
     repeats: int = 0
-    packet_loss_est: int = 0
+    missed: Counter[int] = field(default_factory=Counter)
     unknown_gaps: int = 0
     message_loss_est: int = 0
+
+    @property
+    def packet_loss_est(self) -> int:
+        """Packets of all robots that were lost."""
+        return self.missed.total()

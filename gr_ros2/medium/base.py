@@ -159,10 +159,6 @@ class Transmission(NamedTuple):
     end: float
     mcs: int = 0
 
-    def overlaps(self, other: Transmission) -> bool:
-        """Whether both are on the air at the same time."""
-        return self.start < other.end and other.start < self.end
-
 
 class Reception(NamedTuple):
     """A packet that came out of a robot's receiver.

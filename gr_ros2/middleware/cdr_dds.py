@@ -243,6 +243,10 @@ def participants_in(domain_id: int) -> int:
 
 
 def create_participant(domain_id: int, user_data: bytes) -> Entity:
+    """A participant in a domain, with user data that others see.
+
+    :raises DdsError: the domain cannot be joined
+    """
     qos = _create_qos()
     try:
         _set_userdata(qos, user_data, len(user_data))

@@ -10,7 +10,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -24,13 +24,13 @@ from gr_ros2.middleware.cdr_dds import (
     Entity,
     RawReader,
     RawWriter,
-    WaitSet,
     create_topic,
     delete,
     guid,
 )
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
+from gr_ros2.middleware.dds_events import DdsEvents
 from gr_ros2.middleware.dds_found import FoundEndpoints
 from gr_ros2.middleware.dds_services import DdsClient, DdsServer, ServiceParticipant
 from gr_ros2.middleware.services import (
@@ -44,7 +44,6 @@ from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import normalize_type
 
 _DISCOVERY_QOS = Qos("reliable", "transient_local", 1)
-_PUBLICATIONS, _SUBSCRIPTIONS, _FIRST_ENDPOINT = 1, 2, 3
 
 _log = logging.getLogger(__name__)
 
@@ -82,9 +81,6 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         self._lock = threading.Lock()  # for the tables below; held only briefly, never during a callback
         self._announcing = threading.Lock()
         self._topics: dict[tuple[str, str], Entity] = {}
-        self._services: dict[int, Callable[[], object]] = {}
-        self._numbers: dict[Entity, int] = {}
-        self._next_number = _FIRST_ENDPOINT
         self._subscriptions: list[DdsSubscription] = []
         self._advertised: list[DdsPublisher] = []
         self._pairs: list[DdsServer | DdsClient] = []
@@ -92,13 +88,11 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         try:
             self._guid = guid(self._participant)
             self._others = FoundEndpoints(self._guid)
-            self._waitset = WaitSet(self._participant)
-            self._watches = {
-                number: EndpointWatch(self._participant, publishers=number == _PUBLICATIONS)
-                for number in (_PUBLICATIONS, _SUBSCRIPTIONS)
-            }
-            for number, watch in self._watches.items():
-                self._waitset.attach(watch.condition, number)
+            self._events = DdsEvents(self._participant)
+            for publishers in (True, False):
+                watch = EndpointWatch(self._participant, publishers=publishers)
+                changed = partial(self._graph_changed, watch, publishers=publishers)
+                self._events.attach(watch.condition, (watch.condition,), changed)
             topic = create_topic(self._participant, ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
             self._discovery = RawWriter(self._participant, topic, _DISCOVERY_QOS, ros_graph.DISCOVERY_USER_DATA)
             self.announce()
@@ -137,7 +131,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         publisher = DdsPublisher(self, topic, writer)
         with self._lock:
             self._advertised.append(publisher)
-        self._attach(writer.entity, (writer.entity,), publisher.service)
+        self._events.attach(writer.entity, (writer.entity,), publisher.service)
         self.announce()
         return publisher
 
@@ -174,7 +168,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
                 subscriptions = list(self._subscriptions)
             for subscription in subscriptions:
                 subscription.mute()
-            self._waitset.wake()
+            self._events.wake()
             self.wait_for_thread(self._thread)
             POOL.leave(self.domain_id, self._participant)
 
@@ -185,11 +179,11 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         if qos.depth and qos.durability == "volatile":
             qos = replace(qos, depth=qos.depth + SLACK)
         reader = RawReader(self._participant, topic, qos, self._user_data(subscription.type_name))
-        self._attach(reader.entity, (reader.entity, reader.condition), partial(subscription.service, reader))
+        self._events.attach(reader.entity, (reader.entity, reader.condition), partial(subscription.service, reader))
         return reader
 
     def drop_reader(self, reader: RawReader) -> None:
-        self._detach(reader.entity)
+        self._events.detach(reader.entity)
         reader.delete()
 
     def forget(self, endpoint: DdsSubscription | DdsPublisher) -> None:
@@ -203,7 +197,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         else:
             with self._lock:
                 self._advertised.remove(endpoint)
-            self._detach(endpoint.writer.entity)
+            self._events.detach(endpoint.writer.entity)
             endpoint.writer.delete()
         self.announce()
 
@@ -221,7 +215,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         end.reader, end.writer = reader, writer
         with self._lock:
             self._pairs.append(end)
-        self._attach(reader.entity, (reader.entity, reader.condition, writer.entity), end.service)
+        self._events.attach(reader.entity, (reader.entity, reader.condition, writer.entity), end.service)
         self.announce()
 
     def drop_pair(self, end: DdsServer | DdsClient) -> None:
@@ -229,7 +223,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             return
         with self._lock:
             self._pairs.remove(end)
-        self._detach(end.reader.entity)
+        self._events.detach(end.reader.entity)
         end.reader.delete()
         end.writer.delete()
         self.announce()
@@ -260,13 +254,13 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         deadline: float | None = None
         while not self._closed:
             try:
-                triggered = self._waitset.wait(None if deadline is None else max(0.0, deadline - time.monotonic()))
+                steps = self._events.wait(None if deadline is None else max(0.0, deadline - time.monotonic()))
             except DdsError as error:
                 if not self._closed:
                     _log.error("domain %d: no message will be received any more: %s", self.domain_id, error)
                 return
-            for number in sorted(triggered):  # discovery first, so that a publisher's QoS is known before its messages
-                self._guarded(partial(self._service, number))
+            for step in steps:
+                self._guarded(step)
             with self._lock:
                 outdated = [subscription for subscription in self._subscriptions if subscription.outdated]
             deadline = None
@@ -274,15 +268,6 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
                 self._guarded(partial(subscription.retire, time.monotonic()))
                 if until := subscription.outdated:
                     deadline = until if deadline is None else min(deadline, until)
-
-    def _service(self, number: int) -> None:
-        if number in self._watches:
-            self._graph_changed(number)
-            return
-        with self._lock:
-            service = self._services.get(number)
-        if service is not None:
-            service()
 
     def _guarded(self, step: Callable[[], object]) -> None:
         """Run a step that fails if another thread closed the endpoint after it triggered; that is a normal end."""
@@ -292,14 +277,14 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             if not self._closed and not error.gone:
                 self.count("dds_failed", str(error))
 
-    def _graph_changed(self, number: int) -> None:
+    def _graph_changed(self, watch: EndpointWatch, *, publishers: bool) -> None:
         changed: set[str] = set()
-        while changes := self._watches[number].take():
-            changed |= self._others.change(changes, publishers=number == _PUBLICATIONS)
+        while changes := watch.take():
+            changed |= self._others.change(changes, publishers=publishers)
         if self._gid_bytes == 24 and ros_graph.DISCOVERY_TOPIC in changed and self._others.has_short_gids():
             self._gid_bytes = 16
             self.announce()
-        if number == _PUBLICATIONS:
+        if publishers:
             with self._lock:
                 affected = [s for s in self._subscriptions if ros_graph.dds_topic(s.topic) in changed]
             for subscription in affected:
@@ -333,20 +318,6 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         from gr_ros2.middleware.type_definitions import type_hash
 
         return ros_graph.endpoint_user_data(self._others.hash_of(ros_graph.dds_type(type_name)) or type_hash(type_name))
-
-    def _attach(self, key: Entity, entities: Iterable[Entity], service: Callable[[], object]) -> None:
-        with self._lock:
-            number = self._next_number
-            self._next_number += 1
-            self._services[number] = service
-            self._numbers[key] = number
-        for entity in entities:
-            self._waitset.attach(entity, number)
-        self._waitset.wake()
-
-    def _detach(self, key: Entity) -> None:
-        with self._lock:
-            self._services.pop(self._numbers.pop(key, 0), None)
 
 
 def _split(node: str) -> tuple[str, str]:

@@ -38,7 +38,8 @@ class DdsParticipant(Middleware):
 
     @property
     @abstractmethod
-    def closed(self) -> bool: ...
+    def closed(self) -> bool:
+        """Whether the participant has left its domain."""
 
     @abstractmethod
     def make_reader(self, subscription: DdsSubscription, qos: Qos) -> RawReader:
@@ -241,6 +242,7 @@ class DdsSubscription(Subscription):
         return 0 if self._closed or self._middleware.closed or reader is None else reader.matched()
 
     def readers(self) -> list[RawReader]:
+        """The reader of this subscription, and those with an earlier QoS that still have messages."""
         return [*([self._reader] if self._reader else []), *(reader for _, reader in self._outdated)]
 
     def mute(self) -> None:

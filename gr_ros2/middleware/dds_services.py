@@ -52,7 +52,8 @@ class ServiceParticipant(ServiceGraph):
 
     @property
     @abstractmethod
-    def closed(self) -> bool: ...
+    def closed(self) -> bool:
+        """Whether the participant has left its domain."""
 
     @property
     @abstractmethod

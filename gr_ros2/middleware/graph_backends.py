@@ -1,6 +1,6 @@
 """The table of middlewares, and joining a ROS graph by name.
 
-Invariant: the row of a middleware has everything that the rest of the program needs to know before it is loaded; no
+Invariant: the table says of a middleware everything that the rest of the program needs to know before it is loaded; no
 other module mentions a middleware by name.
 """
 
@@ -17,11 +17,11 @@ from gr_ros2.settings.fields import AUTO, Auto
 
 @dataclass(frozen=True)
 class GraphBackend(Backend):
-    """One row of the middleware table.
+    """One middleware of the table.
 
     :param scope: who can join its graph: ``shared``, other processes and machines; ``process``, only this process;
         ``none``, nobody: it is opened by a path instead of a domain
-    :param meets: other rows whose participants in the same domain it may receive from; a source and a sink on such
+    :param meets: others whose participants in the same domain it may receive from; a source and a sink on such
         graphs must not carry the same topics
     :param localhost_only: whether its constructor takes ``localhost_only``
     """
@@ -85,14 +85,14 @@ def join_graph(name: str, *, domain_id: int | Auto, node_name: str, localhost_on
     :raises MiddlewareError: when the graph cannot be joined
     """
     cls = MIDDLEWARE.load(name)
-    row = MIDDLEWARE[name]
-    if row.scope == "none":
+    backend = MIDDLEWARE[name]
+    if backend.scope == "none":
         raise ConfigError(
             f"middleware = {name!r}: a file, which has a path and no graph to join; open it in Python and hand it "
             "over, or play it on a graph"
         )
     settings: dict[str, Any] = {"domain_id": domain_id, "node_name": node_name}
-    if row.localhost_only and localhost_only != AUTO:
+    if backend.localhost_only and localhost_only != AUTO:
         settings["localhost_only"] = localhost_only
     graph: Middleware = cls(**settings)
     return graph
@@ -106,5 +106,5 @@ def meet(one: Middleware, other: Middleware) -> bool:
 
 
 def _networks(graph: Middleware) -> set[str]:
-    row = MIDDLEWARE.get(graph.name)  # a middleware passed as an object need not be in the table
-    return {graph.name, *(row.meets if row else ())}
+    backend = MIDDLEWARE.get(graph.name)  # a middleware passed as an object need not be in the table
+    return {graph.name, *(backend.meets if backend else ())}

@@ -160,10 +160,12 @@ class ZenohMiddleware(Middleware):
 
     @property
     def session(self) -> Any:
+        """The Zenoh session."""
         return self._session
 
     @property
     def closed(self) -> bool:
+        """Whether :meth:`close` was called."""
         return self._closed
 
     def check_open(self, what: str) -> None:

@@ -220,11 +220,9 @@ class Phy(ABC):
         """
 
     @abstractmethod
-    def receiver(self, own_process: bool = False) -> PacketReceiver:
+    def receiver(self) -> PacketReceiver:
         """A fresh hier block: one complex stream in, message port `pdus` out.
 
-        :param own_process: run a receiver that is written in Python in a process of its own, so that it does not slow
-            down the ROS side; it takes a second to start, and packets come a moment after their samples
         :raises PhyError: for a PHY without samples
         """
 
@@ -251,5 +249,5 @@ class PacketPhy(Phy):
     def transmitter(self) -> PacketTransmitter:
         raise PhyError(f"phy {self.name} has no transmitter; {self.crossing}")
 
-    def receiver(self, own_process: bool = False) -> PacketReceiver:  # noqa: ARG002
+    def receiver(self) -> PacketReceiver:
         raise PhyError(f"phy {self.name} has no receiver; {self.crossing}")

@@ -7,7 +7,6 @@ once, followed by its gap; all behaviour is in the modem.
 from __future__ import annotations
 
 import logging
-import os
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -26,7 +25,6 @@ from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import decoders, fastest, which
 from gr_ros2.phy.pdus import PDUS, AirPacket, PduPort, octets, packets_of
-from gr_ros2.phy.receiver_process import ReceiverProcess
 from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, StreamTimes, whole_and_rest
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
@@ -131,10 +129,8 @@ class BurstPhy(Phy):
     def transmitter(self) -> PacketTransmitter:
         return BurstTransmitter(self)
 
-    def receiver(self, own_process: bool = False) -> PacketReceiver:
-        # Compiled kernels release Python's lock, so that a process of their own would only add a hop.
-        compiled = self.running_modem is not self.modem
-        return BurstSink(self, own_process and not compiled and len(os.sched_getaffinity(0)) > 1)
+    def receiver(self) -> PacketReceiver:
+        return BurstSink(self)
 
 
 class BurstTransmitter(TransmitterBlock):
@@ -284,9 +280,9 @@ def _number(value: int) -> Any:
 class BurstSink(ReceiverBlock):
     """Complex stream in; message ports out: `pdus`, packets whose CRC-32 is right, and `points`, how they look."""
 
-    def __init__(self, phy: BurstPhy, own_process: bool) -> None:
+    def __init__(self, phy: BurstPhy) -> None:
         super().__init__(f"gr_ros2_{phy.name}_rx")
-        self._demodulator = _Demodulator(phy, own_process)
+        self._demodulator = _Demodulator(phy)
         if phy.receiver_taps is None:
             self.connect(self, self._demodulator)
         else:
@@ -315,11 +311,10 @@ class BurstSink(ReceiverBlock):
 class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
     """Filtered samples in, message ports `pdus` and `points` out."""
 
-    def __init__(self, phy: BurstPhy, own_process: bool) -> None:
+    def __init__(self, phy: BurstPhy) -> None:
         super().__init__(f"gr_ros2_{phy.name}_demodulator", [np.complex64], None)
         self._modem = phy.running_modem
-        self._own_process = own_process
-        self._engine: BurstReceiver | ReceiverProcess | None = None
+        self._engine: BurstReceiver | None = None
         self._damaged = 0
         self._failed = False
         self._snr_db: float | None = None
@@ -349,8 +344,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
     def start(self) -> bool:
         self._port.find_readers()
         self._shown = pmt.is_pair(self.message_subscribers(_POINTS))
-        modem = self._modem
-        self._engine = ReceiverProcess(modem, self._send) if self._own_process else modem.receiver()
+        self._engine = self._modem.receiver()
         return super().start()
 
     def stop(self) -> bool:
@@ -389,6 +383,4 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
             return []
 
     def _end_engine(self) -> None:
-        if isinstance(self._engine, ReceiverProcess):
-            self._engine.close()
         self._damaged, self._snr_db, self._engine = self.damaged, self.snr_db, None

@@ -193,6 +193,7 @@ class Blocks(Code):
         return count, -(-bits // count)
 
     def blocks_of(self, bits: Bits) -> Bits:
+        """The data bits of each block, one block per row, the last one filled up with zeros."""
         padded = np.zeros(self.count * self.each, np.uint8)
         padded[: self.bits] = bits
         return padded.reshape(self.count, self.each)

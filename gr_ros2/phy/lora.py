@@ -497,5 +497,5 @@ class LoraPhy(BurstPhy):
     def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._sdr is None else SdrTransmitter(self._sdr)
 
-    def receiver(self, own_process: bool = False) -> PacketReceiver:
-        return super().receiver(own_process) if self._sdr is None else SdrReceiver(self._sdr)
+    def receiver(self) -> PacketReceiver:
+        return super().receiver() if self._sdr is None else SdrReceiver(self._sdr)

@@ -95,6 +95,7 @@ class SdrFrame:
 
     @property
     def symbol_samples(self) -> int:
+        """Samples of a symbol."""
         return self.oversampling << self.spreading_factor
 
     @property

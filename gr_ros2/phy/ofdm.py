@@ -44,7 +44,7 @@ class OfdmOptions(BurstOptions):
         at closely; auto = what noise alone passes once in 1000 samples. ``stock`` = GNU Radio's own blocks and their
         0.9, which need 5 to 7 dB more SNR; at a lower one these lose packets without any noise
     :param rate: ``adaptive`` = the sender chooses modulation and code of each packet by what its receivers report
-        (version 1, and a way back), and the header of each burst says which; ``payload_modulation`` and ``fec`` are
+        (version 1, with reports), and the header of each burst says which; ``payload_modulation`` and ``fec`` are
         then left out. The same at both ends
     :param rates: names of the modulations and codes that ``adaptive`` may choose from, the most robust one first;
         auto = all: bpsk-cc, qpsk-cc, 8psk-cc, 16qam-cc, 64qam-cc, 16qam, 64qam
@@ -203,5 +203,5 @@ class OfdmPhy(BurstPhy):
     def transmitter(self) -> PacketTransmitter:
         return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
 
-    def receiver(self, own_process: bool = False) -> PacketReceiver:
-        return super().receiver(own_process) if self._stock is None else StockReceiver(self._stock)
+    def receiver(self) -> PacketReceiver:
+        return super().receiver() if self._stock is None else StockReceiver(self._stock)

@@ -1,16 +1,15 @@
 """OFDM bursts without GNU Radio's scheduler: detected by a repeated half symbol, demodulated with all symbols as
 reference.
 
-Invariants: a detected preamble is a burst only if its two sync words are those of the layout; the channel is a short
-impulse response, so its estimate at one carrier uses all carriers; the estimate is tracked through the payload with the
-decided payload symbols, weighted by their certainty; if packets may have different lengths, the header carries the
-length; with an adaptive rate it also carries the MCS, whose modulation and code the payload has.
+Invariants: a detected preamble is a burst only if its two sync words are those of the layout; if packets may have
+different lengths, the header carries the length; with an adaptive rate it also carries the MCS, whose modulation and
+code the payload has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,9 @@ from numpy.typing import NDArray
 from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits, mcs_mark
+from gr_ros2.phy.ofdm_channel import ChannelEstimator, ChannelState, Complexes
 from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, OfdmLayout, constellation
 from gr_ros2.phy.soft import Points
-
-Complexes = NDArray[np.complexfloating[Any, Any]]
-"""Complex numbers of single or double precision."""
 
 _FALSE_ALARM = 1e-3
 """Share of noise samples that are examined closely."""
@@ -34,14 +31,6 @@ _CHUNK = 16
 """Payload symbols decided together; timing and channel are estimated once for each such group."""
 _PACE_GAIN = 0.5
 """Gain of the timing loop for the rate of change of the timing."""
-_MEMORY = 32.0
-"""Symbols over which the channel estimate averages."""
-_RIDGE = 0.001
-"""Noise over signal per carrier for which the channel estimate is designed."""
-_TURN = 0.4
-"""Largest error of the carrier offset after the sync words, radians per symbol."""
-_DOUBT = 1e-3
-"""Share of the power sent: if the uncertainty is below this, symbols are not decided again for a better estimate."""
 _TINY = 1e-20
 _FILL_MARK = 0x555
 """Value added to the number field of a header for each byte that fills up the frame."""
@@ -61,14 +50,6 @@ class _SymbolClock(NamedTuple):
 
     begin: float
     pace: float
-
-
-class _Channel(NamedTuple):
-    """Gain of each used carrier, the weight of its estimate, and the noise on each carrier."""
-
-    gains: NDArray[np.complex128]
-    weight: NDArray[np.float64]
-    noise: float
 
 
 class OfdmModem(BurstModem):
@@ -97,20 +78,13 @@ class OfdmModem(BurstModem):
         self.margin = self._prefix
         self.stretch = max(2048, 16 * self._size)
         self._power = layout.power(frames.bits(frames.packet_len))
-        self._carriers = np.array(sorted(layout.data[0] + layout.pilots[0]))
-        self._data = np.flatnonzero(np.isin(self._carriers, layout.data[0]))
-        self._pilots = np.searchsorted(self._carriers, layout.pilots[0])
-        self._known = np.zeros(len(self._carriers), np.complex64)
-        self._known[self._pilots] = layout.pilot_symbols[0]
+        words = np.fft.ifftshift(np.array(layout.sync_words()), axes=1)
+        self._channel = channel = ChannelEstimator(layout, words)
+        self._carriers, self._data, self._pilots = channel.carriers, channel.data, channel.pilots
+        self._known, self._words = channel.known, channel.words
         self._header_mask = layout.header_mask()
         self._prepare_header(mcs)
-        words = np.fft.ifftshift(np.array(layout.sync_words()), axes=1)
-        self._words = words[:, self._carriers].astype(np.complex64)
-        self._twice, self._once = np.flatnonzero(self._words[0]), np.flatnonzero(self._words[0] == 0)
-        self._crosswise = self._words[::-1, self._twice]
-        self._pair_weight = float((np.abs(self._crosswise) ** 2).sum()) / len(self._twice)
         self._prepare_search(words)
-        self._prepare_estimate()
 
     def _prepare_header(self, mcs: int | None) -> None:
         frames = self.frames
@@ -153,20 +127,6 @@ class OfdmModem(BurstModem):
         """Sign with which the second half of the first sync word repeats the first: its carriers are even or odd."""
         self._whole = words.conj().astype(np.complex64)
         self._energy = float((np.abs(words) ** 2).sum())
-
-    def _prepare_estimate(self) -> None:
-        delays = np.arange(self._prefix)
-        basis = np.exp(-2j * np.pi * np.outer(self._carriers, delays) / self._size)
-
-        def smoother(weight: NDArray[np.float64]) -> NDArray[np.complex64]:
-            gram = basis.conj().T @ (basis * weight[:, None])
-            gram += _RIDGE * len(self._carriers) * np.eye(len(delays))
-            return np.asarray(basis @ np.linalg.solve(gram, basis.conj().T), np.complex64)
-
-        self._word_weight = (np.abs(self._words) ** 2).sum(axis=0).astype(np.float64)
-        self._smooth_words = smoother(self._word_weight)
-        self._smooth = smoother(np.ones(len(self._carriers)))
-        self._degrees = 2 * len(self._carriers) - len(delays)
 
     @property
     def rates(self) -> Sequence[OfdmModem]:
@@ -233,18 +193,18 @@ class OfdmModem(BurstModem):
             at = int(np.searchsorted(above, best + 1))
         return Search(positions)
 
-    def _head(self, rows: Complexes) -> tuple[_Channel, int, int]:
+    def _head(self, rows: Complexes) -> tuple[ChannelState, int, int]:
         """Evaluates sync words and header: the channel, the MCS, and the bytes of the packet."""
         all_used = np.ones((1, len(self._data)), bool)
-        channel = self._first_estimate(rows[:2])
-        channel, likely, _, _ = self._decide(rows[2:], channel, self._bpsk, all_used, rounds=1)
+        channel = self._channel.first(rows[:2])
+        channel, likely, _, _ = self._channel.decide(rows[2:], channel, self._bpsk, all_used, rounds=1)
         return channel, *self._said(self._bpsk.soft(likely))
 
     def read(self, samples: Samples, start: int) -> Reading:
         begin, frequency, _ = self._place(samples, start)
         clock = _SymbolClock(float(begin), 0.0)
         rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
-        snr = self._snr(rows[:2])
+        snr = self._channel.snr(rows[:2], self._power)
         channel, mcs, length = self._head(rows)
         sent = self.rates[mcs]
         end = start + sent.samples_of(length) - self._back
@@ -257,7 +217,7 @@ class OfdmModem(BurstModem):
         for first in range(0, count, _CHUNK):
             last = min(count, first + _CHUNK)
             rows = self._rows(samples, clock, frequency, HEAD_SYMBOLS + first, last - first)
-            channel, likely, seen, late = self._decide(rows, channel, sent.constellation, used[first:last])
+            channel, likely, seen, late = self._channel.decide(rows, channel, sent.constellation, used[first:last])
             soft.append(sent.constellation.soft(likely))
             looked.append(seen)
             pace = clock.pace + _PACE_GAIN * late / _CHUNK
@@ -278,16 +238,14 @@ class OfdmModem(BurstModem):
             "counted": self._counted,
             "headers": np.concatenate([modem.headers for modem in self.rates]),
             "header_mask": self._header_mask,
+            **self._channel.constants(),
             "size": self._size,
             "prefix": self._prefix,
             "repeat": self._repeat,
-            "degrees": self._degrees,
             "chunk": _CHUNK,
             "carrier_count": len(self._carriers),
             "data_count": len(self._data),
             "pilot_count": len(self._pilots),
-            "once_count": len(self._once),
-            "twice_count": len(self._twice),
             "shift_count": len(_SHIFTS),
             "point_counts": [len(each.points) for each in constellations],
             "point_bits": [each.bits for each in constellations],
@@ -295,27 +253,16 @@ class OfdmModem(BurstModem):
             "alike": _ALIKE,
             "energy": self._energy,
             "power": self._power,
-            "pair_weight": self._pair_weight,
-            "word_weight_sum": float(self._word_weight.sum()),
             "pace_gain": _PACE_GAIN,
-            "memory": _MEMORY,
-            "reach": _TURN,
-            "doubt": _DOUBT,
             "carriers": self._carriers,
             "data": self._data,
             "pilots": self._pilots,
-            "once": self._once,
-            "twice": self._twice,
             "shifts": _SHIFTS,
             "words": self._words,
             "known": self._known,
             "turns": self._turns,
             "whole": self._whole,
-            "smooth": self._smooth,
-            "smooth_words": self._smooth_words,
-            "crosswise": self._crosswise,
             "points": np.concatenate([each.points for each in constellations]),
-            "word_weight": self._word_weight,
             "marks": np.concatenate([each.marks.reshape(-1) for each in constellations]),
         }
         soft_bits = max(points * each.bits for points, each in zip(most, constellations, strict=True))
@@ -361,99 +308,8 @@ class OfdmModem(BurstModem):
         spectra = np.fft.fft(whole.reshape(count, -1)[:, : self._size])[:, self._carriers] / self._size
         late = clock.begin + drift - round(clock.begin + float(drift[0]))
         if late.any():
-            spectra = spectra * self._advance(late[:, None])
+            spectra = spectra * self._channel.advance(late[:, None])
         return np.asarray(spectra, np.complex64)
-
-    def _advance(self, samples: Any) -> NDArray[np.complex128]:
-        """Factors that advance carriers by a number of samples, fractional or not."""
-        return np.asarray(np.exp(2j * np.pi / self._size * self._carriers * samples))
-
-    def _first_estimate(self, rows: NDArray[np.complex64]) -> _Channel:
-        gains = self._smooth_words @ (rows * self._words.conj()).sum(axis=0)
-        rest = rows - gains * self._words
-        noise = float((np.abs(rest) ** 2).sum()) / self._degrees
-        return _Channel(gains, self._word_weight, max(noise, _TINY))
-
-    def _snr(self, rows: NDArray[np.complex64]) -> float:
-        """Mean power of a burst over that of the noise in the sampled band, from both sync words.
-
-        The noise is measured on the carriers that the first word leaves empty, and from the difference of both words on
-        the others. So it does not depend on the channel.
-        """
-        first, second = rows[:, self._twice] * self._crosswise
-        alike = abs(complex(np.vdot(first, second)))
-        differ = float(np.vdot(first, first).real + np.vdot(second, second).real) - 2 * alike
-        empty = float(np.vdot(rows[0, self._once], rows[0, self._once]).real)
-        noise = max(empty + differ / self._pair_weight, _TINY) / (len(self._carriers) - 0.5)
-        signal = float(np.vdot(rows, rows).real) - rows.size * noise
-        return signal * self._power / (float(self._word_weight.sum()) * noise * self._size)
-
-    def _decide(
-        self, rows: Complexes, channel: _Channel, points: Points, used: NDArray[np.bool_], rounds: int = 2
-    ) -> tuple[_Channel, NDArray[np.float32], Samples, float]:
-        """Likelihoods of constellation points for some symbols, with a channel estimate improved by these symbols.
-
-        Also returns the delay of the symbols in samples.
-
-        :param used: symbols by data carriers: which of them carry a point
-        :param rounds: most rounds of decision and estimation
-        """
-        gains, noise = channel.gains, channel.noise
-        turn = self._tone(rows[:, self._pilots] @ (gains[self._pilots] * self._known[self._pilots]).conj())
-        rows = rows * turn[:, None]
-        model = np.empty(rows.shape, np.complex64)
-        energy = np.ones(rows.shape, np.float32)
-        late = 0.0
-        for _ in range(rounds):
-            likely, _ = self._weigh(rows, gains, noise, points, used)
-            expected, squared = points.expected(likely)
-            model[:] = self._known
-            model[:, self._data] = 0
-            model[:, self._data] = _put(expected, used)
-            energy[:, self._data] = _put(squared, used)
-            turns = rows * (gains * model).conj()
-            turn = self._tone(turns.sum(axis=1))
-            more = self._late(turn @ turns)
-            late += more
-            rows = rows * turn[:, None] * self._advance(more)
-            weight = np.minimum(channel.weight, _MEMORY)
-            total = weight + energy.sum(axis=0)
-            gains = self._smooth @ ((weight * channel.gains + (rows * model.conj()).sum(axis=0)) / total)
-            if np.vdot(expected, expected).real > (1 - _DOUBT) * squared.sum():
-                break
-        likely, seen = self._weigh(rows, gains, noise, points, used)
-        return _Channel(gains, total, noise), likely, seen, late
-
-    def _weigh(
-        self, rows: Complexes, gains: NDArray[np.complex128], noise: float, points: Points, used: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float32], Samples]:
-        gains = gains[self._data]
-        power = np.abs(gains) ** 2 + _TINY
-        seen = (rows[:, self._data] * (gains.conj() / power))[used].astype(np.complex64)
-        return points.weigh(seen, np.tile(noise / power, len(used))[used.reshape(-1)]), seen
-
-    def _tone(self, turns: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Factors that remove a constant phase step from symbol to symbol."""
-        count = len(turns)
-        size = 8 << max(0, (count - 1).bit_length())
-        spectrum = np.fft.fft(turns, size)
-        reach = int(size * _TURN / (2 * np.pi))
-        places = np.arange(-reach, reach + 1)
-        heights = np.abs(spectrum[places])
-        place = int(np.argmax(heights))
-        exact = float(places[place])
-        if 0 < place < len(places) - 1:
-            before, at, after = heights[place - 1 : place + 2]
-            bend = before - 2 * at + after
-            exact += 0.5 * (before - after) / bend if bend < 0 else 0.0
-        back = np.exp(-2j * np.pi * exact / size * np.arange(count))
-        phase = float(np.angle((turns * back).sum()))
-        return np.asarray(back * np.exp(-1j * phase), np.complex64)
-
-    def _late(self, turns: NDArray[np.complex128]) -> float:
-        """Delay of symbols in samples, from the phase slope over their carriers."""
-        slope = float(self._carriers @ turns.imag) / max(float(self._carriers**2 @ np.abs(turns.real)), _TINY)
-        return -slope * self._size / (2 * np.pi)
 
 
 class AdaptiveOfdmModem(OfdmModem):
@@ -477,10 +333,3 @@ class AdaptiveOfdmModem(OfdmModem):
     def _said(self, soft: Soft) -> tuple[int, int]:
         mcs, row = divmod(int(np.argmax(self._signs @ self._word_soft(soft))), len(self.frames.lengths))
         return mcs, self.frames.lengths[row]
-
-
-def _put(values: NDArray[np.generic], used: NDArray[np.bool_]) -> NDArray[np.generic]:
-    """Values at the used places, zeros elsewhere."""
-    out = np.zeros(used.shape, values.dtype)
-    out[used] = values
-    return out

@@ -161,7 +161,7 @@ class PacketPath:
         self._transmitter = self.phy.transmitter()
         return self._follow(packets, self._transmitter)
 
-    def _receive(self, samples: Any, *, faded: bool, shown: bool, own_process: bool = True) -> Any:
+    def _receive(self, samples: Any, *, faded: bool, shown: bool) -> Any:
         """Connect channel, receiver and taps to a block that gives samples; returns the block that gives the receiver's
         input."""
         graph: Any = self
@@ -169,7 +169,7 @@ class PacketPath:
             self._faded = Channel(self.channel, self.phy)
             graph.connect(samples, self._faded)
             samples = self._faded
-        self._receiver = self.phy.receiver(own_process)
+        self._receiver = self.phy.receiver()
         graph.connect(samples, self._receiver)
         if shown:
             self._tap = Tap(_LOOK)

@@ -168,7 +168,7 @@ class WifiPhy(Phy):
     def transmitter(self) -> PacketTransmitter:
         return WifiTransmitter(self)
 
-    def receiver(self, own_process: bool = False) -> PacketReceiver:  # noqa: ARG002 - the blocks are not Python's
+    def receiver(self) -> PacketReceiver:
         return WifiReceiver(self)
 
 

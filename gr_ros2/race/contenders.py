@@ -1,4 +1,4 @@
-"""The contenders of the race and their settings.
+"""The contenders of the races and their settings.
 
 Invariant: the peers have the settings that their manuals offer for slow links and that measured best here.
 docs/explanation/race.md gives the reason for each setting.
@@ -13,14 +13,22 @@ from typing import Any, Literal
 from gr_ros2.core.errors import ConfigError
 
 Stack = Literal["gr-ros2", "dds", "zenoh"]
+Races = Literal["two", "team"]
 
-ADDRESSES = ("10.77.0.1", "10.77.0.2")
+
+def address_of(robot: int) -> str:
+    """IP address of a robot on the radio, by its number from 0."""
+    return f"10.77.0.{robot + 1}"
+
+
+ADDRESSES = (address_of(0), address_of(1))
 """IP addresses of the sending and the receiving end, on the radio."""
 MTU = 1500
 """Bytes of the largest IP packet. Each message of the race fits into one IP packet."""
 
 _IP_UDP_HEADERS = 28
 _ZENOH_PORT = 7447
+_ZENOH_GROUP = "224.0.0.224"
 _ZENOH_SEND_BUFFER = 8192
 """Bytes. The buffer of TCP is small, because a message that waits in it is old when it arrives."""
 _ZENOH_WAIT_US = 20_000
@@ -38,13 +46,16 @@ class Contender:
     :param reliable: whether data that is lost on the air is sent again
     :param summary: description in one line
     :param settings: ``version`` and ``compression`` of both ends and further settings of the ``source`` (`gr-ros2`);
-        or ``transport`` and ``congestion`` control of Zenoh
+        ``transport`` (multicast, udp or tcp) and ``congestion`` control of Zenoh; what waits in the ``queue`` of a
+        topic of a team
+    :param races: between two robots, or among those of a team
     """
 
     stack: Stack
     reliable: bool
     summary: str
     settings: dict[str, Any] = field(default_factory=dict)
+    races: tuple[Races, ...] = ("two", "team")
 
 
 CONTENDERS = {
@@ -54,15 +65,27 @@ CONTENDERS = {
         False,
         "version 0, compressed",
         {"version": 0, "compression": True, "source": {"queue_depth": 8}},
+        ("two",),
     ),
     "gr-ros2-plain": Contender(
         "gr-ros2",
         False,
         "version 0, as it is, a packet per message",
         {"version": 0, "compression": False, "source": {"queue_depth": 1}},
+        ("two",),
+    ),
+    "gr-ros2-latest": Contender(
+        "gr-ros2", False, "the newest message of each robot only", {"queue": "latest"}, ("team",)
     ),
     "cyclone-best-effort": Contender("dds", False, "Cyclone DDS, best effort"),
     "cyclone-reliable": Contender("dds", True, "Cyclone DDS, reliable"),
+    "zenoh-multicast": Contender(
+        "zenoh",
+        False,
+        "Zenoh over UDP multicast, best effort, compressed",
+        {"transport": "multicast", "congestion": "DROP"},
+        ("team",),
+    ),
     "zenoh-udp": Contender(
         "zenoh", False, "Zenoh over UDP, best effort, compressed", {"transport": "udp", "congestion": "DROP"}
     ),
@@ -75,55 +98,67 @@ CONTENDERS = {
 }
 
 
-def chosen(names: Iterable[str]) -> dict[str, Contender]:
-    """The contenders with these names, in the order of the table. Without names: all contenders.
+def chosen(names: Iterable[str], races: Races = "two") -> dict[str, Contender]:
+    """The contenders of a race with these names, in the order of the table. Without names: all of them.
 
     :raises ConfigError: for a name that is not in the table
     """
-    wanted = set(names) or set(CONTENDERS)
-    unknown = sorted(wanted - set(CONTENDERS))
+    known = {name: contender for name, contender in CONTENDERS.items() if races in contender.races}
+    wanted = set(names) or set(known)
+    unknown = sorted(wanted - set(known))
     if unknown:
-        raise ConfigError(f"peers = {unknown[0]!r}: no such contender; known are {', '.join(CONTENDERS)}")
-    return {name: contender for name, contender in CONTENDERS.items() if name in wanted}
+        raise ConfigError(f"peers = {unknown[0]!r}: no such contender; known are {', '.join(known)}")
+    return {name: contender for name, contender in known.items() if name in wanted}
 
 
-def cyclone_uri(peer: str, interface: str) -> str:
-    """Value of ``CYCLONEDDS_URI``: this interface, one peer, no multicast, no message larger than an IP packet."""
+def cyclone_uri(interface: str, peer: str = "") -> str:
+    """Value of ``CYCLONEDDS_URI``: this interface, no message larger than an IP packet.
+
+    :param peer: address of the only other one, without multicast; '' = all are found and reached by multicast
+    """
     largest = MTU - _IP_UDP_HEADERS
+    multicast = "false" if peer else "true"
+    # By default, Cyclone asks a peer only at the start, even if the peer is absent or its packet is lost.
+    peers = f'<Peers AddLocalhost="false"><Peer Address="{peer}" PruneDelay="inf"/></Peers>' if peer else ""
     return (
         '<CycloneDDS><Domain Id="any"><General>'
-        f'<Interfaces><NetworkInterface name="{interface}" multicast="false"/></Interfaces>'
-        "<AllowMulticast>false</AllowMulticast>"
+        f'<Interfaces><NetworkInterface name="{interface}" multicast="{multicast}"/></Interfaces>'
+        f"<AllowMulticast>{multicast}</AllowMulticast>"
         f"<MaxMessageSize>{largest}B</MaxMessageSize><MaxRexmitMessageSize>{largest}B</MaxRexmitMessageSize>"
         f"<FragmentSize>{largest - 128}B</FragmentSize></General>"
         "<Discovery><ParticipantIndex>0</ParticipantIndex><MaxAutoParticipantIndex>0</MaxAutoParticipantIndex>"
-        # By default, Cyclone asks a peer only at the start, even if the peer is absent or its packet is lost.
-        f'<SPDPInterval>8s</SPDPInterval><Peers AddLocalhost="false"><Peer Address="{peer}" PruneDelay="inf"/></Peers>'
-        "</Discovery>"
+        f"<SPDPInterval>8s</SPDPInterval>{peers}</Discovery>"
         "</Domain></CycloneDDS>"
     )
 
 
-def zenoh_config(transport: str, listens: bool) -> dict[str, Any]:
-    """Configuration of a session with one peer at a known address. It sends as few and as small packets as possible.
+def zenoh_config(transport: str, number: int, robots: int, interface: str) -> dict[str, Any]:
+    """Configuration of a session with peers at known addresses. It sends as few and as small packets as possible.
 
-    :param transport: udp or tcp
-    :param listens: whether this end waits for the connection of the other end
+    :param transport: multicast, or udp or tcp to each of the others
+    :param number: of this robot, from 0; it connects to those after it
+    :param robots: how many there are
     """
-    endpoint = f"{transport}/{ADDRESSES[1]}:{_ZENOH_PORT}"
-    retry = {"period_init_ms": 500, "period_max_ms": 1000, "period_increase_factor": 1.5}
+    begin = {
+        "timeout_ms": -1,
+        "exit_on_failure": False,
+        "retry": {"period_init_ms": 500, "period_max_ms": 1000, "period_increase_factor": 1.5},
+    }
+    if transport == "multicast":
+        endpoints = [f"udp/{_ZENOH_GROUP}:{_ZENOH_PORT}#iface={interface}"]
+        later = []
+    else:
+        places = [f"{transport}/{address_of(robot)}:{_ZENOH_PORT}" for robot in range(robots)]
+        endpoints, later = [places[number]], places[number + 1 :]
     return {
         "mode": "peer",
-        ("listen" if listens else "connect"): {
-            "endpoints": [endpoint],
-            "timeout_ms": -1,
-            "exit_on_failure": False,
-            "retry": retry,
-        },
+        "listen": {"endpoints": endpoints, **begin},
+        "connect": {"endpoints": later, **begin},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": False},
         "transport": {
             "shared_memory": {"enabled": False},
+            "multicast": {"compression": {"enabled": True}},
             "unicast": {
                 "compression": {"enabled": True},
                 "open_timeout": _ZENOH_OPEN_MS,

@@ -30,7 +30,7 @@ from gr_ros2.phy.pdus import PDUS, packets_of, pdu_of
 from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
 from gr_ros2.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2.race.namespaces import inside
-from gr_ros2.race.tun import Tun, loopback_up
+from gr_ros2.race.tun import Tun, loopback_up, own_air
 from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry
 
@@ -219,7 +219,8 @@ class RaceIpLink:
         with ExitStack() as stack:
             self._tuns: list[Tun] = []
             for namespace, own, other in zip(namespaces, ADDRESSES, reversed(ADDRESSES), strict=True):
-                tun = Tun(namespace, own, other, mtu=MTU, byte_rate=1 / byte_airtime, overhead=overhead)
+                setup = own_air(own, other, mtu=MTU, byte_rate=1 / byte_airtime, overhead=overhead)
+                tun = Tun(namespace, setup)
                 stack.callback(tun.close)
                 self._tuns.append(tun)
             self._links: list[LoopbackLink] = []

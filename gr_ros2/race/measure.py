@@ -16,9 +16,10 @@ import numpy.typing as npt
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.race.contenders import Races
 from gr_ros2.race.links import LinkLog, LinkReport
 from gr_ros2.race.race_settings import RaceRecording
-from gr_ros2.record.metrics import age, latency
+from gr_ros2.record.metrics import Age, age, latency
 from gr_ros2.settings.registry import Registry
 
 Floats = npt.NDArray[np.float64]
@@ -37,6 +38,9 @@ class RaceCell:
     :param air_bytes_reverse: share of these bytes that the receiving end sent
     :param discovery_bytes: bytes of all frames before the first message
     :param first_message: time from joining the network to the first delivery
+    :param robots: 2 and more on one channel: all numbers are those of all pairs; None for a talker and a listener
+    :param age_peak: the highest age of any pair
+    :param all_heard: time from the last robot's joining until every robot has a message of every other one
     :param drops: frames and messages that were dropped on the way, by name
     :param busy: load average per processor; above 1, the times come from the computer and not from the radio
     """
@@ -61,6 +65,9 @@ class RaceCell:
     first_message: float | None
     drops: dict[str, int]
     busy: float
+    robots: int | None = None
+    age_peak: float | None = None
+    all_heard: float | None = None
 
 
 @dataclass(frozen=True)
@@ -68,11 +75,13 @@ class Column:
     """A number that is compared between contenders.
 
     :param better: whether the largest or the smallest number wins
+    :param races: those in which it is compared
     """
 
     heading: str
     better: Literal["most", "least"]
     shown: Callable[[float], str]
+    races: tuple[Races, ...] = ("two", "team")
 
 
 def _ms(value: float) -> str:
@@ -88,12 +97,20 @@ COLUMNS = {
     "latency_p50": Column("latency p50 [ms]", "least", _ms),
     "latency_p99": Column("latency p99 [ms]", "least", _ms),
     "age_mean": Column("age mean [ms]", "least", _ms),
-    "airtime_per_message": Column("airtime /msg [ms]", "least", _ms),
+    "age_peak": Column("age peak [ms]", "least", _ms, ("team",)),
+    "airtime_per_message": Column("airtime /msg [ms]", "least", _ms, ("two",)),
     "air_bytes_per_message": Column("air bytes /msg", "least", _whole),
     "discovery_bytes": Column("discovery bytes", "least", _whole),
-    "first_message": Column("first message [s]", "least", "{:.2f}".format),
+    "first_message": Column("first message [s]", "least", "{:.2f}".format, ("two",)),
+    "all_heard": Column("all hear all [s]", "least", "{:.2f}".format, ("team",)),
 }
 """The compared numbers, by field of :class:`RaceCell`."""
+
+
+def columns(cells: Sequence[RaceCell]) -> dict[str, Column]:
+    """Those of the race to which these cells belong."""
+    races: Races = "team" if any(cell.robots for cell in cells) else "two"
+    return {name: column for name, column in COLUMNS.items() if races in column.races}
 
 
 class Identity:
@@ -121,43 +138,75 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class Observed:
-    """What was observed of one contender. All times are s, monotonic.
+class RaceSender:
+    """What a robot sends, and how its messages are recognized."""
 
-    :param began: when the first end began to join
+    recording: RaceRecording
+    identity: Identity
+
+    def sent(self, t_first: float) -> list[float]:
+        """When each message counts as sent, if the first one did at ``t_first``."""
+        return [t_first + due for due in self.recording.due]
+
+
+@dataclass(frozen=True)
+class RaceStream:
+    """The messages of one program at another one. All times are s on one clock.
+
     :param t_sent: due time of each message, in the order of the recording
     :param heard: time of each arrival, and the bytes that arrived
+    """
+
+    identity: Identity
+    t_sent: Sequence[float]
+    heard: Sequence[tuple[float, bytes]]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What was observed of one contender. All times are s on one clock.
+
+    :param began: when the first program began to join; of a team the last one
+    :param streams: of every pair of programs
     :param busy: see :class:`RaceCell`
     """
 
     began: float
     matched: bool
-    t_sent: Sequence[float]
-    heard: Sequence[tuple[float, bytes]]
+    streams: Sequence[RaceStream]
     air: LinkReport
     busy: float
 
 
 def measure(
-    seen: Observed, identity: Identity, *, contender: str, load: float, loss: float, sample_rate: float
+    seen: Observed, *, contender: str, load: float, loss: float, sample_rate: float, robots: int | None = None
 ) -> RaceCell:
     """Compute all numbers of a cell."""
-    t_sent = np.array(seen.t_sent)
-    t_delivered = np.full(len(t_sent), np.nan)
-    altered = duplicates = 0
-    for now, payload in seen.heard:
-        number = identity.number(payload)
-        if number is None or number >= len(t_sent):
-            altered += 1
-        elif not np.isnan(t_delivered[number]):
-            duplicates += 1
-        else:
-            t_delivered[number] = now
-    done = ~np.isnan(t_delivered)
-    delivered = int(done.sum())
-    times = latency(np.sort(t_delivered[done] - t_sent[done]))
-    first, last = (t_sent[0], t_sent[-1]) if len(t_sent) else (np.inf, np.inf)
-    ages = age(t_sent[done], t_delivered[done], float(last))
+    altered = duplicates = sent = 0
+    latencies: list[Floats] = []
+    ages: list[Age] = []
+    firsts: list[float] = []
+    for stream in seen.streams:
+        t_sent = np.array(stream.t_sent)
+        t_delivered = np.full(len(t_sent), np.nan)
+        for now, payload in stream.heard:
+            number = stream.identity.number(payload)
+            if number is None or number >= len(t_sent):
+                altered += 1
+            elif not np.isnan(t_delivered[number]):
+                duplicates += 1
+            else:
+                t_delivered[number] = now
+        done = ~np.isnan(t_delivered)
+        sent += len(t_sent)
+        latencies.append(t_delivered[done] - t_sent[done])
+        if done.any():
+            firsts.append(float(t_delivered[done].min()) - seen.began)
+        found = age(t_sent[done], t_delivered[done], float(t_sent[-1])) if len(t_sent) else None
+        ages += [] if found is None else [found]
+    delivered = sum(map(len, latencies))
+    times = latency(np.sort(np.concatenate(latencies)))
+    first = min((stream.t_sent[0] for stream in seen.streams if len(stream.t_sent)), default=np.inf)
     logs = (seen.air.forward, seen.air.reverse)
     before, _ = _traffic(logs, -np.inf, first)
     size, airtime = _traffic(logs, first, np.inf)
@@ -168,21 +217,24 @@ def measure(
         loss=loss,
         sample_rate=sample_rate,
         matched=seen.matched,
-        sent=len(t_sent),
+        sent=sent,
         delivered=delivered,
         altered=altered,
         duplicates=duplicates,
-        pdr=delivered / len(t_sent) if len(t_sent) else None,
+        pdr=delivered / sent if sent else None,
         latency_p50=None if times is None else times.p50,
         latency_p99=None if times is None else times.p99,
-        age_mean=None if ages is None else ages.mean,
+        age_mean=sum(found.mean for found in ages) / len(ages) if ages else None,
         airtime_per_message=airtime / delivered if delivered else None,
         air_bytes_per_message=size / delivered if delivered else None,
         air_bytes_reverse=reverse / size if size else None,
         discovery_bytes=before,
-        first_message=float(t_delivered[done].min()) - seen.began if delivered else None,
+        first_message=min(firsts, default=None),
         drops={name: count for name, count in seen.air.drops.items() if count},
         busy=seen.busy,
+        robots=robots,
+        age_peak=max((found.peak for found in ages), default=None),
+        all_heard=max(firsts) if len(firsts) == len(seen.streams) else None,
     )
 
 
@@ -195,7 +247,7 @@ def shown(cell: RaceCell, column: str) -> str:
 def winners(cells: Sequence[RaceCell]) -> dict[str, list[str]]:
     """The best contenders in each column. All cells must have the same condition."""
     best: dict[str, list[str]] = {}
-    for name, column in COLUMNS.items():
+    for name, column in columns(cells).items():
         values = {cell.contender: getattr(cell, name) for cell in cells if getattr(cell, name) is not None}
         if not values:
             best[name] = []
@@ -212,7 +264,7 @@ def ahead(cells: Sequence[RaceCell], contender: str) -> dict[str, list[str]]:
     """
     own = {cell.contender: cell for cell in cells}.get(contender)
     found: dict[str, list[str]] = {}
-    for name, column in COLUMNS.items():
+    for name, column in columns(cells).items():
         value = None if own is None else getattr(own, name)
         for cell in cells:
             other = getattr(cell, name)

@@ -1,12 +1,13 @@
-"""The settings of the race: the recording, the radio, and the sample rate that follows from the load.
+"""The settings of the race: the recordings, the radio, and the sample rate that follows from the load.
 
-Invariants: a load is the share of the airtime that the recording would need if each message were one uncompressed
-frame with the overhead of a version 0 packet. Every contender has the same recording at the same sample rate.
+Invariants: a load is the share of the airtime that the recordings would need if each message were one uncompressed
+frame with the overhead of a version 0 packet. Every contender has the same recordings at the same sample rate.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from dataclasses import dataclass as plain_dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,7 +31,7 @@ from gr_ros2.wire.v0 import V0
 PHY_NAME = "ofdm"
 """The PHY with its defaults. For every contender, a frame is only as long on the air as its bytes need."""
 SIM_TOPIC = "/robot_1/odom"
-_SIM_ROBOT = 1
+MOST_ROBOTS = 10
 _SIM_START_NS = 1_700_000_000_000_000_000
 """Start of a recording of the simulator, ns since 1970. It is constant, so the messages are always the same."""
 _SIM_HZ = 35.0
@@ -45,6 +46,8 @@ Load = Annotated[float, Field(gt=0, le=100)]
 class RaceSettings(Sampled, PacketSettings, Traffic):
     """One race: every contender at every load and every loss.
 
+    :param robots: all of them send to all others on one channel, each a recording of its own; of a bag all the same,
+        one after the other; null = one robot sends to another one
     :param source: `sim`, the odometry of a simulated robot at 35 Hz, or `bag:PATH`
     :param bag_topic: the topic of the bag that is carried; auto where it has only one
     :param peers: names of ``CONTENDERS``; [] = all
@@ -58,6 +61,7 @@ class RaceSettings(Sampled, PacketSettings, Traffic):
     :param seed: of the simulator, the losses and gr-ros2's sender
     """
 
+    robots: Annotated[int, Field(ge=2, le=MOST_ROBOTS)] | None = None
     bag_topic: Text = AUTO
     peers: tuple[str, ...] = ()
     loss: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.0, 0.05, 0.2, 0.4)
@@ -75,6 +79,7 @@ class RaceRecording:
     :param path: path of the bag
     :param payloads: the messages, in order
     :param due: due time of each message, s after the first one
+    :param phase_s: s from the beginning of all recordings to the first message
     """
 
     path: Path
@@ -82,6 +87,7 @@ class RaceRecording:
     type_name: str
     payloads: tuple[bytes, ...]
     due: tuple[float, ...]
+    phase_s: float = 0.0
 
     @property
     def hz(self) -> float:
@@ -114,16 +120,21 @@ def check(settings: RaceSettings) -> None:
     :raises ConfigError: when a setting is wrong; the message names it
     :raises BackendMissingError: when a contender is not installed
     """
-    racing = chosen(settings.peers).values()
+    racing = chosen(settings.peers, "team" if settings.robots else "two").values()
     if any(contender.stack == "zenoh" for contender in racing) and find_spec("zenoh") is None:
         raise BackendMissingError("zenoh is not installed: pip install eclipse-zenoh==1.10.2, or race other --peers")
     PHY.load(PHY_NAME)(settings.packet_len, 1.0)
 
 
-def conditions(settings: RaceSettings, recording: RaceRecording) -> list[Condition]:
-    """Every combination of load and loss, the smallest first."""
-    phy: Phy = PHY.load(PHY_NAME)(recording.single_packet_len, 1.0)
-    needed = recording.hz * phy.airtime_samples()
+def conditions(settings: RaceSettings, recordings: Sequence[RaceRecording]) -> list[Condition]:
+    """Every combination of load and loss, the smallest first.
+
+    :param recordings: those that share the air
+    """
+    needed = 0.0
+    for recording in recordings:
+        phy: Phy = PHY.load(PHY_NAME)(recording.single_packet_len, 1.0)
+        needed += recording.hz * phy.airtime_samples()
     if settings.sample_rate != AUTO:
         rates = {needed / settings.sample_rate: settings.sample_rate}
     else:
@@ -132,31 +143,42 @@ def conditions(settings: RaceSettings, recording: RaceRecording) -> list[Conditi
 
 
 def record_sim(folder: Path, settings: RaceSettings) -> Path:
-    """Write the simulated robot's odometry as a bag.
+    """Write the simulated robots' odometry as a bag.
 
     :param folder: where the bag goes
     """
     path = folder / "recording"
-    fleet = Fleet(SimSettings(seed=settings.seed, robots=1, odom_rate=_SIM_HZ))
+    fleet = Fleet(SimSettings(seed=settings.seed, robots=settings.robots or 1, odom_rate=_SIM_HZ))
+    topics = [f"/robot_{number}/odom" for number in fleet.robot_ids]
     with BagMiddleware(path=path, mode="write") as bag:
-        publisher = bag.advertise(SIM_TOPIC, "nav_msgs/msg/Odometry", Qos())
-        for message in fleet.messages(settings.duration_s, _SIM_START_NS * 1e-9):
-            if message.topic == SIM_TOPIC:
-                publisher.publish_at(message.payload, _SIM_START_NS + round(message.t * 1e9))  # type: ignore[attr-defined]
+        publishers = {topic: bag.advertise(topic, "nav_msgs/msg/Odometry", Qos()) for topic in topics}
+        for message in fleet.messages(settings.duration_s, _SIM_START_NS * 1e-9, topics):
+            publisher = publishers[message.topic]
+            publisher.publish_at(message.payload, _SIM_START_NS + round(message.t * 1e9))  # type: ignore[attr-defined]
     return path
 
 
-def read_recording(settings: RaceSettings, folder: Path) -> RaceRecording:
-    """Read the recording of the race. A recording of the simulator is made first.
+def read_recordings(settings: RaceSettings, folder: Path) -> list[RaceRecording]:
+    """Read what each robot sends. A recording of the simulator is made first.
 
     :param folder: folder for the bag of the simulator
     :raises ConfigError: when the bag has no such topic, too few messages of it, or messages that are too large
     :raises BagError: when the bag cannot be read
     """
-    path = settings.bag_path or record_sim(folder, settings)
+    robots = settings.robots or 1
+    if settings.bag_path is None:
+        path = record_sim(folder, settings)
+        found = [_read(settings, path, f"/robot_{number + 1}/odom") for number in range(robots)]
+        first = min(stamp for _, stamp in found)
+        return [replace(recording, phase_s=(stamp - first) * 1e-9) for recording, stamp in found]
+    recording, _ = _read(settings, settings.bag_path, settings.bag_topic)
+    return [replace(recording, phase_s=number / robots / recording.hz) for number in range(robots)]
+
+
+def _read(settings: RaceSettings, path: Path, asked: str) -> tuple[RaceRecording, int]:
+    """A topic of a bag, and the stamp of its first message in ns."""
     contents = bag_contents(path)
     found = {name: topic.info.type_name for name, topic in contents.topics.items()}
-    asked = settings.bag_topic
     topic = next(iter(found), "") if asked == AUTO else f"/{asked.lstrip('/')}"
     if topic not in found or (len(found) > 1 and asked == AUTO):
         has = "; ".join([", ".join(found) or "it has none", *contents.remarks])
@@ -177,7 +199,7 @@ def read_recording(settings: RaceSettings, folder: Path) -> RaceRecording:
             f"{path}: {topic} has messages of {recording.largest} B; the race takes up to {_LARGEST_IN_IP} B, which "
             "fit one IP packet"
         )
-    return recording
+    return recording, stamps[0]
 
 
 def dump(settings: RaceSettings) -> dict[str, Any]:

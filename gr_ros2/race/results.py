@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from gr_ros2 import __version__
 from gr_ros2.core.files import write_text, write_whole
 from gr_ros2.race.contenders import CONTENDERS
-from gr_ros2.race.measure import COLUMNS, RaceCell, ahead, by_condition, shown, winners
+from gr_ros2.race.measure import COLUMNS, RaceCell, ahead, by_condition, columns, shown, winners
 from gr_ros2.race.race_settings import dump
 from gr_ros2.race.runner import Race
 from gr_ros2.record.trace import write_csv
@@ -33,11 +33,13 @@ WON = "*"
 OURS = "gr-ros2"
 """The contender with the program's own defaults."""
 _DRAWN = ("pdr", "age_mean", "latency_p99", "airtime_per_message", "first_message")
+_DRAWN_OF_TEAMS = ("pdr", "age_mean", "age_peak", "air_bytes_per_message", "all_heard")
 _LINEAR = {"pdr"}
 
 
 def race_grid(race: Race) -> Grid:
     """One section per condition, one line per contender. A star marks the best contenders of a column."""
+    shown_columns = columns(race.cells)
     sections = []
     for (load, loss), cells in by_condition(race.cells).items():
         best = winners(cells)
@@ -47,24 +49,26 @@ def race_grid(race: Race) -> Grid:
                     f"{load:.0%}",
                     f"{loss:.0%}",
                     cell.contender,
-                    *(shown(cell, name) + (WON if cell.contender in best[name] else " ") for name in COLUMNS),
+                    *(shown(cell, name) + (WON if cell.contender in best[name] else " ") for name in shown_columns),
                 )
                 for cell in cells
             )
         )
-    headings = ("Load", "Loss", "Contender", *(column.heading for column in COLUMNS.values()))
+    headings = ("Load", "Loss", "Contender", *(column.heading for column in shown_columns.values()))
     return Grid(f"The race ({WON} best of its group)", headings, tuple(sections), texts=3)
 
 
 def race_markdown(race: Race) -> str:
     """The table in Markdown, the best of a condition in bold, and who is ahead of ours and where."""
-    headings = ["Load", "Loss", "Contender", *(column.heading for column in COLUMNS.values())]
+    shown_columns = columns(race.cells)
+    headings = ["Load", "Loss", "Contender", *(column.heading for column in shown_columns.values())]
     lines = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
     for (load, loss), cells in by_condition(race.cells).items():
         best = winners(cells)
         for cell in cells:
             numbers = [
-                f"**{shown(cell, name)}**" if cell.contender in best[name] else shown(cell, name) for name in COLUMNS
+                f"**{shown(cell, name)}**" if cell.contender in best[name] else shown(cell, name)
+                for name in shown_columns
             ]
             lines.append(f"| {load:.0%} | {loss:.0%} | `{cell.contender}` | {' | '.join(numbers)} |")
     return "\n".join([*lines, "", *(f"- {line}" for line in ahead_of_ours(race)), ""])
@@ -76,18 +80,20 @@ def ahead_of_ours(race: Race) -> list[str]:
     for (load, loss), cells in by_condition(race.cells).items():
         if not any(cell.contender == OURS for cell in cells):
             continue
-        columns = [f"{COLUMNS[name].heading} ({', '.join(who)})" for name, who in ahead(cells, OURS).items()]
-        lines.append(f"load {load:.0%}, loss {loss:.0%}: ahead of {OURS}: {'; '.join(columns) or 'nobody'}")
+        where = [f"{COLUMNS[name].heading} ({', '.join(who)})" for name, who in ahead(cells, OURS).items()]
+        lines.append(f"load {load:.0%}, loss {loss:.0%}: ahead of {OURS}: {'; '.join(where) or 'nobody'}")
     return lines
 
 
 def notes(race: Race) -> list[str]:
     """Facts that a reader of the table must know, one line each."""
     recording = race.recording
+    robots = race.settings.robots
     size = sum(map(len, recording.payloads)) / len(recording.payloads)
     rates = dict.fromkeys((cell.load, cell.sample_rate) for cell in race.cells)
     lines = [
-        f"{recording.topic}: {len(recording.payloads)} messages of {size:.0f} B on average, {recording.hz:.1f}/s; "
+        (f"{robots} robots on one channel, each with a topic such as " if robots else "")
+        + f"{recording.topic}: {len(recording.payloads)} messages of {size:.0f} B on average, {recording.hz:.1f}/s; "
         + "; ".join(f"load {load:.0%} is {rate:,.0f} samples/s" for load, rate in rates)
     ]
     lines += ahead_of_ours(race)
@@ -95,6 +101,8 @@ def notes(race: Race) -> list[str]:
         where = f"{cell.contender}, load {cell.load:.0%}, loss {cell.loss:.0%}"
         if not cell.matched:
             lines.append(f"{where}: the ends did not find each other before the first message")
+        if robots and cell.all_heard is None:
+            lines.append(f"{where}: not every robot heard every other one; ages are those of the pairs that did")
         if cell.altered or cell.duplicates:
             lines.append(f"{where}: {cell.altered} messages arrived altered, {cell.duplicates} twice")
     if (busy := max((cell.busy for cell in race.cells), default=0)) > 1:
@@ -128,11 +136,12 @@ def race_figure(cells: Sequence[RaceCell]) -> Figure:
     loads, losses = sorted({cell.load for cell in cells}), sorted({cell.loss for cell in cells})
     names = [name for name in CONTENDERS if any(cell.contender == name for cell in cells)]
     found = {(cell.contender, cell.load, cell.loss): cell for cell in cells}
-    figure = Figure(figsize=(2.2 + 3.6 * len(loads), 1.2 + 1.9 * len(_DRAWN)), layout="constrained")
-    axes = figure.subplots(len(_DRAWN), len(loads), squeeze=False, sharex=True, sharey="row")
+    drawn = _DRAWN_OF_TEAMS if any(cell.robots for cell in cells) else _DRAWN
+    figure = Figure(figsize=(2.2 + 3.6 * len(loads), 1.2 + 1.9 * len(drawn)), layout="constrained")
+    axes = figure.subplots(len(drawn), len(loads), squeeze=False, sharex=True, sharey="row")
     places = np.arange(len(losses))
     width = 0.84 / len(names)
-    for row, number in enumerate(_DRAWN):
+    for row, number in enumerate(drawn):
         for column, load in enumerate(loads):
             panel = axes[row][column]
             for index, name in enumerate(names):

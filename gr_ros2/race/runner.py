@@ -1,4 +1,4 @@
-"""Runs the race, one cell after another. A cell is one contender under one condition, in new processes.
+"""Runs a race, one cell after another. A cell is one contender under one condition, in new processes.
 
 Invariants: nothing of a cell remains after it, even after an error: its processes end, and its namespaces and
 interfaces are removed. The cells measured before Ctrl-C or a failure are kept.
@@ -9,16 +9,17 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from gr_ros2.core.errors import RunError
+from gr_ros2.race.channel import RaceChannel
 from gr_ros2.race.contenders import Contender, chosen
-from gr_ros2.race.endpoints import RacePublisher, RaceSubscriber, RaceTopic
+from gr_ros2.race.endpoints import Playback, RaceProgram, RaceTopic, Seat
 from gr_ros2.race.links import LinkReport, RaceIpLink, RaceRadio, RaceRosLink
-from gr_ros2.race.measure import Identity, Observed, RaceCell, measure
+from gr_ros2.race.measure import Identity, Observed, RaceCell, RaceSender, RaceStream, measure
 from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.race_settings import (
     PHY_NAME,
@@ -27,20 +28,24 @@ from gr_ros2.race.race_settings import (
     RaceSettings,
     check,
     conditions,
-    read_recording,
+    read_recordings,
 )
+from gr_ros2.race.slots import run_slots
 from gr_ros2.race.workers import Worker
 
 _POLL_S = 0.05
 _QUIET_S = 3.0
 """s. When no message has arrived for this time, no more are expected."""
 _PLAY_SLACK_S = 30.0
+_TO_BEGIN_S = 0.2
+"""s until all robots of a team have been told when to begin."""
 
 
 @dataclass
 class Race:
     """A race and its results.
 
+    :param recording: of the first robot
     :param interrupted: Ctrl-C ended it before all cells were run
     :param error: the error that ended it, None without one
     """
@@ -62,29 +67,26 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
     check(settings)
     check_means()
     with tempfile.TemporaryDirectory(prefix="gr-ros2-race-") as folder:
-        recording = read_recording(settings, Path(folder))
-        identity = Identity(recording)
-        race = Race(settings, recording)
+        recordings = read_recordings(settings, Path(folder))
+        senders = [RaceSender(recording, Identity(recording)) for recording in recordings]
+        race = Race(settings, recordings[0])
         plan = [
             (condition, name, contender)
-            for condition in conditions(settings, recording)
-            for name, contender in chosen(settings.peers).items()
+            for condition in conditions(settings, recordings)
+            for name, contender in chosen(settings.peers, "team" if settings.robots else "two").items()
         ]
         try:
             for number, (condition, name, contender) in enumerate(plan):
                 if on_cell is not None:
                     on_cell(number, len(plan), f"{name}, load {condition.load:.0%}, loss {condition.loss:.0%}")
-                seen = _run_cell(settings, recording, condition, contender)
-                race.cells.append(
-                    measure(
-                        seen,
-                        identity,
-                        contender=name,
-                        load=condition.load,
-                        loss=condition.loss,
-                        sample_rate=condition.sample_rate,
-                    )
-                )
+                if not settings.robots:
+                    seen = _run_cell(settings, senders[0], condition, contender)
+                elif contender.stack == "gr-ros2":
+                    seen = run_slots(settings, senders, condition, contender)
+                else:
+                    seen = _run_team(settings, senders, condition, contender)
+                values = {"load": condition.load, "loss": condition.loss, "sample_rate": condition.sample_rate}
+                race.cells.append(measure(seen, contender=name, robots=settings.robots, **values))
         except KeyboardInterrupt:
             race.interrupted = True
         except RunError as error:
@@ -92,43 +94,80 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
         return race
 
 
-def _run_cell(settings: RaceSettings, recording: RaceRecording, condition: Condition, contender: Contender) -> Observed:
+def _run_cell(settings: RaceSettings, sender: RaceSender, condition: Condition, contender: Contender) -> Observed:
+    """One robot sends to another one; each direction has its own air."""
+    recording = sender.recording
     radio = RaceRadio(PHY_NAME, condition.sample_rate, condition.loss, settings.seed)
     with ExitStack() as stack:
         spaces = (stack.enter_context(Namespace()), stack.enter_context(Namespace()))
         paths = (spaces[0].path, spaces[1].path)
-        topic = RaceTopic(recording.topic, recording.type_name, recording.topic)
+        topic = output = RaceTopic(recording.topic, recording.type_name)
         if contender.stack == "gr-ros2":
             packet_len = settings.packet_len if contender.settings["compression"] else recording.single_packet_len
             arguments = (radio, paths, (topic.name, topic.type_name), packet_len, contender)
             air = stack.enter_context(Worker("radio", "", RaceRosLink, *arguments))
-            topic = RaceTopic(topic.name, topic.type_name, air.call("output_topic"))
+            output = RaceTopic(air.call("output_topic"), topic.type_name)
         else:
             air = stack.enter_context(Worker("radio", "", RaceIpLink, radio, paths))
-        listener = stack.enter_context(Worker("listener", paths[1], RaceSubscriber, contender, topic))
-        talker = stack.enter_context(
-            Worker(
-                "talker",
-                paths[0],
-                RacePublisher,
-                contender,
-                topic,
-                recording.path,
-                len(recording.due),
-                settings.duration_s,
-            )
-        )
+        plays = _playback(settings, recording, topic)
+        listener = stack.enter_context(Worker("listener", paths[1], RaceProgram, contender, Seat(1), None, [output]))
+        talker = stack.enter_context(Worker("talker", paths[0], RaceProgram, contender, Seat(0), plays))
         # The listener joins first, so that the talker can connect to it.
         timeout_s = settings.match_s + _PLAY_SLACK_S
         began = listener.call("connect", timeout_s=timeout_s)
         talker.call("connect", timeout_s=timeout_s)
         matched = _wait_matched(settings.match_s, talker, listener, air)
-        t_first = talker.call("play", timeout_s=settings.duration_s + _PLAY_SLACK_S)
-        t_sent = [t_first + due for due in recording.due]
-        _drain(settings.drain_s, listener, len(t_sent))
+        t_sent = sender.sent(talker.call("play", timeout_s=settings.duration_s + _PLAY_SLACK_S))
+        _drain(settings.drain_s, [listener], len(t_sent))
         report: LinkReport = air.call("report")
-        busy = os.getloadavg()[0] / (os.cpu_count() or 1)
-        return Observed(began, matched, t_sent, listener.call("heard"), report, busy)
+        (heard,) = listener.call("heard")
+        return Observed(began, matched, [RaceStream(sender.identity, t_sent, heard)], report, _busy())
+
+
+def _run_team(
+    settings: RaceSettings, senders: Sequence[RaceSender], condition: Condition, contender: Contender
+) -> Observed:
+    """All robots send to all others over IP on one channel."""
+    radio = RaceRadio(PHY_NAME, condition.sample_rate, condition.loss, settings.seed)
+    count = len(senders)
+    topics = [
+        RaceTopic(f"/robot_{number}/race", sender.recording.type_name) for number, sender in enumerate(senders, 1)
+    ]
+    with ExitStack() as stack:
+        paths = [stack.enter_context(Namespace()).path for _ in senders]
+        air = stack.enter_context(Worker("channel", "", RaceChannel, radio, paths))
+        robots = []
+        for number, (path, sender) in enumerate(zip(paths, senders, strict=True)):
+            plays = _playback(settings, sender.recording, topics[number])
+            hears = [topic for topic in topics if topic is not topics[number]]
+            arguments = (contender, Seat(number, count, shared=True), plays, hears)
+            robots.append(stack.enter_context(Worker(f"robot {number + 1}", path, RaceProgram, *arguments)))
+        # One after the other, the last one first, to which the others connect. Of Zenoh's multicast the declarations
+        # of robots that join at once go round for ever.
+        began = max(robot.call("connect", timeout_s=settings.match_s + _PLAY_SLACK_S) for robot in reversed(robots))
+        matched = _wait_matched(settings.match_s, *robots)
+        begin = time.monotonic() + _TO_BEGIN_S
+        for robot in robots:
+            robot.ask("play", begin)
+        firsts = [robot.answer(settings.duration_s + _PLAY_SLACK_S) for robot in robots]
+        t_sent = [sender.sent(first) for sender, first in zip(senders, firsts, strict=True)]
+        _drain(settings.drain_s, robots, (count - 1) * sum(map(len, t_sent)))
+        report: LinkReport = air.call("report")
+        streams = []
+        for receiver, robot in enumerate(robots):
+            others = [number for number in range(count) if number != receiver]
+            for number, heard in zip(others, robot.call("heard"), strict=True):
+                streams.append(RaceStream(senders[number].identity, t_sent[number], heard))
+        return Observed(began, matched, streams, report, _busy())
+
+
+def _playback(settings: RaceSettings, recording: RaceRecording, topic: RaceTopic) -> Playback:
+    messages = len(recording.due)
+    return Playback(recording.path, recording.topic, topic, messages, settings.duration_s, recording.phase_s)
+
+
+def _busy() -> float:
+    return os.getloadavg()[0] / (os.cpu_count() or 1)
 
 
 def _wait_matched(limit_s: float, *parts: Worker) -> bool:
@@ -138,11 +177,11 @@ def _wait_matched(limit_s: float, *parts: Worker) -> bool:
     return matched
 
 
-def _drain(limit_s: float, listener: Worker, expected: int) -> None:
+def _drain(limit_s: float, listeners: Sequence[Worker], expected: int) -> None:
     """Wait until all messages on their way have arrived, or none has arrived for ``_QUIET_S``; ``limit_s`` at most."""
     limit = time.monotonic() + limit_s
     count, quiet = -1, 0.0
-    while (found := listener.call("count")) < expected and time.monotonic() < limit:
+    while (found := sum(robot.call("count") for robot in listeners)) < expected and time.monotonic() < limit:
         now = time.monotonic()
         if found != count:
             count, quiet = found, now + _QUIET_S

@@ -1,8 +1,9 @@
 """A TUN device: an IP interface of a network namespace. This process carries the packets of the interface.
 
-Invariants: packets that the radio cannot take yet wait in a kernel queue in front of the device. The queue is bounded
-in bytes, as with a real interface, so senders notice when the link is full. Packets that the queue drops are counted.
-The device is removed when it is closed.
+Invariants: packets that the radio cannot take yet wait in a queue that is bounded in bytes, as with a real interface,
+so senders notice when the link is full: in the kernel in front of the device where the device has an air of its own
+(:func:`own_air`), or where the packets are read (:mod:`gr_ros2.race.channel`). Packets that the queue drops are
+counted. The device is removed when it is closed.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import select
 import struct
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 from gr_ros2.core.errors import RunError
@@ -24,38 +26,63 @@ QUEUE_BYTES = 4000
 only makes messages older."""
 
 _RING_PACKETS = 8
+_SHARED_RING_PACKETS = 1000
+"""Packets in a device that shares a channel: its queue is bounded where the packets are read."""
 _TUNSETIFF = 0x400454CA
 _TUN_WITHOUT_HEADER = 0x1001
 _FRAGMENTS_KEPT_S = 3
 
 
-class Tun:
-    """A point-to-point interface.
+def own_air(address: str, peer: str, *, mtu: int, byte_rate: float, overhead: float) -> tuple[str, ...]:
+    """Commands that set up a point-to-point interface with a queue in the kernel.
 
-    :param namespace: path of the network namespace that contains the interface
     :param address, peer: IPv4 addresses of this end and the other
     :param mtu: bytes of the largest IP packet
     :param byte_rate: bytes/s that the link carries
     :param overhead: airtime that the radio adds to each packet, as a number of bytes
+    """
+    return (
+        f"ip link set {INTERFACE} mtu {mtu} txqueuelen {_RING_PACKETS} up",
+        f"ip addr add {address} peer {peer} dev {INTERFACE}",
+        f"tc qdisc replace dev {INTERFACE} root tbf rate {8 * byte_rate:.0f}bit burst {mtu + round(overhead)} "
+        f"limit {QUEUE_BYTES} overhead {round(overhead)} linklayer ethernet",
+    )
+
+
+def shared_air(address: str, *, mtu: int) -> tuple[str, ...]:
+    """Commands that set up an interface in a network of /24 in which everybody hears multicast.
+
+    :param address: IPv4 address
+    :param mtu: bytes of the largest IP packet
+    """
+    return (
+        f"ip link set {INTERFACE} mtu {mtu} txqueuelen {_SHARED_RING_PACKETS} multicast on up",
+        f"ip addr add {address}/24 dev {INTERFACE}",
+        f"ip route add 224.0.0.0/4 dev {INTERFACE}",
+    )
+
+
+class Tun:
+    """An IP interface.
+
+    :param namespace: path of the network namespace that contains the interface
+    :param setup: commands that set it up
     :raises RunError: when the interface cannot be created
     """
 
-    def __init__(self, namespace: str, address: str, peer: str, *, mtu: int, byte_rate: float, overhead: float) -> None:
+    def __init__(self, namespace: str, setup: Sequence[str]) -> None:
         self._namespace = namespace
-        commands = (
-            "ip link set lo up",
-            f"ip link set {INTERFACE} mtu {mtu} txqueuelen {_RING_PACKETS} up",
-            f"ip addr add {address} peer {peer} dev {INTERFACE}",
-            f"tc qdisc replace dev {INTERFACE} root tbf rate {8 * byte_rate:.0f}bit burst {mtu + round(overhead)} "
-            f"limit {QUEUE_BYTES} overhead {round(overhead)} linklayer ethernet",
-        )
         self._file = inside(namespace, _open)
         try:
-            for command in commands:
+            for command in ("ip link set lo up", *setup):
                 inside(namespace, lambda command=command: _run(command))  # type: ignore[misc]
         except BaseException:
             self.close()
             raise
+
+    def fileno(self) -> int:
+        """The file to wait for, readable when there is a packet."""
+        return self._file
 
     def read(self, timeout_s: float) -> bytes | None:
         """The next IP packet to send; None if there is none within ``timeout_s``."""

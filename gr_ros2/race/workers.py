@@ -44,21 +44,43 @@ class Worker:
         self._process.start()
         theirs.close()
         try:
-            self._answer(_START_S)
+            self.answer()
         except BaseException:
             self.close(at_once=True)
             raise
 
-    def call(self, method: str, *, timeout_s: float = _START_S) -> Any:
+    def call(self, method: str, *arguments: Any, timeout_s: float = _START_S) -> Any:
         """Call a method of the object and return its result, or return the value of an attribute.
 
         :raises RunError: when the call fails, takes longer than ``timeout_s``, or the process has ended
         """
+        self.ask(method, *arguments)
+        return self.answer(timeout_s)
+
+    def ask(self, method: str, *arguments: Any) -> None:
+        """Begin a call. Its :meth:`answer` has to be taken before the next call.
+
+        :raises RunError: when the process has ended
+        """
         try:
-            self._ours.send(method)
+            self._ours.send((method, arguments))
         except OSError as error:
             raise RunError(f"the race's {self._name} has ended before its time") from error
-        return self._answer(timeout_s)
+
+    def answer(self, timeout_s: float = _START_S) -> Any:
+        """Wait for the result of the call that was begun.
+
+        :raises RunError: see :meth:`call`
+        """
+        try:
+            if not self._ours.poll(timeout_s):
+                raise RunError(f"the race's {self._name} has not answered for {timeout_s:g} s")
+            failed, value = self._ours.recv()
+        except (EOFError, ConnectionError) as error:
+            raise RunError(f"the race's {self._name} has ended before its time") from error
+        if failed:
+            raise RunError(f"the race's {self._name}: {value}")
+        return value
 
     def close(self, at_once: bool = False) -> None:
         """Close the connection to the process, so that it ends; if it does not end, kill it. Idempotent.
@@ -79,17 +101,6 @@ class Worker:
     ) -> None:
         self.close(at_once=kind is not None)
 
-    def _answer(self, timeout_s: float) -> Any:
-        try:
-            if not self._ours.poll(timeout_s):
-                raise RunError(f"the race's {self._name} has not answered for {timeout_s:g} s")
-            failed, value = self._ours.recv()
-        except (EOFError, ConnectionError) as error:
-            raise RunError(f"the race's {self._name} has ended before its time") from error
-        if failed:
-            raise RunError(f"the race's {self._name}: {value}")
-        return value
-
 
 def _serve(
     line: Connection, namespace: str, make: Callable[..., AbstractContextManager[Any]], arguments: tuple[Any, ...]
@@ -101,8 +112,9 @@ def _serve(
         with make(*arguments) as served:
             line.send((False, None))
             while True:
-                found = getattr(served, line.recv())
-                line.send((False, found() if callable(found) else found))
+                method, arguments = line.recv()
+                found = getattr(served, method)
+                line.send((False, found(*arguments) if callable(found) else found))
     except (EOFError, ConnectionError):
         return  # the owner has closed the connection, or has ended
     except Exception as error:  # noqa: BLE001 - sent to the owner

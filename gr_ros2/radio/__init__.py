@@ -11,7 +11,7 @@ from gr_ros2.core.backends import Backend, BackendTable
 
 @dataclass(frozen=True)
 class FrontEndBackend(Backend):
-    """One row of the front end table.
+    """One front end of the table.
 
     :param phy: the PHY of a link that names none
     :param phy_options: its settings

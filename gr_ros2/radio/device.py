@@ -1,19 +1,18 @@
 """Common parts of all radios: frequencies, gains, antennas, and a transmitter that works in bursts.
 
 Invariants: a device gets its samples at the time of transmission, in whole bursts, and no sample is beyond full scale.
-A device that does not have the requested sample rate, frequency and gain is refused before it sends. Packets at another
-rate are noise, and another frequency may belong to somebody else. Errors of a vendor's library become one line that
-names front end, args and remedy. The same holds for a device that stops giving or taking samples.
+Errors of a vendor's library become one line that names front end, args and remedy. The same holds for a device that
+stops giving or taking samples.
 """
 
 from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from math import sqrt
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -21,17 +20,12 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
+from gr_ros2.radio.device_checks import DeviceChecks
 from gr_ros2.radio.energy import EnergyCounter
 from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters, Hertz, SharedAir
 from gr_ros2.radio.stream_events import BURSTS_OUT, GapCounter
 from gr_ros2.settings.config import STRICT, Count, Seconds, Text, build
 from gr_ros2.settings.fields import AUTO, Auto
-
-TOLERANCE = 1e-4
-"""Largest relative error of sample rate and frequency. The PHYs are made for clocks within 100 ppm."""
-
-GAIN_TOLERANCE = 0.5
-"""Largest error of a gain, dB, if the device does not have coarser steps."""
 
 SILENT_S = 3.0
 """A device without a sample given or taken for this time, s, counts as dead; a change of direction takes a tenth."""
@@ -45,7 +39,6 @@ _LEAD_S = 0.002
 there must be a pause, the device gets the packet when the pause is over."""
 
 Decibels = Annotated[float, Field(ge=-200, le=200)]
-Direction = Literal["tx", "rx"]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -93,6 +86,7 @@ class DeviceFrontEnd(FrontEnd):
     """A radio. A subclass opens the transmitter and the receiver of its device, and sets both up completely.
 
     :raises RadioError: when there is no such device, or it refuses a setting
+    :ivar checks: compare what the device has with what was asked of it
     """
 
     Options = DeviceOptions
@@ -107,6 +101,7 @@ class DeviceFrontEnd(FrontEnd):
         chosen = self.options
         self.layout = BurstLayout(phy.airtime_samples(), chosen.lead, chosen.tail, chosen.multiple)
         scale = chosen.level / sqrt(phy.burst_power())
+        self.checks = DeviceChecks(self.name, chosen, phy.sample_rate)
         self._shaper = BurstShaper(self.layout, scale, phy.sample_rate, tagged=phy.any_length)
         self._blanker: Blanker | None = None
         if chosen.half_duplex and self.transmits:
@@ -249,60 +244,6 @@ class DeviceFrontEnd(FrontEnd):
     def close(self) -> None:
         # The device is released when nothing refers to its blocks.
         self._transmitting = self._receiving = None
-
-    def check_rate(self, got: float) -> None:
-        """:raises RadioError: when a device runs at another sample rate than the PHY"""
-        wanted = self.phy.sample_rate
-        if not abs(got - wanted) <= TOLERANCE * wanted:
-            raise self._unlike(f"runs at {got:,.0f} samples/s, not at {wanted:,.0f}", "phy.sample_rate")
-
-    def check_antenna(self, direction: Direction, known: Sequence[str]) -> str:
-        """The requested antenna, '' for the device's choice.
-
-        :raises RadioError: when the device has no such antenna
-        """
-        key = f"antenna_{direction}"
-        antenna: str = getattr(self.options, key)
-        if antenna == AUTO:
-            return ""
-        if antenna not in known:
-            raise RadioError(f"front_end {self.name}: {key} = {antenna!r}: the device has {', '.join(known)}")
-        return antenna
-
-    def check_frequency(self, direction: Direction, got: float) -> None:
-        """:raises RadioError: when a device is not tuned to the requested frequency
-
-        :param got: frequency of the device, Hz
-        """
-        options = self.options
-        wanted = options.frequency if direction == "tx" else options.receive_frequency
-        key = "frequency" if direction == "tx" or options.frequency_rx == AUTO else "frequency_rx"
-        if not abs(got - wanted) <= TOLERANCE * wanted:
-            raise self._unlike(f"is tuned to {got:,.0f} Hz, not to {wanted:,.0f}", key)
-
-    def check_gain(
-        self,
-        direction: Direction,
-        got: float,
-        low: float = float("-inf"),
-        high: float = float("inf"),
-        step: float = 0.0,
-    ) -> None:
-        """:raises RadioError: when a device does not have the requested gain, or cannot have it
-
-        :param got: gain of the device, dB. Its gains are from ``low`` to ``high`` in steps of ``step``, all in dB
-        """
-        key = f"gain_{direction}"
-        wanted: float = getattr(self.options, key)
-        near = max(GAIN_TOLERANCE, step)
-        if not low - near <= wanted <= high + near:
-            raise RadioError(f"front_end {self.name}: {key} = {wanted:g} dB: the device has {low:g} to {high:g} dB")
-        if not abs(got - wanted) <= near:
-            raise self._unlike(f"has a gain of {got:g} dB, not of {wanted:g}", key)
-
-    def _unlike(self, found: str, key: str) -> RadioError:
-        args = self.options.args
-        return RadioError(f"front_end {self.name}: args = {args!r}: the device {found}; set {key} to one it has")
 
     @contextmanager
     def one_line(self) -> Iterator[None]:

@@ -87,10 +87,6 @@ class FileFrontEnd(FrontEnd):
         return self._replay
 
     @property
-    def ends(self) -> bool:
-        return self._replay is not None
-
-    @property
     def finished(self) -> bool:
         return self._replay is not None and self._replay.finished and self._recorder is None
 

@@ -191,11 +191,6 @@ class FrontEnd(ABC):
         return None
 
     @property
-    def ends(self) -> bool:
-        """Whether reception ends by itself, as a recording does."""
-        return False
-
-    @property
     def finished(self) -> bool:
         """Whether nothing more will be received, as at the end of a recording."""
         return False

@@ -88,8 +88,8 @@ def one_line(
 
 
 def _phy(front_end: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    row = FRONT_ENDS[front_end]
-    phy: dict[str, Any] = {"name": row.phy}
-    if PHY.load(row.phy).has_samples:
-        phy["sample_rate"] = row.sample_rate
+    backend = FRONT_ENDS[front_end]
+    phy: dict[str, Any] = {"name": backend.phy}
+    if PHY.load(backend.phy).has_samples:
+        phy["sample_rate"] = backend.sample_rate
     return {**phy, **({"options": dict(options)} if options else {})}

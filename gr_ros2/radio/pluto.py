@@ -29,7 +29,8 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import RadioError
 from gr_ros2.phy.flowgraph import Flowgraph
-from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
+from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions
+from gr_ros2.radio.device_checks import Direction
 from gr_ros2.radio.front_end import Hertz
 from gr_ros2.settings.config import STRICT
 from gr_ros2.settings.fields import AUTO, Auto
@@ -141,9 +142,9 @@ class PlutoFrontEnd(DeviceFrontEnd):
             # If the converters report no rate, they have no filter either, and run at the rate of the chip.
             if rate := self._read(device, "voltage0", "sampling_frequency", output=output):
                 break
-        self.check_rate(rate)
-        self.check_frequency(direction, self._read(_PHY, _OSCILLATORS[direction], "frequency", output=True))
-        self.check_gain(direction, self._read(_PHY, "voltage0", "hardwaregain", output=output))
+        self.checks.rate(rate)
+        self.checks.frequency(direction, self._read(_PHY, _OSCILLATORS[direction], "frequency", output=True))
+        self.checks.gain(direction, self._read(_PHY, "voltage0", "hardwaregain", output=output))
 
     def _read(self, device: str, channel: str, attribute: str, *, output: bool) -> float:
         """A setting as the device has it; 0 if the device does not report it."""

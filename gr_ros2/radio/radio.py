@@ -126,9 +126,7 @@ class Radio(PacketPath, HierBlock):
             return
         # The channel also stops tags.
         faded = (front_end.loops_back and self.phy.leaves_tags()) or bool(self.channel.on_samples()) or self._simulated
-        # GNU Radio does not tell a block that samples have ended. So a receiver in another process could not finish
-        # before the sink.
-        heard = self._receive(front_end.source, faded=faded, shown=instrumented, own_process=not front_end.ends)
+        heard = self._receive(front_end.source, faded=faded, shown=instrumented)
         if front_end.clock_offset is not None and self._receiver is not None:
             self._receiver.follow_clock(front_end.clock_offset)
         if record:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from functools import cached_property
 from math import inf
@@ -52,7 +50,6 @@ class RobotLink(Flowgraph):
         says
     :param observer: called with everything that is sent and received. If it raises, it is not called again, and the
         link continues
-    :param clock: clock of events and blocks, s, monotonic; None: that of the front end
     :param instrumented: see :class:`gr_ros2.radio.radio.Radio`
     :raises ConfigError: when the parts do not fit together
     :raises MiddlewareError: when the ROS graph cannot be joined
@@ -65,13 +62,10 @@ class RobotLink(Flowgraph):
         *,
         middleware: Middleware | None = None,
         observer: LinkObserver | None = None,
-        clock: Callable[[], float] | None = None,
         instrumented: bool = False,
     ) -> None:
         super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
-        self._clock = clock or time.monotonic
-        self._own_clock = clock is not None
         self._started: float | None = None
         self._instrumented = instrumented
         self._retry_at = inf
@@ -99,8 +93,7 @@ class RobotLink(Flowgraph):
         """Whether it may send at all."""
         self._open_radio()
         self._stack.callback(self._close_radio)
-        if not self._own_clock:
-            self._clock = self.front_end.clock
+        self._clock = self.front_end.clock
         self._ros = RosSide(
             config,
             self.phy,

@@ -31,13 +31,13 @@ class SoapyFrontEnd(DeviceFrontEnd):
         options = self.options
         block = SoapySink(self.device_args, self.layout.total, self.phy.sample_rate, self._counted)
         try:
-            self.check_rate(block.sample_rate)
-            antenna = self.check_antenna("tx", block.antennas())
+            self.checks.rate(block.sample_rate)
+            antenna = self.checks.antenna("tx", block.antennas())
             block.tune(
                 options.frequency, options.gain_tx, 0.0 if options.bandwidth == AUTO else options.bandwidth, antenna
             )
-            self.check_frequency("tx", block.frequency)
-            self.check_gain("tx", block.gain, *block.gains())
+            self.checks.frequency("tx", block.frequency)
+            self.checks.gain("tx", block.gain, *block.gains())
         except BaseException:
             block.close()
             raise
@@ -47,18 +47,18 @@ class SoapyFrontEnd(DeviceFrontEnd):
         options = self.options
         block = soapy.source(self.device_args, "fc32", 1, "", "", [""], [""])
         block.set_sample_rate(_CHANNEL, self.phy.sample_rate)
-        self.check_rate(block.get_sample_rate(_CHANNEL))
+        self.checks.rate(block.get_sample_rate(_CHANNEL))
         if options.bandwidth != AUTO:
             block.set_bandwidth(_CHANNEL, options.bandwidth)
-        if antenna := self.check_antenna("rx", block.list_antennas(_CHANNEL)):
+        if antenna := self.checks.antenna("rx", block.list_antennas(_CHANNEL)):
             block.set_antenna(_CHANNEL, antenna)
         block.set_frequency(_CHANNEL, options.receive_frequency)
-        self.check_frequency("rx", block.get_frequency(_CHANNEL))
+        self.checks.frequency("rx", block.get_frequency(_CHANNEL))
         if block.has_gain_mode(_CHANNEL):
             block.set_gain_mode(_CHANNEL, False)
         block.set_gain(_CHANNEL, options.gain_rx)
         has = block.get_gain_range(_CHANNEL)
-        self.check_gain("rx", block.get_gain(_CHANNEL), has.minimum(), has.maximum(), has.step())
+        self.checks.gain("rx", block.get_gain(_CHANNEL), has.minimum(), has.maximum(), has.step())
         return block
 
     def _device_time(self) -> float | None:

@@ -14,7 +14,8 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy import Phy
 from gr_ros2.phy.base import LENGTH_TAG
-from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions, Direction
+from gr_ros2.radio.device import DeviceFrontEnd, DeviceOptions
+from gr_ros2.radio.device_checks import Direction
 from gr_ros2.radio.stream_events import UsrpEvents
 from gr_ros2.settings.config import STRICT, Text
 from gr_ros2.settings.fields import AUTO
@@ -72,16 +73,16 @@ class UhdFrontEnd(DeviceFrontEnd):
         if (subdev := options.subdev_tx if sending else options.subdev_rx) != AUTO:
             block.set_subdev_spec(subdev)
         block.set_samp_rate(self.phy.sample_rate)
-        self.check_rate(block.get_samp_rate())
+        self.checks.rate(block.get_samp_rate())
         if options.bandwidth != AUTO:
             block.set_bandwidth(options.bandwidth, _CHANNEL)
-        if antenna := self.check_antenna(direction, block.get_antennas(_CHANNEL)):
+        if antenna := self.checks.antenna(direction, block.get_antennas(_CHANNEL)):
             block.set_antenna(antenna, _CHANNEL)
         block.set_center_freq(options.frequency if sending else options.receive_frequency, _CHANNEL)
-        self.check_frequency(direction, block.get_center_freq(_CHANNEL))
+        self.checks.frequency(direction, block.get_center_freq(_CHANNEL))
         block.set_gain(options.gain_tx if sending else options.gain_rx, _CHANNEL)
         has = block.get_gain_range(_CHANNEL)
-        self.check_gain(direction, block.get_gain(_CHANNEL), has.start(), has.stop(), has.step())
+        self.checks.gain(direction, block.get_gain(_CHANNEL), has.start(), has.stop(), has.step())
         return block
 
 

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.result import LatenessResult
 from gr_ros2.record.trace import Floats, Trace
 
@@ -65,7 +65,7 @@ def lateness_result(parts: Mapping[str, Iterable[Lateness]], begin: float, end: 
     sent = lost = sent_after = lost_after = 0
     for messages in trace.messages():
         submitted = ~np.isnan(messages.t_sent)
-        gone = submitted & ~messages.delivered & (messages.row != LedgerRow.IN_FLIGHT)
+        gone = submitted & ~messages.delivered & (messages.fate != Fate.IN_FLIGHT)
         after = np.zeros(len(submitted), dtype=bool)
         for due, happened in moments:
             after |= (messages.t_sent >= due) & (messages.t_sent <= happened + AFTER_S)

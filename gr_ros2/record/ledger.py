@@ -1,6 +1,6 @@
-"""The loss ledger joins the reports of both ends of a link, so that every sent message ends in exactly one row.
+"""The loss ledger joins the reports of both ends of a link, so that every sent message has exactly one fate.
 
-Invariants: the rows of a topic always add up to the number of messages sent on it; a message counts as delivered once,
+Invariants: the fates of a topic always add up to the number of messages sent on it; a message counts as delivered once,
 and only when a delivery with exactly its bytes was seen (the bytes that the link's codec must return: gaps zero, fields
 quantised); a repeat counts neither as sent nor as delivered, unless it delivers the message that it repeats; payload
 digests are kept only for messages whose result is open; each message takes about 33 bytes in addition.
@@ -33,7 +33,7 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-from gr_ros2.link.ledger_rows import LedgerRow, arrived
+from gr_ros2.link.fates import Fate, arrived
 from gr_ros2.link.tracker import Tracked, Tracker, digest_of
 
 _OPEN = 255
@@ -49,14 +49,15 @@ class TopicLedger:
 
     :param sent: messages for this link: handed to the source, or lost before by its ROS graph; repeats excluded
     :param corrupt: deliveries that match no message; a number above 0 indicates a serious fault
-    :param repeats_delivered: deliveries of repeats whose message already had its row
-    :param rows: ledger row -> messages
+    :param repeats_delivered: deliveries of repeats whose message already had its fate
+    :param fates: fate -> messages
+    :param hops: robots that have sent a message on -> messages delivered
     :param t_sent: s, time of submission; NaN for a message refused before it was queued
     :param t_delivered: s, time of delivery; NaN where it was not delivered
     :param size: serialized bytes; 0 where refused before it was queued
     :param serial: the sender's number of the message
-    :param row: the ledger row it ended in, as its index in ``list(codes)``; _OPEN while its result is open
-    :param codes: ledger row -> its code in ``row``
+    :param fate: its fate, as its index in ``list(codes)``; _OPEN while its result is open
+    :param codes: fate -> its code in ``fate``
     """
 
     src_id: int
@@ -64,19 +65,20 @@ class TopicLedger:
     sent: int = 0
     corrupt: int = 0
     repeats_delivered: int = 0
-    rows: Counter[str] = field(default_factory=Counter)
+    fates: Counter[str] = field(default_factory=Counter)
+    hops: Counter[int] = field(default_factory=Counter)
     t_sent: array[float] = field(default_factory=lambda: array("d"))
     t_delivered: array[float] = field(default_factory=lambda: array("d"))
     size: array[int] = field(default_factory=lambda: array("L"))
     serial: array[int] = field(default_factory=lambda: array("q"))
-    row: array[int] = field(default_factory=lambda: array("B"))
+    fate: array[int] = field(default_factory=lambda: array("B"))
     codes: dict[str, int] = field(default_factory=dict)
 
-    def book(self, position: int, row: str) -> None:
-        """Enter the message at this position of the arrays in this row."""
-        name = str(row)
-        self.rows[name] += 1
-        self.row[position] = self.codes.setdefault(name, len(self.codes))
+    def book(self, position: int, fate: str) -> None:
+        """Enter the fate of the message at this position of the arrays."""
+        name = str(fate)
+        self.fates[name] += 1
+        self.fate[position] = self.codes.setdefault(name, len(self.codes))
 
 
 @dataclass(slots=True, eq=False)
@@ -116,7 +118,8 @@ class Ledger:
         self._lock = Lock()
         self._topics: dict[tuple[int, int], TopicLedger] = {}
         self._sources: dict[int, _SourceBook] = {}
-        self._unmatched: list[tuple[int, int, bytes, float]] = []
+        self._unmatched: list[tuple[Delivered, float]] = []
+        """Deliveries without a message so far, with the digest in place of the payload."""
         self._faults: list[str] = []
         self._finished = False
         self._received = 0
@@ -137,7 +140,7 @@ class Ledger:
             elif isinstance(event, Missed):
                 topic = self._topic(src_id, event.topic_id)
                 topic.sent += event.count
-                topic.rows[LedgerRow.LOST_ON_GRAPH.value] += event.count
+                topic.fates[Fate.LOST_ON_GRAPH.value] += event.count
             else:
                 self._refused(source, event)
 
@@ -175,7 +178,7 @@ class Ledger:
 
         :param drained: nothing is left in the PHY, so packets that were sent and have not arrived are lost
         :return: one ledger per source and topic that occurred, in the order of source and topic id
-        :raises RunError: when the events contradict each other, or rows do not add up
+        :raises RunError: when the events contradict each other, or fates do not add up
         """
         with self._lock:
             if not self._finished:
@@ -183,7 +186,7 @@ class Ledger:
                 self._match_late()
                 for source in self._sources.values():
                     for message in list(source.messages.open):
-                        self._close(source, message, _final_row(source, message, drained))
+                        self._close(source, message, _final_fate(source, message, drained))
             self._check()
             return [self._topics[key] for key in sorted(self._topics)]
 
@@ -208,17 +211,17 @@ class Ledger:
         """Messages sent and delivered so far."""
         with self._lock:
             topics = self._topics.values()
-            return sum(topic.sent for topic in topics), sum(arrived(topic.rows) for topic in topics)
+            return sum(topic.sent for topic in topics), sum(arrived(topic.fates) for topic in topics)
 
-    def rows(self) -> dict[tuple[int, int], Counter[str]]:
-        """The rows of all messages sent so far, by source and topic id, as if the ledger were closed now. Packets that
-        have not arrived count as still in the PHY. The rows add up to the number of messages sent."""
+    def fates(self) -> dict[tuple[int, int], Counter[str]]:
+        """The fates of all messages sent so far, by source and topic id, as if the ledger were closed now. Packets that
+        have not arrived count as still in the PHY. The fates add up to the number of messages sent."""
         with self._lock:
-            rows = {key: Counter(topic.rows) for key, topic in self._topics.items()}
+            fates = {key: Counter(topic.fates) for key, topic in self._topics.items()}
             for source in self._sources.values():
                 for message in source.messages.open:
-                    rows[source.src_id, message.topic_id][str(_final_row(source, message, drained=False))] += 1
-            return rows
+                    fates[source.src_id, message.topic_id][str(_final_fate(source, message, drained=False))] += 1
+            return fates
 
     def unresolved(self) -> int:
         """Messages accepted by the senders whose result is open: not delivered, not refused and not given up."""
@@ -241,7 +244,7 @@ class Ledger:
         topic.t_delivered.append(nan)
         topic.size.append(size)
         topic.serial.append(serial)
-        topic.row.append(_OPEN)
+        topic.fate.append(_OPEN)
         return topic
 
     def _accepted(self, source: _SourceBook, event: Accepted) -> None:
@@ -277,7 +280,7 @@ class Ledger:
         horizon = source.last_received - REORDER_WINDOW
         for message in source.messages.under(*newer.key):
             if message is not newer and message.all_sent and message.last_packet < horizon:
-                self._close(source, message, _final_row(source, message, drained=False))
+                self._close(source, message, _final_fate(source, message, drained=False))
 
     # -- receiver -----------------------------------------------------------------------------------------------
 
@@ -286,20 +289,19 @@ class Ledger:
         if source is not None:
             message = source.messages.find(event)
             if message is not None:
-                return self._deliver(
-                    source, message, now, LedgerRow.REPAIRED if event.repaired else LedgerRow.DELIVERED
-                )
+                fate = Fate.REPAIRED if event.repaired else Fate.DELIVERED
+                return self._deliver(source, message, event, now, fate)
             if source.messages.repeats(event) and source.messages.repeated(event) is None:
                 self._topic(event.src_id, event.topic_id).repeats_delivered += 1
                 return None
-        self._unmatched.append((event.src_id, event.topic_id, digest_of(event.payload), now))
+        self._unmatched.append((event._replace(payload=digest_of(event.payload)), now))
         return None
 
-    def _deliver(
-        self, source: _SourceBook, message: _OpenMessage, now: float, row: LedgerRow = LedgerRow.DELIVERED
-    ) -> float:
-        self._topic(source.src_id, message.topic_id).t_delivered[message.position] = now
-        self._close(source, message, row)
+    def _deliver(self, source: _SourceBook, message: _OpenMessage, event: Delivered, now: float, fate: Fate) -> float:
+        topic = self._topic(source.src_id, message.topic_id)
+        topic.t_delivered[message.position] = now
+        topic.hops[event.hops] += 1
+        self._close(source, message, fate)
         return message.t_sent
 
     def _lost(self, event: Lost) -> None:
@@ -320,31 +322,32 @@ class Ledger:
             self._topics[key] = TopicLedger(src_id, topic_id)
         return self._topics[key]
 
-    def _close(self, source: _SourceBook, message: _OpenMessage, row: str) -> None:
-        self._topic(source.src_id, message.topic_id).book(message.position, row)
+    def _close(self, source: _SourceBook, message: _OpenMessage, fate: str) -> None:
+        self._topic(source.src_id, message.topic_id).book(message.position, fate)
         source.messages.close(message)
 
     def _match_late(self) -> None:
         """Match deliveries that had no message when they came: by their bytes only, with all messages still open."""
-        for src_id, topic_id, digest, now in self._unmatched:
-            source = self._sources.get(src_id)
-            message = next(iter(source.messages.alike(topic_id, digest)), None) if source is not None else None
+        for event, now in self._unmatched:
+            source = self._sources.get(event.src_id)
+            alike = [] if source is None else source.messages.alike(event.topic_id, event.payload)
+            message = next(iter(alike), None)
             if source is not None and message is not None:
-                self._deliver(source, message, now)
+                self._deliver(source, message, event, now, Fate.DELIVERED)
             else:
-                self._topic(src_id, topic_id).corrupt += 1
+                self._topic(event.src_id, event.topic_id).corrupt += 1
         self._unmatched.clear()
 
     def _check(self) -> None:
         for topic in self._topics.values():
             name = f"source {topic.src_id}, topic {topic.topic_id}"
             delivered = sum(not isnan(t) for t in topic.t_delivered)
-            submitted = topic.sent - topic.rows[LedgerRow.LOST_ON_GRAPH.value]
-            if topic.rows.total() != topic.sent or len(topic.t_sent) != submitted:
-                rows = ", ".join(f"{row} {count}" for row, count in sorted(topic.rows.items()))
-                self._faults.append(f"{name}: rows ({rows}) add up to {topic.rows.total()}, sent were {topic.sent}")
-            if arrived(topic.rows) != delivered:
-                self._faults.append(f"{name}: {arrived(topic.rows)} delivered, {delivered} have a delivery time")
+            submitted = topic.sent - topic.fates[Fate.LOST_ON_GRAPH.value]
+            if topic.fates.total() != topic.sent or len(topic.t_sent) != submitted:
+                fates = ", ".join(f"{fate} {count}" for fate, count in sorted(topic.fates.items()))
+                self._faults.append(f"{name}: fates ({fates}) add up to {topic.fates.total()}, sent were {topic.sent}")
+            if arrived(topic.fates) != delivered:
+                self._faults.append(f"{name}: {arrived(topic.fates)} delivered, {delivered} have a delivery time")
         if self._faults:
             raise RunError(f"the loss ledger is inconsistent: {self._faults[0]} ({len(self._faults)} faults)")
 
@@ -375,8 +378,8 @@ def _arrived(source: _SourceBook, identity: PacketId) -> int:
     return ordinal
 
 
-def _final_row(source: _SourceBook, message: _OpenMessage, drained: bool) -> str:
-    """The row of a message for which no further event came.
+def _final_fate(source: _SourceBook, message: _OpenMessage, drained: bool) -> str:
+    """The fate of a message for which no further event came.
 
     It is not taken if all its packets arrived intact, but the sink neither delivered it nor gave it up (for example,
     it was not for this receiver). It is in flight if it waits at the source or in the PHY, or if its last packet is
@@ -385,9 +388,9 @@ def _final_row(source: _SourceBook, message: _OpenMessage, drained: bool) -> str
     if message.reason:
         return message.reason
     if not message.all_sent:
-        return LedgerRow.IN_FLIGHT
+        return Fate.IN_FLIGHT
     if message.received >= message.total:
-        return LedgerRow.NOT_TAKEN
+        return Fate.NOT_TAKEN
     if not drained and message.last_packet >= source.last_received:
-        return LedgerRow.IN_FLIGHT
-    return LedgerRow.GIVEN_UP if source.air["repair"] else LedgerRow.LOST_FRAGMENTS
+        return Fate.IN_FLIGHT
+    return Fate.GIVEN_UP if source.air["repair"] else Fate.LOST_FRAGMENTS

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gr_ros2.link.ledger_rows import arrived
+from gr_ros2.link.fates import arrived
 from gr_ros2.record.ledger import TopicLedger
 
 Floats = npt.NDArray[np.float64]
@@ -68,7 +68,7 @@ def topic_metrics(ledger: TopicLedger, duration_s: float, t_end: float) -> Topic
     t_sent, t_delivered = np.frombuffer(ledger.t_sent), np.frombuffer(ledger.t_delivered)
     done = ~np.isnan(t_delivered)
     latencies = np.sort(t_delivered[done] - t_sent[done])
-    delivered = arrived(ledger.rows)
+    delivered = arrived(ledger.fates)
     delivered_bytes = int(np.array(ledger.size)[done].sum())
     return TopicMetrics(
         sent=ledger.sent,

@@ -15,7 +15,7 @@ GRID_POINTS = 1000
 """Points of the common grid, ends included."""
 
 
-def path_error(sent: npt.ArrayLike, received: npt.ArrayLike, points: int = GRID_POINTS) -> float | None:
+def path_error(sent: npt.ArrayLike, received: npt.ArrayLike) -> float | None:
     """Mean distance of both paths, m, after interpolation to a common arc-length grid (0..1 of each path's length).
 
     Time has no effect: a path that is received late or subsampled has no error as long as it follows the same line
@@ -27,7 +27,7 @@ def path_error(sent: npt.ArrayLike, received: npt.ArrayLike, points: int = GRID_
     one, other = _plane(sent), _plane(received)
     if not len(one) or not len(other):
         return None
-    grid = np.linspace(0.0, 1.0, points)
+    grid = np.linspace(0.0, 1.0, GRID_POINTS)
     return float(np.linalg.norm(_along(one, grid) - _along(other, grid), axis=1).mean())
 
 
@@ -36,7 +36,6 @@ def rms_error(
     sent: npt.ArrayLike,
     t_received: npt.ArrayLike,
     received: npt.ArrayLike,
-    points: int = GRID_POINTS,
 ) -> float | None:
     """RMS distance at equal times, m. Both paths are linear between their points; only the time they share counts.
 
@@ -52,7 +51,7 @@ def rms_error(
     start, end = max(t_one[0], t_other[0]), min(t_one[-1], t_other[-1])
     if start > end:
         return None
-    times = np.linspace(start, end, points)
+    times = np.linspace(start, end, GRID_POINTS)
     apart = _interpolate(times, t_one, one) - _interpolate(times, t_other, other)
     return float(np.sqrt((apart**2).sum(axis=1).mean()))
 

@@ -28,7 +28,6 @@ class Recorder:
     :param registry: names and types of the topic ids
     :param namespaces: namespace of each source id on the ROS graph, for the names of its topics
     :param topic_ids: topics of each source id to report even if nothing was sent on them, None = the whole registry
-    :param latency_clock: time base of the submission times: submit, stamp_wall or stamp_sim
     :param on_delivery: called with every delivery, its time, and the time when the message was submitted, s on the
         run's clock; the latter is None for a repeat, and where no such message is known
     """
@@ -38,7 +37,6 @@ class Recorder:
         registry: Registry,
         namespaces: Mapping[int, str],
         topic_ids: Mapping[int, Iterable[int]] | None = None,
-        latency_clock: str = "submit",
         on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
     ) -> None:
         self.ledger = Ledger()
@@ -54,7 +52,6 @@ class Recorder:
         reported = dict.fromkeys(namespaces, range(len(registry))) if topic_ids is None else topic_ids
         self._keys = [(src_id, topic_id) for src_id, ids in reported.items() for topic_id in ids]
         self._delivered, self._delivered_bytes = 0, 0
-        self._latency_clock = latency_clock
         self._on_delivery = on_delivery
         readers = {topic.topic_id: position_reader(topic.type_name) for topic in registry}
         self._readers: dict[int, PositionReader] = {key: read for key, read in readers.items() if read is not None}
@@ -200,13 +197,14 @@ class Recorder:
             pdr=numbers.pdr,
             goodput_Bps=numbers.goodput_Bps,
             latency_s=LatencyResult(**_values(numbers.latency_s)),
-            latency_clock=self._latency_clock if numbers.latency_s is not None else None,
+            latency_clock="submit" if numbers.latency_s is not None else None,
             age_s=AgeResult(**_values(numbers.age_s)),
             path_error_m=path_error(xy_sent, xy_received),
             rms_error_m=rms_error(t_sent, xy_sent, t_received, xy_received),
             left_out_sent=sent.left_out,
             left_out_received=received.left_out,
-            ledger=dict(sorted(book.rows.items())),
+            ledger=dict(sorted(book.fates.items())),
+            hops={str(hops): count for hops, count in sorted(book.hops.items())},
             corrupt=book.corrupt,
             repeats_delivered=book.repeats_delivered,
             negative_latencies=numbers.negative_latencies,

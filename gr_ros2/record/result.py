@@ -54,7 +54,8 @@ class TopicResult:
     :param path_error_m: mean distance of the paths along their length, None where the type has no position
     :param rms_error_m: RMS distance at equal times, likewise
     :param sent: messages for this link: handed to the source, or lost before by its ROS graph (``lost_on_graph``)
-    :param ledger: row -> messages; the rows add up to ``sent``
+    :param ledger: fate -> messages; the fates add up to ``sent``
+    :param hops: robots that have sent a message on -> messages delivered; they add up to ``delivered``
     :param left_out_sent, left_out_received: messages sent, and messages received, that are left out of the path and of
         its errors: their position is not finite, is beyond 1e9 m, or cannot be read
     :param corrupt: deliveries that match no message sent; a number above 0 indicates a serious fault
@@ -74,6 +75,7 @@ class TopicResult:
     age_s: AgeResult
     path_error_m: _Number | None
     ledger: dict[str, _Count]
+    hops: dict[str, _Count] = field(default_factory=dict)
     rms_error_m: _Number | None = None
     left_out_sent: _Count = 0
     left_out_received: _Count = 0
@@ -85,7 +87,7 @@ class TopicResult:
     @model_validator(mode="after")
     def _adds_up(self) -> TopicResult:
         if sum(self.ledger.values()) != self.sent:
-            raise ValueError(f"ledger rows add up to {sum(self.ledger.values())}, sent are {self.sent}")
+            raise ValueError(f"ledger fates add up to {sum(self.ledger.values())}, sent are {self.sent}")
         return self
 
 
@@ -184,17 +186,22 @@ def air_uses(result: Result) -> list[AirUse]:
     return [AirUse(kind, count, spent.get(kind, 0) / total) for kind, count in packets.items()]
 
 
-def topic_numbers(topic: TopicResult, rows: Iterable[str]) -> dict[str, Any]:
+def topic_numbers(topic: TopicResult, fates: Iterable[str]) -> dict[str, Any]:
     """Every number of a topic as a column of a table.
 
-    :param rows: ledger rows that get a column each
+    :param fates: ledger fates that get a column each
     """
     values = asdict(topic)
     for name in ("latency_s", "age_s"):
         values.update({f"{name[:-2]}_{key}_s": value for key, value in values.pop(name).items()})
     ledger = values.pop("ledger")
-    del values["latency_cdf_s"]
-    return {**values, **{f"ledger_{row}": ledger.get(row, 0) for row in rows}}
+    del values["latency_cdf_s"], values["hops"]
+    return {**values, "relayed": relayed(topic), **{f"ledger_{fate}": ledger.get(fate, 0) for fate in fates}}
+
+
+def relayed(topic: TopicResult) -> int:
+    """Messages delivered that came over other robots."""
+    return sum(count for hops, count in topic.hops.items() if hops != "0")
 
 
 def write_result(result: Result, path: str | Path) -> Path:

@@ -65,11 +65,13 @@ class Pair:
     :param belief: (s, x, y, error), m: what it believes the other's place to be, and by how much it was wrong just
         before
     :param received: s, when the other's newest packets that came were sent
+    :param way: robots that sent its newest message on, the last of them, and s when it came; None before the first
     """
 
     snr_db: list[tuple[float, float]] = field(default_factory=list)
     belief: deque[tuple[float, float, float, float]] = field(default_factory=lambda: deque(maxlen=POINTS))
     received: deque[float] = field(default_factory=lambda: deque(maxlen=256))
+    way: tuple[int, int | None, float] | None = None
 
     def recent(self, now: float) -> int:
         """Packets received lately."""
@@ -78,10 +80,13 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairView:
-    """Who hears whom now: share of the other's packets of the last seconds that came, and their SNR in dB."""
+    """Who hears whom now: share of the other's packets of the last seconds that came, and their SNR in dB; and how
+    many robots sent its newest message of the last seconds on, the last of them ``over``."""
 
     share: float | None
     snr_db: float | None
+    hops: int = 0
+    over: int | None = None
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,8 @@ class TeamRecord:
             elif isinstance(event, Delivered):
                 read = self._positions.get((event.src_id, event.topic_id))
                 pair = self._pairs.get((robot, event.src_id))
+                if pair is not None:
+                    pair.way = event.hops, event.over, now
                 point = None if read is None else read(event.payload)
                 if point is None or pair is None:
                     return
@@ -174,6 +181,7 @@ class TeamRecord:
                     (one, other): PairView(
                         min(pair.recent(now) / sent[other], 1.0) if sent[other] else None,
                         pair.snr_db[-1][1] if pair.snr_db and pair.recent(now) else None,
+                        *(pair.way[:2] if pair.way is not None and pair.way[2] > now - RECENT_S else ()),
                     )
                     for (one, other), pair in self._pairs.items()
                 },

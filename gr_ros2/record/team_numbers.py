@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection
 
-from gr_ros2.record.result import Result
+from gr_ros2.record.result import Result, TopicResult, relayed
 
 TEAM_VALUES = {
     "pair_pdr": "PDR over all pairs",
     "pair_age_mean_s": "mean age over all pairs [s]",
     "pair_age_peak_s": "peak age of any pair [s]",
     "pairs_unheard": "pairs over which nothing came",
+    "relayed": "share of the delivered messages that came over other robots",
     "jain": "Jain's index of the robots' delivered messages",
     "air_use": "airtime of all packets over the duration",
     "formation_error_m": "formation error [m]",
@@ -32,24 +33,31 @@ def team_numbers(result: Result) -> dict[str, float | None]:
     """
     if not result.config.get("robots"):
         return {}
-    ends = [(result.topics, result.phy), *((receiver.topics, receiver.phy) for receiver in result.receivers)]
-    pairs = [topic for topics, _ in ends for topic in topics if topic.sent]
+    pairs = team_pairs(result)
     ages = [topic.age_s.mean for topic in pairs if topic.age_s.mean is not None]
     peaks = [topic.age_s.peak for topic in pairs if topic.age_s.peak is not None]
     each: Counter[int] = Counter()
     for topic in pairs:
         each[topic.src_id] += topic.delivered
     sent = sum(topic.sent for topic in pairs)
-    airtimes = {src_id: sum(kinds.values()) for _, phy in ends for src_id, kinds in _senders(phy).items()}
+    phys = [result.phy, *(receiver.phy for receiver in result.receivers)]
+    airtimes = {src_id: sum(kinds.values()) for phy in phys for src_id, kinds in _senders(phy).items()}
     return {
         "pair_pdr": each.total() / sent if sent else None,
         "pair_age_mean_s": sum(ages) / len(ages) if ages else None,
         "pair_age_peak_s": max(peaks, default=None),
         "pairs_unheard": float(len(pairs) - len(ages)),
+        "relayed": sum(map(relayed, pairs)) / each.total() if each.total() else None,
         "jain": jain(each.values()),
         "air_use": sum(airtimes.values()) / result.duration_s if airtimes and result.duration_s else None,
         **result.task,
     }
+
+
+def team_pairs(result: Result) -> list[TopicResult]:
+    """The pairs of a robot and a topic of another one, on which something was sent."""
+    ends = [result.topics, *(receiver.topics for receiver in result.receivers)]
+    return [topic for topics in ends for topic in topics if topic.sent]
 
 
 def jain(counts: Collection[int]) -> float | None:

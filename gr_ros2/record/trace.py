@@ -46,7 +46,7 @@ SCHEMAS = {
             "t_sent": pa.float64(),  # null: refused before it was queued
             "t_delivered": pa.float64(),
             "size": pa.int64(),  # serialized bytes
-            "row": _TEXT,  # of the loss ledger
+            "fate": _TEXT,  # of the loss ledger
         }
     ),
     PACKETS: pa.schema(
@@ -165,7 +165,7 @@ class Messages:
     t_sent: Floats
     t_delivered: Floats
     size: Ints
-    row: Texts
+    fate: Texts
 
     @property
     def delivered(self) -> npt.NDArray[np.bool_]:
@@ -227,7 +227,7 @@ class Trace:
             yield Messages(
                 topic,
                 src_id,
-                *(columns[name][mine] for name in ("serial", "t_sent", "t_delivered", "size", "row")),
+                *(columns[name][mine] for name in ("serial", "t_sent", "t_delivered", "size", "fate")),
             )
 
     def packets(self) -> Packets:
@@ -357,7 +357,7 @@ def _message_columns(book: TopicLedger, topic: str, t0: float) -> dict[str, Any]
         "t_sent": np.array(book.t_sent) - t0,
         "t_delivered": np.array(book.t_delivered) - t0,
         "size": np.array(book.size, dtype=np.int64),
-        "row": _named(np.array(book.row, dtype=np.int64), {code: row for row, code in book.codes.items()}),
+        "fate": _named(np.array(book.fate, dtype=np.int64), {code: fate for fate, code in book.codes.items()}),
     }
 
 

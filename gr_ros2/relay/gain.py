@@ -129,7 +129,7 @@ class Gains:
         robot = self._heard.get(via)
         for name in () if robot is None else robot.named:
             if name in self._heard and name != self.src_id:
-                self._believe(state, name, number, OTHERS)
+                self._count_as_heard(state, name, number, OTHERS)
         return stream.origin != self.src_id and self._arrived(state, number, now)
 
     def told(self, via: int, newest: Newest) -> None:
@@ -175,7 +175,7 @@ class Gains:
         state = self._streams[stream]
         for robot in self._neighbours(now):
             if robot != stream.origin:
-                self._believe(state, robot, state.newest, OWN)
+                self._count_as_heard(state, robot, state.newest, OWN)
 
     def tells(self, count: int = TOLD) -> list[Newest]:
         """The newest numbers that are here of other robots' streams, in turn."""
@@ -205,7 +205,7 @@ class Gains:
             state.period = (now - since) / (number - first)
         return True
 
-    def _believe(self, state: _State, robot: int, number: int, share: float) -> None:
+    def _count_as_heard(self, state: _State, robot: int, number: int, share: float) -> None:
         before = state.has.get(robot)
         if before is None:
             before = number - UNKNOWN_S / state.period

@@ -1,11 +1,11 @@
-"""Colours of topics, runs and ledger rows, on every page and in every figure.
+"""Colours of topics, runs and ledger fates, on every page and in every figure.
 
-Invariant: a ledger row has the same colour everywhere.
+Invariant: a ledger fate has the same colour everywhere.
 """
 
 from __future__ import annotations
 
-from gr_ros2.link.ledger_rows import ROWS
+from gr_ros2.link.fates import FATES
 
 COLOURS = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f3c8d", "#5a5a5a"),
@@ -21,9 +21,9 @@ OUTCOME_COLOURS = {"heard by all": "#0072b2", "not by all": "#e69f00", "overlapp
 """Colours of what became of a packet on a shared channel, see :meth:`gr_ros2.record.team.Send.outcome`."""
 
 
-def row_colour(row: str) -> str:
-    """The colour of a ledger row. A row that this version does not know also has a fixed colour."""
-    return ROWS[row].colour if row in ROWS else COLOURS[sum(row.encode()) % len(COLOURS)]
+def fate_colour(fate: str) -> str:
+    """The colour of a ledger fate. A fate that this version does not know also has a fixed colour."""
+    return FATES[fate].colour if fate in FATES else COLOURS[sum(fate.encode()) % len(COLOURS)]
 
 
 def ink_on(background: str) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gr_ros2.link.ledger_rows import LedgerRow, row_order
+from gr_ros2.link.fates import Fate, fate_order
 from gr_ros2.record.result import TopicResult
 from gr_ros2.record.trace import Messages
 from gr_ros2.report.figures import latency_figure, ledger_figure
@@ -48,18 +48,18 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
     sections = []
     for name in dict.fromkeys(name for topics in by_topic for name in topics):
         found = [topics.get(name) for topics in by_topic]
-        rows = row_order(topic.ledger for topic in found if topic is not None)
+        fates = fate_order(topic.ledger for topic in found if topic is not None)
         lines = [
             (name, what, *(_DASH if topic is None else of(topic) for topic in found)) for what, of in _NUMBERS.items()
         ]
         lines += [
             (
                 name,
-                row.replace("_", " "),
-                *(_DASH if topic is None else str(topic.ledger.get(row, 0)) for topic in found),
+                fate.replace("_", " "),
+                *(_DASH if topic is None else str(topic.ledger.get(fate, 0)) for topic in found),
             )
-            for row in rows
-            if row != LedgerRow.DELIVERED
+            for fate in fates
+            if fate != Fate.DELIVERED
         ]
         sections.append(lines)
     results = [run.result for run in runs]

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from gr_ros2.link.fates import FATES, Fate, fate_order
 from gr_ros2.link.lateness import LATE_S
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow, row_order
 from gr_ros2.record.result import Result, air_uses
 from gr_ros2.record.trace import Ints, Packets, Trace
 from gr_ros2.report.table import milliseconds
@@ -53,11 +53,11 @@ def _outcome(result: Result) -> Iterator[str]:
     if not sent:
         yield "No message was sent."
         return
-    words = {row: ROWS[row].words if row in ROWS else row.replace("_", " ") for row in row_order([ledger])}
-    words = {LedgerRow.DELIVERED.value: "delivered", **words}
-    if LedgerRow.REPAIRED in words:
-        words[LedgerRow.DELIVERED.value] = "delivered at the first try"
-    parts = [f"{ledger[row]:,} ({_percent(ledger[row] / sent)}) {what}" for row, what in words.items()]
+    words = {fate: FATES[fate].words if fate in FATES else fate.replace("_", " ") for fate in fate_order([ledger])}
+    words = {Fate.DELIVERED.value: "delivered", **words}
+    if Fate.REPAIRED in words:
+        words[Fate.DELIVERED.value] = "delivered at the first try"
+    parts = [f"{ledger[fate]:,} ({_percent(ledger[fate] / sent)}) {what}" for fate, what in words.items()]
     yield f"Of {sent:,} messages sent: {', '.join(parts)}."
 
 
@@ -66,9 +66,7 @@ def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
     if not airtime or not result.duration_s or result.config.get("time") == "unthrottled" or not len(packets.packet):
         return
-    needed = sum(
-        (m.row != LedgerRow.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages()
-    )
+    needed = sum((m.fate != Fate.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
     needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
     share = needed * airtime / result.duration_s / result.phy.get("channels", 1)
     if share > 1:
@@ -154,7 +152,7 @@ def _in_flight(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     waiting = under_way = gone = 0
     counts = Counter(zip(packets.src_id.tolist(), packets.serial.tolist(), strict=True))
     for messages in trace.messages():
-        for serial in messages.serial[messages.row == LedgerRow.IN_FLIGHT].tolist():
+        for serial in messages.serial[messages.fate == Fate.IN_FLIGHT].tolist():
             key = (messages.src_id, serial)
             sent = counts.get(key, 0)
             if not sent:

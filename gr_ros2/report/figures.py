@@ -17,9 +17,9 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.ledger_rows import row_order
+from gr_ros2.link.fates import fate_order
 from gr_ros2.record.result import AirUse
-from gr_ros2.report.colours import AIR_COLOURS, COLOURS, row_colour
+from gr_ros2.report.colours import AIR_COLOURS, COLOURS, fate_colour
 
 SENT_EVERY = 50
 """The paper marks every 50th transmitted message."""
@@ -114,21 +114,21 @@ def latency_figure(curves: Mapping[str, Sequence[float]]) -> Figure:
 
 
 def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
-    """The ledger rows of the sent messages: one bar of 100 % per name, one colour per row, with the counts.
+    """The ledger fates of the sent messages: one bar of 100 % per name, one colour per fate, with the counts.
 
-    :param ledgers: name -> ledger row -> messages; names without messages are left out
+    :param ledgers: name -> fate -> messages; names without messages are left out
     """
     shown = {name: ledger for name, ledger in ledgers.items() if sum(ledger.values())}
-    rows = row_order(shown.values())
+    fates = fate_order(shown.values())
     figure = Figure(figsize=(8.0, 1.5 + 0.42 * max(len(shown), 1)), layout="constrained")
     axes = figure.add_subplot(title="Where every sent message went", xlabel="share of messages sent [%]", xlim=(0, 100))
     left = np.zeros(len(shown))
     places = np.arange(len(shown))
     sent = np.array([sum(ledger.values()) for ledger in shown.values()], dtype=float)
-    for row in rows:
-        counts = np.array([ledger.get(row, 0) for ledger in shown.values()])
+    for fate in fates:
+        counts = np.array([ledger.get(fate, 0) for ledger in shown.values()])
         width = counts / sent * 100 if shown else left
-        axes.barh(places, width, left=left, height=0.7, color=row_colour(row), label=row.replace("_", " "))
+        axes.barh(places, width, left=left, height=0.7, color=fate_colour(fate), label=fate.replace("_", " "))
         for place, start, share, count in zip(range(len(shown)), left, width, counts, strict=True):
             if share > 1.5 + 1.2 * len(str(count)):  # where the number fits into the bar
                 axes.text(start + share / 2, place, str(count), ha="center", va="center", fontsize=8)
@@ -136,7 +136,7 @@ def ledger_figure(ledgers: Mapping[str, Mapping[str, int]]) -> Figure:
     axes.set_yticks(places, [f"{name} ({count:.0f})" for name, count in zip(shown, sent, strict=True)], fontsize=8)
     axes.invert_yaxis()
     if shown:
-        figure.legend(loc="outside lower center", ncols=min(len(rows), 5), fontsize="small", frameon=False)
+        figure.legend(loc="outside lower center", ncols=min(len(fates), 5), fontsize="small", frameon=False)
     else:
         axes.text(50, 0, "nothing was sent", ha="center")
     return figure

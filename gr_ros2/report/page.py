@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from gr_ros2 import __version__
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.files import write_text, write_whole
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.record.repetitions import run_folders
 from gr_ros2.record.result import Result, air_uses, read_result, topic_numbers
 from gr_ros2.record.team import Team, read_team
@@ -37,6 +37,7 @@ from gr_ros2.report.table import (
     PAPER,
     Grid,
     air_grid,
+    hops_grid,
     ledger_grid,
     notes,
     paper_grid,
@@ -221,6 +222,7 @@ def lead_of(run: Run) -> str:
     return " · ".join(parts)
 
 
+_GRIDS: tuple[Callable[[Result], Grid | None], ...] = (team_grid, hops_grid, ledger_grid, air_grid)
 _LATENCY = "End-to-end latency: share of the delivered messages that took at most so long"
 
 
@@ -236,7 +238,7 @@ def _run_section(run: Run, out: Path, prefix: str, several: bool) -> Section:
         heading=run.label if several else "What happened",
         lead=lead_of(run) if several else "",
         sentences=[*explanation(result, run.trace), *notes(result)],
-        grids=[grid for grid in (team_grid(result), ledger_grid(result), air_grid(result)) if grid is not None],
+        grids=[grid for make in _GRIDS if (grid := make(result)) is not None],
         pictures=_draw(run, out, prefix),
         details=settings,
     )
@@ -289,7 +291,7 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
             ledger_figure({topic.topic: topic.ledger for topic in result.topics}),
             out,
             f"{prefix}ledger",
-            "The loss ledger: every sent message ends in exactly one row; in brackets how many were sent",
+            "The loss ledger: every sent message has exactly one fate; in brackets how many were sent",
         )
     )
     if uses := air_uses(result):
@@ -324,7 +326,7 @@ def _draw_team(team: Team, out: Path, prefix: str) -> list[Picture]:
 def write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
     """One line per run and topic with every number of ``result.json``, as CSV and Parquet."""
     lines: list[dict[str, Any]] = []
-    rows = sorted({row for run in runs for topic in run.result.topics for row in topic.ledger})
+    fates = sorted({fate for run in runs for topic in run.result.topics for fate in topic.ledger})
     for run in runs:
         result = run.result
         for topic in result.topics:
@@ -336,7 +338,7 @@ def write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
                         "interrupted": result.interrupted,
                         "phy": result.phy.get("name"),
                     },
-                    **topic_numbers(topic, rows),
+                    **topic_numbers(topic, fates),
                 }
             )
     table = pa.Table.from_pylist(lines)
@@ -353,7 +355,7 @@ def _check(run: Run) -> None:
         messages = counts.get((topic.topic, topic.src_id))
         sent, delivered = (len(messages.serial), int(messages.delivered.sum())) if messages is not None else (0, 0)
         # Messages that were lost before the link are only counted. They are not in the trace.
-        submitted = topic.sent - topic.ledger.get(LedgerRow.LOST_ON_GRAPH, 0)
+        submitted = topic.sent - topic.ledger.get(Fate.LOST_ON_GRAPH, 0)
         if (sent, delivered) != (submitted, topic.delivered):
             raise ConfigError(
                 f"{run.directory / 'messages.parquet'}: {topic.topic} has {sent} messages, {delivered} delivered, but "

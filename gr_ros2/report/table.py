@@ -12,9 +12,9 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.record.result import Result, TopicResult, air_uses
-from gr_ros2.record.team_numbers import TEAM_VALUES, team_numbers
+from gr_ros2.record.team_numbers import TEAM_VALUES, team_numbers, team_pairs
 
 _DASH = "–"
 PAPER = "the paper"
@@ -90,14 +90,36 @@ def team_grid(result: Result) -> Grid | None:
     return Grid("The team", ("Number", "value"), (lines,)) if lines else None
 
 
+def hops_grid(result: Result) -> Grid | None:
+    """The pairs of a robot and a topic of another one, by how many robots sent most of its messages on; None where all
+    came from the robot itself."""
+    groups: dict[int, list[TopicResult]] = {}
+    for pair in team_pairs(result):
+        if pair.delivered:
+            most = max(pair.hops, key=lambda hops: pair.hops[hops], default="0")
+            groups.setdefault(int(most), []).append(pair)
+    if not any(groups):
+        return None
+    lines = []
+    for hops, pairs in sorted(groups.items()):
+        ages = [pair.age_s.mean for pair in pairs if pair.age_s.mean is not None]
+        peaks = [pair.age_s.peak for pair in pairs if pair.age_s.peak is not None]
+        sent, delivered = sum(pair.sent for pair in pairs), sum(pair.delivered for pair in pairs)
+        mean = sum(ages) / len(ages) if ages else None
+        texts = f"{delivered / sent:.3f}", number(mean, "{:.2f}"), number(max(peaks, default=None), "{:.2f}")
+        lines.append((str(hops) if hops else "0 (heard itself)", str(len(pairs)), str(delivered), *texts))
+    headings = ("Robots between", "pairs", "delivered", "PDR", "mean age [s]", "peak age [s]")
+    return Grid("By hops", headings, (tuple(lines),))
+
+
 def ledger_grid(result: Result) -> Grid:
-    """The ledger rows of the sent messages of each topic. Rows that are zero for every topic are left out."""
+    """The ledger fates of the sent messages of each topic. Fates that are zero for every topic are left out."""
     topics = list(_at_every_receiver(result))
-    found = {row for _, topic in topics for row, count in topic.ledger.items() if count}
-    first = [LedgerRow.DELIVERED, *(row for row in (LedgerRow.REPAIRED,) if row in found)]
-    rows = list(dict.fromkeys([*first, *sorted(found)]))
-    headings = ["first try" if row == LedgerRow.DELIVERED and LedgerRow.REPAIRED in found else row for row in rows]
-    lines = ((name, str(topic.sent), *(str(topic.ledger.get(row, 0)) for row in rows)) for name, topic in topics)
+    found = {fate for _, topic in topics for fate, count in topic.ledger.items() if count}
+    first = [Fate.DELIVERED, *(fate for fate in (Fate.REPAIRED,) if fate in found)]
+    fates = list(dict.fromkeys([*first, *sorted(found)]))
+    headings = ["first try" if fate == Fate.DELIVERED and Fate.REPAIRED in found else fate for fate in fates]
+    lines = ((name, str(topic.sent), *(str(topic.ledger.get(fate, 0)) for fate in fates)) for name, topic in topics)
     return Grid("Where every sent message went", ("Topic", "sent", *headings), (tuple(lines),))
 
 

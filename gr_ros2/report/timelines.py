@@ -52,7 +52,7 @@ class Deliveries:
         )
 
 
-def delivery_figure(lines: Mapping[str, Deliveries], duration_s: float, title: str = "Delivery over time") -> Figure:
+def delivery_figure(lines: Mapping[str, Deliveries], duration_s: float) -> Figure:
     """PDR by time of submission, and goodput by time of delivery, in intervals of equal length.
 
     :param lines: name -> its messages, one topic or one run each
@@ -77,7 +77,7 @@ def delivery_figure(lines: Mapping[str, Deliveries], duration_s: float, title: s
         above.plot(middles[some], delivered[some] / sent[some], color=colour, linewidth=wide, label=name, **mark)
         bytes_, _ = np.histogram(line.t_delivered[done], edges, weights=line.size[done])
         below.step(edges, np.append(bytes_, bytes_[-1:]) / width / 1000, where="post", color=colour, linewidth=1.5)
-    above.set(title=title, ylabel="PDR", ylim=(-0.04, 1.06))
+    above.set(title="Delivery over time", ylabel="PDR", ylim=(-0.04, 1.06))
     below.set(ylabel="goodput [kB/s]", xlabel=f"time [s], in intervals of {width:g} s", ylim=(0, None), xlim=(0, end))
     for axes in (above, below):
         axes.grid(alpha=0.3)

@@ -12,7 +12,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from rclpy.utilities import remove_ros_args
 from gr_ros2.core.errors import ConfigError, GrRos2Error
 from gr_ros2.core.systemd import notify
 from gr_ros2.radio.config import load_link
+from gr_ros2.radio.live_settings import LiveSettings
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.waiting import Findings, Waiting
 from gr_ros2.ros.parameters import Parameter, overrides, parameters
@@ -47,7 +48,10 @@ class LinkNode(Node):  # type: ignore[misc]
     """
 
     def __init__(self) -> None:
-        super().__init__("gr_ros2_link", automatically_declare_parameters_from_overrides=True)
+        # The options of a topic are declared when they are set first: topics may come at any time.
+        super().__init__(
+            "gr_ros2_link", allow_undeclared_parameters=True, automatically_declare_parameters_from_overrides=True
+        )
         self._log = _NodeLog(self)
         _LIBRARY_LOG.setLevel(logging.INFO)
         _LIBRARY_LOG.addHandler(self._log)
@@ -59,7 +63,7 @@ class LinkNode(Node):  # type: ignore[misc]
         if given.get("use_sim_time"):
             chosen.setdefault("ros_sink.use_sim_time", True)
         self.link = RobotLink(load_link(Path(str(path)).expanduser(), overrides(chosen)))
-        self._setters = dict(_setters(self.link))
+        self._live = LiveSettings(self.link.source, self.link.sink)
         for parameter in _settings(self.link):
             self._show(parameter)
         self.add_on_set_parameters_callback(self._set)
@@ -73,15 +77,14 @@ class LinkNode(Node):  # type: ignore[misc]
         """Declare a parameter with the value in the link. At the start it may have been given as another type."""
         if self.has_parameter(parameter.name):
             self.undeclare_parameter(parameter.name)
-        descriptor = _descriptor(parameter, read_only=parameter.name not in self._setters)
+        descriptor = _descriptor(parameter, read_only=not self._live.can_change(parameter.name))
         self.declare_parameter(parameter.name, parameter.value, descriptor, ignore_override=True)
 
     def _set(self, changed: Sequence[Any]) -> SetParametersResult:
         for parameter in changed:
-            setter = self._setters.get(parameter.name)
             try:
-                if setter is not None:
-                    setter(parameter.value)
+                if self._live.can_change(parameter.name) or not self.has_parameter(parameter.name):
+                    self._live.change(parameter.name, parameter.value)
             except ConfigError as error:
                 return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -111,16 +114,6 @@ def _settings(link: RobotLink) -> list[Parameter]:
     for prefix, part in (("phy.options.", link.phy), ("front_end.", link.front_end)):
         found += parameters(part.options, prefix)
     return list({parameter.name: parameter for parameter in found}.values())
-
-
-def _setters(link: RobotLink) -> list[tuple[str, Callable[[Any], None]]]:
-    """The settings that the blocks can change while they run, with their setters."""
-    return [
-        (f"{end}.{name.removeprefix('set_')}", getattr(block, name))
-        for end, block in (("ros_source", link.source), ("ros_sink", link.sink))
-        for name in vars(type(block))
-        if name.startswith("set_")
-    ]
 
 
 def _descriptor(parameter: Parameter, *, read_only: bool) -> ParameterDescriptor:

@@ -192,7 +192,7 @@ def _apart(config: SinkConfig, registry: Registry, number: int) -> SinkConfig:
 
 
 class ReportDirection:
-    """The way back for one receiver's reports alone, ready to start. It carries no topics.
+    """The reverse direction for one receiver's reports alone, ready to start. It carries no topics.
 
     :param forward: the direction of the messages
     :param ends: the sender, which hears the reports, and the receiver, which sends them

@@ -34,7 +34,7 @@ def on_own_domains(scenario: Scenario, stack: ExitStack) -> Scenario:
         return replace(scenario, robots=tuple(robots))
     here, there = (stack.enter_context(ReservedDomain(free)).number if domain == AUTO else domain for domain in given)
     back = scenario.back
-    if back is not None:  # the way back has the same two graphs
+    if back is not None:  # the reverse direction has the same two graphs
         ends = {"ros_source": there, "ros_sink": here}
         back = replace(
             back,

@@ -166,6 +166,7 @@ class RunObservers(Observers[RunObserver]):
             guard(observer.run_started, run)
 
     def settle(self) -> None:
+        """Wait until the observer has had all events; one that does not keep up is given up."""
         """Wait until all observers have received everything so far. The link has stopped. If an observer takes too
         long, its remaining events count as missed."""
         for observer in self._threaded:

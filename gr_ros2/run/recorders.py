@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from gr_ros2.core.guard import Guard
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.phy import Phy
@@ -24,6 +25,7 @@ from gr_ros2.run.observers import LiveLink, LiveRun, RunObservers
 from gr_ros2.run.outcome import Outcome, phy_numbers
 from gr_ros2.run.robots import recorder_of
 from gr_ros2.run.scenario import Scenario, dump
+from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.registry import Registry
 
 if TYPE_CHECKING:
@@ -160,6 +162,7 @@ class RunRecords:
 
     :param phys: one per direction
     :param ears: see :func:`gr_ros2.run.robots.ears_of`
+    :param task: of robots that act on what they hear; is told what comes out of their links
     :param on_delivery: see :func:`make_recorder`; of what the first receiver gets
     """
 
@@ -171,6 +174,7 @@ class RunRecords:
         ears: Sequence[Sequence[int]],
         *,
         run_observers: RunObservers,
+        task: TaskRun | None = None,
         on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
     ) -> None:
         self._scenario, self._registry, self._phy = scenario, registry, phys[0]
@@ -182,6 +186,7 @@ class RunRecords:
         called = [robot.ros_source.namespace for robot in scenario.robots] if len(ears) == len(ways) else None
         self.further = FurtherRecorders(registry, ways, ears[1:], called and called[1:])
         self.team = make_team(registry, ways, phys[0])
+        self._task, self._acting = task, Guard(f"task {scenario.task}", needed=True)
         self.all = Observers[LinkObserver]()
         """Observes the first receiver, and what everybody sends."""
         own = self.recorder if len(ways) < 3 else Ear(self.recorder, [way.ros_source.src_id() for way in heard])
@@ -197,7 +202,8 @@ class RunRecords:
         """
         recorder = recorder_of(self._scenario, number)
         receiving = self.further.at(recorder) if recorder else self.all
-        return RobotObserver(self.all, receiving, self.team, src_id)
+        act = None if self._task is None else partial(self._acting, self._task.delivered, number)
+        return RobotObserver(self.all, receiving, self.team, src_id, act)
 
     def live_run(
         self,
@@ -229,6 +235,7 @@ class RunRecords:
     def check(self) -> None:
         """:raises GrRos2Error: if a recorder has failed, see :meth:`gr_ros2.core.guard.Guard.check`"""
         self._recorded.check()
+        self._acting.check()
         self.further.check()
 
     def unresolved(self) -> int:
@@ -271,6 +278,7 @@ class RunRecords:
             phy=numbers(self.recorder),
             wall_s=time.monotonic() - began,
             lateness=lateness(trace),
+            task={} if self._task is None else self._task.numbers(played),
             **rest,
         )
         return Outcome(result, trace, self.team)
@@ -281,10 +289,18 @@ class RobotObserver:
 
     :param sending, receiving: observe its two halves
     :param team: follows it, where it shares a channel
+    :param act: is called with what is delivered to it
     """
 
-    def __init__(self, sending: LinkObserver, receiving: LinkObserver, team: TeamRecord | None, src_id: int) -> None:
-        self._sending, self._receiving, self._team, self._src_id = sending, receiving, team, src_id
+    def __init__(
+        self,
+        sending: LinkObserver,
+        receiving: LinkObserver,
+        team: TeamRecord | None,
+        src_id: int,
+        act: Callable[[Delivered, float], None] | None,
+    ) -> None:
+        self._sending, self._receiving, self._team, self._src_id, self._act = sending, receiving, team, src_id, act
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         self._sending.sender_event(src_id, event)
@@ -295,3 +311,5 @@ class RobotObserver:
         self._receiving.receiver_event(event, now)
         if self._team is not None:
             self._team.receiver_event(self._src_id, event, now)
+        if self._act is not None and isinstance(event, Delivered):
+            self._act(event, now)

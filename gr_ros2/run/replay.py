@@ -9,7 +9,7 @@ whole or not at all.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from gr_ros2.core.names import first
 from gr_ros2.middleware.bag_files import BagContents, RecordedTopic, bag_contents
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import source_names
-from gr_ros2.run.outcome import Outcome, Progress
+from gr_ros2.run.outcome import Outcome
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulated_runner import run_simulated
 from gr_ros2.settings.config import TopicOptions, replaced
@@ -50,7 +50,6 @@ def replay(
     target: Path,
     scenario: Scenario,
     topics: Sequence[str] = (),
-    on_progress: Callable[[Progress], None] | None = None,
 ) -> Replayed:
     """Send a recording through a scenario's link and record what comes out.
 
@@ -76,7 +75,7 @@ def replay(
     src_id = scenario.ros_source.src_id()
     with _bag_at(target, bag_origin_ns(scenario, names)) as bag:
         bag.copy_source(src_id, {topic_id: recorded[name] for name, topic_id in names.items()})
-        outcome = run_simulated(scenario, None, on_progress, registry=registry, bag=bag)
+        outcome = run_simulated(scenario, None, registry=registry, bag=bag)
     left_out = sorted({*recorded, *contents.left_out} - set(names))
     return Replayed(outcome, tuple(names), tuple(left_out), tuple(contents.remarks))
 

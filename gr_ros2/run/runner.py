@@ -37,6 +37,7 @@ from gr_ros2.run.repeat import repetitions
 from gr_ros2.run.robots import ears_of, surroundings
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulated_runner import run_simulated
+from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.config import replaced
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
@@ -50,6 +51,8 @@ REGISTRY_FILE = "registry.csv"
 """Copy of the run's registry, needed to decode its packets later."""
 
 _MATCH_S = 20.0
+_CONTROLLERS_S = 60.0
+"""s within which controllers have to be there. Somebody starts them by hand, once the run says on which graphs."""
 _POLL_S = 0.05
 
 
@@ -220,7 +223,9 @@ class _Run:
         self.registry = registry = scenario.load_registry()
         phys = make_phys(scenario.directions(), registry)
         around = surroundings(scenario, phys[0].sample_rate)
-        self.records = RunRecords(scenario, registry, phys, ears_of(scenario, around), run_observers=run_observers)
+        self.task = TaskRun(scenario, registry) if scenario.task else None
+        ears = ears_of(scenario, around)
+        self.records = RunRecords(scenario, registry, phys, ears, run_observers=run_observers, task=self.task)
         self.scenario = scenario = on_own_domains(scenario, stack)
         self.run_observers = run_observers
         self.progress_guard = Guard("progress")
@@ -237,9 +242,12 @@ class _Run:
             sources = {way.src_id: way.source for way in self.ways}
             run_observers.run_started(self.records.live_run(self.clock, sources, self.links.links))
             if scenario.bag_path is None:
-                fleet, robots = Fleet(scenario.sim), self._robots(stack)
+                fleet = self.task or Fleet(scenario.sim)
+                robots = self._robots(fleet.robot_ids, stack)
                 self.sim = SimPublisher(fleet, robots, scenario.duration_s, clock=self.clock)
                 stack.callback(self.sim.close)
+                if self.task is not None:
+                    self.task.join(robots, self.clock)
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
 
@@ -253,11 +261,10 @@ class _Run:
             return LiveTeam(self.scenario, self.registry, phys, around, **common)
         return Directions(self.scenario, self.registry, phys, **common)
 
-    def _robots(self, stack: ExitStack) -> dict[int, Middleware]:
+    def _robots(self, ids: Iterable[int], stack: ExitStack) -> dict[int, Middleware]:
         """The graph of every simulated robot: that of its source, or else the graph at the other end of the link."""
         from gr_ros2.run.direction import open_graph
 
-        ids = range(1, self.scenario.sim.robots + 1)
         robots = dict.fromkeys(ids, self.ways[0].output)
         for way in self.ways:
             if way.src_id in robots:
@@ -286,9 +293,11 @@ class _Run:
         begin = end = self.clock()
         try:
             self.links.start()
-            self._wait_matched()
+            self._wait_matched(on_progress)
             begin = end = self.clock()
             self.pulse.start()
+            if self.task is not None:
+                self.task.begin(begin)
             self.links.run_began(begin)
             (self.sim or self.ways[0].input).start()
             while not self._submitted(begin):
@@ -333,21 +342,32 @@ class _Run:
             return None
         return lateness_result({"threads": [self.pulse.lateness], **parts}, begin, end, trace)
 
-    def _wait_matched(self) -> None:
-        """Wait until all publishers and subscribers of both graphs have found each other, so that no message is
-        missed."""
-        limit = time.monotonic() + _MATCH_S
-        while time.monotonic() < limit:
-            heard = self.listener is None or self.listener.matched()
-            if heard and (self.sim is None or self._sim_matched(self.sim)):
-                return
-            time.sleep(_POLL_S)
-        raise RunError(
-            f"{self.scenario.name}: publishers and subscribers did not find each other within {_MATCH_S:g} s; "
-            "is the loopback interface up, and the domain free?"
+    def _wait_matched(self, on_progress: Callable[[Progress], None] | None) -> None:
+        """Wait until all publishers and subscribers of all graphs have found each other, so that no message is missed,
+        and the robots their controllers."""
+        self._wait(
+            lambda: (self.listener is None or self.listener.matched()) and self._sim_matched(),
+            _MATCH_S,
+            "publishers and subscribers did not find each other",
+            "is the loopback interface up, and the domain free?",
         )
+        task = self.task
+        if task is not None and (missing := task.uncommanded()):
+            self._report(on_progress, self.clock())  # it says on which graphs controllers are to start
+            what = f"nobody publishes {', '.join(missing)}"
+            remedy = "start the controllers on the graphs of their robots, or set controller: task"
+            self._wait(lambda: not task.uncommanded(), _CONTROLLERS_S, what, remedy)
 
-    def _sim_matched(self, sim: SimPublisher) -> bool:
+    def _wait(self, condition: Callable[[], bool], most_s: float, otherwise: str, remedy: str) -> None:
+        limit = time.monotonic() + most_s
+        while not condition():
+            if time.monotonic() > limit:
+                raise RunError(f"{self.scenario.name}: {otherwise} within {most_s:g} s; {remedy}")
+            time.sleep(_POLL_S)
+
+    def _sim_matched(self) -> bool:
+        if (sim := self.sim) is None:
+            return True
         wanted = [name for way in self.ways for name in way.topics if name in sim.publishers]
         return all(sim.publishers[name].matched() for name in wanted) and all(way.source.matched for way in self.ways)
 
@@ -419,5 +439,6 @@ class _Run:
         return {
             **self.links.counters(),
             "listener": heard,
+            **({"commands": dict(self.task.commands)} if self.task is not None else {}),
             **({"listener_lost": unheard} if unheard else {}),
         }

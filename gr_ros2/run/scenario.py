@@ -43,7 +43,7 @@ from gr_ros2.wire import BROADCAST
 _GRAPH_KEYS = ("middleware", "domain_id")
 """Settings of a block that say on which ROS graph it is."""
 _OWN_KEYS = ("namespace", "robot_id", "dst_id", *_GRAPH_KEYS)
-"""Settings of a block that belong to its robot. The way back does not take them over."""
+"""Settings of a block that belong to its robot. The reverse direction does not take them over."""
 _BACK_SEED = 100_003
 """Difference between the channel seeds of the two directions. It is larger than between any two repetitions."""
 
@@ -70,9 +70,9 @@ class Experiment:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Back(OneWay):
-    """The way back of a two-way scenario, at the same time on a second channel (full duplex).
+    """The reverse direction of a two-way scenario, at the same time on a second channel (full duplex).
 
-    What is not set is as on the way there, with the two graphs swapped; of ``channel`` the seed differs.
+    What is not set is as in the forward direction, with the two graphs swapped; of ``channel`` the seed differs.
 
     :param ros_source: the second robot's sending block; needs a ``namespace`` or ``robot_id`` of its own
     :param ros_sink: the first robot's receiving block
@@ -84,9 +84,9 @@ class Back(OneWay):
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Reports(OverChannel):
-    """The way back for reports of what was heard, on a channel of its own (version 1).
+    """The reverse direction for reports of what was heard, on a channel of its own (version 1).
 
-    :param channel: what lies between them and the sender; what is not set is as on the way there, but for the seed
+    :param channel: what lies between them and the sender; what is not set is as forward, but for the seed
     :param delay_s: s that a report takes beside its airtime
     """
 
@@ -106,8 +106,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
 
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
     :param sim: settings of the simulator; its seed is the scenario's unless given
-    :param back: the way back, where both robots talk; null = one way only
-    :param reports: the way back for reports alone (version 1); null = there is none
+    :param back: the reverse direction, where both robots talk; null = one way only
+    :param reports: the reverse direction for reports alone (version 1); null = there is none
     :param receivers: channels of further receivers of the same sender; what is not set in one is as in ``channel``, but
         for the seed
     :param robots: robots that all send and receive, in real time each with a link and a ROS graph of
@@ -119,6 +119,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
         ``phy.sample_rate``; null = ``channel.snr_db`` between all
     :param task: what the robots do on what they hear of each other: `formation`, `rendezvous`, or `module:Class`, a
         subclass of :class:`gr_ros2.sim.tasks.Task`; '' = each drives its own ways
+    :param controller: who drives the robots of a task. `task`: the task itself; `ros`: a node on the graph of each
+        robot, by ``cmd_vel`` (in real time)
     :param own_domains: ends whose ``domain_id`` is auto are on ROS domains that no other program of this computer uses;
         false = they are on ROS_DOMAIN_ID
     :param seed: of the simulator, the channel and the sender
@@ -134,6 +136,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     duplex: Literal["full", "half"] = "full"
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
     task: str = ""
+    controller: Literal["task", "ros"] = "task"
     localhost_only: bool | Auto = True
     own_domains: bool = True
 
@@ -182,10 +185,14 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError("channel.walls_db: a recording has no world to count walls in; leave it out")
 
     def _check_robots(self) -> None:
-        if self.task and (not self.robots or self.time != "packets" or self.channel.from_positions):
+        if self.task and (not self.robots or self.time == "samples" or self.channel.from_positions):
             raise ValueError(
-                f"task = {self.task!r}: robots act on what they hear in simulated time at packets, on channels that do "
-                "not follow from positions; set robots, time: packets and gains_db"
+                f"task = {self.task!r}: robots act on what they hear in real time or at packets, on channels that do "
+                "not follow from positions; set robots, time: real or packets, and gains_db"
+            )
+        if self.controller != "task" and (not self.task or self.time != "real"):
+            raise ValueError(
+                f"controller = {self.controller!r}: stands in for that of a task in real time; set task and time: real"
             )
         if not self.robots:
             if self.gains_db is not None:
@@ -242,7 +249,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     def directions(self) -> tuple[Scenario, ...]:
         """The one-way scenarios that this scenario consists of, one for each robot that offers messages."""
         if self.robots:
-            alone = replace(self, robots=(), gains_db=None, task="")
+            alone = replace(self, robots=(), gains_db=None, task="", controller="task")
             return tuple(replace(alone, ros_source=robot.ros_source) for robot in self.robots)
         if self.back is None:
             return (self,)
@@ -330,7 +337,7 @@ def _robot(values: Mapping[str, Any], given: Any, number: int, shared: Mapping[s
 
 
 def _way_back(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of ``back``. Settings that it does not have are taken over from the way there."""
+    """The settings of ``back``. Settings that it does not have are taken over from the forward direction."""
     back = dict(values["back"])
     parts = {part: values.get(part, {}) for part in (*ENDS, "channel")}
     if not all(isinstance(part, Mapping) for part in (*parts.values(), *(back.get(name, {}) for name in parts))):

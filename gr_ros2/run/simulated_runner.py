@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from gr_ros2.core.guard import Guard
-from gr_ros2.link import Delivered
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2.run.load import make_phys, published_names, recording, source_names
 from gr_ros2.run.observers import RunObservers
@@ -29,6 +28,8 @@ from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.registry import Registry
 
 _REPORT_S = 0.05
+_CHECKED = 1000
+"""Events after which the run looks whether what records it has failed."""
 
 _log = logging.getLogger(__name__)
 
@@ -66,8 +67,8 @@ def run_simulated(
             for way in ways:
                 ids, names = source_names(way, registry).values(), published_names(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
-        tasks = TaskRun(scenario, ways, registry) if scenario.task else None
-        run = Simulation(scenario, registry, phys, messages=None if tasks is None else tasks.messages())
+        task = TaskRun(scenario, registry) if scenario.task else None
+        run = Simulation(scenario, registry, phys, messages=None if task is None else task.offered())
         run_observers = run_observers or RunObservers(threaded=False)
         records = RunRecords(
             scenario,
@@ -75,18 +76,18 @@ def run_simulated(
             phys,
             ears_of(scenario, run.around),
             run_observers=run_observers,
+            task=task,
             on_delivery=None if bag is None else bag.take,
         )
         seen = [records.of(robot.number, robot.src_id) for robot in run.robots]
         clock = _EventClock()
         run_observers.run_started(records.live_run(clock))
         reported, progress = 0.0, Guard("progress")
-        for timed_event in run.events():
-            clock.now, robot, event = timed_event
-            if tasks is not None and isinstance(event, Delivered):
-                tasks.delivered(robot.number, event, clock.now)
+        for number, timed_event in enumerate(run.events()):
+            clock.now, robot, _ = timed_event
             pass_on(seen[robot.number], timed_event)
-            records.check()
+            if not number % _CHECKED:  # every robot has a recorder
+                records.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
                 reported = time.monotonic()
                 progress(on_progress, Progress(clock.now, scenario.duration_s, *records.recorder.progress()))
@@ -101,7 +102,6 @@ def run_simulated(
         channels=1 if run.medium.shared else len(ways),
         began=began,
         incomplete=tuple(run_observers.incomplete()),
-        task={} if tasks is None else tasks.numbers(),
         counters={**there, **back, "listener": {} if bag is None else dict(bag.written)},
     )
 

@@ -175,23 +175,23 @@ class Registry(Sequence[Topic]):
             raise RegistryError(f"no CSV ({error})", path, reader.line_num) from error
         return cls(list(_topics(rows, path)), path)
 
-    def extended(self, rows: Sequence[NewTopic]) -> Registry:
-        """These rows too, with the next numbers. A name may come again with another type, which it has from then on.
+    def extended(self, topics: Sequence[NewTopic]) -> Registry:
+        """These topics too, with the next numbers. A name may come again with another type or for another robot.
 
-        :raises RegistryError: too many, or a row that is there already
+        :raises RegistryError: too many, or a topic that is there already
         """
-        topics = [Topic(number, *row) for number, row in enumerate(rows, len(self))]
-        if len(self) + len(topics) > MAX_TOPICS:
-            raise RegistryError(f"{len(self) + len(topics)} topics; a link carries at most {MAX_TOPICS}")
-        known = {(topic.name.lstrip("/"), topic.type_name) for topic in self}
-        for topic in topics:
-            key = topic.name.lstrip("/"), topic.type_name
+        added = [Topic(number, *topic) for number, topic in enumerate(topics, len(self))]
+        if len(self) + len(added) > MAX_TOPICS:
+            raise RegistryError(f"{len(self) + len(added)} topics; a link carries at most {MAX_TOPICS}")
+        known = {(topic.name.lstrip("/"), topic.type_name, topic.options.to) for topic in self}
+        for topic in added:
+            key = topic.name.lstrip("/"), topic.type_name, topic.options.to
             if key in known:
                 raise RegistryError(f"duplicate topic {topic.name!r}")
             known.add(key)
         together = Registry.empty()
-        together._topics = (*self, *topics)
-        together._by_name = {**self._by_name, **{topic.name.lstrip("/"): topic for topic in topics}}
+        together._topics = (*self, *added)
+        together._by_name = {**self._by_name, **{topic.name.lstrip("/"): topic for topic in added}}
         return together
 
     def __len__(self) -> int:
@@ -281,20 +281,20 @@ class Registry(Sequence[Topic]):
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def announced(row: AnnouncedTopic, options: Mapping[str, TopicOptions]) -> Topic:
+def announced(told: AnnouncedTopic, options: Mapping[str, TopicOptions]) -> Topic:
     """A topic as its sender has announced it.
 
     :param options: configured options by topic name, which replace the announced ones
     :raises ConfigError: for a name or a type that ROS does not allow
     """
-    if fault := topic_fault(row.name if row.name.startswith("/") else f"/{row.name}"):
-        raise ConfigError(f"malformed topic name {row.name!r}: {fault}")
-    known = options_of(row.name, options)
-    from_row = {"durability": "transient_local" if row.latched else "volatile", "depth": row.depth or AUTO}
-    chosen = {name: value for name, value in from_row.items() if getattr(known, name) == AUTO}
+    if fault := topic_fault(told.name if told.name.startswith("/") else f"/{told.name}"):
+        raise ConfigError(f"malformed topic name {told.name!r}: {fault}")
+    known = options_of(told.name, options)
+    from_publishers = {"durability": "transient_local" if told.latched else "volatile", "depth": told.depth or AUTO}
+    chosen = {name: value for name, value in from_publishers.items() if getattr(known, name) == AUTO}
     merged = build(TopicOptions, {**asdict(known), **chosen})
-    special = row.type_name == CALLS_TYPE or is_service(row.type_name)
-    return Topic(row.topic_id, row.name, row.type_name if special else normalize_type(row.type_name), merged)
+    special = told.type_name == CALLS_TYPE or is_service(told.type_name)
+    return Topic(told.topic_id, told.name, told.type_name if special else normalize_type(told.type_name), merged)
 
 
 def options_of(name: str, options: Mapping[str, TopicOptions]) -> TopicOptions:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gr_ros2.sim.motion import ACCELERATION, MAX_TURN, RADIUS, TICK, TURN_ACCELERATION, State, stopping_paths
+from gr_ros2.sim.motion import ACCELERATION, MAX_TURN, RADIUS, TICK, State, stopping_paths
 from gr_ros2.sim.roadmap import Roadmap
 from gr_ros2.sim.world import Floats, World
 
@@ -91,9 +91,9 @@ class Driver:
 
     def _commands(self) -> tuple[Floats, Floats]:
         """Speeds and turn rates that can be reached within one period, slightly irregular, full braking included."""
-        state, reach, turn_reach = self.state, ACCELERATION * TICK, TURN_ACCELERATION * TICK
-        low, high = max(0.0, state.speed - reach), min(self._max_speed, state.speed + reach)
-        left, right = max(-MAX_TURN, state.turn - turn_reach), min(MAX_TURN, state.turn + turn_reach)
+        state, ((slowest, fastest), (least, most)) = self.state, self.state.reach()
+        low, high = max(0.0, slowest), min(self._max_speed, fastest)
+        left, right = max(-MAX_TURN, least), min(MAX_TURN, most)
         speed, turn = np.meshgrid(np.linspace(low, high, 5), np.linspace(left, right, 11))
         speeds = speed.ravel() + self._rng.normal(0.0, 0.01, speed.size)
         turns = turn.ravel() + self._rng.normal(0.0, 0.02, turn.size)

@@ -82,6 +82,10 @@ class Fleet:
         """The fleet of these settings, which drives only once for all who ask where it is."""
         return Fleet(settings)
 
+    def namespace(self, robot_id: int) -> str:
+        """Where its topics are: ``/robot_1``."""
+        return f"/robot_{robot_id}"
+
     def topics(self) -> dict[str, str]:
         """Topic name without namespace -> type, in the order of the paper's table 4; corrections come last."""
         return dict(ALL_TYPES if self.settings.rtcm_rate else TYPES)
@@ -109,10 +113,6 @@ class Fleet:
         x, y, heading, speed = np.array([state[:4] for state in states]).T
         return np.stack([x, y], 1), np.stack([speed * np.cos(heading), speed * np.sin(heading)], 1)
 
-    def true_path(self, robot_id: int, times: Sequence[float] | Floats) -> Floats:
-        """Rows x, y at those times."""
-        return np.array([self.true_pose(robot_id, float(t))[:2] for t in times]).reshape(-1, 2)
-
     def messages(
         self, duration_s: float, start_time_s: float | None = None, topics: Collection[str] | None = None
     ) -> Iterator[SimMessage]:
@@ -133,7 +133,7 @@ class Fleet:
                 heapq.heapreplace(schedule, (following, order, robot_id, count + 1, topic, rate, phase))
             else:
                 heapq.heappop(schedule)
-            name = f"/robot_{robot_id}/{topic}"
+            name = f"{self.namespace(robot_id)}/{topic}"
             if topics is not None and name not in topics:
                 continue
             state = self.state(robot_id, t)

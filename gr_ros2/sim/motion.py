@@ -64,6 +64,11 @@ class State(NamedTuple):
         """The same robot with the accelerations that reach a speed and turn rate at the next tick."""
         return self._replace(acceleration=(speed - self.speed) / TICK, turn_acceleration=(turn - self.turn) / TICK)
 
+    def reach(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Least and greatest speed, and least and greatest turn rate, that the robot can have at the next tick."""
+        more, turn = ACCELERATION * TICK, TURN_ACCELERATION * TICK
+        return (self.speed - more, self.speed + more), (self.turn - turn, self.turn + turn)
+
     def braking(self) -> tuple[float, float]:
         """Speed and turn rate at the next tick when the robot brakes as hard as it can."""
         turn = math.copysign(max(0.0, abs(self.turn) - TURN_ACCELERATION * TICK), self.turn)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Protocol
 
 from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware import join_graph
@@ -25,8 +26,31 @@ _DEPTH = 100
 _JOIN_S = 1.0
 
 
+class Playable(Protocol):
+    """A message for a graph. ``payload`` is asked for at ``t``, so it may depend on what came before."""
+
+    @property
+    def t(self) -> float: ...
+    @property
+    def topic(self) -> str: ...
+    @property
+    def payload(self) -> bytes: ...
+
+
+class Robots(Protocol):
+    """Who publishes: :class:`gr_ros2.sim.fleet.Fleet`, or the robots of a task."""
+
+    @property
+    def settings(self) -> SimSettings: ...
+    @property
+    def robot_ids(self) -> Sequence[int]: ...
+    def namespace(self, robot_id: int) -> str: ...
+    def topics(self) -> Mapping[str, str]: ...
+    def messages(self, duration_s: float, start_time_s: float | None = None) -> Iterator[Playable]: ...
+
+
 class SimPublisher:
-    """Publishes a fleet on ROS graphs, in a thread of its own.
+    """Publishes simulated robots on ROS graphs, in a thread of its own.
 
     Publishers are announced at construction, so subscribers can be found before ``start``. They stay until ``close``,
     so that a late joiner still gets the map.
@@ -43,7 +67,7 @@ class SimPublisher:
 
     def __init__(
         self,
-        fleet: Fleet,
+        fleet: Robots,
         middleware: Middleware | Mapping[int, Middleware],
         duration_s: float,
         start_time: Callable[[], float] | None = time.time,
@@ -58,19 +82,20 @@ class SimPublisher:
         self._thread = threading.Thread(target=self._run, name="sim-publisher", daemon=True)
         graphs = middleware if isinstance(middleware, Mapping) else dict.fromkeys(fleet.robot_ids, middleware)
         self._publishers: dict[str, Publisher] = {
-            f"/robot_{robot_id}/{topic.name}": graphs[robot_id].advertise(
-                f"/robot_{robot_id}/{topic.name}",
-                topic.type_name,
-                Qos("reliable", "transient_local" if topic.latched else "volatile", _DEPTH),
+            name: graphs[robot_id].advertise(
+                name, topic.type_name, Qos("reliable", "transient_local" if topic.latched else "volatile", _DEPTH)
             )
             for robot_id in fleet.robot_ids
             if robot_id in graphs
             for topic in Registry.from_rows(fleet.topics())
+            for name in [topic.on_graph(fleet.namespace(robot_id))]
         }
         self._transforms: dict[str, TransformPublisher] = {}
         if fleet.settings.transforms:
             self._transforms = {
-                f"/robot_{robot_id}/odom": TransformPublisher(graphs[robot_id], fleet.settings.frame_prefix(robot_id))
+                f"{fleet.namespace(robot_id)}/odom": TransformPublisher(
+                    graphs[robot_id], fleet.settings.frame_prefix(robot_id)
+                )
                 for robot_id in fleet.robot_ids
                 if robot_id in graphs
             }
@@ -139,10 +164,11 @@ class SimPublisher:
             if self._stop.is_set():
                 return
             self.published[message.topic] += 1  # before, so that nobody has received more than this says
-            publisher.publish(message.payload)
+            payload = message.payload
+            publisher.publish(payload)
             self.worst_lag_s = max(self.worst_lag_s, -ahead)
             if message.topic in self._transforms:
-                self._transforms[message.topic].follow(message.payload)
+                self._transforms[message.topic].follow(payload)
 
 
 def simulated_robot(middleware: str = "dds", domain_id: int | Auto = AUTO) -> SimPublisher:

@@ -8,7 +8,9 @@ in. Frame names are those of REP 105. With them an Odometry is 724 B and an Imu 
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -39,6 +41,7 @@ _HEADER, _TIME = _TYPE["std_msgs/msg/Header"], _TYPE["builtin_interfaces/msg/Tim
 _POINT, _POSE = _TYPE["geometry_msgs/msg/Point"], _TYPE["geometry_msgs/msg/Pose"]
 _QUATERNION, _VECTOR = _TYPE["geometry_msgs/msg/Quaternion"], _TYPE["geometry_msgs/msg/Vector3"]
 _TWIST = _TYPE["geometry_msgs/msg/Twist"]
+_TWIST_CDR: Final = {order: struct.Struct(f"{order}6d") for order in "<>"}
 
 
 class Sensors:
@@ -192,6 +195,7 @@ def _rtcm_frame(number: int, rest: bytes) -> bytes:
     return frame + (crc & 0xFFFFFF).to_bytes(3, "big")
 
 
+@lru_cache(maxsize=1024)  # all robots that hear a message ask for the same
 def read_odometry(payload: bytes) -> tuple[int, State]:
     """The stamp in ns of a serialized odometry of a robot on the ground, and what it says."""
     message: Any = _STORE.deserialize_cdr(payload, TYPES["odom"])
@@ -199,6 +203,20 @@ def read_odometry(payload: bytes) -> tuple[int, State]:
     heading = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
     state = State(pose.position.x, pose.position.y, heading, twist.linear.x, twist.angular.z)
     return stamp.sec * 1_000_000_000 + stamp.nanosec, state
+
+
+def write_command(speed: float, turn: float) -> bytes:
+    """A serialized ``geometry_msgs/msg/Twist`` for a robot on the ground, m/s and rad/s."""
+    return bytes(_STORE.serialize_cdr(_twist(speed, turn), TYPES["cmd_vel"]))
+
+
+def read_command(payload: bytes) -> tuple[float, float] | None:
+    """Speed and turn rate of a serialized Twist; None for bytes that are none, or numbers that are not finite."""
+    if len(payload) < 4 + _TWIST_CDR["<"].size:
+        return None
+    order = "<" if payload[1] & 1 else ">"  # RTPS 9.4.2.14: representation identifiers of little endian are odd
+    speed, *_, turn = _TWIST_CDR[order].unpack_from(payload, 4)
+    return (speed, turn) if math.isfinite(speed) and math.isfinite(turn) else None
 
 
 def _twist(speed: float, turn: float) -> Any:

@@ -12,19 +12,21 @@ from __future__ import annotations
 import importlib
 import math
 import random
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.sim.motion import ACCELERATION, MAX_TURN, TICK, TURN_ACCELERATION, State
+from gr_ros2.sim.motion import MAX_TURN, TICK, State
 from gr_ros2.sim.sensors import Sensors, read_odometry
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.world import World
 
 Command = tuple[float, float]
 """Speed in m/s and turn rate in rad/s."""
+COMMAND_HOLDS_S = 0.5
+"""s after which a robot stops that gets no further commands (``cmd_vel_timeout`` of ros2_controllers)."""
 
 
 class LastHeard(NamedTuple):
@@ -50,7 +52,10 @@ class Task:
 
     :param robots: how many there are; they are numbered from 0
     :param rng: for their places
+    :cvar scripted: robots that the task drives itself, whoever controls the others
     """
+
+    scripted: Collection[int] = ()
 
     def __init__(self, robots: int, rng: random.Random) -> None:
         self.robots, self.rng = robots, rng
@@ -83,6 +88,7 @@ class Formation(Task):
     """
 
     SETTLED_S, GAP_M, MOST = 10.0, 3.0, 2.5
+    scripted = (0,)
 
     def __init__(self, robots: int, rng: random.Random) -> None:
         super().__init__(robots, rng)
@@ -190,16 +196,25 @@ class TaskRobots:
     """Robots on an open plane, moved by a task, and their odometry.
 
     :param settings: rate and noise of the odometry, and the seed
+    :param commanded: robots that do what :meth:`follow` tells them, and nothing before
     """
 
-    def __init__(self, task: Task, settings: SimSettings) -> None:
+    def __init__(self, task: Task, settings: SimSettings, commanded: Collection[int] = ()) -> None:
         self._task, self._settings, self._tick = task, settings, 0
         self._states = [task.start(number) for number in range(task.robots)]
         self._heard: list[dict[int, LastHeard]] = [{} for _ in self._states]
-        world = World(settings.size_m, 0, np.random.default_rng(0))
-        start_ns = round(settings.start_time_s * 1e9)
-        self._sensors = [Sensors(settings, world, n + 1, state, start_ns) for n, state in enumerate(self._states)]
+        self._commands = dict.fromkeys(commanded, (-math.inf, (0.0, 0.0)))
+        self.stamp_from(settings.start_time_s)
         self._decide()
+
+    def stamp_from(self, start_time_s: float) -> None:
+        """Stamp odometry with this + t, s. To be called before anything is measured."""
+        self._start_s = start_time_s
+        world = World(self._settings.size_m, 0, np.random.default_rng(0))
+        self._sensors = [
+            Sensors(self._settings, world, number + 1, state, round(start_time_s * 1e9))
+            for number, state in enumerate(self._states)
+        ]
 
     def advance(self, now: float) -> None:
         """Move all robots to a time. What they have heard before it has been taken."""
@@ -209,17 +224,27 @@ class TaskRobots:
             self._decide()
 
     def _decide(self) -> None:
-        now, states, task = self._tick * TICK, self._states, self._task
-        task.watch(now, states)
-        commands = [task.command(n, now, own, self._heard[n]) for n, own in enumerate(states)]
-        self._states = [_towards(own, *command) for own, command in zip(states, commands, strict=True)]
+        now, states = self._tick * TICK, self._states
+        self._task.watch(now, states)
+        commands = [self._command(number, now, own) for number, own in enumerate(states)]
+        self._states = [_following(own, *command) for own, command in zip(states, commands, strict=True)]
+
+    def _command(self, number: int, now: float, own: State) -> Command:
+        if number not in self._commands:
+            return self._task.command(number, now, own, self._heard[number])
+        given, command = self._commands[number]
+        return command if now - given <= COMMAND_HOLDS_S else (0.0, 0.0)
+
+    def follow(self, robot: int, command: Command, now: float) -> None:
+        """A robot's controller has sent a command."""
+        self._commands[robot] = now, command
 
     def heard(self, robot: int, sender: int, odometry: bytes, now: float) -> None:
         """A robot's link has delivered the odometry of another one."""
         self.advance(now)
         made_ns, state = read_odometry(odometry)
         before = self._heard[robot].get(sender)
-        made_s = made_ns * 1e-9 - self._settings.start_time_s
+        made_s = made_ns * 1e-9 - self._start_s
         if before is None or made_s > before.made_s:
             self._heard[robot][sender] = LastHeard(made_s, state)
 
@@ -243,9 +268,7 @@ class TaskRobots:
         return self._task.numbers()
 
 
-def _towards(own: State, speed: float, turn: float) -> State:
+def _following(own: State, speed: float, turn: float) -> State:
     """A robot that follows a command as far as it can within a period."""
-    reach, turn_reach = ACCELERATION * TICK, TURN_ACCELERATION * TICK
-    speed = max(own.speed - reach, min(own.speed + reach, speed))
-    turn = max(own.turn - turn_reach, min(own.turn + turn_reach, turn))
-    return own.towards(speed, turn)
+    (slowest, fastest), (least, most) = own.reach()
+    return own.towards(max(slowest, min(fastest, speed)), max(least, min(most, turn)))

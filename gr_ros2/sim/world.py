@@ -20,6 +20,7 @@ GAP = 1.7
 BORDER = 0.4
 """Width of the wall that the map shows around the room, m."""
 _TRIES = 200
+_STEP_M = 0.15
 
 
 class World:
@@ -86,9 +87,9 @@ class World:
             nearest = np.minimum(nearest, (outside + np.minimum(np.maximum(out_x, out_y), 0)).min(axis=0))
         return np.asarray(nearest.reshape(points.shape[:-1]))
 
-    def clear_line(self, start: Floats, end: Floats, clearance: float, step: float = 0.15) -> bool:
-        """Whether a straight line keeps ``clearance`` from everything, checked every ``step`` metres."""
-        count = max(2, math.ceil(math.hypot(*(end - start)) / step) + 1)
+    def clear_line(self, start: Floats, end: Floats, clearance: float) -> bool:
+        """Whether a straight line keeps ``clearance`` from everything, checked every 15 cm."""
+        count = max(2, math.ceil(math.hypot(*(end - start)) / _STEP_M) + 1)
         line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
         return bool(self.clearance(line).min() >= clearance)
 

@@ -258,6 +258,11 @@ class Planner:
             self._weights |= {name: options[topic_id].options.weight for name, topic_id in names.items()}
         self._remembering: _Remembering | None = None
 
+    @property
+    def task(self) -> str:
+        """What the robots of the scenario do on what they hear, which no forecast tries; '' where they do nothing."""
+        return self._whole.task
+
     def forecast(self) -> Forecast:
         """The scenario as it is."""
         return self._forecast(self.scenario)

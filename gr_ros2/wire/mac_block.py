@@ -29,7 +29,6 @@ NOBODY = 255
 """In place of a name."""
 LONGEST_AHEAD = 127 + 4 * 128
 """Most slots from one send to the next that can be announced."""
-MOST_HEARD = 63 + 3 * 64
 MOST_LEN = 12
 """Bytes of the longest block."""
 

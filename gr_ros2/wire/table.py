@@ -1,7 +1,7 @@
 """The table of topics that a robot announces: a message of version 1 on topic ``TABLE_TOPIC``.
 
-Invariants: ``read_table`` raises nothing but a named WireError; ``read_table(write_table(rows)) == rows``; equal tables
-have equal bytes, so a receiver can tell from their CRC-32 whether it has the newest.
+Invariants: ``read_table`` raises nothing but a named WireError; ``read_table(write_table(topics)) == topics``; equal
+tables have equal bytes, so a receiver can tell from their CRC-32 whether it has the newest.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class AnnouncedTopic(NamedTuple):
     dst_id: int = BROADCAST
 
     def describe(self) -> str:
-        """The row in words."""
+        """The topic in words."""
         words = [f"topic {self.topic_id}: {self.name} {self.type_name}, {QOS_NAMES[self.qos]}"]
         words += ["reliable"] * self.reliable + ["latched"] * self.latched + ["of no use when old"] * self.fresh
         words += [f"depth {self.depth}"] * (self.depth > 0) + [f"codec {self.codec}"] * bool(self.codec)
@@ -52,63 +52,63 @@ class AnnouncedTopic(NamedTuple):
         return ", ".join(words)
 
 
-def write_table(rows: Iterable[AnnouncedTopic]) -> bytes:
+def write_table(topics: Iterable[AnnouncedTopic]) -> bytes:
     """The bytes of a table.
 
     :raises EncodeError: a field out of range, or a text of more than 255 bytes
     """
     parts = [bytes((_FORMAT,))]
-    for row in rows:
-        texts = [text.encode() for text in (row.name, row.type_name, row.codec)]
-        numbers = row.topic_id, row.qos, row.depth, row.dst_id
+    for topic in topics:
+        texts = [text.encode() for text in (topic.name, topic.type_name, topic.codec)]
+        numbers = topic.topic_id, topic.qos, topic.depth, topic.dst_id
         if any(not 0 <= value <= most for value, most in zip(numbers, (239, 2, 255, BROADCAST), strict=True)):
-            raise EncodeError(f"a field of {row} is out of range")
+            raise EncodeError(f"a field of {topic} is out of range")
         if max(map(len, texts)) > 255:
-            raise EncodeError(f"{row}: name, type and codec have at most 255 bytes each")
-        flags = row.qos | row.reliable * _RELIABLE | row.latched * _LATCHED | row.fresh * _FRESH
-        addressed = row.dst_id != BROADCAST
-        parts.append(bytes((row.topic_id, flags | addressed * _ADDRESSED, row.depth)))
-        parts.append(bytes((row.dst_id,)) * addressed)
+            raise EncodeError(f"{topic}: name, type and codec have at most 255 bytes each")
+        flags = topic.qos | topic.reliable * _RELIABLE | topic.latched * _LATCHED | topic.fresh * _FRESH
+        addressed = topic.dst_id != BROADCAST
+        parts.append(bytes((topic.topic_id, flags | addressed * _ADDRESSED, topic.depth)))
+        parts.append(bytes((topic.dst_id,)) * addressed)
         parts += [bytes((len(text),)) + text for text in texts]
     return b"".join(parts)
 
 
 def read_table(data: bytes) -> tuple[AnnouncedTopic, ...]:
-    """The rows of a table.
+    """The topics of a table.
 
     :raises WireError: VersionError (an unknown layout), EntryBoundsError (cut off) or EntryKindError
     """
     if data[:1] != bytes((_FORMAT,)):
         raise VersionError(f"a table of topics of layout {data[:1].hex() or 'none'}")
-    rows: list[AnnouncedTopic] = []
+    topics: list[AnnouncedTopic] = []
     position = 1
     while position < len(data):
         if position + _FIXED > len(data):
-            raise EntryBoundsError(f"row {len(rows)} of a table runs past byte {len(data)}")
+            raise EntryBoundsError(f"topic {len(topics)} of a table runs past byte {len(data)}")
         topic_id, flags, depth = data[position : position + 3]
         position += 3
         dst_id = BROADCAST
         if flags & _ADDRESSED:
             dst_id, position = data[position], position + 1
             if dst_id == BROADCAST:
-                raise EntryKindError(f"row {len(rows)} of a table is for robot {BROADCAST}")
+                raise EntryKindError(f"topic {len(topics)} of a table is for robot {BROADCAST}")
         texts: list[str] = []
         for _ in range(3):
             start = position + 1
             if start > len(data) or start + data[position] > len(data):
-                raise EntryBoundsError(f"a text in row {len(rows)} of a table runs past byte {len(data)}")
+                raise EntryBoundsError(f"a text in topic {len(topics)} of a table runs past byte {len(data)}")
             position = start + data[position]
             try:
                 texts.append(data[start:position].decode())
             except UnicodeDecodeError as error:
-                raise EntryKindError(f"a text in row {len(rows)} of a table is no UTF-8") from error
-        if topic_id >= 240 or flags & _QOS == _QOS or flags > 63 or any(row.topic_id == topic_id for row in rows):
-            raise EntryKindError(f"topic id {topic_id} or flags {flags:#x} in row {len(rows)} of a table")
+                raise EntryKindError(f"a text in topic {len(topics)} of a table is no UTF-8") from error
+        if topic_id >= 240 or flags & _QOS == _QOS or flags > 63 or any(topic.topic_id == topic_id for topic in topics):
+            raise EntryKindError(f"topic id {topic_id} or flags {flags:#x} in topic {len(topics)} of a table")
         name, type_name, codec = texts
         reliable, latched = flags & _RELIABLE != 0, flags & _LATCHED != 0
-        rows.append(
+        topics.append(
             AnnouncedTopic(
                 topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec, flags & _FRESH != 0, dst_id
             )
         )
-    return tuple(rows)
+    return tuple(topics)

@@ -102,13 +102,9 @@ class PacketV0(NamedTuple):
         return True
 
 
-def crc16(data: bytes) -> int:
-    """CRC-16 of section 5.2: polynomial 0x1021, init 0, not reflected, no final xor."""
-    return crc_hqx(data, 0)
-
-
 def with_crc(body: bytes) -> bytes:
-    """A packet's bytes up to its CRC, and the CRC."""
+    """A packet's bytes up to its CRC, and the CRC-16 of section 5.2: polynomial 0x1021, init 0, not reflected, no final
+    xor."""
     return body + _crc.pack(crc_hqx(body, 0))
 
 

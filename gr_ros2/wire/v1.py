@@ -1,7 +1,7 @@
 """Version 1 on the wire, byte for byte; ``docs/reference/wire-format.md`` describes it.
 
 A packet is a header, a body and a trailer. A *source* packet carries entries and has a number of its own. A *repair*
-packet uses the number of a source packet; its row distinguishes it from other packets with this number. A
+packet uses the number of a source packet; its repair id distinguishes it from other packets with this number. A
 repair packet combines the bodies of source packets. One that combines none is a *control* packet: it carries hellos,
 reports and requests.
 
@@ -40,13 +40,13 @@ HEADER_LEN = 4
 ADDRESS_LEN = 2
 """Bytes that destination and hop count add to the header of an addressed packet."""
 REPAIR_HEADER_LEN = 2
-"""Bytes of window and row. A source packet leaves the same number of bytes free, so that its body fits in a repair."""
+"""Bytes of window and repair id. A source packet leaves as many bytes free, so that its body fits in a repair."""
 CRC_LEN = 4
 TAG_LEN = 8
 
 QOS_REPAIR = 3
 """Value of the two QoS bits in packets that are not source packets."""
-ROWS = 128
+REPAIR_IDS = 128
 """Most repair packets at one number."""
 MAX_WINDOW = 127
 """Most numbers that a repair spans."""
@@ -98,7 +98,8 @@ class Header(NamedTuple):
     @property
     def size(self) -> int:
         """Bytes on the wire, with the block."""
-        return HEADER_LEN + (self.dst_id != BROADCAST) * ADDRESS_LEN + len(self.block)
+        size = HEADER_LEN if self.dst_id == BROADCAST else HEADER_LEN + ADDRESS_LEN
+        return size + len(self.block)
 
     def room(self, packet_len: int) -> int:
         """Bytes of the longest body behind such a header."""
@@ -149,14 +150,14 @@ EntryV1 = Part | Control
 class RepairHeader(NamedTuple):
     """The fields after the header of a packet that is not a source packet.
 
-    :param row: 0..127; number and row together identify the packet
+    :param repair_id: 0..127; number and repair id together identify the packet
     :param mask: bit i says that source packet ``number - i`` is part of the combination; 0 in a control packet
     :param oldest: no packet older than the window is repaired any more; in a control packet none up to its number
     :param clear: the entries are not encrypted (as in a hello, without which nothing could be decrypted)
     :param size: bytes on the wire
     """
 
-    row: int
+    repair_id: int
     mask: int = 0
     oldest: bool = False
     clear: bool = False
@@ -185,7 +186,8 @@ def is_sealed(data: bytes) -> bool:
 def body_room(packet_len: int, *, sealed: bool = False, addressed: bool = False, block: bool = False) -> int:
     """Bytes of the longest body of a source packet, whatever the length of its block for medium access."""
     used = HEADER_LEN + addressed * ADDRESS_LEN + REPAIR_HEADER_LEN + (TAG_LEN if sealed else CRC_LEN)
-    return max(packet_len - used - block * MOST_LEN, 0)
+    room = packet_len - used - block * MOST_LEN
+    return room if room > 0 else 0
 
 
 def write_header(header: Header) -> bytes:
@@ -230,15 +232,15 @@ def read_header(data: bytes, packet_len: int) -> Header:
 
 
 def write_repair_header(repair: RepairHeader) -> bytes:
-    """The bytes of window, row and mask. A mask is written if the combination leaves out packets of its window.
+    """The bytes of window, repair id and mask. A mask is written if the combination leaves out packets of its window.
 
     :raises EncodeError: for a field out of range
     """
-    row, mask, oldest, clear, _ = repair
+    repair_id, mask, oldest, clear, _ = repair
     window = mask.bit_length()
-    if not 0 <= row < ROWS or mask < 0 or window > MAX_WINDOW or (mask and (clear or not mask & 1)):
-        raise EncodeError(f"{repair}: a row is 0..127, a mask has up to 127 bits and the lowest set")
-    second = row | oldest * _OLDEST
+    if not 0 <= repair_id < REPAIR_IDS or mask < 0 or window > MAX_WINDOW or (mask and (clear or not mask & 1)):
+        raise EncodeError(f"{repair}: a repair id is 0..127, a mask has up to 127 bits and the lowest set")
+    second = repair_id | oldest * _OLDEST
     if not mask:
         return bytes((clear * _CLEAR, second))
     if mask + 1 == 1 << window:
@@ -247,26 +249,26 @@ def write_repair_header(repair: RepairHeader) -> bytes:
 
 
 def read_repair_header(data: bytes, start: int, end: int) -> RepairHeader:
-    """Window, row and mask from byte ``start`` of a packet whose trailer begins at ``end``.
+    """Window, repair id and mask from byte ``start`` of a packet whose trailer begins at ``end``.
 
     :raises EntryBoundsError: they run into the trailer
     :raises WindowError: bits that contradict each other
     """
     if start + REPAIR_HEADER_LEN > end:
-        raise EntryBoundsError(f"window and row run past byte {end}")
-    window, row = data[start] & 127, data[start + 1] & 127
+        raise EntryBoundsError(f"window and repair id run past byte {end}")
+    window, repair_id = data[start] & 127, data[start + 1] & 127
     flag, oldest = data[start] & _MASKED, data[start + 1] & _OLDEST != 0
     if not window:
-        return RepairHeader(row, 0, oldest, flag != 0)
+        return RepairHeader(repair_id, 0, oldest, flag != 0)
     if not flag:
-        return RepairHeader(row, (1 << window) - 1, oldest)
+        return RepairHeader(repair_id, (1 << window) - 1, oldest)
     size = REPAIR_HEADER_LEN + (window + 7) // 8
     if start + size > end:
         raise EntryBoundsError(f"the mask of {window} numbers runs past byte {end}")
     mask = int.from_bytes(data[start + REPAIR_HEADER_LEN : start + size], "little")
     if not mask & 1 or mask.bit_length() != window or mask + 1 == 1 << window:
         raise WindowError(f"mask {mask:#x} does not begin and end a window of {window}, or leaves nothing out")
-    return RepairHeader(row, mask, oldest, False, size)
+    return RepairHeader(repair_id, mask, oldest, False, size)
 
 
 def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
@@ -478,7 +480,7 @@ def encode(packet: PacketV1, packet_len: int, boot: int, turns: int = 0, *, fixe
     """
     header, entries, repair, combined, _ = packet
     if header.sealed or (repair is None) == (header.qos == QOS_REPAIR):
-        raise EncodeError(f"{header}: a sealed packet, or a repair packet without its window and row")
+        raise EncodeError(f"{header}: a sealed packet, or a repair packet without its window and repair id")
     room = header.room(packet_len)
     data = write_header(header)
     if repair is not None:

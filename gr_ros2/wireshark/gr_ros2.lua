@@ -59,7 +59,7 @@ local f = {
     slot_yields = ProtoField.uint8("gr_ros2.slot.yields", "Gives it up", base.DEC, { [BROADCAST] = "none" }),
     window = ProtoField.uint8("gr_ros2.window", "Window", base.DEC, nil, 0x7F),
     masked = ProtoField.bool("gr_ros2.masked", "M: a mask follows, or not encrypted", 8, nil, 0x80),
-    row = ProtoField.uint8("gr_ros2.row", "Row", base.DEC, nil, 0x7F),
+    repair_id = ProtoField.uint8("gr_ros2.repair_id", "Repair id", base.DEC, nil, 0x7F),
     oldest = ProtoField.bool("gr_ros2.oldest", "Nothing older is repaired any more (O)", 8, nil, 0x80),
     mask = ProtoField.bytes("gr_ros2.mask", "Mask"),
     combined = ProtoField.bytes("gr_ros2.combined", "Combined bodies"),
@@ -666,7 +666,7 @@ local function dissect_body(buffer, tree, packet, at, limit)
     return summary
 end
 
--- Window, row and mask; returns the place behind them and the window, or nil.
+-- Window, repair id and mask; returns the place behind them and the window, or nil.
 local function dissect_repair_header(buffer, tree, at, limit)
     if at + 2 > limit then
         tree:add_proto_expert_info(refused.overrun)
@@ -675,7 +675,7 @@ local function dissect_repair_header(buffer, tree, at, limit)
     local window, masked = buffer(at, 1):uint() % 128, buffer(at, 1):uint() > 127
     local item = tree:add(f.window, buffer(at, 1))
     tree:add(f.masked, buffer(at, 1))
-    tree:add(f.row, buffer(at + 1, 1))
+    tree:add(f.repair_id, buffer(at + 1, 1))
     tree:add(f.oldest, buffer(at + 1, 1))
     at = at + 2
     if window > 0 and masked then

@@ -28,6 +28,11 @@ def test_it_says_what_fits(capsys: pytest.CaptureFixture[str]) -> None:
     assert ": it fits." in out
 
 
+def test_it_says_that_it_does_not_try_a_task(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["plan", "formation", "--duration", "2", "--set", "robots=3", "--no-advice"]) == 0
+    assert "gr-ros2 run says how well they do task 'formation' over this link" in capsys.readouterr().out
+
+
 def test_room_on_the_air_is_not_enough_where_packets_collide(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["plan", "two-robots-half-duplex", "--duration", "5", "--no-advice"]) == 0
     out = capsys.readouterr().out

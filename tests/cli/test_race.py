@@ -13,6 +13,7 @@ from gr_ros2.cli.main import BAD_INPUT, run
         (["--peers", "nobody"], "peers = 'nobody': no such contender; known are gr-ros2, gr-ros2-v0"),
         (["--source", "here.mcap"], "source = 'here.mcap': write sim or bag:PATH"),
         (["--duration", "0"], "duration_s = 0"),
+        (["--robots", "11"], "robots = 11: must be less than or equal to 10"),
     ],
 )
 def test_wrong_input_is_one_line_and_status_2(

@@ -116,6 +116,11 @@ def test_a_running_link_tells_what_it_does(ends: Ends) -> None:
     assert "packets sent" in shown
     several = ends.run("status")
     assert (several.returncode, "say which with --pid" in several.stderr) == (2, True)
+    changed = ends.run("set", "ros_source.topic_options.odom.to=2", "ros_source.debug=true", "--pid", pid)
+    assert changed.stdout == "ros_source.topic_options.odom.to = 2\nros_source.debug = True\n"
+    fixed = ends.run("set", "packet_len=64", "--pid", pid)
+    assert (fixed.returncode, len(fixed.stderr.splitlines())) == (1, 1)
+    assert "packet_len cannot change while the link runs; these can: ros_source." in fixed.stderr
     told = json.loads(ends.run("ping", "2", "--json", "--count", "5", "--interval", "0.2", "--pid", pid).stdout)
     assert (told["asked"], told["lost_there"], told["about"]["packet_len"]) == (5, 0, 220)
     assert told["answered"] >= 4

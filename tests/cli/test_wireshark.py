@@ -168,7 +168,7 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
         assert numbers("packet_number") == [vector["number"]], vector["name"]
         block = data[6 if data[0] & 4 else 4 :][:12] if data[0] & 128 else b""
         at = 5 + (12 if block and block[3] & 128 else 6) * bool(block)
-        assert numbers("row") == ([data[at] & 127] if data[0] & 3 == 3 else [])
+        assert numbers("repair_id") == ([data[at] & 127] if data[0] & 3 == 3 else [])
         assert numbers("shares") == [bool(block)]
         said = read_block(block)[0] if block else None
         for field, value in (

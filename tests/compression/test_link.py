@@ -36,7 +36,7 @@ def test_a_compressed_message_is_delivered_as_it_was() -> None:
 
 
 @pytest.mark.parametrize(
-    ("coded", "row"),
+    ("coded", "fate"),
     [
         (b"\xf2abc", "unknown_dictionary"),
         (b"\x05abc", "unsupported"),
@@ -44,8 +44,8 @@ def test_a_compressed_message_is_delivered_as_it_was() -> None:
         (b"\x12\xff" * 40, "damaged"),
     ],
 )
-def test_what_cannot_be_read_has_a_row(coded: bytes, row: str) -> None:
-    assert received(coded, codec=LinkCodec(REGISTRY)) == [Lost(1, 0, row, 7)]
+def test_what_cannot_be_read_has_a_fate(coded: bytes, fate: str) -> None:
+    assert received(coded, codec=LinkCodec(REGISTRY)) == [Lost(1, 0, fate, 7)]
 
 
 def test_without_a_codec_it_is_unsupported() -> None:

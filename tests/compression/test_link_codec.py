@@ -1,4 +1,4 @@
-"""What the link sees: the first byte, ledger rows, bounds, options."""
+"""What the link sees: the first byte, ledger fates, bounds, options."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_arbitrary_bytes_end_in_a_message_or_a_codec_error(type_name: str, coded
         try:
             assert len(codec.decode(0, first + coded[1:])) <= 5000
         except CodecError as error:
-            assert error.row in ("damaged", "unsupported", "unknown_dictionary")
+            assert error.fate in ("damaged", "unsupported", "unknown_dictionary")
 
 
 @given(st.sampled_from(TYPES[:4]), st.integers(0, 1 << 32), st.data())
@@ -46,7 +46,7 @@ def test_damaged_messages_end_in_a_message_or_a_codec_error(type_name: str, seed
     try:
         assert len(codec.decode(0, bytes(coded))) <= 1 << 20
     except CodecError as error:
-        assert error.row in ("damaged", "unsupported", "unknown_dictionary")
+        assert error.fate in ("damaged", "unsupported", "unknown_dictionary")
 
 
 @given(
@@ -109,7 +109,7 @@ def test_a_wrong_codec_is_an_error_that_names_it() -> None:
         codec_for(ODOMETRY, codec="gzip")
 
 
-def test_a_dictionary_that_is_not_held_is_its_own_row() -> None:
+def test_a_dictionary_that_is_not_held_is_its_own_fate() -> None:
     payloads = simulated("odom", 5.0)
     mine = learn([(ODOMETRY, payload) for payload in payloads], "mine")
     other = learn([(ODOMETRY, payload) for payload in payloads[:20]], "other")
@@ -120,7 +120,7 @@ def test_a_dictionary_that_is_not_held_is_its_own_row() -> None:
         for held in ([], [other]):
             with pytest.raises(UnknownDictionaryError, match=f"own dictionary {mine.digest[:4]}") as error:
                 codec_for(ODOMETRY, *held).decode(0, coded)
-            assert error.value.row == "unknown_dictionary"
+            assert error.value.fate == "unknown_dictionary"
     with pytest.raises(UnknownDictionaryError, match="shipped dictionaries 13"):
         codec_for(ODOMETRY).decode(0, b"\xd2abc")
 
@@ -129,7 +129,7 @@ def test_a_dictionary_that_is_not_held_is_its_own_row() -> None:
 def test_an_unknown_codec_is_unsupported(first: int) -> None:
     with pytest.raises(CodecError, match="unknown codec") as error:
         codec_for(ODOMETRY).decode(0, bytes([first]) + b"abc")
-    assert error.value.row == "unsupported"
+    assert error.value.fate == "unsupported"
 
 
 def test_topics_have_their_types() -> None:

@@ -44,7 +44,7 @@ def ours(coded: bytes, type_name: str, announced: str = "") -> bytes | str:
     try:
         return codec(type_name, announced).decode(0, coded)
     except CodecError as error:
-        return error.row
+        return error.fate
 
 
 def theirs(coded: bytes, type_name: str, announced: str = "") -> bytes | str:

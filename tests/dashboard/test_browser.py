@@ -110,8 +110,8 @@ class Viewer:
         return self.numbers(f'tr[data-topic="{name}"] td[data-field]')
 
     def ledger(self, topic: str) -> dict[str, int]:
-        script = f"{FIND} return found.map(node => [node.dataset.row, node.dataset.value])"
-        return {row: int(count) for row, count in self.run(script, f'tr[data-topic="{topic}"] i[data-row]')}
+        script = f"{FIND} return found.map(node => [node.dataset.fate, node.dataset.value])"
+        return {fate: int(count) for fate, count in self.run(script, f'tr[data-topic="{topic}"] i[data-fate]')}
 
     def text(self, selector: str) -> list[str]:
         texts: list[str] = self.run(f"{FIND} return found.map(node => node.textContent)", selector)
@@ -223,7 +223,7 @@ def test_it_shows_what_the_result_says_and_sliders_act(viewer: Viewer, tmp_path:
     assert (shown["pdr"], shown["goodput_Bps"]) == (topic.pdr, topic.goodput_Bps)
     assert (shown["latency_p50"], shown["latency_p99"]) == (topic.latency_s.p50, topic.latency_s.p99)
     assert (shown["age_mean"], shown["age_peak"]) == (topic.age_s.mean, topic.age_s.peak)
-    assert viewer.ledger(ODOM) == {row: count for row, count in topic.ledger.items() if count}
+    assert viewer.ledger(ODOM) == {fate: count for fate, count in topic.ledger.items() if count}
     tiles = viewer.numbers()
     assert (tiles["sent"], tiles["delivered"], tiles["pdr"]) == (topic.sent, topic.delivered, topic.pdr)
 

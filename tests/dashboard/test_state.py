@@ -23,7 +23,7 @@ from tests.link.v1.air import Robot, registry
 
 
 def make(recorder: Recorder | None = None, packet_len: int = 64) -> DashboardState:
-    ledger = None if recorder is None else recorder.ledger.rows
+    ledger = None if recorder is None else recorder.ledger.fates
     return DashboardState(REGISTRY, NAMES, packet_len, name="test", duration_s=10.0, ledger=ledger)
 
 
@@ -69,8 +69,8 @@ def test_live_numbers_are_the_results(seed: int, with_ledger: bool) -> None:
         assert view.latency_s is not None
         assert view.latency_s.p95 == pytest.approx(topic.latency_s.p95)
         assert (view.age_mean_s, view.age_peak_s) == pytest.approx((topic.age_s.mean, topic.age_s.peak), rel=1e-6)
-        lost = {row: count for row, count in topic.ledger.items() if row in ("too_large", "lost_on_graph")}
-        assert {row: view.ledger[row] for row in lost} == lost
+        lost = {fate: count for fate, count in topic.ledger.items() if fate in ("too_large", "lost_on_graph")}
+        assert {fate: view.ledger[fate] for fate in lost} == lost
 
 
 def test_once_it_is_over_every_number_is_the_results() -> None:
@@ -200,7 +200,7 @@ def test_topics_get_the_names_that_their_robot_announces() -> None:
 def test_topics_found_while_the_source_runs_have_their_names_on_the_graph() -> None:
     state = make()
     found = Topic(5, "found", "nav_msgs/msg/Odometry", TopicOptions())
-    state.subscribed(SRC, {"/robot_4/found": found})
+    state.subscribed(SRC, [("/robot_4/found", found)])
     state.sender_event(SRC, Accepted(0, 5, at(1, 2), 1.0))
     assert [topic.name for topic in state.tick(1.0).topics if topic.topic_id == 5] == ["/robot_4/found"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from html.parser import HTMLParser
 
 from gr_ros2.dashboard.state import DashboardState
-from gr_ros2.dashboard.tables import colour, packets_html, paths_html, team_html, tiles_html, topics_html
-from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.dashboard.tables import colour, heard_html, packets_html, paths_html, team_html, tiles_html, topics_html
+from gr_ros2.dashboard.views import RobotView, Snapshot
 from gr_ros2.record.team import PairView, TeamView
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, at
 
@@ -84,3 +84,8 @@ def test_who_hears_whom_has_a_cell_for_each_pair() -> None:
     assert '<td data-pair="1 2">50%, 18 dB</td>' in html
     assert '<td data-pair="2 1">–</td>' in html
     assert team_html(Snapshot()) == ""
+    far = {(1, 7): PairView(0.0, None, 2, 3)}
+    assert '<td data-pair="1 7">over 3, hop 2</td>' in team_html(Snapshot(team=TeamView(9.0, (1, 7), (), far, {}, {})))
+    heard = heard_html(Snapshot(heard=(RobotView(3, 0.1, 50), RobotView(7, 0.4, 0, 2, 3))))
+    assert '<td data-field="way"></td>' in heard
+    assert '<td data-field="way">over 3, hop 2</td>' in heard

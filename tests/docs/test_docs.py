@@ -49,7 +49,13 @@ ONLY_PARSED = {
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml --check"): "the same; tests/cli/test_status.py",
     **{
         ("docs/how-to/radios.md", f"gr-ros2 {words}"): "needs a running link; tests/cli/test_status.py"
-        for words in ("status", "peers", "ping 2", "ping 2 robot.yaml")
+        for words in (
+            "status",
+            "peers",
+            "ping 2",
+            "ping 2 robot.yaml",
+            "set ros_source.topic_options.goal.to=7",
+        )
     },
     **{
         ("docs/how-to/radios.md", f"gr-ros2 link --robot {own} --radio zmq --listen 5551 --peer 10.0.0.{other}:5551"): (

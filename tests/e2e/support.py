@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gr_ros2.link.ledger_rows import arrived
+from gr_ros2.link.fates import arrived
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.record.result import Result
 from gr_ros2.run.runner import DELIVERED_BAG
@@ -35,7 +35,7 @@ def set_options(overrides: Sequence[str]) -> list[str]:
 
 
 def check_books(result: Result) -> None:
-    """Every message is in exactly one row, and none is corrupt."""
+    """Every message has exactly one fate, and none is corrupt."""
     assert result.topics
     for topic in result.topics:
         assert sum(topic.ledger.values()) == topic.sent, topic

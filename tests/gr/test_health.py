@@ -15,7 +15,7 @@ def stats(**changes: Any) -> dict[str, Any]:
     values: dict[str, Any] = {
         "out": 0, "packets": 0, "missing": 0, "rejected": 0, "delivered": 0, "lost": 0, "latency": None, "age": None,
         "queued": 0, "depth": 100, "queue": "fifo", "snr_db": None, "lost_on_graph": 0, "unpublished": 0,
-        "state_unsaved": 0, **changes,
+        "state_unsaved": 0, "hops": 0, **changes,
     }  # fmt: skip
     latency = None if values["latency"] is None else {"p50": values["latency"], "p95": 2 * values["latency"]}
     return {
@@ -53,9 +53,12 @@ def stats(**changes: Any) -> dict[str, Any]:
                     "lost": {"expired": values["lost"]},
                     "recent_latency_s": latency,
                     "age_s": values["age"],
+                    "hops": values["hops"],
+                    "over": 3 if values["hops"] else None,
                 }
             },
         },
+        "peers": [],
         "packets": {"out": values["out"], "backlog": 0, "damaged": 0, "foreign": 0},
         "phy": {"airtime_s": 0.01, "snr_db": values["snr_db"]},
         "front_end": {"name": "sim", "passed": {}, "lost": {}},
@@ -147,6 +150,18 @@ def test_a_queue_without_a_bound_or_of_the_newest_alone_is_never_full(queue: dic
 def test_the_snr_is_told_where_it_is_known() -> None:
     assert parts(make(), 0.0, snr_db=17.25)[0].values["SNR (dB)"] == "17.2"
     assert "SNR (dB)" not in parts(make(), 0.0)[0].values
+
+
+def test_what_comes_over_others_says_over_whom_and_its_link_is_lost_when_nothing_comes_any_more() -> None:
+    health = make()
+    assert "hops" not in parts(health, 0.0)[2].values
+    topic = parts(health, 1.0, hops=2)[2]
+    assert (topic.values["hops"], topic.values["over robot"]) == ("2", "3")
+    reached = {**stats(), "peers": [{"robot": 7, "heard_s": 0.5, "hops": 2, "over": 3}]}
+    state = health.links(reached, health.judge(reached, 2.0)[0])[7]
+    assert (state.message, state.values) == ("up", {"age (s)": "0.50", "hops": "2", "over robot": "3"})
+    state = health.links(stats(), health.judge(stats(), 20.0)[0])[7]
+    assert (state.message, state.values) == ("lost", {"age (s)": "18.50"})
 
 
 def test_a_limit_of_zero_is_none() -> None:

@@ -60,7 +60,7 @@ class Link:
     @property
     def coding(self) -> str:
         """What the source has announced about its topic."""
-        return str([event.rows[0].codec for event in list(self.told) if isinstance(event, Announced)][-1])
+        return str([event.topics[0].codec for event in list(self.told) if isinstance(event, Announced)][-1])
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from tests.link.v1.air import Robot
 
 def robot(topics: int = 1, packet_rate: float | str = "auto", **options: Any) -> Robot:
     """A robot of version 1, which has these policies, in packets of 64 B with room for 51."""
-    rows = [Topic(n, f"t{n}", "std_msgs/msg/String", TopicOptions(**options)) for n in range(topics)]
-    return Robot(1, Registry(rows), hears=False, repair="off", packet_rate=packet_rate)
+    found = [Topic(n, f"t{n}", "std_msgs/msg/String", TopicOptions(**options)) for n in range(topics)]
+    return Robot(1, Registry(found), hears=False, repair="off", packet_rate=packet_rate)
 
 
 def leave(source: Robot, now: float, most: int = 1000) -> list[bytes]:
@@ -128,8 +128,8 @@ def test_a_sending_thread_that_does_not_run_is_a_computer_that_is_too_slow() -> 
 
 
 def test_a_robot_that_nobody_hears_is_not_too_slow() -> None:
-    rows = [Topic(0, "t", "std_msgs/msg/String", TopicOptions(queue="fifo"))]
-    source = Robot(1, Registry(rows), hears=True, beacon_s=1.0)
+    found = [Topic(0, "t", "std_msgs/msg/String", TopicOptions(queue="fifo"))]
+    source = Robot(1, Registry(found), hears=True, beacon_s=1.0)
     leave(source, 0.0)
     source.end.pace.credit(1, 0.0)
     for tick in range(200):
@@ -298,7 +298,7 @@ def test_a_message_may_be_useless_before_the_deadline_of_its_queue() -> None:
         queue.admit(Outgoing(serial, 0, b"message", 0, 10.0, lifespan_s=lifespan_s), 0)
     assert [message.expires for message in queue] == [70.0, 12.0, 70.0, 15.0]
     dropped = list(queue.expire(12.5, 0.0, 0.0, 50))
-    assert [(item.message.serial, item.row, item.detail) for item in dropped] == [
+    assert [(item.message.serial, item.fate, item.detail) for item in dropped] == [
         (1, "stale", "it waited longer than 2000 ms")
     ]
     assert [item.message.serial for item in queue.expire(16.0, 0.0, 0.0, 50)] == [3]

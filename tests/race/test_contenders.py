@@ -12,7 +12,8 @@ from gr_ros2.race.contenders import ADDRESSES, CONTENDERS, MTU, chosen, cyclone_
 
 def test_contenders_are_chosen_by_name_in_the_order_of_the_table() -> None:
     assert list(chosen(["zenoh-tcp", "gr-ros2"])) == ["gr-ros2", "zenoh-tcp"]
-    assert chosen([]) == CONTENDERS
+    assert list(chosen([])) == [name for name in CONTENDERS if name not in ("gr-ros2-latest", "zenoh-multicast")]
+    assert set(chosen([], "team")) ^ set(CONTENDERS) == {"gr-ros2-v0", "gr-ros2-plain"}
 
 
 def test_an_unknown_contender_is_named_with_those_there_are() -> None:
@@ -26,7 +27,7 @@ def test_each_peer_races_best_effort_and_reliable() -> None:
 
 
 def test_cyclone_talks_to_its_peer_only_in_messages_that_fit_an_ip_packet() -> None:
-    root = ElementTree.fromstring(cyclone_uri(ADDRESSES[1], "air0"))
+    root = ElementTree.fromstring(cyclone_uri("air0", ADDRESSES[1]))
     assert [peer.get("Address") for peer in root.iter("Peer")] == [ADDRESSES[1]]
     assert [item.get("name") for item in root.iter("NetworkInterface")] == ["air0"]
     for name in ("MaxMessageSize", "MaxRexmitMessageSize", "FragmentSize"):
@@ -34,11 +35,19 @@ def test_cyclone_talks_to_its_peer_only_in_messages_that_fit_an_ip_packet() -> N
         assert 1024 < int(size) <= MTU - 28
 
 
-@pytest.mark.parametrize("transport", ["udp", "tcp"])
+def test_cyclone_reaches_a_team_by_multicast() -> None:
+    root = ElementTree.fromstring(cyclone_uri("air0"))
+    assert [item.text for item in root.iter("AllowMulticast")] == ["true"]
+    assert not list(root.iter("Peer"))
+
+
+@pytest.mark.parametrize("transport", ["udp", "tcp", "multicast"])
 def test_zenoh_takes_its_configuration(transport: str) -> None:
     zenoh = pytest.importorskip("zenoh")
-    for listens in (False, True):
-        config = zenoh.Config.from_json5(json.dumps(zenoh_config(transport, listens)))
+    for number, later in enumerate((2, 1, 0)):
+        config = zenoh.Config.from_json5(json.dumps(zenoh_config(transport, number, 3, "air0")))
+        endpoints = json.loads(config.get_json("connect/endpoints"))
+        assert len(endpoints) == (0 if transport == "multicast" else later)
         assert json.loads(config.get_json("transport/unicast/compression/enabled")) is True
         assert json.loads(config.get_json("transport/link/tx/batch_size")) <= MTU
         assert json.loads(config.get_json("scouting/multicast/enabled")) is False

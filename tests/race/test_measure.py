@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.race.links import LinkLog, LinkReport
-from gr_ros2.race.measure import COLUMNS, Identity, Observed, by_condition, measure, shown, winners
+from gr_ros2.race.measure import Identity, Observed, RaceStream, by_condition, columns, measure, shown, winners
 from gr_ros2.race.race_settings import RaceRecording
 from tests.race.support import cell
 from tests.race.test_race_settings import text
@@ -23,6 +24,9 @@ def feedback(number: int, gap: bytes) -> bytes:
     return b"\0\1\0\0\1" + bytes([number]) + gap + struct.pack("<f", 0.5)
 
 
+IDENTITY = Identity(recording(*(text(number) for number in range(4))))
+
+
 def log(*frames: tuple[float, int, float]) -> LinkLog:
     made = LinkLog()
     for frame in frames:
@@ -31,15 +35,12 @@ def log(*frames: tuple[float, int, float]) -> LinkLog:
 
 
 def observed(heard: list[tuple[float, bytes]], there: LinkLog | None = None, back: LinkLog | None = None) -> Observed:
-    t_sent = [10.0, 11.0, 12.0, 13.0]
-    return Observed(
-        9.0, True, t_sent, heard, LinkReport(there or log(), back or log(), {"on_air": 2, "queue_full": 0}), 0.3
-    )
+    stream = RaceStream(IDENTITY, [10.0, 11.0, 12.0, 13.0], heard)
+    return Observed(9.0, True, [stream], LinkReport(there or log(), back or log(), {"on_air": 2, "queue_full": 0}), 0.3)
 
 
-def measured(seen: Observed) -> object:
-    identity = Identity(recording(*(text(number) for number in range(4))))
-    return measure(seen, identity, contender="gr-ros2", load=2.0, loss=0.05, sample_rate=1e5)
+def measured(seen: Observed, robots: int | None = None) -> object:
+    return measure(seen, contender="gr-ros2", load=2.0, loss=0.05, sample_rate=1e5, robots=robots)
 
 
 def test_every_number_of_a_cell() -> None:
@@ -63,6 +64,24 @@ def test_every_number_of_a_cell() -> None:
         "drops": {"on_air": 2},
     }
     assert {name: getattr(found, name) for name in expected} == expected
+
+
+def test_a_team_has_the_numbers_of_all_its_pairs() -> None:
+    one, other = observed([(10.25, text(0)), (12.75, text(2))]), observed([(11.5, text(1)), (13.5, text(3))])
+    streams = [*one.streams, *other.streams]
+    found = measured(replace(one, streams=streams), robots=2)
+    expected = {
+        "sent": 8,
+        "delivered": 4,
+        "pdr": 0.5,
+        "age_mean": pytest.approx(((2.5 * 1.5 + 0.25 * 0.875) / 2.75 + 1.25) / 2),
+        "age_peak": pytest.approx(2.75),
+        "first_message": pytest.approx(1.25),
+        "all_heard": pytest.approx(2.5),
+    }
+    assert {name: getattr(found, name) for name in expected} == expected
+    silent = RaceStream(IDENTITY, [10.0], [])
+    assert measured(replace(one, streams=[*streams, silent]), robots=2).all_heard is None  # type: ignore[attr-defined]
 
 
 def test_what_came_twice_or_altered_is_not_delivered_again() -> None:
@@ -105,7 +124,7 @@ def test_the_best_of_each_column_wins_whoever_it_is() -> None:
     assert best["latency_p99"] == ["cyclone-reliable"]
     assert best["age_mean"] == ["gr-ros2"]
     assert best["first_message"] == ["zenoh-tcp"]
-    assert set(best) == set(COLUMNS)
+    assert set(best) == set(columns([cell("gr-ros2")])) != set(columns([cell("gr-ros2", robots=4)]))
 
 
 def test_nobody_wins_a_column_without_numbers() -> None:

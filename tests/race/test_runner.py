@@ -65,6 +65,28 @@ def test_a_short_race_of_one_of_each_kind(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
+def test_a_short_race_of_three_robots_on_one_channel(tmp_path: Path) -> None:
+    peers = ("gr-ros2", "cyclone-best-effort", "zenoh-udp")
+    options = ("--robots", "3", "--peers", ",".join(peers), "--loss", "0", "--load", "50", "--duration", "1")
+    done = subprocess.run([*COMMAND, *options, "--out", str(tmp_path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    cells = {cell["contender"]: cell for cell in json.loads((tmp_path / "race.json").read_text("utf-8"))["cells"]}
+    assert tuple(cells) == peers
+    for name, cell in cells.items():
+        assert cell["robots"] == 3
+        assert cell["matched"], name
+        assert cell["sent"] == 3 * 2 * 35, name
+        assert cell["altered"] == cell["duplicates"] == 0, name
+        assert cell["delivered"] >= 0.8 * cell["sent"], name
+        assert cell["all_heard"] is not None, name
+    # Cyclone sends a message once to both others, Zenoh over UDP to each.
+    assert 350 < cells["cyclone-best-effort"]["air_bytes_per_message"] < 550
+    assert cells["gr-ros2"]["air_bytes_per_message"] < 150 < cells["zenoh-udp"]["air_bytes_per_message"] < 300
+    assert "3 robots on one channel, each with a topic such as /robot_1/odom" in done.stdout
+
+
+@pytest.mark.slow
 def test_ctrl_c_and_sudden_death_leave_no_process(tmp_path: Path) -> None:
     for how in (signal.SIGINT, signal.SIGKILL):
         with subprocess.Popen(

@@ -138,6 +138,7 @@ STATS = {
         "publish_failed": 0,
         "topics": {},
     },
+    "peers": [],
     "packets": {"out": 0, "backlog": 0, "damaged": 0, "foreign": 0},
     "phy": {"airtime_s": 0.0},
     "front_end": {"name": "sim", "passed": {}, "lost": {}},

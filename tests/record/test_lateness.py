@@ -7,8 +7,8 @@ from math import nan
 import numpy as np
 import pytest
 
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.link.ledger_rows import LedgerRow
 from gr_ros2.record.lateness import AFTER_S, lateness_result, modem_lateness
 from gr_ros2.record.ledger import TopicLedger
 from gr_ros2.record.trace import Trace, make_trace
@@ -23,29 +23,29 @@ def late(*moments: tuple[float, float]) -> Lateness:
     return made
 
 
-def trace(*messages: tuple[float, LedgerRow]) -> Trace:
+def trace(*messages: tuple[float, Fate]) -> Trace:
     """Of messages submitted at these times, s since the begin."""
     book = TopicLedger(1, 0)
-    for number, (t, row) in enumerate(messages):
+    for number, (t, fate) in enumerate(messages):
         book.t_sent.append(BEGIN + t)
-        book.t_delivered.append(BEGIN + t + 0.1 if row is LedgerRow.DELIVERED else nan)
+        book.t_delivered.append(BEGIN + t + 0.1 if fate is Fate.DELIVERED else nan)
         book.size.append(100)
         book.serial.append(number)
-        book.row.append(0)
-        book.book(number, row)
+        book.fate.append(0)
+        book.book(number, fate)
     return make_trace([book], logs={}, tracks={}, name_of=lambda *_: "/odom", published_as={}, t0=BEGIN, t_end=END)
 
 
 def test_losses_in_a_late_moment_and_shortly_after_it_follow_it() -> None:
     moment = (BEGIN + 2, BEGIN + 2.5)
     messages = trace(
-        (1.9, LedgerRow.QUEUE_BOUND),  # before
-        (2.0, LedgerRow.QUEUE_BOUND),
-        (2.4, LedgerRow.DELIVERED),
-        (2.5 + AFTER_S, LedgerRow.LOST_FRAGMENTS),
-        (2.6 + AFTER_S, LedgerRow.LOST_FRAGMENTS),  # long after
-        (2.2, LedgerRow.IN_FLIGHT),  # not lost
-        (nan, LedgerRow.TOO_LARGE),  # never submitted
+        (1.9, Fate.QUEUE_BOUND),  # before
+        (2.0, Fate.QUEUE_BOUND),
+        (2.4, Fate.DELIVERED),
+        (2.5 + AFTER_S, Fate.LOST_FRAGMENTS),
+        (2.6 + AFTER_S, Fate.LOST_FRAGMENTS),  # long after
+        (2.2, Fate.IN_FLIGHT),  # not lost
+        (nan, Fate.TOO_LARGE),  # never submitted
     )
     found = lateness_result({"threads": [late(moment)], "gate": []}, BEGIN, END, messages)
     assert (found.lost, found.lost_after, found.sent, found.sent_after) == (4, 2, 6, 4)

@@ -1,4 +1,4 @@
-"""The loss ledger: rows add up whatever happens, and say what happened where that is known."""
+"""The loss ledger: fates add up whatever happens, and say what happened where that is known."""
 
 from __future__ import annotations
 
@@ -78,23 +78,23 @@ def test_a_delivered_message_keeps_its_times_and_size() -> None:
     ledger.packet_received(named(0))
     ledger.receiver_event(Delivered(SRC, 0, b"hello", 0, 7), 2.5)
     book = only(ledger.finish())
-    assert book.rows == {"delivered": 1}
+    assert book.fates == {"delivered": 1}
     assert (book.t_sent, book.t_delivered, book.size) == (array("d", [0.0]), array("d", [2.5]), array("L", [5]))
 
 
 def test_refusals_before_and_after_queueing() -> None:
     ledger = feed(Refused(0, 0, "too_large"), accepted(1), Refused(1, 0, "queue_bound"), accepted(2))
     book = only(ledger.finish())
-    assert (book.sent, book.rows) == (3, {"too_large": 1, "queue_bound": 1, "in_flight": 1})
+    assert (book.sent, book.fates) == (3, {"too_large": 1, "queue_bound": 1, "in_flight": 1})
     assert isnan(book.t_sent[0])
 
 
-def test_what_the_sources_graph_lost_is_sent_and_has_a_row() -> None:
+def test_what_the_sources_graph_lost_is_sent_and_has_a_fate() -> None:
     ledger = feed(Missed(0, 2), accepted(0), Missed(0, 3), Refused(1, 0, "too_large"))
     assert ledger.totals() == (7, 0)
-    assert ledger.rows() == {(SRC, 0): {"lost_on_graph": 5, "too_large": 1, "in_flight": 1}}
+    assert ledger.fates() == {(SRC, 0): {"lost_on_graph": 5, "too_large": 1, "in_flight": 1}}
     book = only(ledger.finish())
-    assert (book.sent, book.rows) == (7, {"lost_on_graph": 5, "too_large": 1, "in_flight": 1})
+    assert (book.sent, book.fates) == (7, {"lost_on_graph": 5, "too_large": 1, "in_flight": 1})
     assert list(book.serial) == [0, 1]
 
 
@@ -108,18 +108,18 @@ def test_what_lies_behind_the_last_packet_received_is_in_flight() -> None:
     ledger.packet_received(named(1))
     ledger.receiver_event(Delivered(SRC, 0, b"message 1", 0, 1), 9.0)
     # 0 was overtaken; 2 is half sent; 3 still waits
-    assert only(ledger.finish()).rows == {"delivered": 1, "lost_fragments": 1, "in_flight": 2}
+    assert only(ledger.finish()).fates == {"delivered": 1, "lost_fragments": 1, "in_flight": 2}
 
 
 def test_an_empty_phy_turns_in_flight_into_lost() -> None:
     ledger = feed(accepted(0), accepted(1), packet(0, entry(0, 0)))
-    assert only(ledger.finish(drained=True)).rows == {"lost_fragments": 1, "in_flight": 1}
+    assert only(ledger.finish(drained=True)).fates == {"lost_fragments": 1, "in_flight": 1}
 
 
 def test_everything_arrived_and_nothing_came_out() -> None:
     ledger = feed(accepted(0), packet(0, entry(0, 0)))
     ledger.packet_received(named(0))
-    assert only(ledger.finish()).rows == {"not_taken": 1}
+    assert only(ledger.finish()).fates == {"not_taken": 1}
 
 
 def test_the_receivers_reason_stands() -> None:
@@ -127,14 +127,14 @@ def test_the_receivers_reason_stands() -> None:
     ledger.packet_received(named(0))
     ledger.receiver_event(Lost(SRC, 0, "expired", 9), 5.0)
     assert ledger.unresolved() == 0
-    assert only(ledger.finish()).rows == {"expired": 1}
+    assert only(ledger.finish()).fates == {"expired": 1}
 
 
 def test_a_delivery_proves_an_earlier_loss_wrong() -> None:
     ledger = feed(accepted(0), packet(0, entry(0, 9)))
     ledger.receiver_event(Lost(SRC, 0, "expired", 9), 5.0)
     ledger.receiver_event(Delivered(SRC, 0, b"message 0", 0, 9), 6.0)
-    assert only(ledger.finish()).rows == {"delivered": 1}
+    assert only(ledger.finish()).fates == {"delivered": 1}
 
 
 def test_equal_payloads_are_told_apart_by_their_entry_ids() -> None:
@@ -150,7 +150,7 @@ def test_a_delivery_that_matches_nothing_is_corrupt() -> None:
     ledger.receiver_event(Delivered(99, 3, b"whose?", 0, 0), 1.0)
     books = ledger.finish(drained=True)
     assert [(book.src_id, book.sent, book.corrupt) for book in books] == [(SRC, 1, 1), (99, 0, 1)]
-    assert books[0].rows == {"lost_fragments": 1}
+    assert books[0].fates == {"lost_fragments": 1}
 
 
 def test_a_second_delivery_of_one_message_is_no_delivery() -> None:
@@ -158,7 +158,7 @@ def test_a_second_delivery_of_one_message_is_no_delivery() -> None:
     for _ in range(2):
         ledger.receiver_event(Delivered(SRC, 0, b"message 0", 0, 0), 1.0)
     book = only(ledger.finish())
-    assert (book.rows["delivered"], book.corrupt) == (1, 1)
+    assert (book.fates["delivered"], book.corrupt) == (1, 1)
 
 
 def test_repeats_count_neither_as_sent_nor_as_delivered() -> None:
@@ -167,7 +167,7 @@ def test_repeats_count_neither_as_sent_nor_as_delivered() -> None:
     ledger.receiver_event(Delivered(SRC, 0, b"map", 0, 5), 20.0)
     ledger.receiver_event(Lost(SRC, 0, "expired", 5), 20.0)
     book = only(ledger.finish(drained=True))
-    assert (book.sent, book.rows, book.repeats_delivered, book.corrupt) == (1, {"delivered": 1}, 1, 0)
+    assert (book.sent, book.fates, book.repeats_delivered, book.corrupt) == (1, {"delivered": 1}, 1, 0)
     assert list(book.t_delivered) == [2.0]
 
 
@@ -180,7 +180,7 @@ def test_a_message_that_only_a_repeat_carries_across_is_delivered(told: bool) ->
     assert ledger.receiver_event(Delivered(SRC, 0, b"map", 0, 5), 20.0) == 0.0
     assert ledger.receiver_event(Delivered(SRC, 0, b"map", 0, 6), 30.0) is None
     book = only(ledger.finish(drained=True))
-    assert (book.sent, book.rows, book.repeats_delivered, book.corrupt) == (1, {"delivered": 1}, 1, 0)
+    assert (book.sent, book.fates, book.repeats_delivered, book.corrupt) == (1, {"delivered": 1}, 1, 0)
     assert list(book.t_delivered) == [20.0]
 
 
@@ -188,7 +188,7 @@ def test_a_repeat_that_comes_out_altered_is_corrupt() -> None:
     ledger = feed(accepted(0, b"map"), packet(0, entry(0, 4)), packet(1, repeated(0, 5)))
     ledger.receiver_event(Delivered(SRC, 0, b"mop", 0, 5), 20.0)
     book = only(ledger.finish(drained=True))
-    assert (book.rows, book.repeats_delivered, book.corrupt) == ({"lost_fragments": 1}, 0, 1)
+    assert (book.fates, book.repeats_delivered, book.corrupt) == ({"lost_fragments": 1}, 0, 1)
 
 
 def test_a_message_that_takes_a_repeats_id_is_itself_again() -> None:
@@ -196,7 +196,7 @@ def test_a_message_that_takes_a_repeats_id_is_itself_again() -> None:
         accepted(0, b"map"), packet(0, entry(0, 4)), packet(1, repeated(0, 5)), accepted(1), packet(2, entry(1, 5))
     )
     ledger.receiver_event(Delivered(SRC, 0, b"message 1", 0, 5), 20.0)
-    assert only(ledger.finish(drained=True)).rows == {"lost_fragments": 1, "delivered": 1}
+    assert only(ledger.finish(drained=True)).fates == {"lost_fragments": 1, "delivered": 1}
 
 
 def test_a_delivery_told_before_its_packet_is_matched_in_the_end() -> None:
@@ -204,7 +204,7 @@ def test_a_delivery_told_before_its_packet_is_matched_in_the_end() -> None:
     ledger.receiver_event(Delivered(SRC, 0, b"message 0", 0, 0), 1.0)
     ledger.sender_event(SRC, accepted(0))
     book = only(ledger.finish())
-    assert (book.rows, book.corrupt) == ({"delivered": 1}, 0)
+    assert (book.fates, book.corrupt) == ({"delivered": 1}, 0)
 
 
 def test_packets_are_counted_by_fate() -> None:
@@ -232,7 +232,7 @@ def test_packets_of_one_number_are_counted_one_by_one() -> None:
         ledger.sender_event(SRC, sent(7, (entry(serial, 0),), 0.0))
     ledger.packet_received(named(7))
     ledger.packet_received(named(7))
-    assert only(ledger.finish()).rows == {"not_taken": 2, "in_flight": 1}
+    assert only(ledger.finish()).fates == {"not_taken": 2, "in_flight": 1}
 
 
 @pytest.mark.parametrize("total", [1, 15])
@@ -251,7 +251,7 @@ def test_memory_of_open_messages_is_bounded(total: int) -> None:
             ledger.receiver_event(Delivered(SRC, 0, b"message %d" % serial, 0, serial % 256), float(serial))
     assert ledger.unresolved() <= REORDER_WINDOW + 2 * 256
     book = only(ledger.finish(drained=True))
-    assert book.rows == {"delivered": count // 11, "lost_fragments": count - count // 11}
+    assert book.fates == {"delivered": count // 11, "lost_fragments": count - count // 11}
 
 
 _NONE: st.SearchStrategy[list[int]] = st.just([])
@@ -271,8 +271,8 @@ _EVENTS = st.lists(
 
 @settings(max_examples=300, deadline=None)
 @given(_EVENTS, st.booleans())
-def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int]]], drained: bool) -> None:
-    """Any order of events that names each serial once: every message is in exactly one row."""
+def test_fates_add_up_whatever_happens(events: list[tuple[str, int, int, list[int]]], drained: bool) -> None:
+    """Any order of events that names each serial once: every message has exactly one fate."""
     ledger = Ledger()
     topics: list[int] = []  # by serial
     gone: set[int] = set()  # serials that were refused or have started, and so cannot be dropped
@@ -311,10 +311,10 @@ def test_rows_add_up_whatever_happens(events: list[tuple[str, int, int, list[int
             ledger.receiver_event(Lost(SRC, first, "expired", second), now)
     books = {book.topic_id: book for book in ledger.finish(drained)}
     for topic_id in {*topics, *missed}:
-        assert books[topic_id].sent == topics.count(topic_id) + missed[topic_id] == books[topic_id].rows.total()
-        assert books[topic_id].rows["lost_on_graph"] == missed[topic_id]
+        assert books[topic_id].sent == topics.count(topic_id) + missed[topic_id] == books[topic_id].fates.total()
+        assert books[topic_id].fates["lost_on_graph"] == missed[topic_id]
         assert len(books[topic_id].serial) == topics.count(topic_id)
-    assert all(book.rows["delivered"] == sum(not isnan(t) for t in book.t_delivered) for book in books.values())
+    assert all(book.fates["delivered"] == sum(not isnan(t) for t in book.t_delivered) for book in books.values())
     assert ledger.unresolved() == 0
 
 
@@ -351,7 +351,7 @@ def test_what_a_codec_changes_on_purpose_is_delivered_and_nothing_else_is(decode
                     delivered.append(event.payload)
     book = only(ledger.finish())
     assert not set(written) & set(delivered), "every message was changed on the way"
-    assert (book.rows["delivered"], book.corrupt) == (60 - wrong, wrong)
+    assert (book.fates["delivered"], book.corrupt) == (60 - wrong, wrong)
 
 
 @settings(max_examples=40, deadline=None)
@@ -366,7 +366,7 @@ def test_what_a_codec_changes_on_purpose_is_delivered_and_nothing_else_is(decode
 def test_the_engines_over_a_bad_link(
     *, seed: int, loss: float, damage: float, delay: int, queue_depth: int, sizes: tuple[int, int]
 ) -> None:
-    """A real sender and receiver; packets are delayed, lost and damaged: no row is missing, no message corrupt."""
+    """A real sender and receiver; packets are delayed, lost and damaged: no fate is missing, no message corrupt."""
     rng = random.Random(seed)
     registry = Registry.from_rows({"odom": "nav_msgs/Odometry", "map": "nav_msgs/OccupancyGrid"})
     ledger = Ledger()
@@ -400,10 +400,10 @@ def test_the_engines_over_a_bad_link(
     books = ledger.finish()
     assert sum(book.sent for book in books) == sum(submitted)
     for book in books:
-        assert book.sent == submitted[book.topic_id] == book.rows.total()
+        assert book.sent == submitted[book.topic_id] == book.fates.total()
         assert book.corrupt == 0
-        assert book.rows["delivered"] + book.repeats_delivered == outcome[book.topic_id]
+        assert book.fates["delivered"] + book.repeats_delivered == outcome[book.topic_id]
         if not (loss or damage or queue_depth) and sizes[1] < 1000:
-            assert set(+book.rows) <= {"delivered", "in_flight"}
-        assert not book.rows["not_taken"]
+            assert set(+book.fates) <= {"delivered", "in_flight"}
+        assert not book.fates["not_taken"]
     assert ledger.packets()["crc_failed"] == receiver.stats.rejected["crc"]

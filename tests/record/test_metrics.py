@@ -26,7 +26,7 @@ def test_one_lost_of_four() -> None:
         src_id=1,
         topic_id=0,
         sent=4,
-        rows=Counter(delivered=3, lost_fragments=1),
+        fates=Counter(delivered=3, lost_fragments=1),
         t_sent=array("d", [0, 1, 2, 3]),
         t_delivered=array("d", [0.5, nan, 2.5, 2.9]),
         size=array("L", [10, 10, 20, 30]),

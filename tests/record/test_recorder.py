@@ -60,8 +60,8 @@ def test_a_run_over_the_engines() -> None:
     assert path.sent[3].tolist() == [3, 6]
     (messages,) = trace.messages()
     assert messages.t_sent[[0, -1]] == pytest.approx([0, 9.9])
-    assert (messages.row != "delivered").nonzero()[0].tolist() == list(range(20, 30))
-    assert set(messages.row[20:30]) == {"lost_fragments"}
+    assert (messages.fate != "delivered").nonzero()[0].tolist() == list(range(20, 30))
+    assert set(messages.fate[20:30]) == {"lost_fragments"}
     packets = recorder.ledger.packets()["sent"]
     assert recorder.airtime(lambda *_: 0.5) == {
         "airtime_s": 0.5,

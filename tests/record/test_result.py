@@ -72,7 +72,7 @@ def test_every_cut_of_a_result_is_refused(tmp_path: Path, result: Result) -> Non
 def test_a_ledger_that_does_not_add_up_is_refused(tmp_path: Path, result: Result) -> None:
     text = write_result(result, tmp_path).read_text().replace('"lost_fragments": 1', '"lost_fragments": 2')
     (tmp_path / "result.json").write_text(text)
-    with pytest.raises(ConfigError, match="rows add up to 11, sent are 10"):
+    with pytest.raises(ConfigError, match="fates add up to 11, sent are 10"):
         read_result(tmp_path)
 
 

@@ -28,10 +28,10 @@ def test_messages_come_back_with_their_fate(tmp_path: Path) -> None:
     odom, imu = read_trace(tmp_path).messages()
     assert (odom.topic, odom.src_id, imu.topic) == ("/robot_1/odom", 1, "/robot_1/imu")
     assert odom.t_sent == pytest.approx(np.arange(ODOM) / 10)
-    rows = {row: int((odom.row == row).sum()) for row in set(odom.row)}
+    fates = {fate: int((odom.fate == fate).sum()) for fate in set(odom.fate)}
     lost = {"lost_fragments": LOST, "too_large": TOO_LARGE, "in_flight": IN_FLIGHT + UNSENT}
-    assert rows == {**lost, "delivered": ODOM - sum(lost.values())}
-    assert (odom.delivered == (odom.row == "delivered")).all()
+    assert fates == {**lost, "delivered": ODOM - sum(lost.values())}
+    assert (odom.delivered == (odom.fate == "delivered")).all()
     assert (odom.t_delivered - odom.t_sent)[odom.delivered] == pytest.approx(0.07)
     assert set(odom.size.tolist()) == {odom.size[0]}
     assert len(imu.serial) == IMU
@@ -64,10 +64,10 @@ def test_anyone_can_read_the_csv(tmp_path: Path) -> None:
     with open(tmp_path / "messages.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == ODOM + IMU
-    assert list(lines[0]) == ["topic", "src_id", "serial", "t_sent", "t_delivered", "size", "row"]
-    assert (lines[0]["t_delivered"], lines[0]["row"]) == ("", "too_large")
+    assert list(lines[0]) == ["topic", "src_id", "serial", "t_sent", "t_delivered", "size", "fate"]
+    assert (lines[0]["t_delivered"], lines[0]["fate"]) == ("", "too_large")
     table = pa_parquet.read_table(tmp_path / "messages.parquet").to_pylist()
-    assert [line["row"] for line in lines] == [line["row"] for line in table]
+    assert [line["fate"] for line in lines] == [line["fate"] for line in table]
 
 
 def test_a_run_without_messages(tmp_path: Path) -> None:

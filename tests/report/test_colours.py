@@ -1,18 +1,18 @@
-"""Colours that tell topics, runs and ledger rows apart."""
+"""Colours that tell topics, runs and ledger fates apart."""
 
 from __future__ import annotations
 
-from gr_ros2.link.ledger_rows import LedgerRow
-from gr_ros2.report.colours import COLOURS, ink_on, row_colour
+from gr_ros2.link.fates import Fate
+from gr_ros2.report.colours import COLOURS, fate_colour, ink_on
 
 
-def test_no_two_rows_and_no_two_topics_look_alike() -> None:
-    assert len({row_colour(row) for row in LedgerRow}) == len(LedgerRow)
+def test_no_two_fates_and_no_two_topics_look_alike() -> None:
+    assert len({fate_colour(fate) for fate in Fate}) == len(Fate)
     assert len(set(COLOURS)) == len(COLOURS)
 
 
-def test_a_row_of_another_version_has_a_colour_too() -> None:
-    assert row_colour("never heard of") == "#882255"
+def test_a_fate_of_another_version_has_a_colour_too() -> None:
+    assert fate_colour("never heard of") == "#882255"
 
 
 def test_words_on_a_colour_can_be_read() -> None:

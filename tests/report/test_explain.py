@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.record.result import LatenessResult, air_uses
 from gr_ros2.report.explain import explanation
 from gr_ros2.report.page import read_runs, write_report
@@ -106,11 +106,11 @@ def test_nothing_sent() -> None:
     assert explanation(replace(RESULT, topics=()), empty_trace()) == ["No message was sent."]
 
 
-def test_every_row_of_the_ledger_is_said_in_words(tmp_path: Path) -> None:
+def test_every_fate_of_the_ledger_is_said_in_words(tmp_path: Path) -> None:
     run = make_run(tmp_path)
-    everything = replace(run.result.topics[0], ledger=dict.fromkeys(ROWS, 1), sent=len(ROWS))
+    everything = replace(run.result.topics[0], ledger=dict.fromkeys(FATES, 1), sent=len(FATES))
     outcome, *_ = explanation(replace(run.result, topics=(everything,)), run.trace)
-    assert all(row.words in outcome for row in LedgerRow)
+    assert all(fate.words in outcome for fate in Fate)
 
 
 def test_what_repair_did_is_told_and_tabulated(tmp_path: Path) -> None:

@@ -67,12 +67,12 @@ def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_ledger_bars_fill_the_width() -> None:
-    ledgers = {"a": {"delivered": 9, "lost_fragments": 1}, "b": {"in_flight": 5, "new_row": 5}, "c": {}}
+    ledgers = {"a": {"delivered": 9, "lost_fragments": 1}, "b": {"in_flight": 5, "new_fate": 5}, "c": {}}
     axes = ledger_figure(ledgers).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["a (10)", "b (10)"]
     widths = np.array([[bar.get_width() for bar in bars] for bars in axes.containers])
     assert widths.sum(axis=0) == pytest.approx([100, 100])
-    assert [bars.get_label() for bars in axes.containers] == ["delivered", "lost fragments", "new row", "in flight"]
+    assert [bars.get_label() for bars in axes.containers] == ["delivered", "lost fragments", "new fate", "in flight"]
     assert {"9", "1", "5"} <= {text.get_text() for text in axes.texts}
 
 

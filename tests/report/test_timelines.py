@@ -25,9 +25,9 @@ NAN = float("nan")
 
 def _messages(t_sent: list[float], t_delivered: list[float]) -> Messages:
     count = len(t_sent)
-    row = np.array(["x"] * count, dtype=object)
+    fate = np.array(["x"] * count, dtype=object)
     serial = np.arange(count)
-    return Messages("/t", 1, serial, np.array(t_sent), np.array(t_delivered), np.full(count, 500), row)
+    return Messages("/t", 1, serial, np.array(t_sent), np.array(t_delivered), np.full(count, 500), fate)
 
 
 def _line(figure: Figure, place: int, label: str) -> tuple[list[float], list[float]]:

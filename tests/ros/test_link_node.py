@@ -68,6 +68,8 @@ def test_a_link_as_a_node(config: Path, graph: Graph, ending: signal.Signals) ->
         assert graph.set("ros_source.repeat_s", 0) == (True, "")
         assert "less than or equal to 255" in graph.set("ros_source.dst_id", 500)[1]
         assert not graph.set("ros_source.hop", 5)[0]
+        assert "version" in graph.set("ros_source.topic_options.header.to", 7)[1]
+        assert "cannot change while the link runs" in graph.set("ros_source.nothing", 7)[1]
         assert not graph.set("packet_len", 64)[0]
 
         heard: list[Header] = []

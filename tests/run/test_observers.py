@@ -51,7 +51,7 @@ def test_an_onlooker_hears_what_the_result_counts() -> None:
     assert observer.heard.count("Received") == result.packets["received"]
     assert observer.run is not None
     assert observer.run.topics == {(1, 0): "/robot_1/odom"}
-    assert observer.run.ledger.rows()[1, 0] == topic.ledger
+    assert observer.run.ledger.fates()[1, 0] == topic.ledger
     observer.run.links[0].set_packet_loss(0.5)  # which without an observer this PHY refuses
 
 
@@ -63,13 +63,13 @@ def test_everyone_hears_in_turn() -> None:
     assert one.heard == other.heard == ["Accepted", "Rejected"]
 
 
-def test_the_rows_of_an_open_ledger_add_up() -> None:
+def test_the_fates_of_an_open_ledger_add_up() -> None:
     recorder = Recorder(Registry.from_rows({"a": "std_msgs/String"}), {1: "/robot_1"})
     for serial in range(10):
         recorder.sender_event(1, Accepted(serial, 0, bytes([serial]), float(serial)))
-    assert recorder.ledger.rows() == {(1, 0): {"in_flight": 10}}
-    assert recorder.ledger.rows() == {(1, 0): {"in_flight": 10}}
-    assert Ledger().rows() == {}
+    assert recorder.ledger.fates() == {(1, 0): {"in_flight": 10}}
+    assert recorder.ledger.fates() == {(1, 0): {"in_flight": 10}}
+    assert Ledger().fates() == {}
 
 
 def test_who_comes_late_is_told_of_the_run_and_hears_from_then_on() -> None:

@@ -1,8 +1,7 @@
-"""`relay` of a scenario: what reaches robots that do not hear the sender, sealed and not."""
+"""`relay` of a scenario: what reaches robots that do not hear the sender, sealed and not, and over how many robots."""
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -10,31 +9,52 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import Delivered
-from gr_ros2.run.load import make_phys
+from gr_ros2.record.result import Result, TopicResult
+from gr_ros2.record.team_numbers import team_numbers
+from gr_ros2.report.table import hops_grid
 from gr_ros2.run.scenario import load_scenario
-from gr_ros2.run.simulate import Simulation
+from gr_ros2.run.simulated_runner import run_simulated
 from gr_ros2.state.keys import new_key_file
 
 
-def from_end_to_end(*overrides: str) -> int:
-    """Messages of the first robot of `line` that the last one has received, of 16 sent in 8 s."""
-    scenario = load_scenario("line", overrides, duration_s=8)
-    registry = scenario.load_registry()
-    run = Simulation(scenario, registry, make_phys(scenario.directions(), registry))
-    pairs = Counter((event.src_id, robot.src_id) for _, robot, event in run.events() if isinstance(event, Delivered))
-    assert pairs[1, 2] >= 15
-    return pairs[1, 10]
+def line(*overrides: str) -> Result:
+    """`line` for 8 s, in which each robot sends 16 messages."""
+    return run_simulated(load_scenario("line", overrides, duration_s=8)).result
 
 
-def test_messages_cross_three_hops() -> None:
-    assert from_end_to_end() >= 12
-    assert not from_end_to_end("relay='off'")
+def of_the_first(result: Result, robot: int) -> TopicResult:
+    """The odometry of robot 1 at another one."""
+    topics = result.receivers[robot - 2].topics
+    return next(topic for topic in topics if topic.src_id == 1)
+
+
+def test_messages_cross_three_hops_and_the_result_says_so() -> None:
+    result = line()
+    near, far = of_the_first(result, 2), of_the_first(result, 10)
+    assert near.delivered >= 15
+    assert near.hops["0"] >= 10
+    assert far.delivered >= 12
+    assert sum(far.hops.values()) == far.delivered
+    assert min(far.hops) >= "2"
+    grid = hops_grid(result)
+    assert grid is not None
+    ((heard, *over),) = grid.sections
+    assert heard[0] == "0 (heard itself)"
+    assert [line[0] for line in over[:2]] == ["1", "2"]
+    assert sum(int(line[1]) for line in (heard, *over)) == 90
+    assert 0.2 < (team_numbers(result)["relayed"] or 0) < 0.8
+
+
+def test_without_relaying_nothing_crosses() -> None:
+    result = line("relay='off'")
+    assert of_the_first(result, 2).delivered >= 15
+    assert {topic.src_id for topic in result.receivers[8].topics} == {7, 8, 9}
+    assert hops_grid(result) is None
 
 
 def test_sealed_messages_cross_three_hops(tmp_path: Path) -> None:
     new_key_file(tmp_path / "fleet.key")
-    assert from_end_to_end(f"key={tmp_path / 'fleet.key'}") >= 10
+    assert of_the_first(line(f"key={tmp_path / 'fleet.key'}"), 10).delivered >= 10
 
 
 def test_relaying_needs_slots() -> None:

@@ -2,18 +2,53 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.record.result import Result
 from gr_ros2.record.team_numbers import TEAM_VALUES, team_numbers
+from gr_ros2.run.outcome import Progress
+from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulated_runner import run_simulated
+from gr_ros2.sim.tasks import Rendezvous
 from tests.docs.pages import blocks
+
+PROGRAMS = [block for block in blocks("python") if block.page.endswith("teams.md")]
+"""A task of one's own, and a node that drives a robot."""
+
+
+class Near(Rendezvous):
+    """Robots that need not go far."""
+
+    SIDE_M = 8.0
+
+
+class Nodes:
+    """The node of the documentation for each of two robots, started as soon as the run names the graphs."""
+
+    def __init__(self, folder: Path) -> None:
+        self._program = folder / "meet.py"
+        self._program.write_text(PROGRAMS[1].text)
+        self.processes: list[subprocess.Popen[bytes]] = []
+
+    def __call__(self, progress: Progress) -> None:
+        if not self.processes:
+            for robot, (_, domain) in enumerate(progress.graphs, 1):
+                arguments = [str(domain), f"/robot_{robot}", f"/rx_robot_{3 - robot}"]
+                self.processes.append(subprocess.Popen([sys.executable, str(self._program), *arguments]))
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.kill()
+            process.wait()
 
 
 def result(name: str, *overrides: str) -> Result:
@@ -48,12 +83,31 @@ def test_the_numbers_of_a_team_are_those_of_its_pairs() -> None:
 
 
 def test_the_controller_of_the_documentation_stands_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (page,) = [block for block in blocks("python") if block.page.endswith("teams.md")]
-    (tmp_path / "mine.py").write_text(page.text)
+    (tmp_path / "mine.py").write_text(PROGRAMS[0].text)
     monkeypatch.syspath_prepend(tmp_path)
     settings = "robots=3", "duration_s=15", "ros_source.packet_rate=1"
     careful, usual = (result("formation", *settings, task).task for task in ("task=mine:Careful", "task=formation"))
     assert careful["formation_error_m"] != usual["formation_error_m"]
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+@pytest.mark.parametrize("controller", ["task", "ros"])
+def test_robots_meet_in_real_time_whoever_drives_them(tmp_path: Path, controller: str) -> None:
+    settings = "robots=2", "time=real", "duration_s=4", f"task={__name__}:Near", f"controller={controller}"
+    with closing(Nodes(tmp_path)) as nodes:
+        ran = run_scenario(load_scenario("rendezvous", settings), on_progress=nodes if controller == "ros" else None)
+    assert ran.result.task["met"] == 1
+    assert 0 < (ran.result.task["time_to_meet_s"] or 0) <= 4
+    driven = {f"/robot_{robot}/cmd_vel" for robot in (1, 2)} if controller == "ros" else set()
+    assert ran.result.counters["commands"].keys() == driven
+
+
+def test_a_run_without_controllers_says_where_they_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gr_ros2.run.runner._CONTROLLERS_S", 0.1)
+    scenario = load_scenario("formation", ["robots=2", "time=real", "controller=ros"])
+    with pytest.raises(RunError, match=r"nobody publishes /robot_2/cmd_vel within 0\.1 s; start the controllers"):
+        run_scenario(scenario)
 
 
 @pytest.mark.parametrize(
@@ -62,6 +116,8 @@ def test_the_controller_of_the_documentation_stands_in(tmp_path: Path, monkeypat
         (["time=samples"], "task = 'formation'"),
         (["registry=table4"], "their odometry|send their odometry alone"),
         (["task=dance"], "task = 'dance': is no task"),
+        (["controller=ros"], "controller = 'ros'"),
+        (["task=", "time=real", "controller=ros"], "controller = 'ros'"),
     ],
 )
 def test_what_does_not_go_together_is_said(overrides: list[str], said: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.ledger_rows import ARRIVED
+from gr_ros2.link.fates import ARRIVED
 from gr_ros2.record.result import Result, TopicResult, read_result, write_result
 from gr_ros2.report.table import ledger_grid, summary_grid
 from gr_ros2.run.runner import run_scenario
@@ -41,7 +41,7 @@ def run(**settings: Any) -> Result:
 
 def checked(topic: TopicResult) -> TopicResult:
     assert not topic.corrupt
-    assert sum(topic.ledger.get(row, 0) for row in ARRIVED) == topic.delivered
+    assert sum(topic.ledger.get(fate, 0) for fate in ARRIVED) == topic.delivered
     return topic
 
 

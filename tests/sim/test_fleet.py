@@ -188,8 +188,8 @@ def test_map_message(fleet: Fleet, messages: list[SimMessage]) -> None:
     assert grid.info.resolution == pytest.approx(fleet.world.map_origin_resolution(100)[1])
 
 
-def test_true_path_is_continuous_across_ticks(fleet: Fleet) -> None:
-    path = fleet.true_path(1, np.arange(0, 10, 0.001))
+def test_the_true_path_is_continuous_across_ticks(fleet: Fleet) -> None:
+    path = np.array([fleet.true_pose(1, float(t))[:2] for t in np.arange(0, 10, 0.001)])
     assert np.hypot(*np.diff(path, axis=0).T).max() <= 0.001 * fleet.settings.max_speed + 1e-9
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import random
+import struct
 from collections.abc import Mapping
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.sim.motion import State
-from gr_ros2.sim.sensors import read_odometry
+from gr_ros2.sim.sensors import read_command, read_odometry, write_command
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.tasks import Command, Formation, LastHeard, Rendezvous, Task, TaskRobots, make_task, towards
 
@@ -82,6 +85,31 @@ def test_robots_follow_commands_as_far_as_they_can() -> None:
     assert towards(State(0, 0, 0, 0, 0), 3.0, 0.0, 2.0) == (2.0, 0.0)
     assert towards(State(0, 0, 0, 0, 0), -3.0, 0.1, 2.0)[0] == 0, "it turns first"
     assert towards(State(0, 0, 0, 0, 0), 0.0, 0.0, 2.0) == (0.0, 0.0)
+
+
+def test_a_robot_does_what_its_controller_says_for_as_long_as_it_says_so() -> None:
+    robots = TaskRobots(OnlyAhead(2, random.Random(1)), QUIET, commanded=[0])
+    robots.advance(1.0)
+    assert [read_odometry(robots.odometry(n, 1.0))[1].speed for n in (0, 1)] == pytest.approx([0, 1])
+    for at in (1.0, 1.2, 1.4):
+        robots.advance(at)
+        robots.follow(0, (0.3, 0.1), at)
+    assert read_odometry(robots.odometry(0, 1.8))[1][3:5] == pytest.approx((0.3, 0.1))
+    assert read_odometry(robots.odometry(0, 2.9))[1][3:5] == pytest.approx((0.0, 0.0))
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False), st.floats(allow_nan=False, allow_infinity=False))
+def test_commands_are_read_as_written(speed: float, turn: float) -> None:
+    payload = write_command(speed, turn)
+    swapped = b"\0\0\0\0" + struct.pack(">6d", *struct.unpack("<6d", payload[4:]))
+    assert read_command(payload) == read_command(swapped) == (speed, turn)
+
+
+@given(st.binary(max_size=60))
+def test_what_is_no_command_is_none(payload: bytes) -> None:
+    command = read_command(payload)
+    assert command is None or (len(payload) >= 52 and all(map(math.isfinite, command)))
+    assert read_command(write_command(math.nan, 0.0)) is None
 
 
 def test_a_task_of_a_users_module_stands_in() -> None:

@@ -39,8 +39,8 @@ def times(a: int, b: int) -> int:
 INVERSE = [0] + [next(b for b in range(1, 256) if times(a, b) == 1) for a in range(1, 256)]
 
 
-def coefficient(row: int, number: int) -> int:
-    return INVERSE[(128 + row % 128) ^ (number % 128)]
+def coefficient(repair_id: int, number: int) -> int:
+    return INVERSE[(128 + repair_id % 128) ^ (number % 128)]
 
 
 def subkey(key: bytes, src_id: int, boot: int) -> bytes:
@@ -292,13 +292,13 @@ def read_packet(
         packet["block"] = read_medium_access(data[start:end])
         start += 12 if data[start + 3] & 128 else 6
         room -= 12
-    row, window, hello = 255, 0, False
+    repair_id, window, hello = 255, 0, False
     if qos == 3:
         if start + 2 > end:
             raise Refused("entry_bounds")
-        window, row = data[start] % 128, data[start + 1] % 128
+        window, repair_id = data[start] % 128, data[start + 1] % 128
         masked, oldest = data[start] >= 128, data[start + 1] >= 128
-        packet["row"], packet["oldest"] = row, oldest
+        packet["repair_id"], packet["oldest"] = repair_id, oldest
         start += 2
         members = list(range(window))
         if not window:
@@ -316,7 +316,7 @@ def read_packet(
         packet["clear"] = hello
     if sealed:
         assert key is not None
-        nonce = bytes(4) + number.to_bytes(8, "big") + bytes([row])
+        nonce = bytes(4) + number.to_bytes(8, "big") + bytes([repair_id])
         associated = data[:start] if not addressed else data[:5] + data[6:start]
         opened = subkey(key, data[1], boot)
         if encrypts and not hello:
@@ -339,15 +339,15 @@ def read_packet(
 
 
 def solve(known: dict[int, bytes], repairs: list[tuple[int, list[int], bytes]], room: int) -> dict[int, bytes]:
-    """Bodies that follow from repairs (row, numbers, combination): Gauss-Jordan elimination, nothing clever."""
+    """Bodies that follow from repairs (repair id, numbers, combination): Gauss-Jordan elimination, nothing clever."""
     missing = sorted({number for _, numbers, _ in repairs for number in numbers} - set(known))
     column = {number: at for at, number in enumerate(missing)}
     rows: list[list[int]] = []
-    for row, numbers, combined in repairs:
+    for repair_id, numbers, combined in repairs:
         left = [0] * len(missing)
         right = list(combined.ljust(room, b"\0")[:room])
         for number in numbers:
-            factor = coefficient(row, number)
+            factor = coefficient(repair_id, number)
             if number in column:
                 left[column[number]] = factor
             else:

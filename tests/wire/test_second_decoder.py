@@ -18,11 +18,11 @@ from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.gf256 import coefficient
 from gr_ros2.link.v1.inbox import Inbox
-from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, SealMode, subkey
+from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.relayed import read_carried, read_relayed, write_carried, write_relayed
-from gr_ros2.wire.table import AnnouncedTopic, read_table
+from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 from tests.link.v1.air import KEY, Air, Robot, registry
 from tests.wire import second_decoder as second
 
@@ -53,7 +53,7 @@ def test_packets(case: dict[str, Any]) -> None:
     read = second.read_packet(data, case["packet_len"], case["boot"], case["newest"])
     assert read["entries"] == case["entries"]
     assert read["number"] == case["number"]
-    assert read.get("row") == case.get("row")
+    assert read.get("repair_id") == case.get("repair_id")
     assert read.get("block") == case.get("block")
     said = json.loads(json.dumps(read_block(block)[0]._asdict())) if block else None
     assert said == case.get("block")
@@ -116,12 +116,12 @@ def test_kept_messages() -> None:
         1,
         40,
         Settings(2, packet_len=64),
-        topics=(AnnouncedTopic(0, "map", "std_msgs/msg/String", latched=True),),
         decoder_for=None,
         marks={},
         stats=ReceiverStats(),
         control=lambda _: None,
     )
+    inbox.announced.take(write_table((AnnouncedTopic(0, "map", "std_msgs/msg/String", latched=True),)))
     found = []
     for number, payload in enumerate(received, 1):
         part = v1.Part(0, payload)
@@ -148,8 +148,8 @@ def test_a_hello_that_is_not_first_in_the_clear_and_a_message_in_a_control_packe
 
 def test_coefficients() -> None:
     for case in VECTORS["coefficients"]:
-        row, number = case["row"], case["number"]
-        assert coefficient(row, number) == second.coefficient(row, number) == case["coefficient"]
+        repair_id, number = case["repair_id"], case["number"]
+        assert coefficient(repair_id, number) == second.coefficient(repair_id, number) == case["coefficient"]
 
 
 @named("repairs")
@@ -168,18 +168,18 @@ def test_repairs(case: dict[str, Any]) -> None:
         packet = v1.decode(data, case["packet_len"], case["boot"], case["newest"] >> 16)
         assert packet.repair is not None
         repair = packet.repair
-        found.update(decoder.repair(case["newest"], repair.mask, repair.row, packet.combined))
+        found.update(decoder.repair(case["newest"], repair.mask, repair.repair_id, packet.combined))
         read = second.read_packet(data, case["packet_len"], case["boot"], case["newest"])
         assert read["members"] == case["members"]
         members, body = read["members"], read["body"]
         assert isinstance(members, list)
         assert isinstance(body, bytes)
-        equations.append((repair.row, members, body))
+        equations.append((repair.repair_id, members, body))
     assert found == missing
     if len(missing) < 20:  # the second decoder takes its time
         assert second.solve(here, equations, room) == missing
     else:
-        short = [(row, members, body[:3]) for row, members, body in equations]
+        short = [(repair_id, members, body[:3]) for repair_id, members, body in equations]
         assert second.solve({}, short, 3) == {number: body[:3] for number, body in missing.items()}
 
 
@@ -193,13 +193,13 @@ def test_sealed_packets(case: dict[str, Any]) -> None:
     assert read["entries"] == case["entries"]
     mode: SealMode = "encrypt" if case["encrypts"] else "authenticate"
     header = v1.read_header(data, 64)
-    start, row, plain = header.size, SOURCE_ROW, False
+    start, repair_id, plain = header.size, NOT_A_REPAIR, False
     if header.qos == v1.QOS_REPAIR:
         repair = v1.read_repair_header(data, start, len(data) - 8)
-        start, row, plain = start + repair.size, repair.row, repair.clear
+        start, repair_id, plain = start + repair.size, repair.repair_id, repair.clear
     trailer = Keys((key,), mode).own(1, case["boot"])
-    body = trailer.open(data[:start], data[start:], case["number"], row, plain=plain)
-    assert trailer.close(data[:start], body, case["number"], row, plain=plain) == data
+    body = trailer.open(data[:start], data[start:], case["number"], repair_id, plain=plain)
+    assert trailer.close(data[:start], body, case["number"], repair_id, plain=plain) == data
     for wrong in (case["newest"] + 65_536, case["newest"]):
         with pytest.raises(second.Refused, match="tag"):
             damaged = data[:-1] + bytes((data[-1] ^ 1,)) if wrong == case["newest"] else data
@@ -243,7 +243,7 @@ def test_the_second_decoder_understands_a_whole_link(mode: SealMode) -> None:
         elif read["members"]:
             members = read["members"]
             assert isinstance(members, list)
-            equations.append((int(str(read["row"])), members, body))
+            equations.append((int(str(read["repair_id"])), members, body))
     assert equations
     bodies |= second.solve(bodies, equations, room)
     whole = second.messages(bodies, room)

@@ -50,12 +50,12 @@ entries = st.lists(parts() | controls, max_size=6).map(tuple)
 
 @st.composite
 def repair_headers(draw: st.DrawFn, control: bool) -> RepairHeader:
-    row = draw(st.integers(0, 127))
+    repair_id = draw(st.integers(0, 127))
     if control:
-        return RepairHeader(row, clear=draw(st.booleans()))
+        return RepairHeader(repair_id, clear=draw(st.booleans()))
     mask = draw(st.integers(0, (1 << 127) - 1)) | 1
-    size = len(v1.write_repair_header(RepairHeader(row, mask)))
-    return RepairHeader(row, mask, draw(st.booleans()), size=size)
+    size = len(v1.write_repair_header(RepairHeader(repair_id, mask)))
+    return RepairHeader(repair_id, mask, draw(st.booleans()), size=size)
 
 
 @st.composite
@@ -133,7 +133,7 @@ def test_what_a_key_seals_is_told_by_its_header() -> None:
 
 
 @given(st.binary(max_size=24), st.integers(0, 24))
-def test_any_window_and_row_read_or_are_refused_by_name(data: bytes, start: int) -> None:
+def test_any_window_and_repair_id_read_or_are_refused_by_name(data: bytes, start: int) -> None:
     try:
         repair = v1.read_repair_header(data, start, len(data))
     except WireError as error:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from zlib import crc32
 
 from gr_ros2.core.errors import CodecError
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.wire.table import AnnouncedTopic, read_table
@@ -23,7 +23,6 @@ _WAITING = 256
 class AnnouncedTopics:
     """The table of topics of one start of one robot.
 
-    :param topics: where they are known beforehand
     :param decoder_for: makes the decoder for its messages from its table of topics
     :param most: bytes of messages that may wait for the table
     :ivar topics: by topic id
@@ -32,7 +31,6 @@ class AnnouncedTopics:
 
     def __init__(
         self,
-        topics: tuple[AnnouncedTopic, ...],
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
         most: int,
     ) -> None:
@@ -43,8 +41,6 @@ class AnnouncedTopics:
         self._waiting: deque[Ready] = deque()
         self._bytes = 0
         self._most = most
-        if topics:
-            self._know(topics)
 
     def topic_of(self, ready: Ready) -> AnnouncedTopic | None:
         """The topic of a message; None if the message has to wait for a table."""
@@ -75,7 +71,9 @@ class AnnouncedTopics:
         if digest == self.digest:
             return None
         self.digest = digest
-        self._know(topics)
+        self.topics = {topic.topic_id: topic for topic in topics}
+        if self._decoder_for is not None:
+            self._codec = self._decoder_for(topics)
         return topics
 
     def waiting(self) -> list[Ready]:
@@ -84,21 +82,14 @@ class AnnouncedTopics:
         return sorted(waiting, key=lambda ready: ready.order)
 
     def decode(self, ready: Ready) -> bytes:
-        """The payload of a message.
+        """The payload of a coded message.
 
-        :raises CodecError: it cannot be decoded; ``row`` names the row of the ledger
+        :raises CodecError: it cannot be decoded; ``fate`` names the fate of the message
         """
-        if not ready.coded:
-            return ready.payload
         if self._codec is None:
             raise CodecError("coded, and no codec is configured here")
         return self._codec.decode(ready.topic_id, ready.payload)
 
-    def unknown(self, ready: Ready) -> LedgerRow:
-        """The row of the ledger of a message that is given up because its table did not arrive."""
-        return LedgerRow.UNKNOWN_DICTIONARY if ready.topic_id in self.topics else LedgerRow.UNKNOWN_TOPIC
-
-    def _know(self, topics: tuple[AnnouncedTopic, ...]) -> None:
-        self.topics = {topic.topic_id: topic for topic in topics}
-        if self._decoder_for is not None:
-            self._codec = self._decoder_for(topics)
+    def unknown(self, ready: Ready) -> Fate:
+        """The fate of a message that is given up because its table did not arrive."""
+        return Fate.UNKNOWN_DICTIONARY if ready.topic_id in self.topics else Fate.UNKNOWN_TOPIC

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.queues import Dropped
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.packing import Message
@@ -181,7 +181,7 @@ class Custody:
             leaves = held.last >= 0 or (held.out is not None and held.out.started)
             if held.own is not None and not leaves and now >= held.own.expires:
                 if not held.low:
-                    self._drop([Dropped(held.own, LedgerRow.STALE, "it waited too long for its way to another robot")])
+                    self._drop([Dropped(held.own, Fate.STALE, "it waited too long for its way to another robot")])
                 self._forget(name)
             elif held.out is None:
                 self._hand_on(name, held, now)

@@ -51,28 +51,25 @@ class RepairDecoder:
         self._plausible = plausible
         self._span = span
         self._most = equations
-        self._bodies: dict[int, bytes] = {}
-        self._rows: dict[int, tuple[bytes, bytes]] = {}
+        self.bodies: dict[int, bytes] = {}
+        """Those of the source packets that are known, by number."""
+        self._equations: dict[int, tuple[bytes, bytes]] = {}
         """By pivot: the coefficients of the equation from the pivot on, and its right side."""
         self._grown = False
         """Whether an equation was added since they were solved for each other's pivots."""
 
     def __contains__(self, number: int) -> bool:
         """Whether a source packet is known."""
-        return number in self._bodies
-
-    def body(self, number: int) -> bytes:
-        """The body of a source packet that is known."""
-        return self._bodies[number]
+        return number in self.bodies
 
     @property
     def equations(self) -> int:
         """Number of equations held that do not determine a packet yet."""
-        return len(self._rows)
+        return len(self._equations)
 
     def lacks(self, first: int) -> bool:
         """Whether an equation is held that does not determine a packet yet and names none before ``first``."""
-        return any(pivot >= first for pivot in self._rows)
+        return any(pivot >= first for pivot in self._equations)
 
     def begin(self, number: int) -> None:
         """Ignore all packets older than this number."""
@@ -92,25 +89,25 @@ class RepairDecoder:
 
         :return: this packet and those that follow from it; nothing if it was known already or is too old
         """
-        if number in self._bodies or number < self.floor:
+        if number in self.bodies or number < self.floor:
             return []
         self.advance(number)
-        if not self._rows:
-            self._bodies[number] = body
+        if not self._equations:
+            self.bodies[number] = body
             return [(number, body)]
         return self._learn([(number, body)])
 
-    def repair(self, number: int, mask: int, row: int, combined: bytes) -> Found:
+    def repair(self, number: int, mask: int, repair_id: int, combined: bytes) -> Found:
         """Take a repair.
 
         :param number: newest number of its window
         :param mask: bit i says that packet ``number - i`` is part of it
-        :param row: row of its coefficients
+        :param repair_id: says its coefficients
         :param combined: the linear combination of the bodies
         :return: the packets that follow from it
         """
         self.advance(number)
-        bodies = self._bodies
+        bodies = self.bodies
         numbers = window_numbers(number, mask)
         missing = [member for member in numbers if member not in bodies]
         if not missing:
@@ -119,7 +116,7 @@ class RepairDecoder:
         if missing[-1] < self.floor:
             self.counts["too_old"] += 1
             return []
-        shifted = 128 | row
+        shifted = 128 | repair_id
         right = int.from_bytes(combined, "little")
         for member in numbers:
             body = bodies.get(member)
@@ -133,21 +130,21 @@ class RepairDecoder:
 
     def _insert(self, pivot: int, left: int, right: int) -> Found:
         """Reduce an equation by those held and store it; return the packet that it determines by itself."""
-        rows, room = self._rows, self._room
+        equations, room = self._equations, self._room
         while left:
             shift = ((left & -left).bit_length() - 1) >> 3
             pivot += shift
             left >>= shift * 8
-            held = rows.get(pivot)
+            held = equations.get(pivot)
             if held is None or left < 256:
                 break
             size = (left.bit_length() + 7) >> 3
             if size < len(held[0]):  # equations that reach less far determine packets sooner
                 factor = TIMES[INVERSE[left & 255]]
                 sides = left.to_bytes(size, "little"), right.to_bytes(room, "little")
-                rows[pivot] = sides[0].translate(factor), sides[1].translate(factor)
+                equations[pivot] = sides[0].translate(factor), sides[1].translate(factor)
                 left, right = (int.from_bytes(side, "little") for side in held)
-                held, self._grown = rows[pivot], True
+                held, self._grown = equations[pivot], True
             factor = TIMES[left & 255]
             left ^= int.from_bytes(held[0].translate(factor), "little")
             right ^= int.from_bytes(held[1].translate(factor), "little")
@@ -160,41 +157,41 @@ class RepairDecoder:
         body = right.to_bytes(room, "little").translate(factor)
         if left < 256:
             return self._accept(pivot, body)
-        if len(rows) >= self._most:
+        if len(equations) >= self._most:
             self.counts["too_many"] += 1
             return []
         self.counts["held"] += 1
         self._grown = True
-        rows[pivot] = (left.to_bytes((left.bit_length() + 7) >> 3, "little").translate(factor), body)
+        equations[pivot] = (left.to_bytes((left.bit_length() + 7) >> 3, "little").translate(factor), body)
         return []
 
     def _learn(self, found: Found) -> Found:
         """Put packets that have become known into the equations; return these and all that follow."""
-        bodies, rows, room = self._bodies, self._rows, self._room
+        bodies, equations, room = self.bodies, self._equations, self._room
         known = {number for number, _ in found}
         done = 0
         while done < len(found):
             number, body = found[done]
             done += 1
             bodies[number] = body
-            if not rows:
+            if not equations:
                 continue
             more: Found = []
             for pivot in self._naming(number):
-                left, right = rows[pivot]
+                left, right = equations[pivot]
                 at = number - pivot
                 factor = left[at]
                 rest = int.from_bytes(left, "little") ^ factor << at * 8
                 side = int.from_bytes(right, "little") ^ int.from_bytes(body.translate(TIMES[factor]), "little")
                 if rest > 1:
                     size = (rest.bit_length() + 7) >> 3
-                    rows[pivot] = (rest.to_bytes(size, "little"), side.to_bytes(room, "little"))
+                    equations[pivot] = (rest.to_bytes(size, "little"), side.to_bytes(room, "little"))
                 else:
-                    del rows[pivot]
+                    del equations[pivot]
                     more += self._accept(pivot, side.to_bytes(room, "little"))
-                    if not rows:
+                    if not equations:
                         break
-            own = rows.pop(number, None)  # last, so that no equation that still names the packet goes into it
+            own = equations.pop(number, None)  # last, so that no equation that still names the packet goes into it
             if own is not None:
                 rest = int.from_bytes(own[0], "little") ^ 1
                 side = int.from_bytes(own[1], "little") ^ int.from_bytes(body, "little")
@@ -211,44 +208,48 @@ class RepairDecoder:
         A repair that follows from the equations may name packets that they determine together, while none does so
         alone: those of which older packets are not worth a repair any more, for instance.
         """
-        rows, room = self._rows, self._room
-        if not self._grown or len(rows) > MAX_WINDOW:
+        equations, room = self._equations, self._room
+        if not self._grown or len(equations) > MAX_WINDOW:
             return []
         self._grown = False
         found: Found = []
-        pivots = sorted(rows)
+        pivots = sorted(equations)
         for index in range(len(pivots) - 2, -1, -1):
             pivot = pivots[index]
-            coefficients = rows[pivot][0]
-            left, right = (int.from_bytes(side, "little") for side in rows[pivot])
+            coefficients = equations[pivot][0]
+            left, right = (int.from_bytes(side, "little") for side in equations[pivot])
             before = left
             for other in pivots[index + 1 :]:
                 shift = other - pivot
                 if shift >= len(coefficients):
                     break
                 factor = left >> shift * 8 & 255
-                if not factor or other not in rows or shift + len(rows[other][0]) > MAX_WINDOW:
+                if not factor or other not in equations or shift + len(equations[other][0]) > MAX_WINDOW:
                     continue
-                more, side = (int.from_bytes(held.translate(TIMES[factor]), "little") for held in rows[other])
+                more, side = (int.from_bytes(held.translate(TIMES[factor]), "little") for held in equations[other])
                 left, right = left ^ more << shift * 8, right ^ side
             if left == 1:
-                del rows[pivot]
+                del equations[pivot]
                 found += self._accept(pivot, right.to_bytes(room, "little"))
-                if not rows:
+                if not equations:
                     break
             elif left != before:
                 size = (left.bit_length() + 7) >> 3
-                rows[pivot] = (left.to_bytes(size, "little"), right.to_bytes(room, "little"))
+                equations[pivot] = (left.to_bytes(size, "little"), right.to_bytes(room, "little"))
         return found
 
     def _naming(self, number: int) -> list[int]:
         """Pivots, older than this packet, of the equations that contain it."""
-        rows = self._rows
-        if len(rows) < MAX_WINDOW:
-            pivots = [pivot for pivot in rows if pivot < number]
+        equations = self._equations
+        if len(equations) < MAX_WINDOW:
+            pivots = [pivot for pivot in equations if pivot < number]
         else:
-            pivots = [pivot for pivot in range(number - MAX_WINDOW + 1, number) if pivot in rows]
-        return [pivot for pivot in pivots if number - pivot < len(rows[pivot][0]) and rows[pivot][0][number - pivot]]
+            pivots = [pivot for pivot in range(number - MAX_WINDOW + 1, number) if pivot in equations]
+        return [
+            pivot
+            for pivot in pivots
+            if number - pivot < len(equations[pivot][0]) and equations[pivot][0][number - pivot]
+        ]
 
     def _accept(self, number: int, body: bytes) -> Found:
         """Return a body that follows from equations, if it is plausible."""
@@ -260,13 +261,13 @@ class RepairDecoder:
     def _disbelieve(self) -> Found:
         """Discard all equations: one of them is wrong, and it is not known which."""
         self.counts["implausible"] += 1
-        self._rows.clear()
+        self._equations.clear()
         return []
 
     def _forget(self, floor: int) -> None:
         """Forget everything older than ``floor``."""
         held: dict[int, Any]
-        for held in (self._bodies, self._rows):
+        for held in (self.bodies, self._equations):
             if floor - self.floor > len(held):
                 for number in [number for number in held if number < floor]:
                     del held[number]

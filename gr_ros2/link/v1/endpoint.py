@@ -5,7 +5,7 @@
 
 Invariants: every submitted message is accepted once; it then leaves whole or is refused with a named reason;
 ``receive`` never raises, whatever the bytes; packets leave only when the pace (rate or credit) allows; each number is
-sent once, and each row once per number; there is no clock, no randomness and no IO here: the caller passes in the time,
+sent once, and each repair id once per number; there is no clock, randomness or IO here: the caller passes in the time,
 the boot number and the stored state.
 """
 
@@ -52,7 +52,6 @@ class EndpointV1:
     :param keys: keys that seal its packets
     :param codec: codes the messages sent
     :param decoder_for: makes the decoder for a robot's messages from its table of topics
-    :param rows: topics of robots that announce none
     :param heard: what ``save`` stored before this start
     :param save: stores up to which packet a robot was heard; needed if ``keys`` must keep replays out after a restart
     :param observer: called with every SenderEvent, in order
@@ -74,7 +73,6 @@ class EndpointV1:
         keys: Keys | None = None,
         codec: MessageCodec | None = None,
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None = None,
-        rows: tuple[AnnouncedTopic, ...] = (),
         heard: Mapping[int, tuple[int, int]] | None = None,
         save: Save | None = None,
         observer: Callable[[SenderEvent], None] | None = None,
@@ -102,7 +100,7 @@ class EndpointV1:
         self.messages = messages = Outbox(topics, settings, self, boot=boot, room=room, codec=codec, observer=observer)
         self.sent = messages.stats
         self._receiving = ReceivingSide(
-            settings, boot, keys, rows=rows, decoder_for=decoder_for, access=access, heard=heard or {}, save=save
+            settings, boot, keys, decoder_for=decoder_for, access=access, heard=heard or {}, save=save
         )
         self.received = self._receiving.stats
         self.neighbours = neighbours = self._receiving.neighbours
@@ -145,10 +143,13 @@ class EndpointV1:
         self._receiving.tell(self._sending, messages, window, rate)
         self.pace, self.pings = self._sending.pace, self._sending.pings
 
-    def submitted(self, topic_id: int, now: float) -> bool:
+    def submitted(self, topic_id: int, now: float) -> None:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
-        self._now = max(self._now, now)
+        self._now = now if now > self._now else self._now
         self._hold.submitted(topic_id, now)
+
+    def behind(self, now: float) -> bool:
+        """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         return self._access is None and self._sending.behind(now)  # with medium access, messages wait for their slot
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
@@ -205,6 +206,7 @@ class EndpointV1:
                 neighbour.trailer.size == TAG_LEN,
                 neighbour.inbox.reports.snr.snr_db,
                 neighbour.inbox.reports.loss,
+                self.received.missed[neighbour.src_id],
                 len(neighbour.inbox.announced.topics),
             )
             for neighbour in self.neighbours
@@ -233,7 +235,7 @@ class EndpointV1:
 
     def next_packet(self, now: float) -> SentPacket | None:
         """See :class:`gr_ros2.link.endpoint.PacketSide`."""
-        self._now = max(self._now, now)
+        self._now = now if now > self._now else self._now
         if not self.answers or not self.pace.may_leave(now):
             return None
         if self._access is not None and not self._may_begin(self._access, now):
@@ -265,7 +267,7 @@ class EndpointV1:
 
     def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
         """See :class:`gr_ros2.link.endpoint.PacketSide`."""
-        self._now = max(self._now, now)
+        self._now = now if now > self._now else self._now
         self._sending.repairs.received()
         return self._receiving.receive(arrival, now)
 

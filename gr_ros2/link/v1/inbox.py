@@ -17,7 +17,7 @@ from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met
-from gr_ros2.link.ledger_rows import ROWS, LedgerRow
+from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.announced import AnnouncedTopics
@@ -93,7 +93,6 @@ class Inbox:
 
     :param first: number of the first packet that may be needed
     :param room: bytes of its longest body
-    :param topics: its topics, where they are known beforehand
     :param decoder_for: makes the decoder for its messages from its table of topics
     :param marks: CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as
         many as its depth
@@ -113,7 +112,6 @@ class Inbox:
         room: int,
         settings: Settings,
         *,
-        topics: tuple[AnnouncedTopic, ...],
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
         marks: dict[int, tuple[int, ...]],
         stats: ReceiverStats,
@@ -146,7 +144,7 @@ class Inbox:
         self._commands, self._deadlines = settings.commands, settings.deadlines
         self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
         """Numbers that its packets have reached, and when, s."""
-        self.announced = AnnouncedTopics(topics, decoder_for, bounds.unknown)
+        self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
         self._last: dict[int, tuple[int, int]] = {}
         """The newest message that was delivered, by topic."""
         self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
@@ -180,7 +178,6 @@ class Inbox:
             return []
         self.counts["packets"] += 1
         late = number < decoder.newest
-        self._stats.packet_loss_est -= late
         self._advance(number, now, here=True)
         self.reports.arrived(late=late)
         for found in decoder.source(number, body[: self._room]):
@@ -195,7 +192,7 @@ class Inbox:
         return number not in self.decoder and number >= self.decoder.floor
 
     def repair(
-        self, number: int, mask: int, row: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
+        self, number: int, mask: int, repair_id: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
     ) -> Events:
         """Take a repair; only one that was not here before calls for a report."""
         self.reports.unreported += new
@@ -205,7 +202,7 @@ class Inbox:
         if oldest:
             self.order.repaired_from(number - window + 1)
         redundant = self.decoder.counts["redundant"]
-        for found in self.decoder.repair(number, mask, row, combined):
+        for found in self.decoder.repair(number, mask, repair_id, combined):
             self._recovered(found)
         if self.decoder.counts["redundant"] > redundant:
             self.reports.repaired_in_vain()
@@ -228,7 +225,7 @@ class Inbox:
         self._now = now
         events = self._settled()
         for partial in self._reassembly.expired(now, _INCOMPLETE_S):
-            self._lose(partial, LedgerRow.EXPIRED)
+            self._lose(partial, Fate.EXPIRED)
         expired, self._events = self._events, []
         return events + expired
 
@@ -239,7 +236,7 @@ class Inbox:
             return ordered
         return waiting + _INCOMPLETE_S if ordered is None else min(ordered, waiting + _INCOMPLETE_S)
 
-    def close(self, reason: LedgerRow) -> Events:
+    def close(self, reason: Fate) -> Events:
         """Give up everything that is not delivered."""
         for partial in self._reassembly.clear():
             self._lose(partial, reason)
@@ -253,8 +250,8 @@ class Inbox:
         """Whether a latched message, named in a hello at a packet number, is neither here, nor a newer one of its
         topic, nor arriving."""
         topic_id, value = mark
-        row = self.announced.topics.get(topic_id)
-        if row is not None and row.dst_id not in (BROADCAST, self._own):
+        topic = self.announced.topics.get(topic_id)
+        if topic is not None and topic.dst_id not in (BROADCAST, self._own):
             return False
         here = value in self.marks.get(topic_id, ()) or self._last.get(topic_id, (-1, -1))[0] > number
         return not here and not self._reassembly.growing(topic_id, now - 1.0)
@@ -288,8 +285,9 @@ class Inbox:
         self.decoder.advance(number)
         if gone:
             self.counts["missing"] += gone
-            self._stats.packet_loss_est += gone
-            self.reports.missed(gone, counts=newest >= self._first)
+            met = newest >= self._first  # what came before the first packet that was heard is not lost
+            self._stats.missed[self.src_id] += gone * met
+            self.reports.missed(gone, counts=met)
             self.order.missing(now, newest + 1, newest + gone)
 
     def _recovered(self, found: tuple[int, bytes]) -> None:
@@ -319,12 +317,12 @@ class Inbox:
             return
         whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
         for partial in self._reassembly.overflowing():
-            self._lose(partial, LedgerRow.MEMORY)
+            self._lose(partial, Fate.MEMORY)
         if whole is None:
             return
         payload = whole.payload()
         if payload is None:
-            self._lose(whole, LedgerRow.DAMAGED)
+            self._lose(whole, Fate.DAMAGED)
             return
         order = (whole.begin, whole.place)
         self._arrived(Ready(whole.topic_id, order, payload, qos, whole.coded, whole.repaired))
@@ -343,14 +341,22 @@ class Inbox:
             self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
             self._table(ready.payload)
             return
+        self._known(ready)
+
+    def _known(self, ready: Ready) -> None:
+        """Deliver a message as soon as its topic is known. One of a reliable topic waits for those before it, unless it
+        came over another robot."""
         topic = self.announced.topic_of(ready)
         if topic is None:
-            for lost in self.announced.wait(ready):
-                self._give_up([lost], self.announced.unknown(lost))
-        elif topic.reliable and ready.order[0] > self.order.low:
+            self._await_table(ready)
+        elif topic.reliable and ready.over is None and ready.order[0] > self.order.low:
             self.order.wait(ready)
         else:
             self._deliver(ready, topic)
+
+    def _await_table(self, ready: Ready) -> None:
+        for lost in self.announced.wait(ready):
+            self._give_up([lost], self.announced.unknown(lost))
 
     def _of_another(self, ready: Ready) -> None:
         """A message of another robot."""
@@ -367,12 +373,7 @@ class Inbox:
             self._table(ready.payload)
         else:
             self._over.append((ready.topic_id, ready.order))
-            topic = self.announced.topic_of(ready)
-            if topic is not None:
-                self._deliver(ready, topic)
-            else:
-                for lost in self.announced.wait(ready):
-                    self._give_up([lost], self.announced.unknown(lost))
+            self._known(ready)
         events, self._events = self._events, []
         return events
 
@@ -386,19 +387,19 @@ class Inbox:
     def _deliver(self, ready: Ready, topic: AnnouncedTopic) -> None:
         topic_id, order = ready.topic_id, ready.order
         if topic.dst_id not in (BROADCAST, self._own) and self._own != NOBODY:
-            self._give_up([ready], LedgerRow.NOT_FOR_US)
+            self._give_up([ready], Fate.NOT_FOR_US)
             return
         if self.sealed_after is not None and self._old(order[0], topic):
-            self._give_up([ready], LedgerRow.NOT_FRESH)
+            self._give_up([ready], Fate.NOT_FRESH)
             return
         if topic.fresh and self._late(order[0], topic):
-            self._give_up([ready], LedgerRow.LATE)
-            return
-        if order <= self._last.get(topic_id, (-1, -1)) and (topic_id, order) in self._over:
-            self._stats.repeats += 1
+            self._give_up([ready], Fate.LATE)
             return
         if order <= self._last.get(topic_id, (-1, -1)):
-            self._give_up([ready], _passed_over(topic))
+            if (topic_id, order) in self._over:
+                self._stats.repeats += 1
+            else:
+                self._give_up([ready], _passed_over(topic))
             return
         self._last[topic_id] = order
         for partial in self._reassembly.overtaken(topic_id, order[0]):
@@ -410,17 +411,17 @@ class Inbox:
                 return
             self.marks[topic_id] = (*marks, mark)[-max(topic.depth, 1) :]
         try:
-            payload = self.announced.decode(ready)
+            payload = self.announced.decode(ready) if ready.coded else ready.payload
         except CodecError as error:
-            self._give_up([ready], ROWS[error.row])
+            self._give_up([ready], FATES[error.fate])
             return
         qos = ready.qos if ready.qos >= 0 else topic.qos
         key = Key(self.boot, *order)
-        self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired))
+        self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired, ready.hops, ready.over))
 
     def _old(self, number: int, topic: AnnouncedTopic) -> bool:
         """Whether a message may be older than its topic allows, because nothing proves that it is not."""
-        most = self._max_ages.get(topic.name.lstrip("/"), self._max_age_s)
+        most = self._max_ages.get(topic.name.lstrip("/"), self._max_age_s) if self._max_ages else self._max_age_s
         if most == AUTO:
             most = MAX_AGE_S if topic.fresh else 0.0
         return most > 0 and self.sealed_after is not None and self._now - self.sealed_after(number) > most
@@ -443,20 +444,21 @@ class Inbox:
             return
         if topics is None:
             return
-        self._give_up(self.order.without({*self.announced.topics, CARRIED_TOPIC}), LedgerRow.UNKNOWN_TOPIC)
+        for ready in self.order.without({*self.announced.topics, CARRIED_TOPIC}):
+            self._await_table(ready)  # an older table, which came over others, lacks topics of the newest one
         self._events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
-            self._arrived(ready)
+            self._known(ready)
 
-    def _lose(self, partial: PartialMessage, reason: LedgerRow) -> None:
+    def _lose(self, partial: PartialMessage, reason: Fate) -> None:
         key = Key(self.boot, partial.begin, partial.place)
         self._events.append(Lost(self.src_id, partial.topic_id, reason, key))
 
-    def _give_up(self, messages: Iterable[Ready], reason: LedgerRow) -> None:
+    def _give_up(self, messages: Iterable[Ready], reason: Fate) -> None:
         for ready in messages:
             self._events.append(Lost(self.src_id, ready.topic_id, reason, Key(self.boot, *ready.order)))
 
 
-def _passed_over(topic: AnnouncedTopic) -> LedgerRow:
-    """The ledger row of a message that is not delivered because a later one of its topic was."""
-    return LedgerRow.GIVEN_UP if topic.reliable else LedgerRow.OVERTAKEN
+def _passed_over(topic: AnnouncedTopic) -> Fate:
+    """The fate of a message that is not delivered because a later one of its topic was."""
+    return Fate.GIVEN_UP if topic.reliable else Fate.OVERTAKEN

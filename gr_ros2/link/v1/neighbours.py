@@ -37,7 +37,7 @@ from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.peers import START
 from gr_ros2.link.v1.proofs import OwnHellos, Proofs
 from gr_ros2.link.v1.replays import Floor, Floors, Save
-from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Trailer
+from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Trailer
 from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, Heard, Hello
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
@@ -57,8 +57,8 @@ _CHANGE_S = 1.0
 most, and a robot that restarts is met soon."""
 _STARTS = 256
 """Starts that have ended of which is known how far they were heard."""
-_ROWS_KEPT = 512
-"""Packet numbers, counted back from the newest, for which it is known which rows were used."""
+_NUMBERS_KEPT = 512
+"""Packet numbers, counted back from the newest, for which it is known which repair ids were used."""
 _MOST = 1 << 48
 """Number of packets that a start of a robot can have."""
 
@@ -79,8 +79,8 @@ class Neighbour:
     proofs: Proofs
     gone: bool = False
     """Whether it has been silent for long."""
-    rows: dict[int, int] = field(default_factory=dict)
-    """Rows of repair packets that carried entries, as bits, by packet number."""
+    repair_ids: dict[int, int] = field(default_factory=dict)
+    """Repair ids of packets that carried entries, as bits, by packet number."""
     asked: dict[int, float] = field(default_factory=dict)
     """When each topic was requested."""
     echo: tuple[bytes, int] | None = None
@@ -96,23 +96,23 @@ class Neighbour:
 
     def number(self, low: int) -> int:
         """The full packet number for its low 16 bits: the one nearest to the newest."""
-        newest = self.inbox.newest
+        newest = self.inbox.decoder.newest
         number = newest + ((low - newest + _HALF) & 0xFFFF) - _HALF
         if not 0 <= number < _MOST:
             raise ReplayedError(f"packet {low} of robot {self.src_id} is older than its start")
         return number
 
-    def new(self, number: int, row: int) -> bool:
-        """Whether a packet was not here before, as far as this is known; notes the row of a repair packet."""
-        if row == SOURCE_ROW:
+    def new(self, number: int, repair_id: int) -> bool:
+        """Whether a packet was not here before, as far as this is known; notes the repair id of a repair packet."""
+        if repair_id == NOT_A_REPAIR:
             return self.inbox.lacks_packet(number)
-        oldest = self.inbox.newest - _ROWS_KEPT
-        used = self.rows.get(number, 0)
-        if used >> row & 1 or number <= oldest:
+        oldest = self.inbox.decoder.newest - _NUMBERS_KEPT
+        used = self.repair_ids.get(number, 0)
+        if used >> repair_id & 1 or number <= oldest:
             return False
-        self.rows[number] = used | 1 << row
-        if len(self.rows) > 2 * _ROWS_KEPT:
-            self.rows = {number: used for number, used in self.rows.items() if number > oldest}
+        self.repair_ids[number] = used | 1 << repair_id
+        if len(self.repair_ids) > 2 * _NUMBERS_KEPT:
+            self.repair_ids = {number: used for number, used in self.repair_ids.items() if number > oldest}
         return True
 
 
@@ -162,8 +162,10 @@ class Neighbours:
         self._own = own
         self._settings = settings
         self._keys = keys
+        self._trailer_len = keys.trailer_len
         self._provable = keys.sealed and settings.hears
         self.floors = Floors(heard, save, dropped)
+        self._stores = save is not None and keys.sealed
         self.own_hellos = OwnHellos(own[0])
         self._make_inbox = inbox
         self._known: dict[int, Neighbour] = {}
@@ -202,7 +204,7 @@ class Neighbours:
         :return: None if it is kept until a hello or a proof comes, or dropped because it is not proven
         :raises WireError: the packet cannot be opened, or must not be
         """
-        start, end = header.size, len(data) - self._keys.trailer_len
+        start, end = header.size, len(data) - self._trailer_len
         repair = None
         if header.qos == QOS_REPAIR:
             repair = read_repair_header(data, start, end)
@@ -215,9 +217,9 @@ class Neighbours:
             self.dropped["early"] += 1
             return None
         number = neighbour.number(header.number)
-        row = SOURCE_ROW if repair is None else repair.row
+        repair_id = NOT_A_REPAIR if repair is None else repair.repair_id
         try:
-            body = neighbour.trailer.open(data[:start], data[start:], number, row)
+            body = neighbour.trailer.open(data[:start], data[start:], number, repair_id)
         except (CrcError, TagError):
             self._keep(header.src_id, data)
             raise
@@ -230,9 +232,9 @@ class Neighbours:
             if number <= neighbour.proofs.proven:
                 self.dropped["unproven"] += 1
                 return None
-        new = neighbour.new(number, row)
+        new = neighbour.new(number, repair_id)
         if control and not new:
-            raise ReplayedError(f"row {row} at packet {number} of robot {header.src_id} was here before")
+            raise ReplayedError(f"repair id {repair_id} at packet {number} of robot {header.src_id} was here before")
         met = new and self._heard(neighbour, number, now)
         return Opened(neighbour, header, number, repair, body, met=met, new=new)
 
@@ -278,7 +280,7 @@ class Neighbours:
             return
         hello, _, clear, rest = self._read_hello(data, header, repair)
         if hello.boot != self._own[1]:
-            self._trailer(header.src_id, hello, clear, rest, (hello.turns << 16 | header.number, repair.row))
+            self._trailer(header.src_id, hello, clear, rest, (hello.turns << 16 | header.number, repair.repair_id))
             raise SameIdError(
                 f"robot {header.src_id} is this robot, but start {hello.boot:016x} has that id too: two robots have it "
                 "(give one another robot_id), or a recording of an earlier start is on the air"
@@ -308,10 +310,10 @@ class Neighbours:
         number = hello.turns << 16 | header.number
         neighbour = self._known.get(src_id)
         if neighbour is not None and neighbour.boot == hello.boot:
-            neighbour.trailer.open(clear, rest, number, repair.row, plain=True)
+            neighbour.trailer.open(clear, rest, number, repair.repair_id, plain=True)
             jumps = not sealed and abs(number - neighbour.inbox.newest) > _HALF
             if not (jumps and neighbour.gone):
-                if jumps or not neighbour.new(number, repair.row):
+                if jumps or not neighbour.new(number, repair.repair_id):
                     raise ReplayedError(f"a hello of robot {src_id} at packet {number} was here before, or cannot be")
                 if number >= neighbour.hello_number:
                     neighbour.hello, neighbour.hello_number = hello, number
@@ -325,7 +327,7 @@ class Neighbours:
         if refused:
             newest = boot if neighbour is None else neighbour.boot
             raise ReplayedError(f"start {hello.boot:016x} of robot {src_id}, after start {newest:016x} was heard")
-        trailer = self._trailer(src_id, hello, clear, rest, (number, repair.row))
+        trailer = self._trailer(src_id, hello, clear, rest, (number, repair.repair_id))
         again, stores = boot == hello.boot, self._counts_on_store(hello)
         if again and stores and number < floor:
             raise ReplayedError(f"a hello of robot {src_id} from before packet {floor}, up to which it was heard")
@@ -345,7 +347,7 @@ class Neighbours:
         if self.proves(hello):
             inbox.sealed_after = proofs.sealed_after
         self._met_at[src_id] = now
-        met.new(number, repair.row)
+        met.new(number, repair.repair_id)
         self._known[src_id] = met
         self.floors.store(met.floor, max(first, number + 1) if stores else 0, now)
         return Opened(met, header, number, repair, b"", entries, True, neighbour)
@@ -367,7 +369,7 @@ class Neighbours:
         """A new packet of a known robot arrived; returns whether the robot was taken for gone."""
         neighbour.heard = now
         back, neighbour.gone = neighbour.gone, False
-        if self._counts_on_store(neighbour.hello):
+        if self._stores and not self.proves(neighbour.hello):
             self.floors.guard(neighbour.floor, number, now)
         return back
 
@@ -387,4 +389,4 @@ class Neighbours:
 
     def _counts_on_store(self, hello: Hello) -> bool:
         """Whether only the stored packet number keeps replays of a robot out."""
-        return self.floors.stores and self._keys.sealed and not self.proves(hello)
+        return self._stores and not self.proves(hello)

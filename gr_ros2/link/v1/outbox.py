@@ -3,7 +3,8 @@
 Which of them goes into the next packet says ``packing``, how long it is worth repairing ``lifetime``, and what is kept
 for robots that join late ``kept``.
 
-Invariant: every message ends in being sent or in a Refused with its row.
+Invariants: every message is sent or ends in a Refused with its fate; a topic id is for the same robot as long as this
+start lasts, so that no older table of a receiver lets it deliver what is for another one.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from typing import Any, Protocol
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.link.endpoint import check_live_options
 from gr_ros2.link.events import Accepted, Missed, Refused
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
@@ -25,9 +27,9 @@ from gr_ros2.link.v1.kept import KeptMessages
 from gr_ros2.link.v1.lifetime import WORTH
 from gr_ros2.link.v1.packing import ENTRY, Message, Packing
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopic, SentTopics
-from gr_ros2.settings.config import QueuePolicy
+from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.registry import NewTopic, Registry
+from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOPIC
 
 Observer = Callable[[Accepted | Refused | Missed], None]
@@ -36,8 +38,11 @@ Observer = Callable[[Accepted | Refused | Missed], None]
 class Owner(Protocol):
     """What an outbox tells its endpoint."""
 
-    def submitted(self, topic_id: int, now: float) -> bool:
-        """A message of a topic has come; returns whether the computer is too slow for what comes."""
+    def submitted(self, topic_id: int, now: float) -> None:
+        """A message of a topic has come."""
+
+    def behind(self, now: float) -> bool:
+        """Whether messages that wait do so because the computer is too slow for what comes."""
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """The table of topics has changed.
@@ -99,16 +104,16 @@ class Outbox:
             self.sent.add(topics)
             self._tabulate()
 
-    def add(self, rows: Sequence[NewTopic]) -> Registry:
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
         """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one learn of them from the next
         hello."""
-        together = (Registry.empty() if self.topics is None else self.topics).extended(rows)
-        topics = together[-len(rows) :] if rows else ()
+        together = (Registry.empty() if self.topics is None else self.topics).extended(topics)
+        added = together[-len(topics) :] if topics else ()
         if self._codec is not None:
-            for topic in topics:
+            for topic in added:
                 self._codec.add(topic)
         self.topics = together
-        self.sent.add(topics)
+        self.sent.add(added)
         self._tabulate()
         self._owner.topics_changed(added=True)
         return together
@@ -136,6 +141,24 @@ class Outbox:
             self._owner.topics_changed()
         return self.queue(topic_id) != before
 
+    def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:
+        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
+        before = self.sent[topic_id]
+        name, type_name = before.topic.name, before.topic.type_name
+        check_live_options(name, before.topic.options, options)
+        meant = name, type_name, options.to
+        known = [
+            one for one in self.sent.named() if (one.topic.name, one.topic.type_name, one.topic.options.to) == meant
+        ]
+        after = known[0] if known else self.sent[self.add([(name, type_name, options)])[-1].topic_id]
+        after.publishers = before.publishers
+        after.change(options)
+        self.sent.find_deadlines()
+        if self._tabulate() or after is not before:
+            self._owner.topics_changed(asked=True)
+        assert self.topics is not None
+        return self.topics, after.topic
+
     def missed(self, topic_id: int, total: int) -> None:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         new = total - self.stats.missed[topic_id]
@@ -151,7 +174,8 @@ class Outbox:
         topic = self.sent.get(topic_id)
         if topic is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
-        if self._owner.submitted(topic_id, now) and topic.is_stream:
+        self._owner.submitted(topic_id, now)
+        if topic.queue and topic.is_stream and self._owner.behind(now):
             self.drop(list(topic.queue.shed(now)))
         self.packing.turns.join(topic_id)
         serial = self._serial
@@ -164,7 +188,7 @@ class Outbox:
         if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
-            self._refuse(serial, topic_id, LedgerRow.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         coded = codec is not None
         message = Message(serial, topic_id, payload, topic.qos, now, topic.weight, lifespan_s, coded=coded)
@@ -250,9 +274,9 @@ class Outbox:
             if isinstance(item.message, Message):
                 item.message.lifetime.end()
             if not item.message.repeat:
-                self._refuse(item.message.serial, item.message.topic_id, item.row, item.detail)
+                self._refuse(item.message.serial, item.message.topic_id, item.fate, item.detail)
 
-    def _refuse(self, serial: int, topic_id: int, reason: LedgerRow, detail: str) -> None:
+    def _refuse(self, serial: int, topic_id: int, reason: Fate, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1
         if self._observer is not None:
             self._observer(Refused(serial, topic_id, reason, detail))

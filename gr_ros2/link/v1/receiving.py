@@ -21,7 +21,7 @@ from gr_ros2.link.events import (
     ReceiverEvent,
     Rejected,
 )
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import RateController
 from gr_ros2.link.stats import ReceiverStats
@@ -32,7 +32,7 @@ from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.replays import Save
-from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys
+from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.wire.control import (
@@ -59,7 +59,6 @@ GIVE_UP_S = 10.0
 class ReceivingSide:
     """The receiving half of one robot.
 
-    :param rows: topics of robots that announce none
     :param decoder_for: makes the decoder for a robot's messages from its table of topics
     :param heard: what ``save`` stored before this start
     :param access: is told what is heard on a channel that others share
@@ -74,7 +73,6 @@ class ReceivingSide:
         boot: int,
         keys: Keys,
         *,
-        rows: tuple[AnnouncedTopic, ...],
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
         access: Access | None = None,
         heard: Mapping[int, tuple[int, int]],
@@ -86,7 +84,6 @@ class ReceivingSide:
         self._boot = boot
         self._sealed = keys.sealed
         self._give_up_s = GIVE_UP_S / settings.airtime_share
-        self._rows = rows
         self._decoder_for = decoder_for
         self._marks: dict[int, dict[int, tuple[int, ...]]] = {}
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
@@ -153,19 +150,19 @@ class ReceivingSide:
         neighbour = self.neighbours.get(event.src_id)
         if neighbour is not None:
             neighbour.inbox.marks.pop(event.topic_id, None)
-        self.stats.lost[event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED.value] += 1
-        return Lost(event.src_id, event.topic_id, LedgerRow.PUBLISH_FAILED, event.key)
+        self.stats.lost[event.src_id, event.topic_id, Fate.PUBLISH_FAILED.value] += 1
+        return Lost(event.src_id, event.topic_id, Fate.PUBLISH_FAILED, event.key)
 
     def _receive(self, arrival: ReceivedPacket, now: float) -> None:
         try:
             header = read_header(arrival.data, self._settings.packet_len)
             opened = self._open(arrival.data, header, now)
-            if opened is None or opened.new:  # what was here before says nothing about now
-                self._note_slot(header, arrival, now, trusted=opened is not None)
+            if self._access is not None and (opened is None or opened.new):  # what was here says nothing about now
+                self._note_slot(self._access, header, arrival, now, trusted=opened is not None)
             if opened is None:
                 return
             opened.neighbour.timeout = None
-            if not self._for_us(header):
+            if self._access is not None and not self._for_us(header):
                 self.stats.dropped["not_for_us"] += 1
                 return
             if arrival.snr_db is not None and opened.new:
@@ -179,12 +176,12 @@ class ReceivingSide:
             for early in self.neighbours.early(opened.neighbour.src_id):
                 self._receive(ReceivedPacket(early), now)
 
-    def _note_slot(self, header: Header, arrival: ReceivedPacket, now: float, *, trusted: bool) -> None:
+    def _note_slot(self, access: Access, header: Header, arrival: ReceivedPacket, now: float, *, trusted: bool) -> None:
         """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
-        if self._access is None or arrival.received_at is None or header.src_id == self._settings.src_id:
+        if arrival.received_at is None or header.src_id == self._settings.src_id:
             return
         block = read_block(header.block)[0] if header.block else None
-        self._access.hear(header.src_id, block, arrival.received_at, trusted=trusted)
+        access.hear(header.src_id, block, arrival.received_at, trusted=trusted)
         if self.relaying is not None and trusted:
             self.relaying.heard(header.src_id, block, now)
 
@@ -218,22 +215,22 @@ class ReceivingSide:
             self._meet(opened, now)
         self._sender, inbox = neighbour, neighbour.inbox
         if repair is None:
-            entries = read_body(opened.body, self._room(header))
+            entries = read_body(opened.body, header.room(self._settings.packet_len))
             packet = PacketV1(header, tuple(entries), encrypted=neighbour.encrypts)
-            self._arrived(arrival, neighbour, number, SOURCE_ROW, packet)
+            self._arrived(arrival, neighbour, number, NOT_A_REPAIR, packet)
             self._report_all(inbox.source(number, opened.body, entries, header.qos, now))
             return False
         if repair.mask:
             packet = PacketV1(header, (), repair, opened.body, neighbour.encrypts)
-            self._arrived(arrival, neighbour, number, repair.row, packet)
+            self._arrived(arrival, neighbour, number, repair.repair_id, packet)
             oldest, new = repair.oldest, opened.new
             self._report_all(
-                inbox.repair(number, repair.mask, repair.row, opened.body, oldest=oldest, now=now, new=new)
+                inbox.repair(number, repair.mask, repair.repair_id, opened.body, oldest=oldest, now=now, new=new)
             )
             return False
-        entries = opened.entries if opened.entries is not None else read_body(opened.body, self._room(header))
+        entries = opened.entries or read_body(opened.body, header.room(self._settings.packet_len))
         packet = PacketV1(header, tuple(entries), repair, b"", neighbour.encrypts and not repair.clear)
-        self._arrived(arrival, neighbour, number, repair.row, packet)
+        self._arrived(arrival, neighbour, number, repair.repair_id, packet)
         if repair.clear:
             neighbour.echo = arrival.data[-ECHO_LEN:], self._window.packets.newest
             if neighbour.hello.capabilities & WANTS_PROOF:
@@ -249,20 +246,18 @@ class ReceivingSide:
         self._report_all(inbox.heard(number, now, over=repair.oldest))
         return proved
 
-    def _room(self, header: Header) -> int:
-        """Bytes of the longest body that can be in a packet."""
-        return header.room(self._settings.packet_len)
-
-    def _arrived(self, arrival: ReceivedPacket, neighbour: Neighbour, number: int, row: int, packet: PacketV1) -> None:
+    def _arrived(
+        self, arrival: ReceivedPacket, neighbour: Neighbour, number: int, repair_id: int, packet: PacketV1
+    ) -> None:
         """Report a packet before the events that it causes."""
-        identity = PacketId(neighbour.src_id, neighbour.boot, number, row)
+        identity = PacketId(neighbour.src_id, neighbour.boot, number, repair_id)
         self._events.append(Received(arrival.data, packet, identity, arrival.received_at, arrival.snr_db))
 
     def _meet(self, opened: Opened, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""
         neighbour = opened.neighbour
         if opened.replaced is not None:
-            self._report_all(opened.replaced.inbox.close(LedgerRow.SENDER_RESTARTED))
+            self._report_all(opened.replaced.inbox.close(Fate.SENDER_RESTARTED))
         self._forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
@@ -319,7 +314,6 @@ class ReceivingSide:
             first,
             room,
             self._settings,
-            topics=self._rows,
             decoder_for=self._decoder_for,
             marks=self._marks.setdefault(src_id, {}),
             stats=self.stats,

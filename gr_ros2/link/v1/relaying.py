@@ -13,7 +13,7 @@ robots and the topics that they announce.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from math import inf
 
@@ -39,6 +39,8 @@ TABLE_S = 5.0
 """s after which the table of a robot that is heard is worth sending on again: some may have come since."""
 MOST_FAR = 64
 """Robots that are known over others only."""
+MOST_EARLY = 16
+"""Messages carried to this robot that wait for the table of their origin."""
 _BOOT_LEN = 8
 
 
@@ -65,6 +67,7 @@ class Relaying:
         self._newest: dict[Stream, Relayed] = {}
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
+        self._early = deque[tuple[Relayed, int]](maxlen=MOST_EARLY)
         self._chosen: Stream | None = None
         self.found: Callable[[int, float], None] = lambda _, __: None
         """Called with a robot that is reached over others for the first time."""
@@ -133,13 +136,21 @@ class Relaying:
         if message.dst_id not in (BROADCAST, self.src_id):
             return []
         if message.topic_id == TABLE_TOPIC:
-            return self._announced(message, now)
+            return self._announced(message, via, now)
         inbox = self._inbox(message.origin, message.start)
-        if inbox is None:
+        if inbox is not None:
+            return self._delivered(inbox, message, via, now)
+        if taker == BROADCAST:
             self._dropped["unknown_origin"] += 1
             return []
+        # Whoever has handed it on has forgotten it by now. It waits until the table of its origin is here.
+        self._dropped["unknown_origin"] += len(self._early) == MOST_EARLY
+        self._early.append((message, via))
+        return []
+
+    def _delivered(self, inbox: Inbox, message: Relayed, via: int, now: float) -> Events:
         order = message.number, message.place
-        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False)
+        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False, message.hops, via)
         return self._reached(inbox, now) + inbox.relayed(ready, now)
 
     def _reached(self, inbox: Inbox, now: float) -> Events:
@@ -166,7 +177,7 @@ class Relaying:
             if inbox is not None and (neighbour is None or neighbour.gone):
                 hops, over = self.hops.get(src_id, 0), self.custody.routes.over(src_id, now, lambda _: True)
                 topics = len(inbox.announced.topics)
-                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, topics, hops, over))
+                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, 0, topics, hops, over))
         return found
 
     def handle_timeout(self, now: float) -> Events:
@@ -187,8 +198,8 @@ class Relaying:
     def _carried(self, src_id: int, topic_id: int) -> bool:
         """Whether a robot's messages of a topic are handed on to the one for which they are."""
         neighbour = self._neighbours.get(src_id)
-        row = None if neighbour is None else neighbour.inbox.announced.topics.get(topic_id)
-        return row is not None and row.reliable and (row.dst_id != BROADCAST or row.type_name == CALLS_TYPE)
+        topic = None if neighbour is None else neighbour.inbox.announced.topics.get(topic_id)
+        return topic is not None and topic.reliable and (topic.dst_id != BROADCAST or topic.type_name == CALLS_TYPE)
 
     def _take(self, via: int, message: Relayed, now: float) -> bool:
         stream = Stream(message.origin, message.start, message.topic_id)
@@ -202,7 +213,7 @@ class Relaying:
         payload = boot.to_bytes(_BOOT_LEN, "big") + table
         self._take(src_id, Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload), now)
 
-    def _announced(self, message: Relayed, now: float) -> Events:
+    def _announced(self, message: Relayed, via: int, now: float) -> Events:
         """The table of a far robot."""
         boot = int.from_bytes(message.payload[:_BOOT_LEN], "big")
         if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start:
@@ -219,8 +230,14 @@ class Relaying:
                 return []
             inbox = self.far[message.origin] = self._make_inbox(message.origin, boot)
             self.found(message.origin, now)
-        ready = Ready(TABLE_TOPIC, (message.number, message.place), message.payload[_BOOT_LEN:], -1, False, False)
-        return self._reached(inbox, now) + inbox.relayed(ready, now)
+        events = self._delivered(inbox, message._replace(payload=message.payload[_BOOT_LEN:]), via, now)
+        for early in [early for early in self._early if early[0].origin == message.origin]:
+            self._early.remove(early)
+            if early[0].start == message.start:
+                events = events + self._delivered(inbox, *early, now)
+            else:
+                self._dropped["unknown_origin"] += 1
+        return events
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
         """Where messages of a start of a robot come together, directly or over others."""

@@ -4,8 +4,8 @@ the key.
 A fleet shares keys. Each start of each robot seals with its own key. That key is derived from the fleet's key by HKDF
 (RFC 5869), with the robot's id and the number of the start, its *boot number*, half of which is random. So two robots
 that have one id by mistake do not share a key. The nonce consists of the full packet number (not only 16 bits of it)
-and the packet's row. No pair of key and nonce is used twice as long as a number is sent once, and a row is used once
-per number. A packet that is sent again is the same packet, byte for byte.
+and the packet's repair id. No pair of key and nonce is used twice as long as a number is sent once, and a repair id
+once per number. A packet that is sent again is the same packet, byte for byte.
 
 Invariants: ``open`` returns a body only if the trailer belongs to the packet's bytes, its sender's boot number and its
 full packet number; otherwise it raises a named WireError. The hop count of a sealed packet is not covered, because
@@ -29,8 +29,8 @@ from gr_ros2.wire.v1 import CRC_LEN, HEADER_LEN, TAG_LEN, crc, session_crc
 
 SealMode = Literal["none", "authenticate", "encrypt"]
 
-SOURCE_ROW = 255
-"""Takes the place of the row in the nonce of a source packet."""
+NOT_A_REPAIR = 255
+"""Takes the place of the repair id in the nonce of a source packet."""
 
 _SUBKEY_LEN = 16
 _SALT = b"gr-ros2 version 1"
@@ -42,17 +42,17 @@ _info = Struct(">BQ")
 class Trailer(Protocol):
     """Closes and opens the packets of one start of one robot.
 
-    ``clear`` is what stands before the body: the header, and in a repair packet also window, row and mask.
-    ``number`` is the full packet number. ``row`` is the row of a repair packet; for other packets it is
-    ``SOURCE_ROW``. ``plain``: the body is not encrypted, whatever the mode (as in a hello).
+    ``clear`` is what stands before the body: the header, and in a repair packet also window, repair id and mask.
+    ``number`` is the full packet number. ``repair_id`` is that of a repair packet; for other packets it is
+    ``NOT_A_REPAIR``. ``plain``: the body is not encrypted, whatever the mode (as in a hello).
     """
 
     size: int
 
-    def close(self, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+    def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
         """The whole packet."""
 
-    def open(self, clear: bytes, rest: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+    def open(self, clear: bytes, rest: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
         """The body.
 
         :param rest: what follows ``clear`` in the packet
@@ -73,12 +73,12 @@ class Checksum:
         self._turns = 0
         self._session = session_crc(boot, 0)
 
-    def close(self, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
+    def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
         """See :class:`Trailer`."""
         data = clear + body
         return data + crc(data, self._of(number >> 16))
 
-    def open(self, clear: bytes, rest: bytes, number: int, row: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
+    def open(self, clear: bytes, rest: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
         """See :class:`Trailer`."""
         body = rest[:-CRC_LEN]
         if crc(clear + body, self._of(number >> 16)) != rest[-CRC_LEN:]:
@@ -106,17 +106,17 @@ class Seal:
         self.encrypt = encrypt
         self._cipher = AESCCM(subkey(key, src_id, boot), tag_length=TAG_LEN)
 
-    def close(self, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+    def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
         """See :class:`Trailer`."""
-        nonce = _nonce.pack(0, number, row)
+        nonce = _nonce.pack(0, number, repair_id)
         named = clear if len(clear) <= _HOP else without_hop(clear)
         if self.encrypt and not plain:
             return clear + self._cipher.encrypt(nonce, body, named)
         return clear + body + self._cipher.encrypt(nonce, b"", named + body)
 
-    def open(self, clear: bytes, rest: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
+    def open(self, clear: bytes, rest: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
         """See :class:`Trailer`."""
-        nonce = _nonce.pack(0, number, row)
+        nonce = _nonce.pack(0, number, repair_id)
         named = clear if len(clear) <= _HOP else without_hop(clear)
         try:
             if self.encrypt and not plain:

@@ -3,7 +3,7 @@
 A packet is *alive* until every peer that reports has confirmed it, or until all messages in it are over: late, or
 replaced by newer ones.
 
-Invariants: a repair packet's row is used once per number; no live packet is more than ``span`` numbers old.
+Invariants: a repair id is used once per number; no live packet is more than ``span`` numbers old.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from gr_ros2.link.v1.lifetime import GROUP, Lifetime
-from gr_ros2.wire.v1 import MAX_WINDOW, ROWS
+from gr_ros2.wire.v1 import MAX_WINDOW, REPAIR_IDS
 
 SPAN = 30_000
 """Numbers that a sender repairs and a peer remembers, if its memory allows; numbers are mod 65,536."""
-_ALL_ROWS = (1 << ROWS) - 1
+_ALL_USED = (1 << REPAIR_IDS) - 1
 
 
 @dataclass(slots=True, eq=False)
@@ -61,9 +61,9 @@ class SentPackets:
         self.records: dict[int, Sent] = {}
         self.everybody = 0
         self._span = span
-        self._rows: dict[int, int] = {}
-        """Rows already used, as bits, by number."""
-        self._row = 0
+        self._repair_ids: dict[int, int] = {}
+        """Repair ids already used, as bits, by number."""
+        self._repair_id = 0
 
     def add(self, number: int, body: bytes, data: bytes, lifetimes: tuple[Lifetime, ...], now: float) -> None:
         """A source packet left."""
@@ -122,21 +122,21 @@ class SentPackets:
                 return True
         return False
 
-    def take_row(self, number: int) -> int | None:
-        """A row that no repair packet at this number has used; None if all are used."""
-        used = self._rows.get(number, 0)
-        if used == _ALL_ROWS:
+    def take_repair_id(self, number: int) -> int | None:
+        """A repair id that no repair packet at this number has used; None if all are used."""
+        used = self._repair_ids.get(number, 0)
+        if used == _ALL_USED:
             return None
-        row = self._row
-        while used >> row & 1:
-            row = (row + 1) % ROWS
-        self._rows[number] = used | 1 << row
-        self._row = (row + 1) % ROWS
-        if len(self._rows) > 2 * self._span:
-            for old in [old for old in self._rows if old < number - self._span]:
-                del self._rows[old]
-        return row
+        repair_id = self._repair_id
+        while used >> repair_id & 1:
+            repair_id = (repair_id + 1) % REPAIR_IDS
+        self._repair_ids[number] = used | 1 << repair_id
+        self._repair_id = (repair_id + 1) % REPAIR_IDS
+        if len(self._repair_ids) > 2 * self._span:
+            for old in [old for old in self._repair_ids if old < number - self._span]:
+                del self._repair_ids[old]
+        return repair_id
 
     def full(self, number: int) -> bool:
         """Whether no further repair packet can stand at a number."""
-        return self._rows.get(number, 0) == _ALL_ROWS
+        return self._repair_ids.get(number, 0) == _ALL_USED

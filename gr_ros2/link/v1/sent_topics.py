@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
 from gr_ros2.link.v1.lifetime import Lifetimes
 from gr_ros2.settings.commands import is_command
+from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
 from gr_ros2.wire.table import AnnouncedTopic
@@ -30,6 +31,7 @@ class SentTopic:
     :param publishers: the QoS that its publishers offer
     :param newest: when the newest of its messages that have left was submitted, s
     :param lifetimes: its messages that have left
+    :ivar dst_id: the robot for which its messages are, 255 for all
     """
 
     topic: Topic
@@ -42,6 +44,11 @@ class SentTopic:
     publishers: PublisherQos = UNKNOWN_QOS
     newest: float = -inf
     lifetimes: Lifetimes = field(default_factory=Lifetimes)
+    dst_id: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        to = self.topic.options.to
+        self.dst_id = BROADCAST if to == AUTO else to
 
     @property
     def kept(self) -> bool:
@@ -66,12 +73,6 @@ class SentTopic:
         return 1 if depth == AUTO else depth
 
     @property
-    def dst_id(self) -> int:
-        """The robot for which its messages are, 255 for all."""
-        to = self.topic.options.to
-        return BROADCAST if to == AUTO else to
-
-    @property
     def in_order(self) -> bool:
         """Whether its messages are delivered in order, each after all earlier ones."""
         wanted = self.topic.options.reliability
@@ -83,6 +84,13 @@ class SentTopic:
         topic, self.publishers = self.topic, publishers
         self.latched = topic.latched or (publishers.latched and topic.options.durability == AUTO)
         self.queue.change(*queue_for(topic.options, publishers, command=self.command))
+
+    def change(self, options: TopicOptions) -> None:
+        """Use other options from now on, for the same robot."""
+        self.topic = replace(self.topic, options=options)
+        self.qos, self.weight = qos_class(options, command=self.command), options.weight
+        self.queue.limit(options.max_rate)
+        self.follow(self.publishers)
 
     def announced(self, codec: str) -> AnnouncedTopic:
         """Its row in the table.

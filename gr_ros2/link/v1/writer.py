@@ -1,7 +1,7 @@
 """Writes packets: header, body, and the trailer that closes them; and counts and reports what leaves.
 
-Invariants: each number is used once for a source packet, and each row once per number; packets have ``packet_len``
-bytes at most, and exactly as many where all have the same length.
+Invariants: each number is used once for a source packet, and each repair id once per number; packets have
+``packet_len`` bytes at most, and exactly as many where all have the same length.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gr_ros2.link.v1.gf256 import combine
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.repair import RepairWindow
-from gr_ros2.link.v1.sealing import SOURCE_ROW, Checksum, Keys
+from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Checksum, Keys
 from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.wire.v1 import (
@@ -43,7 +43,7 @@ class PacketWriter:
     """Writes the packets of one robot.
 
     :param keys: keys that seal them
-    :param window: records what may be repaired, and gives out rows
+    :param window: records what may be repaired, and gives out repair ids
     :param rate: chooses the MCS of each packet; None for a fixed rate
     :param stats: counts what leaves
     :param hold: is told of new packets
@@ -72,6 +72,7 @@ class PacketWriter:
         self.leave_at: float | None = None
         self._shares = shares
         self._src_id, self._boot, self._dst_id = settings.src_id, boot, settings.dst_id
+        self._hop = HOP if settings.dst_id != BROADCAST else 0
         self._packet_len = settings.packet_len
         self._window, self._rate, self._stats, self._hold, self._observer = window, rate, stats, hold, observer
         self.sealed, self._encrypts = keys.sealed, keys.encrypts
@@ -98,30 +99,34 @@ class PacketWriter:
         body = write_body(entries, self.room)
         header = self._header(qos, number)
         clear = write_header(header)
-        data = self._trailer.close(clear, self._padded(body, clear), number, SOURCE_ROW)
+        padded = body.ljust(self._end_of_body - len(clear), b"\0")
+        data = self._trailer.close(clear, padded, number, NOT_A_REPAIR)
         self._window.sent(number, body, data, lifetimes, now)
         if lifetimes:
             self._hold.left(now, self._window.peers.loss)
         packet = PacketV1(header, tuple(entries), encrypted=self._encrypts)
-        return self._leave(data, packet, (number, SOURCE_ROW), "new", now, parts=parts)
+        identity = PacketId(self._src_id, self._boot, number, NOT_A_REPAIR)
+        return self._leave(data, packet, identity, "new", now, parts=parts)
 
     def control(self, entries: Sequence[EntryV1], kind: AirKind, now: float, *, clear: bool = False) -> SentPacket:
         """Write a packet of entries that are not messages; it stands at the newest number."""
         window = self._window
-        row = window.packets.take_row(window.packets.newest)
-        if row is None:
+        repair_id = window.packets.take_repair_id(window.packets.newest)
+        if repair_id is None:
             return self.source([], window.exhausted(now), 0, (), now)
         body = write_body(entries, self.room)
-        fields = RepairHeader(row, oldest=not window.packets.unconfirmed(now), clear=clear)
+        fields = RepairHeader(repair_id, oldest=not window.packets.unconfirmed(now), clear=clear)
         return self._repair_packet(fields, window.packets.newest, body, entries, kind=kind, now=now)
 
     def repair(self, chosen: Sent | Repair, now: float) -> SentPacket:
         """Write a combination of packets, or a packet again as it was."""
         if isinstance(chosen, Repair):
-            number, mask, row, oldest, combined = chosen
-            return self._repair_packet(RepairHeader(row, mask, oldest), number, combined, (), kind="repair", now=now)
+            number, mask, repair_id, oldest, combined = chosen
+            return self._repair_packet(
+                RepairHeader(repair_id, mask, oldest), number, combined, (), kind="repair", now=now
+            )
         if self._shares:  # with another block it is another packet, and needs a nonce of its own
-            again = self._window.packets.take_row(chosen.number)
+            again = self._window.packets.take_repair_id(chosen.number)
             if again is None:
                 return self.control([], "repair", now)
             body = combine([(chosen.number, chosen.body)], again)
@@ -129,51 +134,47 @@ class PacketWriter:
         header = read_header(chosen.data, self._packet_len)
         entries = tuple(read_body(chosen.body, self.room))
         packet = PacketV1(header, entries, encrypted=self._encrypts)
-        return self._leave(chosen.data, packet, (chosen.number, SOURCE_ROW), "repair", now)
+        identity = PacketId(self._src_id, self._boot, chosen.number, NOT_A_REPAIR)
+        return self._leave(chosen.data, packet, identity, "repair", now)
 
     def _repair_packet(
         self, repair: RepairHeader, number: int, body: bytes, entries: Sequence[EntryV1], *, kind: AirKind, now: float
     ) -> SentPacket:
         header = self._header(QOS_REPAIR, number)
         clear = write_header(header) + write_repair_header(repair)
-        body = self._padded(body, clear)
-        data = self._trailer.close(clear, body, number, repair.row, plain=repair.clear)
+        body = body.ljust(self._end_of_body - len(clear), b"\0")
+        data = self._trailer.close(clear, body, number, repair.repair_id, plain=repair.clear)
         encrypted = self._encrypts and not repair.clear
         combined = body if repair.mask else b""
         packet = PacketV1(header, tuple(entries), repair, combined, encrypted)
-        return self._leave(data, packet, (number, repair.row), kind, now)
+        return self._leave(data, packet, PacketId(self._src_id, self._boot, number, repair.repair_id), kind, now)
 
     def _leave(
         self,
         data: bytes,
         packet: PacketV1,
-        place: tuple[int, int],
+        identity: PacketId,
         kind: AirKind,
         now: float,
         *,
         parts: tuple[SentEntry, ...] = (),
     ) -> SentPacket:
-        """A packet leaves at its place: number and row."""
-        self._stats.air[kind] += 1
-        self._stats.packets += 1
+        """A packet leaves."""
+        stats = self._stats
+        stats.air[kind] += 1
+        stats.packets += 1
         mcs = 0
         if self._rate is not None:
             mcs = self._rate.sent(None if self._dst_id == BROADCAST else self._dst_id, now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
-        sent = SentPacket(
-            data, packet, PacketId(self._src_id, self._boot, *place), parts, now, kind, mcs, self.leave_at
-        )
+        sent = SentPacket(data, packet, identity, parts, now, kind, mcs, self.leave_at)
         if self._observer is not None:
             self._observer(sent)
         return sent
 
-    def _padded(self, body: bytes, clear: bytes) -> bytes:
-        return body.ljust(self._end_of_body - len(clear), b"\0")
-
     def _header(self, qos: int, number: int) -> Header:
-        hop = HOP if self._dst_id != BROADCAST else 0
-        return Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, hop, self.block)
+        return Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, self._hop, self.block)
 
 
 def room_of(settings: Settings, keys: Keys, *, block: bool) -> int:

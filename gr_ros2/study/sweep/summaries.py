@@ -51,7 +51,7 @@ class Summary:
 def rows_of(plan: SweepPlan, results: Results) -> list[dict[str, Any]]:
     """One mapping per run and topic, and one per run for all topics together; cells in their order."""
     rows = []
-    ledger = sorted({row for result in results.values() for topic in result.topics for row in topic.ledger})
+    ledger = sorted({fate for result in results.values() for topic in result.topics for fate in topic.ledger})
     for cell in plan.cells:
         for repetition, scenario in enumerate(cell.runs):
             if (result := results.get((cell.number, repetition))) is None:

@@ -10,7 +10,7 @@ from rosbags.typesys import get_types_from_msg
 from gr_ros2.compression import LinkCodec
 from gr_ros2.compression.link_codec import ANNOUNCED
 from gr_ros2.link.events import Lost, SentPacket
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.table import AnnouncedTopic
@@ -74,7 +74,7 @@ def test_what_is_never_announced_is_lost_by_name_and_memory_is_bounded() -> None
         sender.end.messages.submit(0, payload(number), air.now)
         air.run(2 * SLOT_S)
     lost = [event for event in receiver.events if isinstance(event, Lost)]
-    assert len(lost) >= 400 - 256 - 5 and {event.reason for event in lost} == {LedgerRow.UNKNOWN_DICTIONARY}
+    assert len(lost) >= 400 - 256 - 5 and {event.reason for event in lost} == {Fate.UNKNOWN_DICTIONARY}
     assert not receiver.delivered(1)
     sender.end.messages.learn(THING, TYPES)
     air.run(1.0)

@@ -11,9 +11,9 @@ import pytest
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered, Gone, Rejected
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.rate import Mcs
-from gr_ros2.link.v1.sealing import SOURCE_ROW, Keys, Seal, SealMode, subkey
+from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Seal, SealMode, subkey
 from gr_ros2.link.v1.unreported import MEETING_S
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.wire.control import Report
@@ -239,14 +239,14 @@ def test_forged_starts_silence_a_robot_for_half_of_the_time_at_most() -> None:
 
 
 def test_no_pair_of_key_and_nonce_comes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over restarts, wrapping numbers, rows used up and a change of keys; the same packet sent again is the same."""
+    """Over restarts, wrapping numbers, repair ids used up, a change of keys; a packet sent again is the same."""
     seen: dict[tuple[bytes, int, int, int, bool], bytes] = {}
     close = Seal.close
     boots = {}
 
-    def watched(self: Seal, clear: bytes, body: bytes, number: int, row: int, *, plain: bool = False) -> bytes:
-        data = close(self, clear, body, number, row, plain=plain)
-        name = (*boots[id(self)], number, row)
+    def watched(self: Seal, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
+        data = close(self, clear, body, number, repair_id, plain=plain)
+        name = (*boots[id(self)], number, repair_id)
         assert seen.setdefault(name, data) == data  # type: ignore[arg-type]
         return data
 
@@ -273,7 +273,7 @@ def test_no_pair_of_key_and_nonce_comes_twice(monkeypatch: pytest.MonkeyPatch) -
                 one.end.messages.submit(rng.randrange(3), rng.randbytes(30), now)
             one.slot(now)
     assert len(seen) > 70_000
-    assert {row for *_, row in seen} >= {SOURCE_ROW, *range(128)}
+    assert {repair_id for *_, repair_id in seen} >= {NOT_A_REPAIR, *range(128)}
 
 
 SLOT = 0.001
@@ -283,7 +283,7 @@ def test_a_message_of_the_attackers_own_is_not_taken_in_the_clear() -> None:
     one, two, air = pair()
     body = write_body([Part(0, b"mine")], body_room(64))
     clear = write_header(Header(0, False, 1, one.end.window.packets.newest + 1 & 0xFFFF))
-    packet = Keys().own(1, one.boot).close(clear, body, one.end.window.packets.newest + 1, SOURCE_ROW)
+    packet = Keys().own(1, one.boot).close(clear, body, one.end.window.packets.newest + 1, NOT_A_REPAIR)
     assert not any(isinstance(event, Delivered) for event in two.receive(packet, air.now))
     assert two.end.received.rejected["not_sealed"] == 1
 
@@ -418,7 +418,7 @@ def test_what_was_withheld_for_long_is_not_executed() -> None:
         two.receive(data, air.now)
     air.run(5.0)
     assert not any(payload.startswith(b"late") for payload in two.delivered())
-    assert two.end.received.lost[1, 0, LedgerRow.NOT_FRESH.value] > 50
+    assert two.end.received.lost[1, 0, Fate.NOT_FRESH.value] > 50
     assert any(payload.startswith(b"line") for payload in two.delivered())  # nobody said that it must be fresh
 
 
@@ -454,4 +454,4 @@ def test_what_is_fresh_is_taken(loss: float) -> None:
         one.end.messages.submit(0, b"go %d" % number, air.now)
         air.run(0.1)
     assert len(two.delivered()) >= 599
-    assert not two.end.received.lost[1, 0, LedgerRow.NOT_FRESH.value]
+    assert not two.end.received.lost[1, 0, Fate.NOT_FRESH.value]

@@ -13,7 +13,7 @@ from gr_ros2.link.events import Rejected
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.sealing import SOURCE_ROW, SealMode
+from gr_ros2.link.v1.sealing import NOT_A_REPAIR, SealMode
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import Hello
 from gr_ros2.wire.v1 import Header, PacketV1, Part, RepairHeader
@@ -78,7 +78,7 @@ def test_jumps_of_short_packets_cost_no_more_than_others() -> None:
     trailer = keys("none").own(1, 7)
     for step in range(1, 200):
         number = step * 32_000
-        data = trailer.close(v1.write_header(Header(0, False, 1, number & 0xFFFF)), b"", number, SOURCE_ROW)
+        data = trailer.close(v1.write_header(Header(0, False, 1, number & 0xFFFF)), b"", number, NOT_A_REPAIR)
         lines, _ = work(
             lambda data=data, step=step: (end.receive(ReceivedPacket(data), step * 0.1), end.handle_timeout(step * 0.1))
         )
@@ -108,7 +108,7 @@ def test_memory_is_counted_as_it_is_used(packet_len: int) -> None:
 
     def packet(number: int) -> bytes:
         body = v1.write_body([Part(number % 240, b"x", 0, 0, False)], room).ljust(packet_len - 8, b"\0")
-        return trailer.close(v1.write_header(Header(0, False, 1, number)), body, number, SOURCE_ROW)
+        return trailer.close(v1.write_header(Header(0, False, 1, number)), body, number, NOT_A_REPAIR)
 
     tracemalloc.start()
     before, _ = tracemalloc.get_traced_memory()

@@ -39,7 +39,7 @@ def test_messages_cross_both_ways_with_nothing_known_beforehand(mode: SealMode, 
     air.run(2.0)
     assert two.delivered() == [text(number) for number in range(60)]
     assert one.delivered() == [text(number, 300) for number in range(0, 60, 10)]
-    rows = next(event.rows for event in two.events if isinstance(event, Announced))
+    rows = next(event.topics for event in two.events if isinstance(event, Announced))
     assert [(row.name, row.type_name, row.reliable) for row in rows] == [
         ("odom", "std_msgs/msg/String", True),
         ("scan", "std_msgs/msg/String", False),
@@ -226,7 +226,7 @@ def test_an_earlier_map_never_comes_after_a_later_one(hears: bool) -> None:
         one.end.messages.submit(1, text(number, 300), air.now)
         air.run(20.0)
     assert two.delivered() == [text(number, 300) for number in range(3)]
-    rows = [event.rows for event in two.events if isinstance(event, Announced)][-1]
+    rows = [event.topics for event in two.events if isinstance(event, Announced)][-1]
     assert [row.depth for row in rows if row.latched] == [1]
     before = len(two.delivered())
     two.start()
@@ -252,7 +252,7 @@ def test_topics_that_come_later_are_announced_and_keep_what_their_publishers_kee
         one.end.messages.submit(number, sent[number], air.now)
     air.run(60.0, lambda: len(two.delivered()) == MAX_TOPICS)
     assert sorted(two.delivered()) == sorted(sent)
-    rows = [event.rows for event in two.events if isinstance(event, Announced)][-1]
+    rows = [event.topics for event in two.events if isinstance(event, Announced)][-1]
     assert [row.topic_id for row in rows if row.latched] == [7]
     assert one.end.messages.topics is not None
     assert len(rows) == len(one.end.messages.topics) == MAX_TOPICS
@@ -462,7 +462,7 @@ def test_a_lifespan_ends_repair_and_message() -> None:
     assert two.delivered() == []
 
 
-def test_more_repairs_than_rows_move_on_to_the_next_number() -> None:
+def test_more_repairs_than_repair_ids_move_on_to_the_next_number() -> None:
     one, two = Robot(1, registry(), repair="idle"), Robot(2)
     air = Air(one, two)
     air.run(0.5)
@@ -600,3 +600,25 @@ def test_no_repair_leaves_before_the_sending_thread_is_told_to_look(loss: float)
                 repairs += 1
                 assert at is not None and at < air.now, "the slot in which it left"
     assert repairs > 100 * loss
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_lost_packets_are_those_since_a_robot_was_heard_the_same_in_total_and_by_robot(mode: SealMode) -> None:
+    one, two = Robot(1, registry(), mode=mode), Robot(2, registry(), mode=mode)
+    air = Air(one)
+    for number in range(200):
+        one.end.messages.submit(0, text(number), air.now)
+        air.step()
+    air.robots.append(two)
+    for number in range(200, 400):
+        one.end.messages.submit(0, text(number), air.now)
+        air.step()
+    assert len(two.delivered()) > 150
+    assert two.end.received.packet_loss_est == 0
+    air.lost = lambda _, receiver: receiver is two and air.rng.random() < 0.2
+    for number in range(400, 600):
+        one.end.messages.submit(0, text(number), air.now)
+        air.step()
+    (peer,) = two.end.peers(air.now)
+    assert peer.lost == two.end.received.packet_loss_est
+    assert 20 <= peer.lost <= 70

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.link.events import Delivered, Gone, Lost, Met
-from gr_ros2.link.ledger_rows import LedgerRow
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.v1.sealing import SealMode
 from tests.link.v1.air import Air, Robot, registry
 
@@ -84,8 +84,8 @@ def test_what_was_on_its_way_when_a_sender_restarts_is_named() -> None:
     traffic.air.lost = usual
     traffic.recovers()
     lost = [event for event in two.events if isinstance(event, Lost)]
-    assert [event.topic_id for event in lost if event.reason is LedgerRow.SENDER_RESTARTED] == [2]
-    assert two.end.received.lost[1, 2, LedgerRow.SENDER_RESTARTED.value] == 1
+    assert [event.topic_id for event in lost if event.reason is Fate.SENDER_RESTARTED] == [2]
+    assert two.end.received.lost[1, 2, Fate.SENDER_RESTARTED.value] == 1
 
 
 def test_reports_that_are_lost_for_a_minute() -> None:

@@ -30,17 +30,17 @@ def test_the_tables_are_the_field() -> None:
 
 
 @given(st.integers(0, 255), st.integers(0, 1 << 40))
-def test_coefficients_are_as_the_page_has_them(row: int, number: int) -> None:
-    factor = coefficient(row, number)
-    assert product(factor, (128 + row % 128) ^ (number % 128)) == 1
-    assert CAUCHY[(128 | row % 128) ^ number % 128] == TIMES[factor]
+def test_coefficients_are_as_the_page_has_them(repair_id: int, number: int) -> None:
+    factor = coefficient(repair_id, number)
+    assert product(factor, (128 + repair_id % 128) ^ (number % 128)) == 1
+    assert CAUCHY[(128 | repair_id % 128) ^ number % 128] == TIMES[factor]
 
 
 @given(st.integers(1, 24), st.randoms(use_true_random=False))
 def test_square_parts_are_invertible(size: int, rng: random.Random) -> None:
-    rows = rng.sample(range(128), size)
+    repair_ids = rng.sample(range(128), size)
     columns = rng.sample(range(128), size)
-    matrix = [[coefficient(row, column) for column in columns] for row in rows]
+    matrix = [[coefficient(row, column) for column in columns] for row in repair_ids]
     for index in range(size):
         pivot = next((row for row in range(index, size) if matrix[row][index]), -1)
         assert pivot >= index, "the matrix is singular"
@@ -53,10 +53,10 @@ def test_square_parts_are_invertible(size: int, rng: random.Random) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 1 << 30), st.binary(max_size=20)), max_size=6), st.integers(0, 127))
-def test_a_combination_is_the_sum_of_the_products(bodies: list[tuple[int, bytes]], row: int) -> None:
+def test_a_combination_is_the_sum_of_the_products(bodies: list[tuple[int, bytes]], repair_id: int) -> None:
     longest = max((len(body) for _, body in bodies), default=0)
     expected = bytearray(longest)
     for number, body in bodies:
         for at, byte in enumerate(body):
-            expected[at] ^= product(coefficient(row, number), byte)
-    assert combine(bodies, row) == bytes(expected)
+            expected[at] ^= product(coefficient(repair_id, number), byte)
+    assert combine(bodies, repair_id) == bytes(expected)

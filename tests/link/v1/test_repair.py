@@ -16,7 +16,7 @@ from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.repair import RepairMode, RepairWindow
 from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.link.v1.thrift import AHEAD
-from gr_ros2.wire.v1 import MAX_WINDOW, ROWS
+from gr_ros2.wire.v1 import MAX_WINDOW, REPAIR_IDS
 
 ROOM = 24
 
@@ -52,17 +52,17 @@ def test_whatever_is_recovered_is_what_was_sent(
     receiver = decoder()
     receiver.begin(first)
     here: set[int] = set()
-    row = 0
+    repair_id = 0
     for number in range(first, first + count):
         if rng.random() >= loss:
             here |= known(receiver.source(number, body(number)))
         if rng.random() < 0.6:
-            row += 1
+            repair_id += 1
             mask = rng.getrandbits(min(size, number - first + 1)) | 1
             members = window_numbers(number, mask)
             if rng.random() >= loss:
-                combined = combine(((member, body(member)) for member in members), row % ROWS)
-                here |= known(receiver.repair(number, mask, row % ROWS, combined))
+                combined = combine(((member, body(member)) for member in members), repair_id % REPAIR_IDS)
+                here |= known(receiver.repair(number, mask, repair_id % REPAIR_IDS, combined))
     assert all((number in receiver) == (number in here) for number in range(first, first + count))
 
 
@@ -73,17 +73,17 @@ def test_a_full_window_is_recovered_from_as_many_repairs(first: int) -> None:
     numbers = range(first, first + MAX_WINDOW)
     mask = (1 << MAX_WINDOW) - 1
     found: set[int] = set()
-    for row in range(MAX_WINDOW):
+    for repair_id in range(MAX_WINDOW):
         assert not found
-        combined = combine(((number, body(number)) for number in numbers), row)
-        found |= known(receiver.repair(numbers[-1], mask, row, combined))
+        combined = combine(((number, body(number)) for number in numbers), repair_id)
+        found |= known(receiver.repair(numbers[-1], mask, repair_id, combined))
     assert found == set(numbers)
     assert receiver.equations == 0
 
 
 def test_one_wrong_repair_does_not_spread() -> None:
     receiver = RepairDecoder(ROOM, lambda found: found.rstrip(b"\0") in (body(1), body(2), body(3)), 4096)
-    right = [combine([(1, body(1)), (2, body(2)), (3, body(3))], row) for row in range(5)]
+    right = [combine([(1, body(1)), (2, body(2)), (3, body(3))], repair_id) for repair_id in range(5)]
     receiver.repair(3, 7, 0, bytes(byte ^ 1 for byte in right[0]))
     receiver.repair(3, 7, 1, right[1])
     assert receiver.repair(3, 7, 2, right[2]) == []
@@ -111,11 +111,11 @@ def test_packets_that_are_still_worth_it_are_recovered_without_the_others(count:
     some = sorted(data.draw(st.sets(st.integers(1, count), min_size=1, max_size=count - 1)))
     before = data.draw(st.integers(0, count - 1))
     found: set[int] = set()
-    for row in range(before + len(some) + 1):
-        named = list(range(1, count + 1)) if row < before else some
+    for repair_id in range(before + len(some) + 1):
+        named = list(range(1, count + 1)) if repair_id < before else some
         mask = sum(1 << named[-1] - number for number in named)
-        combined = combine([(number, body(number)) for number in named], row)
-        found |= known(receiver.repair(named[-1], mask, row, combined))
+        combined = combine([(number, body(number)) for number in named], repair_id)
+        found |= known(receiver.repair(named[-1], mask, repair_id, combined))
     assert found >= set(some)
 
 
@@ -123,7 +123,7 @@ def test_memory_is_bounded() -> None:
     receiver = decoder(span=100)
     for number in range(0, 5000, 2):
         receiver.source(number, body(number))
-        receiver.repair(number, 0b1011, number % ROWS, b"x" * ROOM)
+        receiver.repair(number, 0b1011, number % REPAIR_IDS, b"x" * ROOM)
     assert receiver.floor == 4998 - 99
     assert sum(number in receiver for number in range(5000)) <= 100
     assert receiver.equations <= 100
@@ -136,7 +136,7 @@ def test_the_newest_live_packets_are_combined() -> None:
     repair = window(count=10).next(0.2)
     assert isinstance(repair, Repair)
     assert (repair.number, repair.mask, repair.oldest) == (10, (1 << 10) - 1, True)
-    assert repair.combined == combine(((number, body(number)) for number in range(1, 11)), repair.row)
+    assert repair.combined == combine(((number, body(number)) for number in range(1, 11)), repair.repair_id)
 
 
 def test_one_live_packet_is_repeated_in_effect() -> None:
@@ -153,7 +153,7 @@ def test_one_live_packet_is_repeated_in_effect() -> None:
 
 
 def known_text(receiver: RepairDecoder, repair: Repair) -> bytes:
-    ((_, found),) = receiver.repair(repair.number, repair.mask, repair.row, repair.combined)
+    ((_, found),) = receiver.repair(repair.number, repair.mask, repair.repair_id, repair.combined)
     return found.rstrip(b"\0")
 
 
@@ -199,13 +199,13 @@ def test_short_messages_are_repaired_beside_a_long_one() -> None:
     assert len(alone) == 10
 
 
-def test_a_row_is_used_once_per_number() -> None:
+def test_a_repair_id_is_used_once_per_number() -> None:
     sender = window(count=1)
-    rows = [sender.packets.take_row(1) for _ in range(ROWS)]
-    assert sorted(row for row in rows if row is not None) == list(range(ROWS))
-    assert sender.packets.take_row(1) is None
+    repair_ids = [sender.packets.take_repair_id(1) for _ in range(REPAIR_IDS)]
+    assert sorted(repair_id for repair_id in repair_ids if repair_id is not None) == list(range(REPAIR_IDS))
+    assert sender.packets.take_repair_id(1) is None
     assert sender.next(0.0) is None  # no repair can stand there any more
-    assert sender.packets.take_row(2) is not None
+    assert sender.packets.take_repair_id(2) is not None
 
 
 def test_a_packet_that_one_receiver_lacks_goes_again_as_it_was() -> None:
@@ -336,3 +336,15 @@ def test_nothing_lives_longer_than_the_span() -> None:
     repair = sender.next(0.0)
     assert isinstance(repair, Repair)
     assert window_numbers(repair.number, repair.mask)[-1] >= 300
+
+
+def test_a_repair_that_stands_at_a_later_packet_leaves_out_none_that_is_alive() -> None:
+    sender = window("thrifty", 8)
+    sender.peers.meet(2, 0.1)
+    sender.peers.prove(2, 6)  # the receiver takes combinations from packet 7 on
+    for number in (1, 2):
+        sender.packets.records[number].lifetimes[0].end()
+    repair = sender.tell(1, 0.2)
+    assert isinstance(repair, Repair)
+    assert (repair.number, repair.oldest) == (7, True)
+    assert window_numbers(repair.number, repair.mask) == [7, 6, 5, 4, 3]

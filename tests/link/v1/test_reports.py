@@ -15,7 +15,7 @@ def kinds(robot: Robot) -> list[str]:
 
 @pytest.mark.parametrize(("loss", "share"), [(0.0, 0.2), (0.1, 0.3), (0.2, 0.36)])
 def test_reports_take_no_more_than_their_share(loss: float, share: float) -> None:
-    """Where the way back carries nothing else, a report could leave for every packet."""
+    """Where the reverse direction carries nothing else, a report could leave for every packet."""
     one, two = Robot(1, registry()), Robot(2)
     air = Air(one, two, loss=loss)
     air.run(1.0)

@@ -1,6 +1,6 @@
-"""The possible fates of a message: the rows of the loss ledger.
+"""The possible fates of a message, as the loss ledger counts them.
 
-Invariant: every message that was sent ends in exactly one row. A row is its name: it counts, compares and is written as
+Invariant: every message that was sent has exactly one fate. A fate is its name: it counts, compares and is written as
 that text.
 """
 
@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 from enum import Enum
 
 
-class LedgerRow(str, Enum):
-    """A row of the ledger.
+class Fate(str, Enum):
+    """What became of a message.
 
     :ivar end: where the fate is known: source, sink, or link where the records of both ends have to be joined
     :ivar colour: its colour in figures and on the dashboard
@@ -49,32 +49,30 @@ class LedgerRow(str, Enum):
     colour: str
     words: str
 
-    def __new__(cls, name: str, end: str, colour: str, words: str) -> LedgerRow:
-        row = str.__new__(cls, name)
-        row._value_ = name
-        row.end, row.colour, row.words = end, colour, words
-        return row
+    def __new__(cls, name: str, end: str, colour: str, words: str) -> Fate:
+        fate = str.__new__(cls, name)
+        fate._value_ = name
+        fate.end, fate.colour, fate.words = end, colour, words
+        return fate
 
     def __str__(self) -> str:
         return str(self.value)
 
 
-ARRIVED = (LedgerRow.DELIVERED, LedgerRow.REPAIRED)
-"""The rows of delivered messages."""
+ARRIVED = (Fate.DELIVERED, Fate.REPAIRED)
+"""The fates of delivered messages."""
 
 
-def arrived(rows: Mapping[str, int]) -> int:
-    """How many of the messages in these rows were delivered."""
-    return sum(rows.get(row, 0) for row in ARRIVED)
+def arrived(fates: Mapping[str, int]) -> int:
+    """How many of the messages with these fates were delivered."""
+    return sum(fates.get(fate, 0) for fate in ARRIVED)
 
 
-ROWS = {row.value: row for row in LedgerRow}
-"""The rows by name. Results of another version may have rows that are not here."""
+FATES = {fate.value: fate for fate in Fate}
+"""The fates by name. Results of another version may have fates that are not here."""
 
 
-def row_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
-    """The ledger rows that occurred: delivered and repaired first, then the others by name, in_flight last."""
-    found = {row for ledger in ledgers for row, count in ledger.items() if count}
-    return sorted(
-        found, key=lambda row: (row != LedgerRow.DELIVERED, row != LedgerRow.REPAIRED, row == LedgerRow.IN_FLIGHT, row)
-    )
+def fate_order(ledgers: Iterable[Mapping[str, int]]) -> list[str]:
+    """The ledger fates that occurred: delivered and repaired first, then the others by name, in_flight last."""
+    found = {fate for ledger in ledgers for fate, count in ledger.items() if count}
+    return sorted(found, key=lambda fate: (fate != Fate.DELIVERED, fate != Fate.REPAIRED, fate == Fate.IN_FLIGHT, fate))

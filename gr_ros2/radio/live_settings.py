@@ -1,0 +1,69 @@
+"""The settings of a running link that can change, by their names in its YAML file.
+
+Invariant: a setting can change if its block has a method ``set_<name>``; an option of a topic, if it is in
+``LIVE_OPTIONS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.link.endpoint import LIVE_OPTIONS
+from gr_ros2.settings.config import TopicOptions
+
+_SETTER, _OPTIONS = "set_", "ros_source.topic_options"
+
+
+class LiveSettings:
+    """Those of one link.
+
+    :param source: the block that sends
+    :param sink: the block that receives
+    """
+
+    def __init__(self, source: RosSource, sink: RosSink) -> None:
+        self._source = source
+        self._setters: dict[str, Callable[[Any], None]] = {
+            f"{end}.{name.removeprefix(_SETTER)}": getattr(block, name)
+            for end, block in (("ros_source", source), ("ros_sink", sink))
+            for name in vars(type(block))
+            if name.startswith(_SETTER)
+        }
+
+    def can_change(self, name: str) -> bool:
+        """Whether a setting can change while the link runs; ``ros_source.topic_options.TOPIC.OPTION`` for a topic."""
+        place = _of_topic(name)
+        return name in self._setters if place is None else place[1] in LIVE_OPTIONS
+
+    def change(self, name: str, value: Any) -> str:
+        """Change one setting; returns it in words.
+
+        :raises ConfigError: for one that cannot change, or a value that is not allowed
+        """
+        if not self.can_change(name):
+            options = f"{_OPTIONS}.TOPIC.{'|'.join(LIVE_OPTIONS)}"
+            others = ", ".join(other for other in self._setters if other != _OPTIONS)
+            raise ConfigError(f"{name} cannot change while the link runs; these can: {others}, {options}")
+        place = _of_topic(name)
+        if place is None:
+            self._setters[name](value)
+            return f"{name} = {value}"
+        topic, option = place
+        given = self._source.config.topic_options
+        known = next((other for other in given if other.lstrip("/") == topic.lstrip("/")), topic)
+        before = given.get(known, TopicOptions())
+        changed = {**{each.name: getattr(before, each.name) for each in fields(TopicOptions)}, option: value}
+        self._source.set_topic_options({**given, known: changed})
+        return f"{name} = {value}"
+
+
+def _of_topic(name: str) -> tuple[str, str] | None:
+    """Topic and option of a setting of one topic, None for others."""
+    if not name.startswith(f"{_OPTIONS}."):
+        return None
+    topic, _, option = name.removeprefix(f"{_OPTIONS}.").rpartition(".")
+    return (topic, option) if topic else None

@@ -1,0 +1,130 @@
+"""Services across links of several robots, with whole blocks and graphs in memory, in simulated time."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.gr import RosLink
+from gr_ros2.gr.ends import EndpointSetup
+from gr_ros2.link import ReceivedPacket
+from gr_ros2.link.events import ReceiverEvent
+from gr_ros2.mac import Slots
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions
+from gr_ros2.settings.registry import Registry
+from tests.domains import free_domains
+from tests.link.v1.air import SLOT_S
+from tests.link.v1.test_relaying import Line
+from tests.middleware.calling import ADD, Adder, Caller
+from tests.packets import data_of
+
+LAST = 4
+CALLS = 100
+NEAR, FAR = f"/rx_robot_{LAST}/add", f"/robot_{LAST}/add"
+
+
+class LinkedRobot:
+    """A link whose packets a test carries, as a robot of a :class:`Line`.
+
+    :param folder: for the state of its starts
+    """
+
+    def __init__(self, src_id: int, line: Line, folder: Any, stack: ExitStack) -> None:
+        self.src_id, self.events = src_id, list[ReceiverEvent]()
+        (domain,) = free_domains(1)
+        self.graph, *both = (stack.enter_context(MemoryMiddleware(domain_id=domain)) for _ in range(3))
+        self._graphs = self.graph, *both
+        options = {"odom": TopicOptions(queue="latest")}
+        self.link = RosLink(
+            Registry.from_rows({"odom": "std_msgs/String", "add": ADD}),
+            SourceConfig(
+                namespace=f"/robot_{src_id}", packet_len=96, topic_options=options, state=f"{folder}/{src_id}"
+            ),
+            SinkConfig(robot_id=src_id, packet_len=96),
+            setup=EndpointSetup(
+                reports=True,
+                half_duplex=True,
+                relay=True,
+                access=lambda robot: Slots(robot, SLOT_S, random.Random(robot), period_s=0.1),
+            ),
+            middleware=(both[0], both[1]),
+            clock=lambda: line.now,
+            seed=src_id,
+        )
+        stack.callback(self.link.close)
+        self.link.source.use_credit()
+        self._endpoint = self.link.end.endpoint
+        self.messages = self._endpoint.messages
+
+    @property
+    def end(self) -> LinkedRobot:
+        return self
+
+    def slot(self, now: float) -> bytes | None:
+        """What it sends in a slot."""
+        if self._endpoint.pace.out_of_credit:
+            self._endpoint.pace.credit()
+        with self.link.end.lock:
+            return data_of(self._endpoint.next_packet(now))
+
+    def receive(self, data: bytes, now: float, began: float) -> None:
+        """Take a packet."""
+        with self.link.end.lock:
+            events = self._endpoint.receive(ReceivedPacket(data, began), now)
+        self._settle(events)
+
+    def handle_timeout(self, now: float) -> list[ReceiverEvent]:
+        """Look what has become too late."""
+        with self.link.end.lock:
+            events = list(self._endpoint.handle_timeout(now))
+        self._settle(events)
+        return []
+
+    def _settle(self, events: list[ReceiverEvent]) -> None:
+        if events:
+            self.link.sink._settle(events)
+            self.settle()
+
+    def settle(self) -> None:
+        """Wait until programs, server and client on its graph have taken what they were sent."""
+        for graph in 2 * self._graphs:
+            taken = threading.Event()
+            graph.thread.call(taken.set)
+            taken.wait()
+
+    def counted(self) -> dict[str, int]:
+        return dict(self.link.calls.stats()["counters"])  # type: ignore[union-attr]
+
+
+@pytest.fixture
+def line(tmp_path: Any) -> Iterator[Line]:
+    line = Line(loss=0.1)
+    with ExitStack() as stack:
+        line.robots = [LinkedRobot(src_id, line, tmp_path, stack) for src_id in range(1, LAST + 1)]  # type: ignore[misc]
+        yield line
+
+
+@pytest.mark.slow
+def test_calls_cross_three_hops_and_are_answered_once(line: Line) -> None:
+    first, last = line.robots[0], line.robots[-1]
+    adder, caller = Adder(last.graph, FAR), Caller(first.graph, NEAR)
+    while not caller.there:
+        line.run(1)
+    for number in range(CALLS):
+        caller.call(number)
+        first.settle()
+        line.run(1)
+    end = line.now + 35
+    while line.now < end and len(caller.got) < CALLS:
+        line.run(1)
+    assert len(caller.got) >= 0.99 * CALLS
+    assert all(totals == [number + 1000] for number, totals in caller.got.items())
+    assert len(adder.taken) == len(set(adder.taken)) >= len(caller.got)

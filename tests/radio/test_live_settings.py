@@ -1,0 +1,77 @@
+"""Settings of a running link that change: whom a topic is for, by one name for ROS parameters and the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gnuradio import gr
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.radio.live_settings import LiveSettings
+from tests.domains import free_domains
+from tests.gr.test_found_topics import text
+from tests.middleware.support import STRING
+from tests.waiting import wait_for
+
+TO = "ros_source.topic_options.goal.to"
+
+
+@pytest.mark.parametrize("found", [False, True], ids=["registry", "found on the graph"])
+def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -> None:
+    domains = free_domains(3)
+    common: dict[str, Any] = {"version": 1, "middleware": "memory"}
+    (tmp_path / "topics.csv").write_text(f"goal,{STRING}\n")
+    topics = {"topics": ["goal"]} if found else {"registry": str(tmp_path / "topics.csv")}
+    source = RosSource(robot_id=1, domain_id=domains[0], state=str(tmp_path / "state"), **topics, **common)
+    sinks = [
+        RosSink(robot_id=robot, domain_id=domain, **common) for robot, domain in zip((2, 3), domains[1:], strict=True)
+    ]
+    near, *far = (MemoryMiddleware(domain_id=domain) for domain in domains)
+    heard: list[list[bytes]] = [[], []]
+    for graph, payloads in zip(far, heard, strict=True):
+        graph.subscribe("/rx_robot_1/goal", STRING, Qos("reliable", "volatile", 0), payloads.append)
+    publisher = near.advertise("/goal", STRING, Qos("reliable", "volatile", 0))
+    top = gr.top_block()
+    for sink in sinks:
+        top.msg_connect((source, "pdus"), (sink, "pdus"))
+    live = LiveSettings(source, sinks[0])
+    live.change(TO, 2)  # also of a topic that the graph does not have yet
+    top.start()
+    try:
+        wait_for(publisher.matched, "the source's subscription")
+        said: list[list[bytes]] = [[], []]
+        for number, to in enumerate((2, 3, "auto", 3, 2)):
+            live.change(TO, to)
+            publisher.publish(text(number))
+            for place, robot in enumerate((2, 3)):
+                said[place] += [text(number)] * (to in (robot, "auto"))
+            wait_for(lambda: heard == said, f"{said}, not {heard}")
+        with pytest.raises(ConfigError, match="goal: codec cannot change while running; these can: to, "):
+            source.set_topic_options({"goal": {"codec": "zstd"}})
+        with pytest.raises(ConfigError, match="to = 256"):
+            live.change(TO, 256)
+        with pytest.raises(
+            ConfigError, match=r"^packet_len cannot change while the link runs; these can: ros_source\.\w+"
+        ):
+            live.change("packet_len", 100)
+        live.change("ros_source.topic_options./goal.weight", 2.0)
+        (counted,) = source.stats()["topics"].values()
+        assert (counted["submitted"], counted["types"], counted["sent"]) == (5, 1, 5)
+        assert [sink.stats()["topics"]["/rx_robot_1/goal"]["delivered"] for sink in sinks] == [3, 3]
+        assert source.config.topic_options["goal"].to == 2
+        assert sorted(str(topic.options.to) for _, topic in source.subscriptions.named()) == ["2", "3", "auto"]
+        assert {name for name, _ in source.subscriptions.named()} == {"/goal"}
+    finally:
+        top.stop()
+        top.wait()
+        ends: list[Any] = [source, *sinks, near, *far]
+        for end in ends:
+            end.close()
