@@ -108,8 +108,8 @@ class Peers:
         self._times: dict[int, float] = {}
         """When the newest packets left, s."""
         self._ordered = -1
-        """The newest packet of a message that is delivered in order. A peer cannot know what a missing packet carried, so
-        that this message waits for every packet before it."""
+        """The newest packet of a message that is delivered in order. A peer cannot know what a missing packet carried:
+        this message waits for every packet before it."""
         self._served: set[int] = set()
         """Peers that lack the packet that was urgent last."""
         self._period = 0.0
