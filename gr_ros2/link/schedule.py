@@ -51,7 +51,7 @@ class PaperScheduler:
         payload = 0
         for topic_id in self._line:
             for message in queues.get(topic_id, ()):
-                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment, V0)
+                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment)
                 lengths = self._fitting(message, cut, len(picks), payload)
                 picks += [message] * len(lengths)
                 chosen += lengths
