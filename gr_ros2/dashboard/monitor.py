@@ -124,7 +124,7 @@ class RunMonitor:
 
     def _tick(self, run: LiveRun, state: DashboardState) -> None:
         for src_id, source in run.sources.items():
-            state.subscribed(src_id, source.subscriptions.subscribed)
+            state.subscribed(src_id, source.subscriptions.named())
         queued = {
             (src_id, topic["topic_id"]): topic["queued"]
             for src_id, source in run.sources.items()

@@ -8,7 +8,7 @@ Counts are exact during the run. When the result is known, every number comes fr
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from math import nan
 from threading import Lock
 from typing import get_args
@@ -199,10 +199,10 @@ class DashboardState:
                     self._packets[f"rejected_{event.error.kind}"] += 1
                     self._packets["rejected"] += 1
 
-    def subscribed(self, src_id: int, topics: Mapping[str, Topic]) -> None:
-        """Take over what a source in this process subscribes, by absolute name. Topics may be added while it runs."""
+    def subscribed(self, src_id: int, topics: Iterable[tuple[str, Topic]]) -> None:
+        """Take over what a source in this process subscribes, with absolute names. More may come while it runs."""
         with self._lock:
-            for full_name, topic in topics.items():
+            for full_name, topic in topics:
                 self._learn((src_id, topic.topic_id), topic.name, topic.type_name, full_name)
 
     def finish(self, result: Result | None, *, failed: bool = False) -> None:

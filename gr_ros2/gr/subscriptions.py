@@ -131,6 +131,11 @@ class Subscriptions:
             for name, topic in self.subscribed.items()
         }
 
+    def named(self) -> list[tuple[str, Topic]]:
+        """All topics so far, with their names on the ROS graph: one for each type, and for each robot it was for."""
+        names = {topic.name: name for name, topic in self.subscribed.items()}
+        return [(names[topic.name], topic) for topic in self.registry if topic.is_topic and topic.name in names]
+
     def types(self) -> list[tuple[str, str]]:
         """Name on the ROS graph and type of each topic."""
         return [(name, topic.type_name) for name, topic in self.subscribed.items()]

@@ -8,7 +8,7 @@ counts such payloads.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from operator import attrgetter
 from typing import Any
 
@@ -32,6 +32,8 @@ FARTHEST_M = 1e9
 """A coordinate beyond this, more than twice the distance to the Moon, is not a position of a robot. It would also hide
 every other point in a path's figures and means."""
 
+_REMEMBERED = 1024
+"""Messages of a type whose positions are kept: each robot of a run asks for that of every message it hears."""
 PositionReader = Callable[[bytes], tuple[float, float] | None]
 
 
@@ -41,6 +43,7 @@ def humble_types() -> Typestore:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
+@cache
 def position_reader(type_name: str) -> PositionReader | None:
     """A function from a serialized message to its (x, y) in metres. The function returns None if the bytes are not a
     message of this type or have no valid position.
@@ -54,6 +57,7 @@ def position_reader(type_name: str) -> PositionReader | None:
     point_of: Callable[[Any], Any] = attrgetter(where) if where else lambda message: message
     deserialize = humble_types().deserialize_cdr
 
+    @lru_cache(maxsize=_REMEMBERED)
     def read(payload: bytes) -> tuple[float, float] | None:
         try:
             point = point_of(deserialize(payload, type_name))

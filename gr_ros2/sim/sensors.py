@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -194,6 +195,7 @@ def _rtcm_frame(number: int, rest: bytes) -> bytes:
     return frame + (crc & 0xFFFFFF).to_bytes(3, "big")
 
 
+@lru_cache(maxsize=1024)  # all robots that hear a message ask for the same
 def read_odometry(payload: bytes) -> tuple[int, State]:
     """The stamp in ns of a serialized odometry of a robot on the ground, and what it says."""
     message: Any = _STORE.deserialize_cdr(payload, TYPES["odom"])

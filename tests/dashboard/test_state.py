@@ -200,7 +200,7 @@ def test_topics_get_the_names_that_their_robot_announces() -> None:
 def test_topics_found_while_the_source_runs_have_their_names_on_the_graph() -> None:
     state = make()
     found = Topic(5, "found", "nav_msgs/msg/Odometry", TopicOptions())
-    state.subscribed(SRC, {"/robot_4/found": found})
+    state.subscribed(SRC, [("/robot_4/found", found)])
     state.sender_event(SRC, Accepted(0, 5, at(1, 2), 1.0))
     assert [topic.name for topic in state.tick(1.0).topics if topic.topic_id == 5] == ["/robot_4/found"]
 

@@ -67,6 +67,8 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
         assert (counted["submitted"], counted["types"], counted["sent"]) == (5, 1, 5)
         assert [sink.stats()["topics"]["/rx_robot_1/goal"]["delivered"] for sink in sinks] == [3, 3]
         assert source.config.topic_options["goal"].to == 2
+        assert sorted(str(topic.options.to) for _, topic in source.subscriptions.named()) == ["2", "3", "auto"]
+        assert {name for name, _ in source.subscriptions.named()} == {"/goal"}
     finally:
         top.stop()
         top.wait()
