@@ -8,7 +8,7 @@ import time
 from bench.rows import Row
 from bench.yardstick import cost
 from gr_ros2.link import ReceivedPacket
-from gr_ros2.link.events import Delivered
+from gr_ros2.link.events import Delivered, SentPacket
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
@@ -47,7 +47,7 @@ def transfer() -> tuple[float, float]:
     now = 0.0
     while submitted < MESSAGES:
         # Slots are done in turns of 50 so that reading the clock costs nothing beside them.
-        outgoing: list[tuple[ReceivedPacket, float]] = []
+        outgoing: list[tuple[SentPacket, float]] = []
         begin = clock()
         for slot in range(50):
             now += 1 / PACKETS_S
@@ -57,10 +57,10 @@ def transfer() -> tuple[float, float]:
             sender.pace.credit()
             sent = sender.next_packet(now)
             if sent is not None:
-                outgoing.append((ReceivedPacket(sent.data, now), now))
+                outgoing.append((sent, now))
         packets[0] += len(outgoing)
         spent[0] += clock() - begin
-        heard = [packet for packet in outgoing if rng.random() >= LOSS]
+        heard = [(ReceivedPacket(sent.data, at), at) for sent, at in outgoing if rng.random() >= LOSS]
         begin = clock()
         for arrival, at in heard:
             delivered += sum(isinstance(event, Delivered) for event in receiver.receive(arrival, at))

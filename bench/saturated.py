@@ -213,16 +213,22 @@ def ratios(name: str, loss: float, *, back: bool = False) -> dict[str, tuple[flo
     }
 
 
-def paced(name: str, loss: float, *, back: bool, seed: int, best_effort: Sequence[str]) -> dict[str, float]:
+def paced(
+    name: str, loss: float, *, back: bool, seed: int, best_effort: Sequence[str], duration_s: float | None = None
+) -> dict[str, float]:
     """Mean age in s of each topic of a scenario in simulated time; of one that delivers nothing, its duration.
 
     :param back: see :func:`run`
     :param best_effort: topics whose publishers are not reliable, so that no message waits for an earlier one
+    :param duration_s: simulated s; None for those of the scenario
     """
     options = [f"ros_source.topic_options.{topic}.reliability=best_effort" for topic in best_effort]
     channel = {"packet_loss": loss}
-    reports = {"reports": {"channel": channel}} if back else {}
-    settings: dict[str, Any] = {"channel": channel, "seed": seed, "time": "packets", **reports}
+    settings: dict[str, Any] = {"channel": channel, "seed": seed, "time": "packets"}
+    if back:
+        settings["reports"] = {"channel": channel}
+    if duration_s is not None:
+        settings["duration_s"] = duration_s
     result = simulate(load_scenario(name, options, **settings))
     ages = {topic.topic.rsplit("/", 1)[-1]: topic.age_s.mean for topic in result.topics}
     return {topic: result.duration_s if age is None else age for topic, age in ages.items()}

@@ -71,7 +71,7 @@ class Pace:
     @property
     def ready(self) -> float:
         """s, since when a packet could have left; infinite if that is not known."""
-        return max(self._since, self.slot)
+        return self._since if self._since > self.slot else self.slot
 
     @property
     def credited(self) -> bool:
@@ -102,11 +102,11 @@ class Pace:
 
     def free(self, now: float) -> float:
         """When the air is free of all packets that have left, as far as it can be estimated; not before ``now``."""
-        return max(now, self._free)
+        return now if now > self._free else self._free
 
     def may_leave(self, now: float) -> bool:
         """Whether a packet may leave. While packets wait for their credits, the interval of the credits is measured."""
-        if now < self.slot or self.out_of_credit:
+        if now < self.slot or (self._credits == 0 and not self._unpaced):
             return False
         if self._busy_since < inf:
             if self._steady and self._rough:
@@ -127,8 +127,8 @@ class Pace:
 
         :param waiting: whether more is waiting
         """
-        interval = self.interval
-        self._free = max(now, self._free) + interval
+        interval = 1 / self._rate if self._rate else self._median
+        self._free = (now if now > self._free else self._free) + interval
         if self._credits is not None and not self._unpaced:
             self._credits -= 1
             self._busy_since = now if not self._credits and waiting else inf

@@ -30,7 +30,10 @@ class Slowness:
 
     def waited(self, since: float, now: float) -> None:
         """A message leaves that could have left since then, as far as it is known here."""
-        self._idle += max(0.0, now - max(since, self._pace.ready))
+        ready = self._pace.ready
+        could = since if since > ready else ready
+        if could < now:
+            self._idle += now - could
         if now - self._window >= _WINDOW_S:
             self._slow = self._idle > (now - self._window) / 2
             self._idle, self._window = 0.0, now

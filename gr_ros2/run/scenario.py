@@ -217,7 +217,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
         if self.time != "real" or self.duplex != "half":
             raise ValueError(
                 f"robots: time = {self.time!r} with duplex = {self.duplex!r}; robots with links of their own share one "
-                "channel at its pace: set time: real and duplex: half, or time to packets or samples"
+                "channel at its pace: set time: real and duplex: half, or time to packets or samples; two robots on a "
+                "channel of their own each are back"
             )
         if not PHY.load(self.phy.name).has_samples:
             raise ValueError(

@@ -100,7 +100,8 @@ class Header(NamedTuple):
     @property
     def size(self) -> int:
         """Bytes on the wire, with the block."""
-        return HEADER_LEN + (self.dst_id != BROADCAST) * ADDRESS_LEN + len(self.block)
+        size = HEADER_LEN if self.dst_id == BROADCAST else HEADER_LEN + ADDRESS_LEN
+        return size + len(self.block)
 
     def room(self, packet_len: int) -> int:
         """Bytes of the longest body behind such a header."""
@@ -187,7 +188,8 @@ def is_sealed(data: bytes) -> bool:
 def body_room(packet_len: int, *, sealed: bool = False, addressed: bool = False, block: bool = False) -> int:
     """Bytes of the longest body of a source packet, whatever the length of its block for medium access."""
     used = HEADER_LEN + addressed * ADDRESS_LEN + REPAIR_HEADER_LEN + (TAG_LEN if sealed else CRC_LEN)
-    return max(packet_len - used - block * MOST_LEN, 0)
+    room = packet_len - used - block * MOST_LEN
+    return room if room > 0 else 0
 
 
 def write_header(header: Header) -> bytes:

@@ -62,11 +62,13 @@ class Assassin:
 
 @pytest.mark.slow
 def test_a_sweep_survives_the_loss_of_a_worker(tmp_path: Path, cluster: Any) -> None:
-    made = plan(tmp_path, repetitions=5)
+    """Robots × range × policy, at packets."""
+    grid = {"robots": [2, 3], "gains_db": [-100, -115], "medium": ["slots", "aloha", "exclusive"]}
+    made = plan(tmp_path, scenario="formation", description=None, grid=grid, repetitions=1)
     assassin = Assassin(cluster)
     outcome = run_sweep(made, tmp_path / "out", scheduler=cluster.scheduler_address, on_progress=assassin)
     assert assassin.robbed
-    assert assassin.total == len(outcome.results) == 15
+    assert assassin.total == len(outcome.results) == 12
     assert (outcome.failures, outcome.interrupted) == ((), False)
     wait_for(lambda: len(assassin.client.nthreads()) == 2, "the worker's successor")
     assert assassin.victim not in assassin.client.nthreads()

@@ -82,12 +82,10 @@ class AnnouncedTopics:
         return sorted(waiting, key=lambda ready: ready.order)
 
     def decode(self, ready: Ready) -> bytes:
-        """The payload of a message.
+        """The payload of a coded message.
 
         :raises CodecError: it cannot be decoded; ``fate`` names the fate of the message
         """
-        if not ready.coded:
-            return ready.payload
         if self._codec is None:
             raise CodecError("coded, and no codec is configured here")
         return self._codec.decode(ready.topic_id, ready.payload)

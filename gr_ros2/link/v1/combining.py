@@ -55,7 +55,7 @@ class Combining:
         """The next window."""
         found: list[Sent] = []
         everybody = self._packets.everybody
-        before = -1
+        before, free = -1, GROUP
         for record in reversed(self._packets.records.values()):
             if record.number <= before:
                 break
@@ -69,7 +69,8 @@ class Combining:
             if not found:
                 before = record.number - MAX_WINDOW
             found.append(record)
-            if len(found) == GROUP:
+            free -= 1
+            if not free:
                 break
         if not self._packets.many(now):
             return found
@@ -114,13 +115,13 @@ class Combining:
                 break
         return found[::-1]
 
-    def combine(self, window: list[Sent], proven: int) -> tuple[Repair, list[Sent]] | None:
+    def combine(self, window: list[Sent], proven: int, now: float) -> tuple[Repair, list[Sent]] | None:
         """The combination of a window, and the packets that it combines: all in its span if a mask does not fit beside
         the bodies. None if none can be sent.
 
         :param proven: it must stand at a later number
         """
-        window = self._anchored(window, proven)
+        window = self._anchored(window, proven, now)
         if not window:
             return None
         packets = self._packets
@@ -137,10 +138,11 @@ class Combining:
         combined = combine([(record.number, record.body) for record in window], repair_id)
         return Repair(newest, mask, repair_id, first == packets.oldest, combined), window
 
-    def _anchored(self, window: list[Sent], proven: int) -> list[Sent]:
+    def _anchored(self, window: list[Sent], proven: int, now: float) -> list[Sent]:
         """The window, changed so that a repair can stand at its newest packet.
 
-        A later packet is added, or the newest ones are left out.
+        A later packet is added with all live ones before it, because a receiver takes what a repair leaves out for
+        packets that are not repaired any more; or the newest packets of the window are left out.
         """
         packets = self._packets
         newest = window[0].number
@@ -149,7 +151,7 @@ class Combining:
         for number in range(max(newest, proven) + 1, min(packets.newest, window[-1].number + MAX_WINDOW - 1) + 1):
             record = packets.records.get(number)
             if record is not None and not packets.full(number):
-                return [record, *window]
+                return [record, *reversed([*packets.live(newest + 1, number - 1, now)]), *window]
         while window and packets.full(window[0].number):
             window = window[1:]
         return window if window and window[0].number > proven else []

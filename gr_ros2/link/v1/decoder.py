@@ -51,7 +51,8 @@ class RepairDecoder:
         self._plausible = plausible
         self._span = span
         self._most = equations
-        self._bodies: dict[int, bytes] = {}
+        self.bodies: dict[int, bytes] = {}
+        """Those of the source packets that are known, by number."""
         self._equations: dict[int, tuple[bytes, bytes]] = {}
         """By pivot: the coefficients of the equation from the pivot on, and its right side."""
         self._grown = False
@@ -59,11 +60,7 @@ class RepairDecoder:
 
     def __contains__(self, number: int) -> bool:
         """Whether a source packet is known."""
-        return number in self._bodies
-
-    def body(self, number: int) -> bytes:
-        """The body of a source packet that is known."""
-        return self._bodies[number]
+        return number in self.bodies
 
     @property
     def equations(self) -> int:
@@ -92,11 +89,11 @@ class RepairDecoder:
 
         :return: this packet and those that follow from it; nothing if it was known already or is too old
         """
-        if number in self._bodies or number < self.floor:
+        if number in self.bodies or number < self.floor:
             return []
         self.advance(number)
         if not self._equations:
-            self._bodies[number] = body
+            self.bodies[number] = body
             return [(number, body)]
         return self._learn([(number, body)])
 
@@ -110,7 +107,7 @@ class RepairDecoder:
         :return: the packets that follow from it
         """
         self.advance(number)
-        bodies = self._bodies
+        bodies = self.bodies
         numbers = window_numbers(number, mask)
         missing = [member for member in numbers if member not in bodies]
         if not missing:
@@ -170,7 +167,7 @@ class RepairDecoder:
 
     def _learn(self, found: Found) -> Found:
         """Put packets that have become known into the equations; return these and all that follow."""
-        bodies, equations, room = self._bodies, self._equations, self._room
+        bodies, equations, room = self.bodies, self._equations, self._room
         known = {number for number, _ in found}
         done = 0
         while done < len(found):
@@ -270,7 +267,7 @@ class RepairDecoder:
     def _forget(self, floor: int) -> None:
         """Forget everything older than ``floor``."""
         held: dict[int, Any]
-        for held in (self._bodies, self._equations):
+        for held in (self.bodies, self._equations):
             if floor - self.floor > len(held):
                 for number in [number for number in held if number < floor]:
                     del held[number]

@@ -143,10 +143,13 @@ class EndpointV1:
         self._receiving.tell(self._sending, messages, window, rate)
         self.pace, self.pings = self._sending.pace, self._sending.pings
 
-    def submitted(self, topic_id: int, now: float) -> bool:
+    def submitted(self, topic_id: int, now: float) -> None:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
-        self._now = max(self._now, now)
+        self._now = now if now > self._now else self._now
         self._hold.submitted(topic_id, now)
+
+    def behind(self, now: float) -> bool:
+        """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         return self._access is None and self._sending.behind(now)  # with medium access, messages wait for their slot
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
@@ -232,7 +235,7 @@ class EndpointV1:
 
     def next_packet(self, now: float) -> SentPacket | None:
         """See :class:`gr_ros2.link.endpoint.PacketSide`."""
-        self._now = max(self._now, now)
+        self._now = now if now > self._now else self._now
         if not self.answers or not self.pace.may_leave(now):
             return None
         if self._access is not None and not self._may_begin(self._access, now):
@@ -250,7 +253,8 @@ class EndpointV1:
         begins = access.departure(now)
         if now < begins - self._lead - _EARLY_S:
             return False
-        block = access.block()
+        relaying = self._receiving.relaying
+        block = access.block(1 if relaying is None else relaying.gains.weight)
         self._writer.block, self._writer.leave_at = block or b"", max(begins, now)
         return block is not None
 
@@ -264,7 +268,7 @@ class EndpointV1:
 
     def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
         """See :class:`gr_ros2.link.endpoint.PacketSide`."""
-        self._now = max(self._now, now)
+        self._now = now if now > self._now else self._now
         self._sending.repairs.received()
         return self._receiving.receive(arrival, now)
 

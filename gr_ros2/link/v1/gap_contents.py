@@ -36,17 +36,18 @@ class GapContents:
 
     def learn(self, number: int) -> None:
         """A packet is known now: look at the gaps before and after it."""
-        known = self._decoder
-        for step, end in ((-1, known.floor), (1, known.newest)):
-            if number == end:  # nothing is known beyond it
-                continue
+        decoder, known = self._decoder, self._decoder.bodies
+        for step, end in ((-1, decoder.floor), (1, decoder.newest)):
             other = number + step
+            if number == end or other in known:  # nothing is known beyond it, or no gap is there
+                continue
             while other != end and other not in known and abs(other - number) < MAP:
                 other += step
-            if abs(other - number) > 1 and other in known:
+            if other in known:
                 self._look(min(number, other), max(number, other))
         if len(self._topics) > _MANY:
-            self._topics = {n: topic_id for n, topic_id in self._topics.items() if n not in known and n >= known.floor}
+            floor = decoder.floor
+            self._topics = {n: topic_id for n, topic_id in self._topics.items() if n not in known and n >= floor}
 
     def _look(self, before: int, after: int) -> None:
         """Compare the fragments of two known packets, between which all are missing."""
@@ -66,5 +67,5 @@ class GapContents:
                 self._topics.update(dict.fromkeys(range(first, after), part.topic_id))
 
     def _parts(self, number: int) -> list[Part]:
-        entries: list[EntryV1] = read_body(self._decoder.body(number), self._room)
+        entries: list[EntryV1] = read_body(self._decoder.bodies[number], self._room)
         return [entry for entry in entries if isinstance(entry, Part)]

@@ -27,7 +27,7 @@ OVERLAP = 1 / 4
 """Part of a packet's airtime by which a repair may delay a message."""
 WAITED = 1 / 16
 """Number of repairs owed per wait, independent of the losses."""
-_MOST_LOSS = 0.5
+_MOST_LOSS, _MOST_OWED = 0.5, 2.0
 _SMOOTHING = 1 / 8
 _STEADY = 1 / 4
 """A topic is periodic if its intervals deviate from their mean by at most this part of it."""
@@ -109,8 +109,9 @@ class Hold:
 
         :param loss: share of packets lost, as far as it is known or expected
         """
-        loss = min(loss, _MOST_LOSS)
-        self._owed = min(self._owed + loss / (1 - loss), 2.0)
+        if self._owed < _MOST_OWED:
+            loss = min(loss, _MOST_LOSS)
+            self._owed = min(self._owed + loss / (1 - loss), _MOST_OWED)
         if self._would_end < inf:
             self._ended(self._would_end - now)
 
@@ -154,6 +155,6 @@ class Hold:
             self._soonest = (inf, inf)
             for period in self._periods.values():
                 due = period.due
-                if due < self._soonest[0] and due + period.late > now:
-                    self._soonest = (due, due + period.late)
+                if due < self._soonest[0] and (until := due + period.late) > now:
+                    self._soonest = (due, until)
         return self._soonest

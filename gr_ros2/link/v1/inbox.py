@@ -395,11 +395,11 @@ class Inbox:
         if topic.fresh and self._late(order[0], topic):
             self._give_up([ready], Fate.LATE)
             return
-        if order <= self._last.get(topic_id, (-1, -1)) and (topic_id, order) in self._over:
-            self._stats.repeats += 1
-            return
         if order <= self._last.get(topic_id, (-1, -1)):
-            self._give_up([ready], _passed_over(topic))
+            if (topic_id, order) in self._over:
+                self._stats.repeats += 1
+            else:
+                self._give_up([ready], _passed_over(topic))
             return
         self._last[topic_id] = order
         for partial in self._reassembly.overtaken(topic_id, order[0]):
@@ -411,7 +411,7 @@ class Inbox:
                 return
             self.marks[topic_id] = (*marks, mark)[-max(topic.depth, 1) :]
         try:
-            payload = self.announced.decode(ready)
+            payload = self.announced.decode(ready) if ready.coded else ready.payload
         except CodecError as error:
             self._give_up([ready], FATES[error.fate])
             return
@@ -421,7 +421,7 @@ class Inbox:
 
     def _old(self, number: int, topic: AnnouncedTopic) -> bool:
         """Whether a message may be older than its topic allows, because nothing proves that it is not."""
-        most = self._max_ages.get(topic.name.lstrip("/"), self._max_age_s)
+        most = self._max_ages.get(topic.name.lstrip("/"), self._max_age_s) if self._max_ages else self._max_age_s
         if most == AUTO:
             most = MAX_AGE_S if topic.fresh else 0.0
         return most > 0 and self.sealed_after is not None and self._now - self.sealed_after(number) > most

@@ -96,7 +96,7 @@ class Neighbour:
 
     def number(self, low: int) -> int:
         """The full packet number for its low 16 bits: the one nearest to the newest."""
-        newest = self.inbox.newest
+        newest = self.inbox.decoder.newest
         number = newest + ((low - newest + _HALF) & 0xFFFF) - _HALF
         if not 0 <= number < _MOST:
             raise ReplayedError(f"packet {low} of robot {self.src_id} is older than its start")
@@ -106,7 +106,7 @@ class Neighbour:
         """Whether a packet was not here before, as far as this is known; notes the repair id of a repair packet."""
         if repair_id == NOT_A_REPAIR:
             return self.inbox.lacks_packet(number)
-        oldest = self.inbox.newest - _NUMBERS_KEPT
+        oldest = self.inbox.decoder.newest - _NUMBERS_KEPT
         used = self.repair_ids.get(number, 0)
         if used >> repair_id & 1 or number <= oldest:
             return False
@@ -162,8 +162,10 @@ class Neighbours:
         self._own = own
         self._settings = settings
         self._keys = keys
+        self._trailer_len = keys.trailer_len
         self._provable = keys.sealed and settings.hears
         self.floors = Floors(heard, save, dropped)
+        self._stores = save is not None and keys.sealed
         self.own_hellos = OwnHellos(own[0])
         self._make_inbox = inbox
         self._known: dict[int, Neighbour] = {}
@@ -202,7 +204,7 @@ class Neighbours:
         :return: None if it is kept until a hello or a proof comes, or dropped because it is not proven
         :raises WireError: the packet cannot be opened, or must not be
         """
-        start, end = header.size, len(data) - self._keys.trailer_len
+        start, end = header.size, len(data) - self._trailer_len
         repair = None
         if header.qos == QOS_REPAIR:
             repair = read_repair_header(data, start, end)
@@ -367,7 +369,7 @@ class Neighbours:
         """A new packet of a known robot arrived; returns whether the robot was taken for gone."""
         neighbour.heard = now
         back, neighbour.gone = neighbour.gone, False
-        if self._counts_on_store(neighbour.hello):
+        if self._stores and not self.proves(neighbour.hello):
             self.floors.guard(neighbour.floor, number, now)
         return back
 
@@ -387,4 +389,4 @@ class Neighbours:
 
     def _counts_on_store(self, hello: Hello) -> bool:
         """Whether only the stored packet number keeps replays of a robot out."""
-        return self.floors.stores and self._keys.sealed and not self.proves(hello)
+        return self._stores and not self.proves(hello)

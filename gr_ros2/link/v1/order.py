@@ -110,19 +110,19 @@ class Order:
     def settle(self, now: float) -> list[Ready]:
         """Find up to which packet everything is here or given up; the messages that waited for that, topic by topic."""
         decoder, void, gaps = self._decoder, self._void, self._gaps
-        newest, floor = decoder.newest, decoder.floor
-        dead = max(self._dead, floor)
-        low = max(self.low, min(dead, newest + 1))
+        newest, floor, here = decoder.newest, decoder.floor, decoder.bodies
+        dead = self._dead if self._dead > floor else floor
+        low = max(self.low, dead if dead <= newest else newest + 1)
         while gaps and gaps[0][2] < floor:
             gaps.popleft()
         if self.held > self._most:
             low = newest + 1
         elif gaps and not self.told:
             low = self._give_up(low, dead, now)
-        while low <= newest and (low in decoder or low in void):
+        while low <= newest and (low in here or low in void):
             low += 1
-        wanted = max(self.wanted, dead)
-        while wanted <= newest and (wanted in decoder or wanted in void):
+        wanted = self.wanted if self.wanted > dead else dead
+        while wanted <= newest and (wanted in here or wanted in void):
             wanted += 1
         self.wanted = wanted
         self.low = low
@@ -131,7 +131,7 @@ class Order:
         for topic_id, line in self._waiting.items():
             if line:
                 passed = max(low, self._passed.get(topic_id, 0))
-                while passed <= newest and (passed in decoder or passed in void or not may_carry(passed, topic_id)):
+                while passed <= newest and (passed in here or passed in void or not may_carry(passed, topic_id)):
                     passed += 1
                 self._passed[topic_id] = passed
                 line.sort(key=_in_order)

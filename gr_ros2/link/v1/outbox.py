@@ -38,8 +38,11 @@ Observer = Callable[[Accepted | Refused | Missed], None]
 class Owner(Protocol):
     """What an outbox tells its endpoint."""
 
-    def submitted(self, topic_id: int, now: float) -> bool:
-        """A message of a topic has come; returns whether the computer is too slow for what comes."""
+    def submitted(self, topic_id: int, now: float) -> None:
+        """A message of a topic has come."""
+
+    def behind(self, now: float) -> bool:
+        """Whether messages that wait do so because the computer is too slow for what comes."""
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """The table of topics has changed.
@@ -171,7 +174,8 @@ class Outbox:
         topic = self.sent.get(topic_id)
         if topic is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
-        if self._owner.submitted(topic_id, now) and topic.is_stream:
+        self._owner.submitted(topic_id, now)
+        if topic.queue and topic.is_stream and self._owner.behind(now):
             self.drop(list(topic.queue.shed(now)))
         self.packing.turns.join(topic_id)
         serial = self._serial

@@ -172,7 +172,7 @@ class Packing:
         parts: list[EntryV1] = []
         sent: list[SentEntry] = []
         lifetimes: list[Lifetime] = []
-        stats, qos = self._stats, picks[0][0].qos
+        stats, qos, since = self._stats, picks[0][0].qos, inf
         for place, (message, taken) in enumerate(picks):
             topic_id, offset, lifetime = message.topic_id, message.offset, message.lifetime
             topic = self._topics[topic_id]
@@ -181,6 +181,8 @@ class Packing:
                 lifetime.expires = message.expires
                 lifetime.in_order, lifetime.long = topic.in_order, self._long(message)
                 topic.queue.started(now)
+            if message.submitted < since and not topic.topic.options.max_rate:
+                since = message.submitted
             lifetime.awaited = len(topic.queue) > 1
             payload = message.take(taken)
             last, begin = message.offset == len(message.payload), message.begin
@@ -202,8 +204,7 @@ class Packing:
         # On a shared channel a topic that goes along in a packet has had a turn: fresh messages are in every packet.
         self.turns.sent([message.topic_id for message, _ in picks] if self._shares else [self._holder])
         stats.entries += len(picks)
-        free = (message.submitted for message, _ in picks if not self._topics[message.topic_id].topic.options.max_rate)
-        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, min(free, default=inf))
+        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, since)
 
 
 def _may_cut(message: Message, taken: int, used: int, room: int, *, large: int) -> bool:

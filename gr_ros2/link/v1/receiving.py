@@ -157,12 +157,12 @@ class ReceivingSide:
         try:
             header = read_header(arrival.data, self._settings.packet_len)
             opened = self._open(arrival.data, header, now)
-            if opened is None or opened.new:  # what was here before says nothing about now
-                self._note_slot(header, arrival, now, trusted=opened is not None)
+            if self._access is not None and (opened is None or opened.new):  # what was here says nothing about now
+                self._note_slot(self._access, header, arrival, now, trusted=opened is not None)
             if opened is None:
                 return
             opened.neighbour.timeout = None
-            if not self._for_us(header):
+            if self._access is not None and not self._for_us(header):
                 self.stats.dropped["not_for_us"] += 1
                 return
             if arrival.snr_db is not None and opened.new:
@@ -176,12 +176,12 @@ class ReceivingSide:
             for early in self.neighbours.early(opened.neighbour.src_id):
                 self._receive(ReceivedPacket(early), now)
 
-    def _note_slot(self, header: Header, arrival: ReceivedPacket, now: float, *, trusted: bool) -> None:
+    def _note_slot(self, access: Access, header: Header, arrival: ReceivedPacket, now: float, *, trusted: bool) -> None:
         """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
-        if self._access is None or arrival.received_at is None or header.src_id == self._settings.src_id:
+        if arrival.received_at is None or header.src_id == self._settings.src_id:
             return
         block = read_block(header.block)[0] if header.block else None
-        self._access.hear(header.src_id, block, arrival.received_at, trusted=trusted)
+        access.hear(header.src_id, block, arrival.received_at, trusted=trusted)
         if self.relaying is not None and trusted:
             self.relaying.heard(header.src_id, block, now)
 
@@ -215,7 +215,7 @@ class ReceivingSide:
             self._meet(opened, now)
         self._sender, inbox = neighbour, neighbour.inbox
         if repair is None:
-            entries = read_body(opened.body, self._room(header))
+            entries = read_body(opened.body, header.room(self._settings.packet_len))
             packet = PacketV1(header, tuple(entries), encrypted=neighbour.encrypts)
             self._arrived(arrival, neighbour, number, NOT_A_REPAIR, packet)
             self._report_all(inbox.source(number, opened.body, entries, header.qos, now))
@@ -228,7 +228,7 @@ class ReceivingSide:
                 inbox.repair(number, repair.mask, repair.repair_id, opened.body, oldest=oldest, now=now, new=new)
             )
             return False
-        entries = opened.entries if opened.entries is not None else read_body(opened.body, self._room(header))
+        entries = opened.entries or read_body(opened.body, header.room(self._settings.packet_len))
         packet = PacketV1(header, tuple(entries), repair, b"", neighbour.encrypts and not repair.clear)
         self._arrived(arrival, neighbour, number, repair.repair_id, packet)
         if repair.clear:
@@ -245,10 +245,6 @@ class ReceivingSide:
                 sending.pings.receive(neighbour.src_id, self._settings.src_id, entry, now)
         self._report_all(inbox.heard(number, now, over=repair.oldest))
         return proved
-
-    def _room(self, header: Header) -> int:
-        """Bytes of the longest body that can be in a packet."""
-        return header.room(self._settings.packet_len)
 
     def _arrived(
         self, arrival: ReceivedPacket, neighbour: Neighbour, number: int, repair_id: int, packet: PacketV1

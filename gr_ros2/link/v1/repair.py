@@ -74,7 +74,7 @@ class RepairWindow:
         :param lifetimes: lifetimes of the messages in it; () for a packet that is not worth repairing
         """
         self.peers.sent(number, now)
-        if not self.peers:
+        if not self.peers.all:
             self._unreported.sent(number, lifetimes)
         elif self._shared is not None:
             self._shared.sent(number, lifetimes, self.peers.loss)
@@ -128,7 +128,10 @@ class RepairWindow:
         """Whether ``urgent`` or ``Peers.over`` may have something."""
         if self._shared is not None and self._shared.due:
             return True
-        return bool(self.peers.urges) or self.peers.in_vain or self._unreported.due(self.packets.newest)
+        peers = self.peers
+        if peers.all:
+            return peers.in_vain or bool(peers.urges)
+        return self._unreported.due(self.packets.newest)
 
     def tell(self, number: int, now: float) -> Repair | None:
         """A repair from which peers learn that a packet is not repaired any more; None if there is none."""
@@ -182,12 +185,12 @@ class RepairWindow:
         return record
 
     def _combination(self, window: list[Sent], now: float) -> Repair | None:
-        found = self._combining.combine(window, self.peers.proven)
+        found = self._combining.combine(window, self.peers.proven, now)
         if found is None:
             return None
         repair, combined = found
         first = combined[-1].number
-        if not self.peers:
+        if not self.peers.all:
             self._unreported.cover(combined, now)
         self._unreported.repaired()
         if self.mode == "thrifty":

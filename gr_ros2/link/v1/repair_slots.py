@@ -39,7 +39,7 @@ class RepairSlots:
     @property
     def mode(self) -> RepairMode:
         """What idle slots carry."""
-        mode, reported = self._setting, bool(self._window.peers)
+        mode, reported = self._setting, bool(self._window.peers.all)
         if not self._pace.known:  # nothing limits how many packets leave: repair only what reports call for
             return "thrifty" if mode != "off" and reported else "off"
         if mode != AUTO:
@@ -66,8 +66,9 @@ class RepairSlots:
     def spare(self, now: float) -> SentPacket | None:
         """What a slot carries that nothing else needs."""
         self._window.mode = self.mode
-        over = self._window.peers.over(now)
-        return self._repair(now) if over < 0 else self._tell(over, now)
+        if self._window.peers.in_vain and (over := self._window.peers.over(now)) >= 0:
+            return self._tell(over, now)
+        return self._repair(now)
 
     def next(self, now: float) -> float:
         """When ``spare`` may have something, s; inf for never."""

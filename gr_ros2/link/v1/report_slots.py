@@ -50,7 +50,11 @@ class ReportSlots:
 
     def due(self, now: float) -> list[Reporter]:
         """The reports that are due; on a shared channel as many as may leave, those first that miss something."""
-        due = [report for n in self._neighbours if (report := n.inbox.reports).due(now) <= now]
+        due = []
+        for neighbour in self._neighbours:
+            report = neighbour.inbox.reports
+            if report.due(now) <= now:
+                due.append(report)
         if self._shares:
             self._allowed = min(self._allowed + REPORTS * self._packet_len, AT_ONCE * REPORT_LEN)
             due.sort(key=lambda r: (not r.lacks and now < r.reported_at + WAITS_S, r.reported_at))
@@ -100,6 +104,8 @@ class ReportSlots:
 
     def asks(self, now: float) -> SentPacket | None:
         """A packet with requests, if there are any."""
+        if now < self.requests.check_at:
+            return None
         asks = self.requests.entries(self._writer.room, now)
         return self._writer.control(asks, "hello", now) if asks else None
 

@@ -97,7 +97,8 @@ class Reporter:
         """
         self.unreported += 1
         self._arrived += 1
-        self._unspent = min(self._unspent + 1 / SHARE, _MOST)
+        if self._unspent < _MOST:
+            self._unspent = min(self._unspent + 1 / SHARE, _MOST)
         if not late:
             self.loss -= self.loss * _SMOOTHING
 
@@ -160,10 +161,10 @@ class Reporter:
         self._old_turn = not self._old_turn
         if self._old_turn and wanted < newest - MAP + 1:
             base = wanted + MAP - 1
-        arrived = 0
+        arrived, here = 0, decoder.bodies
         for back in range(MAP):
             number = base - back
-            if number in decoder or number < wanted:
+            if number in here or number < wanted:
                 arrived |= 1 << back
         settled = wanted > base - MAP
         loss = min(round(self.loss * 128), 127)

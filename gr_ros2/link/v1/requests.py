@@ -22,19 +22,20 @@ class Requests:
 
     :param hears: whether other robots can be heard
     :ivar lacking: whether they keep messages that this one lacked when it last looked
+    :ivar check_at: when it looks next, s; infinite for never
     """
 
     def __init__(self, neighbours: Iterable[Neighbour], *, hears: bool) -> None:
         self.lacking = False
         self._neighbours = neighbours
-        self._check_at = -inf if hears else inf
+        self.check_at = -inf if hears else inf
 
     def entries(self, room: int, now: float) -> list[Ask]:
         """Requests, as many as ``room`` bytes hold."""
         found: list[Ask] = []
-        if now < self._check_at:
+        if now < self.check_at:
             return found
-        self._check_at = now + CHECK_S
+        self.check_at = now + CHECK_S
         self.lacking = False
         for neighbour in self._neighbours:
             hello, inbox, asked = neighbour.hello, neighbour.inbox, neighbour.asked

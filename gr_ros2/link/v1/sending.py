@@ -77,7 +77,7 @@ class SendingSide:
 
     def packet(self, now: float) -> SentPacket | None:
         """The next packet, None if there is nothing to send."""
-        if self._alone(now):
+        if self.settings.beacon_s and self._alone(now):
             return self._beacon(now)
         self.urged = False
         if not self._started:
@@ -93,7 +93,8 @@ class SendingSide:
             return self._writer.control(self.pings.entries(self._writer.room, snrs_db, now), "hello", now)
         if now >= self._repeat_at:
             self._repeat(now)
-        messages.expire(now, self.pace.sure_interval(now))
+        if messages.sent.deadlines:
+            messages.expire(now, self.pace.sure_interval(now))
         due = reports.due(now)
         if due and reports.overdue:
             return reports.packet(due, now)

@@ -31,6 +31,7 @@ class SentTopic:
     :param publishers: the QoS that its publishers offer
     :param newest: when the newest of its messages that have left was submitted, s
     :param lifetimes: its messages that have left
+    :ivar dst_id: the robot for which its messages are, 255 for all
     """
 
     topic: Topic
@@ -43,6 +44,11 @@ class SentTopic:
     publishers: PublisherQos = UNKNOWN_QOS
     newest: float = -inf
     lifetimes: Lifetimes = field(default_factory=Lifetimes)
+    dst_id: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        to = self.topic.options.to
+        self.dst_id = BROADCAST if to == AUTO else to
 
     @property
     def kept(self) -> bool:
@@ -65,12 +71,6 @@ class SentTopic:
         """
         depth = self.topic.options.depth
         return 1 if depth == AUTO else depth
-
-    @property
-    def dst_id(self) -> int:
-        """The robot for which its messages are, 255 for all."""
-        to = self.topic.options.to
-        return BROADCAST if to == AUTO else to
 
     @property
     def in_order(self) -> bool:

@@ -41,13 +41,19 @@ class Thrift:
         self._packets, self._peers = packets, peers
         self._flight: deque[tuple[float, int, int]] = deque()
         """The time until which a repair may be on its way without a report about it, and its window."""
+        self._loss = self._gain = 0.0
+        """Loss for which it is known by how much ``_ahead`` grows with a packet."""
         self._ahead = 0.0
         """Number of repairs that may be sent before a report calls for them."""
 
     def sent(self) -> None:
         """A new packet left that is worth repairing."""
-        loss = min(self._peers.loss, MOST_LOSS)
-        self._ahead = min(self._ahead + AHEAD * loss / (1 - loss) ** 3, _MOST_AHEAD)
+        if self._ahead < _MOST_AHEAD:
+            if self._peers.loss != self._loss:
+                loss = self._loss = self._peers.loss
+                loss = min(loss, MOST_LOSS)
+                self._gain = AHEAD * loss / (1 - loss) ** 3
+            self._ahead = min(self._ahead + self._gain, _MOST_AHEAD)
 
     def repaired(self) -> None:
         """A repair leaves, of any kind."""

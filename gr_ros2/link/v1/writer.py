@@ -72,6 +72,7 @@ class PacketWriter:
         self.leave_at: float | None = None
         self._shares = shares
         self._src_id, self._boot, self._dst_id = settings.src_id, boot, settings.dst_id
+        self._hop = HOP if settings.dst_id != BROADCAST else 0
         self._packet_len = settings.packet_len
         self._window, self._rate, self._stats, self._hold, self._observer = window, rate, stats, hold, observer
         self.sealed, self._encrypts = keys.sealed, keys.encrypts
@@ -98,12 +99,14 @@ class PacketWriter:
         body = write_body(entries, self.room)
         header = self._header(qos, number)
         clear = write_header(header)
-        data = self._trailer.close(clear, self._padded(body, clear), number, NOT_A_REPAIR)
+        padded = body.ljust(self._end_of_body - len(clear), b"\0")
+        data = self._trailer.close(clear, padded, number, NOT_A_REPAIR)
         self._window.sent(number, body, data, lifetimes, now)
         if lifetimes:
             self._hold.left(now, self._window.peers.loss)
         packet = PacketV1(header, tuple(entries), encrypted=self._encrypts)
-        return self._leave(data, packet, (number, NOT_A_REPAIR), "new", now, parts=parts)
+        identity = PacketId(self._src_id, self._boot, number, NOT_A_REPAIR)
+        return self._leave(data, packet, identity, "new", now, parts=parts)
 
     def control(self, entries: Sequence[EntryV1], kind: AirKind, now: float, *, clear: bool = False) -> SentPacket:
         """Write a packet of entries that are not messages; it stands at the newest number."""
@@ -131,51 +134,47 @@ class PacketWriter:
         header = read_header(chosen.data, self._packet_len)
         entries = tuple(read_body(chosen.body, self.room))
         packet = PacketV1(header, entries, encrypted=self._encrypts)
-        return self._leave(chosen.data, packet, (chosen.number, NOT_A_REPAIR), "repair", now)
+        identity = PacketId(self._src_id, self._boot, chosen.number, NOT_A_REPAIR)
+        return self._leave(chosen.data, packet, identity, "repair", now)
 
     def _repair_packet(
         self, repair: RepairHeader, number: int, body: bytes, entries: Sequence[EntryV1], *, kind: AirKind, now: float
     ) -> SentPacket:
         header = self._header(QOS_REPAIR, number)
         clear = write_header(header) + write_repair_header(repair)
-        body = self._padded(body, clear)
+        body = body.ljust(self._end_of_body - len(clear), b"\0")
         data = self._trailer.close(clear, body, number, repair.repair_id, plain=repair.clear)
         encrypted = self._encrypts and not repair.clear
         combined = body if repair.mask else b""
         packet = PacketV1(header, tuple(entries), repair, combined, encrypted)
-        return self._leave(data, packet, (number, repair.repair_id), kind, now)
+        return self._leave(data, packet, PacketId(self._src_id, self._boot, number, repair.repair_id), kind, now)
 
     def _leave(
         self,
         data: bytes,
         packet: PacketV1,
-        place: tuple[int, int],
+        identity: PacketId,
         kind: AirKind,
         now: float,
         *,
         parts: tuple[SentEntry, ...] = (),
     ) -> SentPacket:
-        """A packet leaves at its place: number and repair id."""
-        self._stats.air[kind] += 1
-        self._stats.packets += 1
+        """A packet leaves."""
+        stats = self._stats
+        stats.air[kind] += 1
+        stats.packets += 1
         mcs = 0
         if self._rate is not None:
             mcs = self._rate.sent(None if self._dst_id == BROADCAST else self._dst_id, now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
-        sent = SentPacket(
-            data, packet, PacketId(self._src_id, self._boot, *place), parts, now, kind, mcs, self.leave_at
-        )
+        sent = SentPacket(data, packet, identity, parts, now, kind, mcs, self.leave_at)
         if self._observer is not None:
             self._observer(sent)
         return sent
 
-    def _padded(self, body: bytes, clear: bytes) -> bytes:
-        return body.ljust(self._end_of_body - len(clear), b"\0")
-
     def _header(self, qos: int, number: int) -> Header:
-        hop = HOP if self._dst_id != BROADCAST else 0
-        return Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, hop, self.block)
+        return Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, self._hop, self.block)
 
 
 def room_of(settings: Settings, keys: Keys, *, block: bool) -> int:

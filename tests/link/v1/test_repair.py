@@ -336,3 +336,15 @@ def test_nothing_lives_longer_than_the_span() -> None:
     repair = sender.next(0.0)
     assert isinstance(repair, Repair)
     assert window_numbers(repair.number, repair.mask)[-1] >= 300
+
+
+def test_a_repair_that_stands_at_a_later_packet_leaves_out_none_that_is_alive() -> None:
+    sender = window("thrifty", 8)
+    sender.peers.meet(2, 0.1)
+    sender.peers.prove(2, 6)  # the receiver takes combinations from packet 7 on
+    for number in (1, 2):
+        sender.packets.records[number].lifetimes[0].end()
+    repair = sender.tell(1, 0.2)
+    assert isinstance(repair, Repair)
+    assert (repair.number, repair.oldest) == (7, True)
+    assert window_numbers(repair.number, repair.mask) == [7, 6, 5, 4, 3]
