@@ -18,8 +18,8 @@ from gr_ros2.report.table import as_table
 from gr_ros2.settings.config import build
 
 _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
-_TEAM = {"packet_len": 96, "loss": (0.05,)}
-"""Packets carry a block for medium access, and conditions are fewer because each takes longer."""
+_TEAM = {"packet_len": 96, "loss": (0.05,), "load": (2.0, 4.0)}
+"""Packets carry a block for medium access, and the channel is scarce: below that all contenders carry everything."""
 
 
 @click.command()
@@ -27,7 +27,9 @@ _TEAM = {"packet_len": 96, "loss": (0.05,)}
 @click.option("--robots", type=int, metavar="N", help="2 to 10 robots on one channel, all to all; default one to one.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/race-TIME.")
 @click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20,40, of a team 5.")
-@click.option("--load", metavar="PERCENT,...", help="Of the link's capacity by the messages as they are; 50,200.")
+@click.option(
+    "--load", metavar="PERCENT,...", help="Of the channel by messages as they are; 50,200, of a team 200,400."
+)
 @click.option("--sample-rate", type=OrAuto(click.FLOAT), help="Samples/s instead of --load.")
 @click.option("--peers", metavar="NAME,...", help="Who races; default all.")
 @click.option("--source", help="sim, a simulated robot's odometry at 35 Hz, or bag:PATH.")
