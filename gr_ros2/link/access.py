@@ -15,9 +15,12 @@ class Access(Protocol):
     def departure(self, now: float) -> float:
         """When the next packet may begin."""
 
-    def block(self) -> bytes | None:
+    def block(self, weight: int = 1) -> bytes | None:
         """The bytes behind the header of the packet that begins at the departure. None: nothing may begin there after
-        all; ask for the departure again."""
+        all; ask for the departure again.
+
+        :param weight: packets to send while others send one, 1 to 16: more where there is much to relay
+        """
 
     def hear(self, src_id: int, block: Any, began: float, *, trusted: bool = True) -> None:
         """A packet of a robot was received.

@@ -49,7 +49,7 @@ class Aloha:
             self._next = now + max(self._airtime, self._rng.expovariate(1 / self._every))
         return self._next
 
-    def block(self) -> bytes | None:
+    def block(self, weight: int = 1) -> bytes | None:  # noqa: ARG002
         """See :class:`gr_ros2.link.access.Access`. ALOHA says nothing to others."""
         self._next = None
         return b""

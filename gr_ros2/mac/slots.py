@@ -4,15 +4,19 @@ Each packet says in which slot it stands and in which two slots its sender sends
 picks its slots among those that nobody it hears has announced, and that no neighbour expects to receive in: a neighbour
 of a neighbour would destroy what that neighbour receives. Of two robots that want one slot, the lower id keeps it.
 
-*Rate.* From one send to the next there are (the most robots that this one or a neighbour hears + 2 + those that have
-entered lately) * 16 / 15 slots, and at least the period of the messages. One slot in 16 is never reserved.
+*Rate.* A robot's weight says how many packets it sends while others send one: 1, and more where it has much to relay. A
+frame has a slot for each packet around the one of this robot and its neighbours that has most around it, and one more.
+It lasts at least the period of the messages.
 
-*Entry.* A robot without slots sends in an open slot with probability 1 / v. v grows when no neighbour names the robot
+*Choice.* The first free slot after an equal part of the frame. Slots go on from frame to frame, so one counts as free
+only if nobody else is known to send in the slot one frame before.
+
+*Entry.* A robot without slots sends in a free slot with probability 1 / v. v grows when no neighbour names the robot
 by its next send, and shrinks with each newcomer that gets in. A neighbour names two robots a packet, newcomers first.
 
-*Who is not heard.* Two robots that always collide at a third one are never heard by it, so no map names their slots.
-Whoever a neighbour does not name for a while picks at random among the first free slots, and so does a robot that
-hears nobody.
+*Who is not heard.* Two robots that always collide at a third one are never heard by it: its map lacks their slots. A
+robot whose next slot is not in a neighbour's map, or that nobody names for a while, picks at random among the first
+free slots, and so does a robot that hears nobody.
 
 Invariants: sans-IO, the caller passes in times of its own clock, and the generator; what arrives with bytes that were
 not checked keeps its sender's announced slots free and does nothing else; the work for a packet heard is bounded by the
@@ -36,30 +40,24 @@ from gr_ros2.wire.mac_block import (
     write_block,
 )
 
-OPEN = 16
-"""Every so many slots, one is never reserved."""
 LISTEN_S = 0.5
 """s for which a robot listens before it enters."""
 HEARD_S = 3.0
 """s for which a robot that was heard counts as heard; longer where robots send less than three times in it."""
-CHOICE = 8
+CHOICE = 4
 """Free slots among which a robot picks at random where it does so."""
 MIXED = 0.02
-"""Share of picks at random where nothing calls for it: robots in step part."""
-PATIENCE = 4
-"""Packets of a neighbour without this robot's name, beyond those in which it names all its neighbours twice."""
+"""Share of picks at random where nothing calls for it: of two neighbours in step each may be heard by all others."""
 NAMED = 2.2
-"""Intervals for which a robot that was heard is named: one packet of it may be lost."""
-NEW = 3
-"""Intervals for which a robot that has entered leaves one slot more to those that enter after it."""
+"""Frames for which a robot that was heard is named: one packet of it may be lost."""
 UNSURE = 1.5
-"""Intervals without being named, of which each has two names for each robot, after which a robot may be in step with
+"""Frames without being named, of which each has two names for each robot, after which a robot may be in step with
 another one."""
 KNOWN_LATE = 9
 """Slots that this is at least: a host knows a packet some slots after it began, and composes its own ahead. Without it
 two links on one computer (6 ms a slot) picked at random half of the time, and sent 27 instead of 41 packets/s each."""
 EASED = 0.97
-"""What v is multiplied by in an open slot. With twice v after an entry in vain, about one robot enters in two slots."""
+"""What v is multiplied by in a free slot. With twice v after an entry in vain, about one robot enters in two slots."""
 _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 64.0, 64.0
 _NEVER = -1 << 40
 _SWEEP = 64
@@ -68,21 +66,20 @@ _SWEEP = 64
 class _HeardRobot:
     """What is known of a robot that is heard."""
 
-    __slots__ = ("ahead", "entered", "heard", "last", "named", "unnamed")
+    __slots__ = ("ahead", "deaf", "heard", "last", "named", "weight")
 
     def __init__(self, slot: int) -> None:
-        self.entered = slot
-        """The slot in which it was first heard since it has entered."""
         self.last = slot
         """The slot of its newest packet."""
         self.heard = 0
-        """Robots that it hears."""
+        """Sum of the weights of the robots that it hears."""
+        self.weight = 1
         self.ahead: tuple[int, ...] = ()
         """The slots that it has announced."""
         self.named = _NEVER
         """The slot in which this robot has last named it."""
-        self.unnamed = 0
-        """Packets of it in a row that do not name this robot."""
+        self.deaf = False
+        """Whether its newest map lacks the next slot of this robot, or, without a map, it does not name this robot."""
 
 
 class Slots:
@@ -98,10 +95,13 @@ class Slots:
         self.src_id = src_id
         self.clock = SlotClock(slot_s)
         self.reserved = False
+        self._weight = 1
         self._rng = rng
         self._period = period_s / slot_s
         self._mine: list[int] = []
         self._announced: tuple[int, ...] = ()
+        self._sent = _NEVER
+        """The slot of the newest packet."""
         self._taken: dict[int, int] = {}
         """Slot -> the robot that has announced it."""
         self._expected: set[int] = set()
@@ -109,8 +109,8 @@ class Slots:
         self._conflicts: dict[int, int] = {}
         """Slot that two robots want -> the one of them that gives it up."""
         self._robots: dict[int, _HeardRobot] = {}
-        self._named_at = self._hidden_at = self._confirmed_at = self._heard_at = self._swept = _NEVER
-        """Slots: a neighbour last named another robot; one that is not heard here; this robot; anybody was heard."""
+        self._named_at = self._confirmed_at = self._heard_at = self._swept = _NEVER
+        """Slots: a neighbour last named another robot; this robot; anybody was heard."""
         self._entered_at: int | None = None
         """The slot of the first send since the entry; None outside."""
         self._rate = _ENTRY_RATE
@@ -140,8 +140,9 @@ class Slots:
             self._mine.append(self._entry(self.clock.slot(max(now, self._since + LISTEN_S)) + 1))
         return self.clock.begin(self._mine[0])
 
-    def block(self) -> bytes | None:
+    def block(self, weight: int = 1) -> bytes | None:
         """See :class:`gr_ros2.link.access.Access`."""
+        self._weight = weight
         if not self._mine:  # asked ahead of the end of its silence: nobody is there whose slots it could take
             assert self._since is not None
             self.clock.start(self._since + LISTEN_S)
@@ -150,7 +151,7 @@ class Slots:
         self._sweep(slot)
         alone = self._alone(slot)
         if self._entered_at is None:
-            if not self._open(slot):
+            if not self._free(slot):
                 return None
             self._entered_at = slot
         elif not alone and self._confirmed_at < max(self._entered_at, slot - 2 * self._memory()):
@@ -168,7 +169,7 @@ class Slots:
         self._mine = kept
         while len(kept) < 2:
             kept.append(self._pick(kept[-1] if kept else slot, slot))
-        self._announced = tuple(kept)
+        self._announced, self._sent = tuple(kept), slot
         return write_block(self._content(slot))
 
     def _leave(self) -> None:
@@ -177,44 +178,45 @@ class Slots:
         self._entered_at = None
 
     def _entry(self, first: int) -> int:
-        """An open slot at random, from ``first`` on."""
+        """A free slot at random, from ``first`` on."""
         for slot in range(first, first + LONGEST_AHEAD):
-            if self._open(slot):
+            if self._free(slot):
                 if self._rng.random() < 1 / self._rate:
                     return slot
                 self._rate = max(1.0, self._rate * EASED)
         return first + LONGEST_AHEAD
 
-    def _open(self, slot: int) -> bool:
-        return slot % OPEN == 0 or self._free(slot)
-
     def _free(self, slot: int) -> bool:
-        return slot % OPEN != 0 and slot not in self._taken and slot not in self._expected
+        return slot not in self._taken and slot not in self._expected
 
     def _pick(self, base: int, now: int) -> int:
         """The slot to send in after ``base``."""
         alone = self._alone(now)
-        step = self._interval(now)
+        frame = self._frame(now)
+        step = max(round(frame / self._weight), 1)
         if alone:
             step = round(max(step, self._rate) * self._rng.uniform(0.5, 1.5))
         ahead = announceable(step)
         places: list[int] = []
-        unsure = alone or self._confirmed_at < now - max(UNSURE * step, KNOWN_LATE) or self._unheard(now)
+        unsure = alone or self._confirmed_at < now - max(UNSURE * frame, KNOWN_LATE) or self._unheard(now)
         wanted = CHOICE if unsure or self._rng.random() < MIXED else 1
         while ahead <= LONGEST_AHEAD and len(places) < wanted:
-            if self._free(base + ahead) and base + ahead not in self._mine:
-                places.append(base + ahead)
+            at, before = base + ahead, base + ahead - frame
+            if self._free(at) and at not in self._mine and (before <= now or before == base or self._free(before)):
+                places.append(at)
             ahead = announceable(ahead + 1) if ahead < LONGEST_AHEAD else ahead + 1
         return self._rng.choice(places) if places else base + announceable(step)
 
-    def _interval(self, now: int) -> int:
-        """Slots from one send to the next."""
+    def _frame(self, now: int) -> int:
+        """Slots in which every robot around sends as often as its weight says."""
         oldest = now - self._memory()
-        heard = [robot.heard for robot in self._robots.values() if robot.last >= oldest]
-        most = max([len(heard), *heard])
-        lately = now - NEW * most
-        entered = sum(robot.entered >= lately for robot in self._robots.values())
-        return max(math.ceil(self._period - 1e-9), round((most + 2 + entered) * OPEN / (OPEN - 1)))
+        heard = [robot for robot in self._robots.values() if robot.last >= oldest]
+        most = max([self._load(oldest) + self._weight, *(robot.heard + robot.weight for robot in heard)])
+        return max(math.ceil(self._period - 1e-9), most + 1)
+
+    def _load(self, oldest: int) -> int:
+        """Sum of the weights of the robots heard since a slot."""
+        return sum(robot.weight for robot in self._robots.values() if robot.last >= oldest)
 
     def _memory(self) -> int:
         """Slots for which a robot that was heard counts as heard."""
@@ -228,26 +230,28 @@ class Slots:
         return self._heard_at < now - self._lately()
 
     def _unheard(self, now: int) -> bool:
-        """Whether a neighbour does not name this robot although it should."""
+        """Whether a neighbour does not expect this robot in its next slot."""
         oldest = now - self._lately()
-        return any(robot.last >= oldest and robot.unnamed > PATIENCE + robot.heard for robot in self._robots.values())
+        return any(robot.last >= oldest and robot.deaf for robot in self._robots.values())
 
     def _content(self, slot: int) -> Block:
         oldest = slot - self._memory()
         heard = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= oldest}
-        fresh = slot - NAMED * self._interval(slot)
+        fresh = slot - NAMED * self._frame(slot)
         names = nsmallest(2, (n for n in heard if heard[n].last >= fresh), key=lambda src_id: heard[src_id].named)
         for src_id in names:
             heard[src_id].named = self._turn(slot) if heard[src_id].named == _NEVER else slot
         first, second = [*names, NOBODY, NOBODY][:2]
         ahead = self._mine[0] - slot, self._mine[1] - self._mine[0]
-        short = Block(slot % SLOT_NUMBERS, ahead, len(heard), (first, second))
-        if self._named_at < oldest and all(robot.heard == len(heard) for robot in heard.values()):
+        load = self._load(oldest)
+        short = Block(slot % SLOT_NUMBERS, ahead, load, (first, second))
+        around = {load + self._weight, *(robot.heard + robot.weight for robot in heard.values())}
+        if self._weight == 1 and self._named_at < oldest and len(around) == 1:
             return short
         expected = sum(1 << n for n in range(MAP_SLOTS) if slot + 1 + n in self._taken)
-        wanted = min((at for at in self._conflicts if slot < at < slot + SLOT_NUMBERS), default=None)
+        wanted = min((at for at in self._conflicts if slot + 1 < at < slot + SLOT_NUMBERS), default=None)
         conflict = (0, NOBODY) if wanted is None else (wanted - slot, self._conflicts.pop(wanted))
-        return short._replace(expected=expected, conflict=conflict)
+        return short._replace(expected=expected, conflict=conflict, weight=self._weight)
 
     def _turn(self, now: int) -> int:
         """When a newcomer counts as named: at random, or all robots would name the same ones at the same time."""
@@ -291,20 +295,20 @@ class Slots:
             self._rate = max(1.0, self._rate - 1)
         elif slot not in robot.ahead:
             robot.named = _NEVER
-            # Where all hear all, both announcements were lost. Where somebody is hidden, the slot more that an entry
-            # costs makes room for those who collide unheard.
-            if slot > robot.last + self._lately() or self._hidden_at >= slot - self._memory():
-                robot.entered = slot
         self._heard_at = max(self._heard_at, slot)
         for at in robot.ahead:
             if at not in ahead and self._taken.get(at) == src_id:
                 del self._taken[at]
-        robot.last, robot.heard, robot.ahead = slot, block.heard, tuple(ahead)
+            if at not in ahead and self._conflicts.get(at) == src_id:
+                del self._conflicts[at]
+        robot.last, robot.ahead, robot.heard, robot.weight = slot, tuple(ahead), block.heard, block.weight
         for at in ahead:
             self._claim(at, src_id)
-        self._named(robot, block.names, slot)
-        if block.expected is not None:
-            self._mapped(slot, block.expected, block.conflict)
+        self._named(block.names, slot)
+        if block.expected is None:
+            robot.deaf = self.src_id not in block.names
+        else:
+            self._mapped(robot, block.expected, block.conflict)
 
     def _claim(self, slot: int, src_id: int) -> None:
         owner = self._taken.get(slot, src_id)
@@ -317,23 +321,22 @@ class Slots:
             else:
                 self._conflicts[slot] = src_id
 
-    def _named(self, robot: _HeardRobot, names: tuple[int, int], slot: int) -> None:
-        robot.unnamed += 1
+    def _named(self, names: tuple[int, int], slot: int) -> None:
         for name in names:
             other = self._robots.get(name)
             if name == self.src_id:
                 self._confirmed_at = max(self._confirmed_at, slot)
                 self._rate = _ENTRY_RATE
-                robot.unnamed = 0
             elif other is not None and other.named == _NEVER:
                 other.named = self._turn(slot)  # one confirmation is enough
             elif name != NOBODY:
                 self._named_at = slot
-                if other is None:
-                    self._hidden_at = slot
 
-    def _mapped(self, slot: int, expected: int, conflict: tuple[int, int]) -> None:
+    def _mapped(self, robot: _HeardRobot, expected: int, conflict: tuple[int, int]) -> None:
+        slot = robot.last
         at = slot + 1
+        if self._sent < slot - 1 and self._announced and 0 <= self._announced[0] - at < MAP_SLOTS:
+            robot.deaf = not expected >> self._announced[0] - at & 1
         while expected:
             skip = (expected & -expected).bit_length()
             at += skip
@@ -351,6 +354,6 @@ class Slots:
         self._expected.clear()
         self._conflicts.clear()
         self._robots.clear()
-        self._heard_at = self._confirmed_at = self._hidden_at = self._named_at = _NEVER
+        self._heard_at = self._confirmed_at = self._named_at = _NEVER
         self._swept = _NEVER
         self._rate = _ENTRY_RATE

@@ -8,7 +8,8 @@ robot that is heard, and each stream, an engine keeps the newest number that thi
 - *Belief.* A message that was sent was heard with probability ``BELIEF`` by each robot in range: by the own neighbours
   when this robot sent it, and by those neighbours that the sender names as heard when another robot sent it.
 
-The gain of sending a stream's newest message is the sum over the neighbours of how much younger it makes them, in s.
+The gain of sending a stream's newest message is the sum over the neighbours of how much younger it makes them, in s. A
+robot's *weight*, by which it shares the channel with others, is the sum of the gains of all streams over the largest.
 
 Invariants: sans-IO, the caller passes in times; the work for a message heard is bounded by the robots heard, and that
 for a choice by robots times streams; equal calls give equal choices; memory is bounded by ``MOST_STREAMS`` and the ids.
@@ -21,6 +22,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from gr_ros2.wire.control import Newest
+from gr_ros2.wire.mac_block import MOST_WEIGHT
 
 HEARD_S = 3.0
 """s for which a robot that was heard counts as a neighbour."""
@@ -35,6 +37,8 @@ ARRIVALS = 16
 TOLD = 2
 """Streams of which a packet tells the newest number."""
 MOST_STREAMS = 4096
+SMOOTHING = 0.1
+"""Share by which the weight follows from one choice to the next."""
 _HALF = 1 << 15
 
 
@@ -87,6 +91,8 @@ class Gains:
         """The same by what an entry ``Newest`` names."""
         self._heard: dict[int, _Heard] = {}
         self._turn = 0
+        self._weight = 1.0
+        self._chosen_at = 0.0
 
     def has(self, stream: Stream) -> int:
         """The newest number of a stream that is here; -1 for none."""
@@ -159,12 +165,21 @@ class Gains:
         """
         neighbours = self._neighbours(now)
         best: Stream | None = None
-        most = worth = 0.0
+        most = worth = total = 0.0
         for stream, state in self._streams.items():
             gain = self._gain(stream, state, neighbours)
+            total += gain
             if gain and gain * gain / cost(stream) > worth:
                 best, most, worth = stream, gain, gain * gain / cost(stream)
+        own = len(neighbours) * (now - self._chosen_at)  # of a message made since the choice before
+        self._chosen_at = now
+        self._weight += SMOOTHING * (max(total / max(most, own, 1e-9), 1.0) - self._weight)
         return best, most
+
+    @property
+    def weight(self) -> int:
+        """Packets to send while others send one: messages of about the largest gain that wait, smoothed."""
+        return min(int(self._weight), MOST_WEIGHT)
 
     def neighbours(self, now: float) -> int:
         """Robots that are heard."""

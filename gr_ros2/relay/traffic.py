@@ -25,6 +25,10 @@ class SwarmTraffic(Protocol):
 
     relays: bool
 
+    @property
+    def weight(self) -> int:
+        """Packets to send while others send one."""
+
     def compose(self, number: int, made: float, now: float) -> bytes:
         """The content of the packet that leaves now.
 
@@ -40,6 +44,7 @@ class OwnOnly:
     """Each robot sends its own messages."""
 
     relays = False
+    weight = 1
 
     def compose(self, number: int, made: float, now: float) -> bytes:  # noqa: ARG002
         return _stamp.pack(made)
@@ -56,6 +61,10 @@ class ByGain:
         self._src_id = src_id
         self._gains = Gains(src_id)
         self._newest: dict[int, Relayed] = {}
+
+    @property
+    def weight(self) -> int:
+        return self._gains.weight
 
     def compose(self, number: int, made: float, now: float) -> bytes:
         own = Stream(self._src_id, 0, 0)

@@ -169,7 +169,7 @@ class SwarmRobot:
             self._hear(reception)
         at = self.access.departure(self._local(now))
         if (at - self._offset) / self._ppm <= now + 1e-9:
-            block = self.access.block()
+            block = self.access.block(self.traffic.weight)
             if block is not None:
                 start = now + self._rng.uniform(0, self._config.jitter_s)
                 number, made = self.newest(now)

@@ -4,12 +4,14 @@
 byte 0        slot in which the packet is sent, mod 256
 byte 1        slots from there to the sender's next packet     0 none; 1..127; above that 127 + 4 (code - 127)
 byte 2        slots from that one to the packet after it       likewise
-byte 3        H, robots that the sender hears                  H = 1: bytes 6 to 11; 0..63; above 63 + 3 (code - 63)
+byte 3        H, robots that the sender hears, by weight       H = 1: bytes 6 to 11; 0..63; above 63 + 3 (code - 63)
 bytes 4, 5    two robots that the sender hears                 255 none
-bytes 6..9    map                                              bit i: the sender expects to receive in slot + 1 + i
+bytes 6..9    W - 1 in the upper 4 bits, map below             bit i: the sender expects to receive in slot + 1 + i
 byte 10       slots to one that two robots want                0 none
 byte 11       the robot of these two that gives it up
 ```
+
+W is the weight of the sender: the packets that it sends while others send one. A short block has W = 1.
 
 Invariants: reading raises nothing but an EntryBoundsError, for a block that is cut off; every block has one encoding.
 """
@@ -23,8 +25,9 @@ from gr_ros2.core.errors import EncodeError, EntryBoundsError
 
 SLOT_NUMBERS = 256
 """Slots are counted modulo this."""
-MAP_SLOTS = 32
+MAP_SLOTS = 28
 """Slots of a map."""
+MOST_WEIGHT = 16
 NOBODY = 255
 """In place of a name."""
 LONGEST_AHEAD = 127 + 4 * 128
@@ -41,10 +44,11 @@ class Block(NamedTuple):
 
     :param slot: in which the packet is sent, mod 256
     :param ahead: slots from this packet to the sender's next one, and from that to the one after; 0 for none
-    :param heard: number of robots that the sender hears
+    :param heard: sum of the weights of the robots that the sender hears: their number where none relays
     :param names: two of them, 255 for none
     :param expected: map; bit i set: the sender expects to receive in ``slot + 1 + i``. None where there is no map
     :param conflict: slots to one that two robots want, and the one of them that gives it up; (0, 255) for none
+    :param weight: packets that the sender sends while others send one, 1 to 16; 1 where there is no map
     """
 
     slot: int
@@ -53,6 +57,7 @@ class Block(NamedTuple):
     names: tuple[int, int] = (NOBODY, NOBODY)
     expected: int | None = None
     conflict: tuple[int, int] = (0, NOBODY)
+    weight: int = 1
 
     def describe(self) -> str:
         """The fields in words."""
@@ -62,7 +67,7 @@ class Block(NamedTuple):
         if self.expected is None:
             return text
         slots = ", ".join(f"+{i + 1}" for i in range(MAP_SLOTS) if self.expected >> i & 1) or "no slot"
-        text += f", expects to receive in {slots}"
+        text += f", expects to receive in {slots}, weight {self.weight}"
         at, yields = self.conflict
         return f"{text}, robot {yields} gives up +{at}" if at else text
 
@@ -77,12 +82,16 @@ def write_block(block: Block) -> bytes:
 
     :raises EncodeError: for a field out of range
     """
-    slot, ahead, heard, names, expected, conflict = block
+    slot, ahead, heard, names, expected, conflict, weight = block
     hidden = 0 if expected is None else _HIDDEN
     try:
         first, second = (_ahead_code(n) for n in ahead)
         data = _SHORT.pack(slot, first, second, hidden | _heard_code(heard), *names)
-        return data if expected is None else data + _LONG.pack(expected, *conflict)
+        if expected is None:
+            return data
+        if expected >> MAP_SLOTS:
+            raise ValueError(f"a map has {MAP_SLOTS} slots")
+        return data + _LONG.pack((weight - 1) << MAP_SLOTS | expected, *conflict)
     except Exception as error:
         raise EncodeError(f"a field of {block} is out of range ({error})") from error
 
@@ -99,8 +108,9 @@ def read_block(data: bytes, start: int = 0) -> tuple[Block, int]:
     robots = robots if robots < 64 else 3 * robots - 126
     if not heard & _HIDDEN:
         return Block(slot, ahead, robots, (names[0], names[1])), end
-    expected, *conflict = _LONG.unpack_from(data, start + _SHORT.size)
-    return Block(slot, ahead, robots, (names[0], names[1]), expected, (conflict[0], conflict[1])), end
+    word, at, loser = _LONG.unpack_from(data, start + _SHORT.size)
+    weight, expected = 1 + (word >> MAP_SLOTS), word & (1 << MAP_SLOTS) - 1
+    return Block(slot, ahead, robots, (names[0], names[1]), expected, (at, loser), weight), end
 
 
 def block_len(data: bytes, start: int, end: int) -> int:

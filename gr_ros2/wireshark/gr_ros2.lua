@@ -52,8 +52,9 @@ local f = {
     slot = ProtoField.uint8("gr_ros2.slot", "Slot, mod 256"),
     slot_next = ProtoField.uint16("gr_ros2.slot.next", "Slots to the next send"),
     slot_after = ProtoField.uint16("gr_ros2.slot.after", "Slots from that to the one after"),
-    slot_heard = ProtoField.uint8("gr_ros2.slot.heard", "Robots heard"),
+    slot_heard = ProtoField.uint8("gr_ros2.slot.heard", "Robots heard, by weight"),
     slot_name = ProtoField.uint8("gr_ros2.slot.name", "Hears robot", base.DEC, { [BROADCAST] = "none" }),
+    slot_weight = ProtoField.uint8("gr_ros2.slot.weight", "Weight"),
     slot_map = ProtoField.uint32("gr_ros2.slot.map", "Expects to receive, bit i in slot + 1 + i", base.HEX),
     slot_conflict = ProtoField.uint8("gr_ros2.slot.conflict", "Slots to one that two robots want"),
     slot_yields = ProtoField.uint8("gr_ros2.slot.yields", "Gives it up", base.DEC, { [BROADCAST] = "none" }),
@@ -750,7 +751,8 @@ local function dissect_block(buffer, tree, at, limit)
     block:add(f.slot_name, buffer(at + 4, 1))
     block:add(f.slot_name, buffer(at + 5, 1))
     if size == MOST_BLOCK then
-        block:add(f.slot_map, buffer(at + 6, 4))
+        block:add(f.slot_weight, buffer(at + 6, 1), 1 + buffer(at + 6, 1):bitfield(0, 4))
+        block:add(f.slot_map, buffer(at + 6, 4), buffer(at + 6, 4):bitfield(4, 28))
         block:add(f.slot_conflict, buffer(at + 10, 1))
         block:add(f.slot_yields, buffer(at + 11, 1))
     end

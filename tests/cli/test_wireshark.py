@@ -177,6 +177,7 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
             ("slot.after", said and [said.ahead[1]]),
             ("slot.heard", said and [said.heard]),
             ("slot.name", said and list(said.names)),
+            ("slot.weight", said and said.expected is not None and [said.weight]),
             ("slot.map", said and said.expected is not None and [said.expected]),
             ("slot.conflict", said and said.expected is not None and [said.conflict[0]]),
             ("slot.yields", said and said.expected is not None and [said.conflict[1]]),

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.relay.gain import HEARD_S, OWN, UNKNOWN_S, Gains, Stream
 from gr_ros2.wire.control import Newest
+from gr_ros2.wire.mac_block import MOST_WEIGHT
 
 ODOM = Stream(7, 0xCAFE, 0)
 
@@ -38,6 +39,19 @@ def test_the_gain_is_the_time_that_a_neighbour_is_behind() -> None:
     assert gains.gain(ODOM, 1.0) == pytest.approx(0.6)
     gains.sent(ODOM, 1.0)
     assert gains.gain(ODOM, 1.0) == pytest.approx(0.6 * (1 - OWN))
+
+
+def test_the_weight_is_the_number_of_messages_that_wait_to_be_relayed() -> None:
+    gains = hearing(2, 3)
+    for topic_id in range(1, 30):
+        gains.message(2, Stream(7, 0xCAFE, topic_id), 1, 1.0)
+        for _ in range(80):
+            gains.best(1.0)
+        assert abs(gains.weight - min(1 + topic_id, MOST_WEIGHT)) <= 1
+    gains.neighbour(2, 100.0)
+    for now in range(100, 150):
+        gains.best(float(now))
+    assert gains.weight == 1, "an own message is worth more"
 
 
 def test_what_a_neighbour_tells_stands_against_belief() -> None:

@@ -255,7 +255,10 @@ def read_medium_access(data: bytes) -> dict[str, object]:
     ahead = [code if code < 128 else 127 + 4 * (code - 127) for code in data[1:3]]
     heard = data[3] & 127
     heard = heard if heard <= 63 else 63 + 3 * (heard - 63)
-    expected, conflict = (int.from_bytes(data[6:10], "big"), list(data[10:12])) if data[3] & 128 else (None, [0, 255])
+    expected, conflict, weight = None, [0, 255], 1
+    if data[3] & 128:
+        weight, expected = 1 + (data[6] >> 4), int.from_bytes(data[6:10], "big") & 0x0FFFFFFF
+        conflict = list(data[10:12])
     return {
         "slot": data[0],
         "ahead": ahead,
@@ -263,6 +266,7 @@ def read_medium_access(data: bytes) -> dict[str, object]:
         "names": list(data[4:6]),
         "expected": expected,
         "conflict": conflict,
+        "weight": weight,
     }
 
 

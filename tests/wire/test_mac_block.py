@@ -7,14 +7,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError
-from gr_ros2.wire.mac_block import LONGEST_AHEAD, MOST_LEN, Block, announceable, read_block, write_block
+from gr_ros2.wire.mac_block import (
+    LONGEST_AHEAD,
+    MAP_SLOTS,
+    MOST_LEN,
+    MOST_WEIGHT,
+    Block,
+    announceable,
+    read_block,
+    write_block,
+)
 
 VECTORS = {
     "000000000000": Block(0, (0, 0), 0, (0, 0)),
     "ff1617130204": Block(255, (22, 23), 19, (2, 4)),
     "10807f40ffff": Block(16, (131, 127), 66, (255, 255)),
     "20ff01ff0001": Block(32, (639, 1), 255, (0, 1), 0),
-    "0507078203048000000112fe": Block(5, (7, 7), 2, (3, 4), 0x80000001, (18, 254)),
+    "050707820304b800000112fe": Block(5, (7, 7), 2, (3, 4), 0x8000001, (18, 254), 12),
 }
 aheads = st.integers(0, LONGEST_AHEAD).map(announceable)
 bytes_ = st.integers(0, 255)
@@ -27,14 +36,16 @@ blocks = st.builds(
     st.tuples(bytes_, bytes_),
     st.none(),
     st.just((0, 255)),
+    st.just(1),
 ) | st.builds(
     Block,
     bytes_,
     st.tuples(aheads, aheads),
     robots,
     st.tuples(bytes_, bytes_),
-    st.integers(0, 2**32 - 1),
+    st.integers(0, 2**MAP_SLOTS - 1),
     st.tuples(bytes_, bytes_),
+    st.integers(1, MOST_WEIGHT),
 )
 
 
@@ -76,7 +87,16 @@ def test_a_number_of_robots_without_a_code_is_rounded_up() -> None:
 
 
 @pytest.mark.parametrize(
-    "block", [Block(256), Block(0, (128, 0)), Block(0, (643, 0)), Block(0, names=(256, 0)), Block(0, expected=1 << 32)]
+    "block",
+    [
+        Block(256),
+        Block(0, (128, 0)),
+        Block(0, (643, 0)),
+        Block(0, names=(256, 0)),
+        Block(0, expected=1 << 28),
+        Block(0, expected=0, weight=17),
+        Block(0, expected=0, weight=0),
+    ],
 )
 def test_a_field_out_of_range_is_refused(block: Block) -> None:
     with pytest.raises(EncodeError):

@@ -253,7 +253,8 @@ class EndpointV1:
         begins = access.departure(now)
         if now < begins - self._lead - _EARLY_S:
             return False
-        block = access.block()
+        relaying = self._receiving.relaying
+        block = access.block(1 if relaying is None else relaying.gains.weight)
         self._writer.block, self._writer.leave_at = block or b"", max(begins, now)
         return block is not None
 

@@ -33,11 +33,11 @@ class Greedy:
         self.now = now
         return now
 
-    def block(self) -> bytes:
+    def block(self, weight: int = 1) -> bytes:  # noqa: ARG002
         slot = self.victim.clock.slot(self.now)
         first, second = [*self.victim._mine, slot + 20, slot + 40][:2]
         ahead = max(first - slot, 1), max(second - first, 1)
-        return write_block(Block(slot % 256, ahead, 40, (1, 2), 0xFFFFFFFF, (ahead[0], self.victim.src_id)))
+        return write_block(Block(slot % 256, ahead, 40, (1, 2), 0xFFFFFFF, (ahead[0], self.victim.src_id)))
 
     def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:
         pass
