@@ -1,8 +1,9 @@
 """A computer that is too slow: the demo, in real time, with a third of the processor time that it needs.
 
 First the demo runs free, and its processor time is measured while messages are sent. Then it runs with a third of that.
-Where the kernel does not give processor time by quota without rights, SIGSTOP and SIGCONT do: every ``TICK_S`` the
-demo's process is stopped if it has used more than its share, with nothing saved up for longer than ``PERIOD_S``.
+Where the kernel does not give processor time by quota without rights, SIGSTOP and SIGCONT do, in periods of
+``PERIOD_S`` as the kernel's: the process is stopped once it has used its share, and goes on when it has half of a
+period's again. With stops as short as they can be, its 50 threads would be woken three times as often for them.
 It starts free, since loading a program is not what is measured.
 
 Ages are those of the receiving robot's ROS graph, from the stamp that the simulated robot gives a message when it is
@@ -115,8 +116,8 @@ def _hold(process: subprocess.Popen[str], cores: float | None, seconds: float) -
         used = spent()
         if cores is not None:
             left = min(left + cores * (now - last) - (used - before), cores * PERIOD_S)
-            if stopped != (left < 0):
-                stopped = left < 0
+            if (left >= cores * PERIOD_S / 2) if stopped else (left < 0):
+                stopped = not stopped
                 process.send_signal(signal.SIGSTOP if stopped else signal.SIGCONT)
         last, before = now, used
         time.sleep(TICK_S)

@@ -285,5 +285,6 @@ class Subscriptions:
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            self._messages.submit(self._now(topic_id), whole or payload, self._clock())
+            waited_s = 0.0 if subscription is None else subscription.waited_s
+            self._messages.submit(self._now(topic_id), whole or payload, self._clock(), waited_s=waited_s)
             self._live.wake()

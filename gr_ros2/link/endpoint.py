@@ -66,7 +66,14 @@ class MessageSide(Protocol):
     """The messages that an end sends."""
 
     def submit(
-        self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf, dst_id: int | Auto = AUTO
+        self,
+        topic_id: int,
+        payload: bytes,
+        now: float,
+        lifespan_s: float = inf,
+        dst_id: int | Auto = AUTO,
+        *,
+        waited_s: float = 0.0,
     ) -> None:
         """Take a serialized message.
 
@@ -74,6 +81,7 @@ class MessageSide(Protocol):
 
         :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline (version 1)
         :param dst_id: the robot for which it is, auto as its topic says: others carry it there (version 1)
+        :param waited_s: s for which it has waited on this computer, and newer ones of its topic have come (version 1)
         :raises ConfigError: for a topic that is not sent
         """
 

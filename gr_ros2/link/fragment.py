@@ -11,21 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gr_ros2.wire import Format
-
-
-def fragment_len(size: int, pending_topics: int, packet_len: int, min_fragment: int, wire_format: Format) -> int:
-    """Length of the fragments of a message of ``size`` bytes whose first entry is about to be sent.
-
-    Two or more pending topics share packets, k = max(k*(2), k_min); a single one fills them. A message that would need
-    more fragments than allowed at that k is cut to fill packets.
-    """
-    alone = wire_format.single_entry_payload(packet_len)
-    if pending_topics < 2:
-        return alone
-    shared = max(wire_format.equal_entry_payload(packet_len, 2), min_fragment)
-    return shared if -(-size // shared) <= wire_format.max_fragments else alone
-
 
 @dataclass(slots=True, eq=False)
 class Outgoing:

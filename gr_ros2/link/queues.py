@@ -26,6 +26,8 @@ STANDING_S = 0.25
 the demo needs (``python -m bench slow_computer``), its IMU was 1.9 s old where only the queue's bound dropped. With 0.5
 s its oldest topic was 0.7 to 1.6 s old, with 0.25 s 0.8 s."""
 
+OVERLOADED = f"it waited for {STANDING_S:g} s and newer ones came"
+
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
@@ -120,7 +122,7 @@ class TopicQueue(deque[Outgoing]):
             return
         for message in [waiting for waiting in self if now - waiting.submitted > STANDING_S and not waiting.started]:
             self.remove(message)
-            yield Dropped(message, Fate.OVERLOAD, f"it waited for {STANDING_S:g} s and newer ones came")
+            yield Dropped(message, Fate.OVERLOAD, OVERLOADED)
 
     def expire(self, now: float, interval: float, lead: float, payload: int) -> Iterator[Dropped]:
         """Drop the messages that cannot be delivered in time, even if they had the link to themselves.

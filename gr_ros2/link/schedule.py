@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from gr_ros2.link.fragment import Outgoing, fragment_len
+from gr_ros2.link.fragment import Outgoing
 from gr_ros2.settings.config import SourceConfig
 from gr_ros2.wire.v0 import V0
 
@@ -51,7 +51,7 @@ class PaperScheduler:
         payload = 0
         for topic_id in self._line:
             for message in queues.get(topic_id, ()):
-                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment, V0)
+                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment)
                 lengths = self._fitting(message, cut, len(picks), payload)
                 picks += [message] * len(lengths)
                 chosen += lengths
@@ -86,3 +86,16 @@ class PaperScheduler:
         for topic_id in dict.fromkeys(message.topic_id for message in plan.picks):
             self._line.remove(topic_id)
             self._line.append(topic_id)
+
+
+def fragment_len(size: int, pending_topics: int, packet_len: int, min_fragment: int) -> int:
+    """Length of the fragments of a message of ``size`` bytes whose first entry is about to be sent.
+
+    Two or more pending topics share packets, k = max(k*(2), k_min); a single one fills them. A message that would need
+    more fragments than allowed at that k is cut to fill packets.
+    """
+    alone = V0.single_entry_payload(packet_len)
+    if pending_topics < 2:
+        return alone
+    shared = max(V0.equal_entry_payload(packet_len, 2), min_fragment)
+    return shared if -(-size // shared) <= V0.max_fragments else alone

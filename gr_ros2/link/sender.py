@@ -89,6 +89,8 @@ class Sender:
         now: float,
         lifespan_s: float = inf,  # noqa: ARG002 - as in other versions
         dst_id: int | Auto = AUTO,  # noqa: ARG002
+        *,
+        waited_s: float = 0.0,  # noqa: ARG002
     ) -> None:
         """Take a serialized message.
 

@@ -102,11 +102,13 @@ class Subscription(ABC):
     """A subscription of this participant.
 
     :ivar lost: messages that were lost before they reached the callback, as far as the graph reports them
+    :ivar waited_s: s for which the message that the callback gets has waited for it at least
     :ivar calling: for back-ends: held while calling back
     """
 
     def __init__(self) -> None:
         self.lost = 0
+        self.waited_s = 0.0
         self.calling = threading.RLock()
         self._offers: list[Qos] = []
         self._on_offers: OffersCallback | None = None

@@ -193,9 +193,11 @@ class DdsSubscription(Subscription):
             text = f"{self.topic}: callbacks do not keep up, depth {self._wanted.depth} is full, the oldest are dropped"
             self._middleware.count_lost(self, self.topic, text, excess)
             fresh = fresh[excess:]
+        newest = {sample.source: sample.stamp for sample in fresh}
         for sample in fresh:
             if self._closed:
                 break
+            self.waited_s = max(0.0, (newest[sample.source] - sample.stamp) * 1e-9)
             self._middleware.deliver(self.topic, self._callback, sample.payload)
         return len(samples)
 

@@ -7,6 +7,7 @@ message; no step begins after ``close`` was called.
 from __future__ import annotations
 
 import threading
+import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -78,7 +79,7 @@ class QueuedSubscription(Subscription):
         self._thread = thread
         self._depth = depth
         self._callback = callback
-        self._waiting: deque[bytes] = deque()
+        self._waiting: deque[tuple[float, bytes]] = deque()
         self._queueing = threading.Lock()
 
     @abstractmethod
@@ -97,7 +98,7 @@ class QueuedSubscription(Subscription):
             full = bool(self._depth) and len(self._waiting) >= self._depth
             if full:
                 self._waiting.popleft()
-            self._waiting.append(payload)
+            self._waiting.append((time.monotonic(), payload))
         if full:
             text = f"{self.topic}: callbacks do not keep up, depth {self._depth} is full, the oldest are dropped"
             self._participant.count_lost(self, self.topic, text)
@@ -121,7 +122,8 @@ class QueuedSubscription(Subscription):
     def _take(self) -> None:
         with self.calling:
             with self._queueing:
-                payload = self._waiting.popleft()
+                came, payload = self._waiting.popleft()
+                self.waited_s = self._waiting[-1][0] - came if self._waiting else 0.0
             if not self.closed:
                 self._participant.deliver(self.topic, self._callback, payload)
 

@@ -6,7 +6,7 @@ version of the paper (section 5). ``v1`` is the version with repair, sealing and
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 from gr_ros2.core.errors import (
     CrcError,
@@ -78,15 +78,13 @@ def format_of(version: int) -> Format:
     return FORMATS[version]
 
 
-def decode(data: bytes, packet_len: int, accept: Collection[int] = FORMATS.keys()) -> Packet:
+def decode(data: bytes, packet_len: int) -> Packet:
     """The packet in these bytes, read by the version that its first four bits give.
 
-    Bytes with a version nibble that is not accepted are checked by the rules of the lowest accepted version. Damaged
-    bytes are refused by the CRC (a damaged version nibble is damage like any other), all others by the version.
+    Bytes with an unknown version are checked by the rules of version 0: damaged bytes are refused by the CRC (a damaged
+    version nibble is damage like any other), all others by the version.
 
     :param packet_len: packet length of the link, bytes
-    :param accept: accepted versions, at least one
     :raises WireError: see the ``decode`` of each version
     """
-    version = data[0] >> 4 if data else -1
-    return FORMATS[version if version in accept else min(accept)].decode(data, packet_len)
+    return FORMATS.get(data[0] >> 4 if data else 0, V0).decode(data, packet_len)

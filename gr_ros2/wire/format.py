@@ -98,7 +98,7 @@ class Span(NamedTuple):
 
 
 class Format(Protocol):
-    """One version of the wire format: its limits, its arithmetic, packets to bytes and back."""
+    """One version of the wire format: its limits, its arithmetic, and reading a packet."""
 
     @property
     def version(self) -> int:
@@ -109,20 +109,8 @@ class Format(Protocol):
         """Width of packet numbers, bits."""
 
     @property
-    def id_bits(self) -> int:
-        """Width of a message's number (unique within its source and topic), bits."""
-
-    @property
     def max_topics(self) -> int:
         """Topic ids are below this number."""
-
-    @property
-    def max_entries(self) -> int:
-        """Most entries of one packet."""
-
-    @property
-    def max_fragments(self) -> int:
-        """Most fragments of one message."""
 
     @property
     def min_packet_len(self) -> int:
@@ -132,29 +120,11 @@ class Format(Protocol):
     def max_packet_len(self) -> int:
         """Longest ``packet_len`` of a link."""
 
-    @property
-    def entry_cost(self) -> int:
-        """Most bytes that a further entry takes in addition to its payload."""
-
     def largest_message(self, packet_len: int) -> int:
         """Most bytes of a message."""
 
-    def smallest_packet_len(self, size: int) -> int | None:
-        """Smallest ``packet_len`` that carries a message of ``size`` bytes, None if none does."""
-
-    def room(self, packet_len: int, entries: int, payload: int) -> int:
-        """Payload bytes that one more entry may have.
-
-        :param entries: in the packet so far
-        :param payload: bytes of payload in the packet so far, all entries together
-        :return: negative if no further entry fits
-        """
-
     def single_entry_payload(self, packet_len: int) -> int:
         """Most payload bytes of a packet with one entry."""
-
-    def equal_entry_payload(self, packet_len: int, entries: int) -> int:
-        """Most payload bytes of each of this many equal entries; negative if they do not fit."""
 
     def packed_len(self, payload_lens: Sequence[int]) -> int:
         """Bytes of a packet with entries of these payload lengths, without padding."""
@@ -164,13 +134,6 @@ class Format(Protocol):
 
         :param packet_len: bytes of the longest packet on this link
         :param size: bytes of this packet, None = as many
-        """
-
-    def encode(self, packet: Any, packet_len: int) -> bytes:
-        """A packet's bytes.
-
-        :param packet: a value of this version
-        :raises EncodeError: a field out of range, or more than fits
         """
 
     def decode(self, data: bytes, packet_len: int) -> Packet:

@@ -131,7 +131,6 @@ class FormatV0:
     max_packet_len = _MAX_PACKET_LEN
     min_packet_len = overhead(1) + _ENTRY_HEADER_LEN + 1
     """One entry of one byte."""
-    entry_cost = _ENTRY_HEADER_LEN + 1
 
     def largest_message(self, packet_len: int) -> int:
         """Bytes of the largest message that 255 entries can carry."""

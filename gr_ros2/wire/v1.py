@@ -39,6 +39,8 @@ BROADCAST = 255
 HEADER_LEN = 4
 ADDRESS_LEN = 2
 """Bytes that destination and hop count add to the header of an addressed packet."""
+_ENTRY_COST = 3
+"""Most bytes that an entry takes in addition to its payload, as schedulers count."""
 REPAIR_HEADER_LEN = 2
 """Bytes of window and repair id. A source packet leaves as many bytes free, so that its body fits in a repair."""
 CRC_LEN = 4
@@ -465,11 +467,6 @@ class PacketV1(NamedTuple):
         """Messages and fragments, in their order."""
         return tuple([entry for entry in self.body if isinstance(entry, Part)])
 
-    @property
-    def controls(self) -> tuple[Control, ...]:
-        """Entries that are not messages, in their order."""
-        return tuple([entry for entry in self.body if not isinstance(entry, Part)])
-
 
 def encode(packet: PacketV1, packet_len: int, boot: int, turns: int = 0, *, fixed: bool = True) -> bytes:
     """The bytes of a packet that is not sealed.
@@ -493,26 +490,34 @@ def encode(packet: PacketV1, packet_len: int, boot: int, turns: int = 0, *, fixe
     return data + crc(data, session_crc(boot, turns))
 
 
-def decode(data: bytes, packet_len: int, boot: int, turns: int = 0) -> PacketV1:
-    """Read a packet that is not sealed.
+def decode(data: bytes, packet_len: int, boot: int | None = None, turns: int = 0) -> PacketV1:
+    """Read a packet.
 
     :param packet_len: bytes of the longest packet on this link
-    :param boot: boot number of the sender, from its hello
+    :param boot: boot number of the sender, from its hello, for a packet that is not sealed; None: it is not known. Then
+        the trailer is checked only if the packet itself carries that hello, and of a sealed packet only a hello is read
     :raises WireError: LengthError, VersionError, CrcError, WindowError, EntryBoundsError, EntryKindError, VarintError
-        or PadError, in this order of checks
+        or PadError
     """
     header = read_header(data, packet_len)
-    if header.sealed or crc(data[:-CRC_LEN], session_crc(boot, turns)) != data[-CRC_LEN:]:
+    start, end = header.size, len(data) - (TAG_LEN if header.sealed else CRC_LEN)
+    if boot is not None and (header.sealed or crc(data[:end], session_crc(boot, turns)) != data[end:]):
         raise CrcError("CRC-32 does not match, or the packet is sealed")
-    room = header.room(packet_len)
-    start, end = header.size, len(data) - CRC_LEN
-    if header.qos != QOS_REPAIR:
-        return PacketV1(header, tuple(read_body(data[start:end], room)))
-    repair = read_repair_header(data, start, end)
-    start += repair.size
-    if repair.mask:
+    repair = None
+    if header.qos == QOS_REPAIR:
+        repair = read_repair_header(data, start, end)
+        start += repair.size
+    clear = repair is not None and repair.clear
+    if header.sealed and not clear:
+        return PacketV1(header, (), repair, b"", encrypted=True)
+    if repair is not None and repair.mask:
         return PacketV1(header, (), repair, data[start:end])
-    return PacketV1(header, tuple(read_body(data[start:end], room)), repair)
+    body = tuple(read_body(data[start:end], header.room(packet_len)))
+    if boot is None and clear and not header.sealed:
+        hello = body[0] if body else None
+        if not isinstance(hello, Hello) or crc(data[:end], session_crc(hello.boot, hello.turns)) != data[end:]:
+            raise CrcError("CRC-32 does not match that of its hello")
+    return PacketV1(header, body, repair)
 
 
 class FormatV1:
@@ -520,38 +525,21 @@ class FormatV1:
 
     version = VERSION
     number_bits = 16
-    id_bits = 16
-    """A message is named by the number of the packet in which it began."""
     max_topics = MAX_TOPICS
-    max_entries = 4095
-    max_fragments = MAX_BACK
     min_packet_len = 40
     max_packet_len = 4095
-    entry_cost = 3
 
     def largest_message(self, packet_len: int) -> int:  # noqa: ARG002 - the same in packets of any length
         """Bytes of the largest message."""
         return MAX_MESSAGE
 
-    def smallest_packet_len(self, size: int) -> int | None:
-        """Smallest packet_len that carries a message of ``size`` bytes, None if none does."""
-        return self.min_packet_len if size <= MAX_MESSAGE else None
-
-    def room(self, packet_len: int, entries: int, payload: int) -> int:
-        """Payload bytes that one more entry may have; negative if no further entry fits."""
-        return body_room(packet_len) - self.entry_cost * (entries + 1) - payload
-
     def single_entry_payload(self, packet_len: int) -> int:
         """Payload bytes of a packet with one entry; this can be one byte more, because the entry may fill the body."""
-        return self.room(packet_len, 0, 0)
-
-    def equal_entry_payload(self, packet_len: int, entries: int) -> int:
-        """Most payload bytes of each of this many equal entries; negative if they do not fit."""
-        return body_room(packet_len) // entries - self.entry_cost
+        return body_room(packet_len) - _ENTRY_COST
 
     def packed_len(self, payload_lens: Sequence[int]) -> int:
         """Bytes of a packet with entries of these payload lengths, without padding."""
-        return HEADER_LEN + REPAIR_HEADER_LEN + CRC_LEN + sum(payload_lens) + self.entry_cost * len(payload_lens)
+        return HEADER_LEN + REPAIR_HEADER_LEN + CRC_LEN + sum(payload_lens) + _ENTRY_COST * len(payload_lens)
 
     def layout(self, packet: PacketV1, packet_len: int, size: int | None = None) -> list[Span]:
         """See :meth:`gr_ros2.wire.format.Format.layout`."""
@@ -568,40 +556,9 @@ class FormatV1:
         rest = (packet_len if size is None else size) - trailer - sum(span.size for span in spans)
         return [*spans, Span("pad", max(rest, 0)), Span("crc", trailer)]
 
-    def encode(self, packet: PacketV1, packet_len: int) -> bytes:
-        """A packet's bytes, for the lowest boot number of a sender: see ``encode`` of this module.
-
-        :raises EncodeError: a field out of range, or more than fits
-        """
-        return encode(packet, packet_len, 0)
-
     def decode(self, data: bytes, packet_len: int) -> PacketV1:
-        """Read a packet as far as this is possible without the hello of its sender.
-
-        The trailer is checked only if the packet itself carries that hello. Of a sealed packet, only a hello is read.
-
-        :raises WireError: LengthError, VersionError, CrcError, WindowError, EntryBoundsError, EntryKindError,
-            VarintError or PadError
-        """
-        header = read_header(data, packet_len)
-        trailer = TAG_LEN if header.sealed else CRC_LEN
-        room = header.room(packet_len)
-        start, end = header.size, len(data) - trailer
-        repair = None
-        if header.qos == QOS_REPAIR:
-            repair = read_repair_header(data, start, end)
-            start += repair.size
-        clear = repair is not None and repair.clear
-        if header.sealed and not clear:
-            return PacketV1(header, (), repair, b"", encrypted=True)
-        if repair is not None and repair.mask:
-            return PacketV1(header, (), repair, data[start:end])
-        body = tuple(read_body(data[start:end], room))
-        if clear and not header.sealed:
-            hello = body[0] if body else None
-            if not isinstance(hello, Hello) or crc(data[:end], session_crc(hello.boot, hello.turns)) != data[end:]:
-                raise CrcError("CRC-32 does not match that of its hello")
-        return PacketV1(header, body, repair)
+        """See ``decode`` of this module."""
+        return decode(data, packet_len)
 
 
 def _shown(entry: EntryV1) -> tuple[Part, ...]:

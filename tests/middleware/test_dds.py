@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import count
@@ -79,6 +80,33 @@ def test_between_processes(join: Callable[..., DdsMiddleware], peer: Callable[..
     source.publish(sent)
     wait_for(lambda: len(there.received) >= 4 and len(received) >= 4, "messages")
     assert received == sent and there.received == sent
+
+
+def test_a_message_tells_how_long_it_has_waited_behind_which_newer_ones_came(
+    join: Callable[..., DdsMiddleware],
+) -> None:
+    waits: list[float] = []
+    begun, sent = threading.Event(), threading.Event()
+
+    def take(_: bytes) -> None:
+        begun.set()
+        assert sent.wait(PATIENCE_S)
+        waits.append(subscription.waited_s)
+
+    subscription = join().subscribe("/odom", STRING, RELIABLE, take)
+    publisher = join(node_name="other").advertise("/odom", STRING, RELIABLE)
+    wait_for(lambda: publisher.matched() and subscription.matched(), "match")
+    publisher.publish(message(0))
+    assert begun.wait(PATIENCE_S)
+    times = []
+    for number in range(1, 4):
+        publisher.publish(message(number))
+        times.append(time.monotonic())
+        wait_for(lambda: time.monotonic() > times[-1] + 0.02, "time to pass")
+    sent.set()
+    wait_for(lambda: len(waits) == 4, "messages")
+    assert waits[0] == waits[3] == 0
+    assert waits[1] > waits[2] >= 0.015
 
 
 def test_latched_message_reaches_an_adapting_subscription_that_comes_late(

@@ -19,7 +19,7 @@ from gr_ros2.link.endpoint import check_live_options
 from gr_ros2.link.events import Accepted, Missed, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.queues import Dropped, PublisherQos
+from gr_ros2.link.queues import OVERLOADED, STANDING_S, Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -168,30 +168,42 @@ class Outbox:
                 self._observer(Missed(topic_id, new))
 
     def submit(
-        self, topic_id: int, payload: bytes, now: float, lifespan_s: float = inf, dst_id: int | Auto = AUTO
+        self,
+        topic_id: int,
+        payload: bytes,
+        now: float,
+        lifespan_s: float = inf,
+        dst_id: int | Auto = AUTO,
+        *,
+        waited_s: float = 0.0,
     ) -> None:
         """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         topic = self.sent.get(topic_id)
         if topic is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._owner.submitted(topic_id, now)
-        if topic.queue and topic.is_stream and self._owner.behind(now):
+        over = False
+        if (topic.queue or waited_s > STANDING_S) and topic.is_stream and self._owner.behind(now):
             self.drop(list(topic.queue.shed(now)))
+            over = waited_s > STANDING_S
         self.packing.turns.join(topic_id)
         serial = self._serial
         self._serial += 1
         self.stats.submitted[topic_id] += 1
-        codec = self._codec
+        codec = None if over else self._codec
         if self._observer is not None:
             expected = None if codec is None else codec.canonical(topic_id, payload)
             self._observer(Accepted(serial, topic_id, payload, now, expected))
+        if over:
+            self._refuse(serial, topic_id, Fate.OVERLOAD, OVERLOADED)
+            return
         if codec is not None:
             payload = codec.encode(topic_id, payload)
         if len(payload) > MAX_MESSAGE:
             self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         coded = codec is not None
-        message = Message(serial, topic_id, payload, topic.qos, now, topic.weight, lifespan_s, coded=coded)
+        message = Message(serial, topic_id, payload, topic.qos, now - waited_s, topic.weight, lifespan_s, coded=coded)
         message.dst_id = topic.dst_id if dst_id == AUTO else dst_id
         self.kept.keep(topic, message)
         self._admit(topic, message)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf
 
+from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.shared import SharedRepairs, newest_of
 from gr_ros2.link.v1.unreported import Unreported
@@ -88,8 +89,8 @@ class Peers:
     :ivar loss: share of packets that the peer with the most losses loses, as far as it is known or expected
     :ivar proven: some peer may take packets up to this number for replays
     :ivar in_vain: whether a peer waits for a packet in vain
-    :ivar urges: heap of the packets that some peer lacks and for which later messages wait: whether all in it are long,
-        and its number
+    :ivar urges: heap of the packets that some peer lacks and for which later messages wait, or may wait soon: whether
+        all in it are long, and its number
     :ivar once: the newest packets that were neither sent again nor combined: what a report says arrived when it was
         sent
     """
@@ -106,6 +107,9 @@ class Peers:
         self.urges: list[tuple[bool, int]] = []
         self._times: dict[int, float] = {}
         """When the newest packets left, s."""
+        self._ordered = -1
+        """The newest packet of a message that is delivered in order. A peer cannot know what a missing packet carried:
+        this message waits for every packet before it."""
         self._served: set[int] = set()
         """Peers that lack the packet that was urgent last."""
         self._period = 0.0
@@ -115,8 +119,10 @@ class Peers:
         """Whether any peer reports."""
         return bool(self.all)
 
-    def sent(self, number: int, now: float) -> None:
+    def sent(self, number: int, lifetimes: tuple[Lifetime, ...], now: float) -> None:
         """A source packet leaves, after ``SentPackets.newest``."""
+        if any(lifetime.in_order for lifetime in lifetimes):
+            self._ordered = number
         before = self._times.get(self._packets.newest)
         if before is not None:
             self._period += (now - before - self._period) / 8
@@ -202,13 +208,13 @@ class Peers:
             if record.number not in peer.lost:
                 peer.lost.add(record.number)
                 heappush(self._resend, -record.number)
-                if any(lifetime.in_order for lifetime in record.lifetimes):
+                if self._shared is None or any(lifetime.in_order for lifetime in record.lifetimes):
                     heappush(self.urges, (all(lifetime.long for lifetime in record.lifetimes), record.number))
 
     def urgent(self, now: float) -> Sent | None:
         """The oldest packet that a report names as lost and for which later messages wait; packets of long messages go
         after others. It is returned once."""
-        while self.urges:
+        while self.urges and (self._shared is not None or self.urges[0][1] <= self._ordered):
             _, number = heappop(self.urges)
             record = self._packets.records.get(number)
             lacking = [peer for peer in self.all.values() if number in peer.lost]

@@ -73,7 +73,7 @@ class RepairWindow:
         :param data: the packet as it was sent
         :param lifetimes: lifetimes of the messages in it; () for a packet that is not worth repairing
         """
-        self.peers.sent(number, now)
+        self.peers.sent(number, lifetimes, now)
         if not self.peers.all:
             self._unreported.sent(number, lifetimes)
         elif self._shared is not None:

@@ -5,6 +5,10 @@ from __future__ import annotations
 import pytest
 
 from bench.saturated import SCENARIOS, TOLERANCE, paced_ratios, ratios, run
+from gr_ros2.link.events import Delivered
+from gr_ros2.link.queues import PublisherQos
+from gr_ros2.settings.config import TopicOptions
+from tests.link.v1.air import Air, Robot, registry
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
@@ -53,3 +57,31 @@ def test_a_full_link_that_nobody_answers_tells_its_topics_in_the_first_second() 
         busy = [topic for topic in topics if topic.submitted > 100]
         assert busy
         assert all(topic.delivered > 5 for topic in busy)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("loss", [0.1, 0.3])
+@pytest.mark.parametrize("best_effort", [(), ("imu",)])
+def test_nothing_waits_for_long_on_a_full_link_where_topics_of_all_kinds_lose_packets(
+    loss: float, best_effort: tuple[str, ...], seed: int
+) -> None:
+    """A message in order waits for every packet before it, also for those of the table and of best-effort topics."""
+    sender, receiver = Robot(1, registry(odom=TopicOptions(), imu=TopicOptions())), Robot(2)
+    for topic_id, name in enumerate(("odom", "imu")):
+        sender.end.messages.follow(topic_id, PublisherQos(reliable=name not in best_effort))
+    air = Air(sender, receiver, loss=loss, seed=seed)
+    air.lost = lambda by, _: air.rng.random() < (0.8 if by is sender and air.now < 0.3 else loss)
+    number, at = 0, 0.0
+    while air.now < 8.0:
+        for topic_id in (0, 1, 1):
+            number += 1
+            sender.end.messages.submit(topic_id, number.to_bytes(40, "little"), air.now)
+        before = len(receiver.delivered())
+        air.step()
+        if any(event.topic_id == 0 for event in _delivered(receiver)[before:]):
+            at = air.now
+        assert air.now - at < 3.0
+
+
+def _delivered(robot: Robot) -> list[Delivered]:
+    return [event for event in robot.events if isinstance(event, Delivered)]
