@@ -25,7 +25,7 @@ class Slowness:
         self._pace = pace
         self._idle, self._window = 0.0, -inf
         """s for which the PHY was idle although a message waited, since the begin of the window."""
-        self._slow = False
+        self.slow = False
         """Whether it was so for more than half of the last window."""
 
     def waited(self, since: float, now: float) -> None:
@@ -35,9 +35,9 @@ class Slowness:
         if could < now:
             self._idle += now - could
         if now - self._window >= _WINDOW_S:
-            self._slow = self._idle > (now - self._window) / 2
+            self.slow = self._idle > (now - self._window) / 2
             self._idle, self._window = 0.0, now
 
     def behind(self, now: float) -> bool:
         """Whether messages that wait do so because the computer is too slow, not the air."""
-        return self._slow or (self._pace.credited and now - self._pace.ready > _WINDOW_S)
+        return self.slow or (self._pace.credited and now - self._pace.ready > _WINDOW_S)

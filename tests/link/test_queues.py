@@ -129,18 +129,19 @@ def test_a_sending_thread_that_does_not_run_is_a_computer_that_is_too_slow() -> 
 
 def test_what_waited_too_long_on_the_ros_graph_of_a_slow_computer_is_dropped_before_it_is_coded() -> None:
     source = robot()
-    leave(source, 0.0)
-    source.end.pace.credit(1, 0.0)
+    overloaded(source, airtime=0.005, seconds=3.0)
+    source.end.messages.submit(0, bytes(45), 3.0)
+    before, queued = refused(source.end)["overload"], source.end.messages.queued()[0]
     for waited_s in (0.3, 0.26, 0.2, 0.0):
-        source.end.messages.submit(0, bytes(45), 5.0, waited_s=waited_s)
-    assert refused(source.end) == {"overload": 2}
-    source.end.messages.submit(0, bytes(45), 5.1)  # .3 s after the third of them had come
-    assert refused(source.end) == {"overload": 3}
+        source.end.messages.submit(0, bytes(45), 3.0, waited_s=waited_s)
+    assert refused(source.end) == {"overload": before + 2}
+    assert source.end.messages.queued()[0] == queued + 2
 
 
 def test_what_waited_on_the_ros_graph_leaves_where_the_computer_keeps_up() -> None:
     source = robot()
     leave(source, 0.0)
+    source.end.pace.credit(1, 0.0)
     for waited_s in (0.3, 0.2, 0.0):
         source.end.messages.submit(0, bytes(45), 5.0, waited_s=waited_s)
     assert not refused(source.end)

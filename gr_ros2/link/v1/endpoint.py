@@ -152,6 +152,11 @@ class EndpointV1:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         return self._access is None and self._sending.behind(now)  # with medium access, messages wait for their slot
 
+    @property
+    def slow(self) -> bool:
+        """See :class:`gr_ros2.link.v1.outbox.Owner`."""
+        return self._access is None and self._sending.slow
+
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self.answers = self.answers or added

@@ -44,6 +44,10 @@ class Owner(Protocol):
     def behind(self, now: float) -> bool:
         """Whether messages that wait do so because the computer is too slow for what comes."""
 
+    @property
+    def slow(self) -> bool:
+        """Whether the computer was too slow lately, whatever waits now."""
+
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
         """The table of topics has changed.
 
@@ -182,10 +186,11 @@ class Outbox:
         if topic is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._owner.submitted(topic_id, now)
-        over = False
-        if (topic.queue or waited_s > STANDING_S) and topic.is_stream and self._owner.behind(now):
+        if topic.queue and topic.is_stream and self._owner.behind(now):
             self.drop(list(topic.queue.shed(now)))
-            over = waited_s > STANDING_S
+        if not (topic.is_stream and self._owner.slow):
+            waited_s = 0.0  # one delay of a computer that keeps up costs no message
+        over = waited_s > STANDING_S
         self.packing.turns.join(topic_id)
         serial = self._serial
         self._serial += 1

@@ -122,6 +122,11 @@ class SendingSide:
         """Whether messages that wait do so because the computer is too slow."""
         return self._slowness.behind(now) and not self._alone(now)
 
+    @property
+    def slow(self) -> bool:
+        """Whether the computer was too slow lately, whatever waits now."""
+        return self._slowness.slow
+
     def next_departure(self, now: float) -> float:
         """When ``packet`` may have something, s; without regard to credits."""
         if self._alone(now):
