@@ -247,7 +247,7 @@ def test_sealed_packets_with_and_without_the_key(
     first, *entries = capsys.readouterr().out.split("packet 2: ")[1].splitlines()
     assert first.endswith("tag ok")
     if "block" in vector["name"]:
-        assert entries.pop(0).endswith("expects to receive in +1, +32, robot 254 gives up +18")
+        assert entries.pop(0).endswith("expects to receive in +1, +28, weight 12, robot 254 gives up +18")
     check_entries(vector, entries)
     assert run(["packet", "decode", "--packet-len", "64", *packets]) == 0
     first, *entries = capsys.readouterr().out.split("packet 2: ")[1].splitlines()

@@ -85,6 +85,7 @@ def test_the_next_run_starts_from_nothing() -> None:
 def test_a_run_that_fails_is_said_to_have_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     monitor = RunMonitor()
     monkeypatch.setattr("gr_ros2.run.runner._MATCH_S", -1.0)
+    monkeypatch.setattr("gr_ros2.run.runner._Run._sim_matched", lambda _: False)
     scenario = load_scenario("paper-direct", ENDS, duration_s=0.5)
     with pytest.raises(RunError, match="did not find each other"):
         run_scenario(scenario, observers=[monitor])
