@@ -96,7 +96,7 @@ def test_what_the_next_robot_has_not_taken_goes_over_another_one() -> None:
     (taker,) = {held.taker for held in custody_of(line.robots[0])._held.values()}
     gone = taker - 1
     heard.update({gone: [], 0: [3 - gone], 3: [3 - gone]})
-    until(line, 90, lambda: whole in line.robots[-1].delivered(1))
+    until(line, 150, lambda: whole in line.robots[-1].delivered(1))
     assert line.robots[-1].delivered(1).count(whole) == 1
 
 
@@ -140,7 +140,7 @@ def test_a_message_with_a_deadline_is_not_handed_on_after_it() -> None:
     rows = named(queue="deadline", deadline_s=4.0)
     line = line_of(robot(1, topics=rows), *(robot(src_id) for src_id in (2, 3, LAST)), loss=0.0)
     line.near = lambda one: []  # type: ignore[method-assign]  # noqa: ARG005
-    for n in range(20):
+    for n in range(400):
         line.robots[0].end.messages.submit(1, b"goal %d" % n, line.now)
     line.run(15)
     assert not len(custody_of(line.robots[0]))
