@@ -22,7 +22,7 @@ from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
-from gr_ros2.settings.config import PacketLen, PacketSettings, Sampled, Seconds, Text, Traffic
+from gr_ros2.settings.config import PacketLen, PacketSettings, Populated, Sampled, Seconds, Text, Traffic
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
@@ -43,7 +43,7 @@ Load = Annotated[float, Field(gt=0, le=100)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
-class RaceSettings(Sampled, PacketSettings, Traffic):
+class RaceSettings(Populated, Sampled, PacketSettings, Traffic):
     """One race: every contender at every load and every loss.
 
     :param robots: all of them send to all others on one channel, each a recording of its own; of a bag all the same,
