@@ -38,7 +38,7 @@ def _decode(codec: LinkCodec, coded: bytes) -> None:
     try:
         message = codec.decode(0, coded)
     except CodecError as error:
-        assert error.row in ("damaged", "unsupported", "unknown_dictionary")
+        assert error.fate in ("damaged", "unsupported", "unknown_dictionary")
         return
     assert len(message) <= _MAX_SIZE
 

@@ -8,7 +8,7 @@ from functools import partial
 from fuzz.loop import main, within
 from gr_ros2.core.errors import EntryBoundsError
 from gr_ros2.mac import Slots
-from gr_ros2.wire.mac_block import Block, read_block, write_block
+from gr_ros2.wire.mac_block import MAP_SLOTS, Block, read_block, write_block
 
 MOST_LINES = 4000
 """Lines of Python for a block heard; of which the most go to the 255 robots that an odd clock is compared with."""
@@ -39,7 +39,8 @@ def corpus() -> list[bytes]:
     """Robots that take turns, and next to nothing."""
     turns = b""
     for n in range(40):
-        block = Block(n * 4 % 256, (8, 8), 2, (1, 3), 1 << n % 32, (5, 1)) if n % 2 else Block(n * 4 % 256, (8, 8))
+        slot, expected = n * 4 % 256, 1 << n % MAP_SLOTS
+        block = Block(slot, (8, 8), 2, (1, 3), expected, (5, 1)) if n % 2 else Block(slot, (8, 8))
         turns += bytes((2 + n % 2, 64, 1)) + write_block(block).ljust(12, b"\0")
     return [b"", turns[:15], turns]
 
