@@ -88,7 +88,8 @@ def wait_for_end(flowgraph: Any) -> None:
             waiting.join(_LOOK_S)
     except BaseException:
         flowgraph.stop()
-        waiting.join()
+        if waiting.ident is not None:  # the signal may come before the thread has started
+            waiting.join()
         raise
 
 
