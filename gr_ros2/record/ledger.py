@@ -132,7 +132,9 @@ class Ledger:
         with self._lock:
             if self._finished:
                 return
-            source = self._sources.setdefault(src_id, _SourceBook(src_id))
+            source = self._sources.get(src_id)
+            if source is None:
+                source = self._sources[src_id] = _SourceBook(src_id)
             if isinstance(event, SentPacket):
                 self._sent(source, event)
             elif isinstance(event, Accepted):

@@ -327,7 +327,8 @@ class _Run:
         self._check_alone()
         played = end - begin
         if scenario.duration_s and not self.interrupted:
-            played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
+            ends = scenario.bag_path is not None or (self.task is not None and self.task.over)
+            played = min(scenario.duration_s, played) if ends else scenario.duration_s
         return self.records.outcome(
             begin=begin,
             end=end,

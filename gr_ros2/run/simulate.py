@@ -301,6 +301,11 @@ class Simulation:
         """Everything that happens, in the order of time. To be called only once."""
         return EventLoop(self.robots, self.medium).run()
 
+    def end(self, now: float) -> None:
+        """Offer nothing more; what has been offered is still sent."""
+        for robot in self.robots:
+            robot.end(now)
+
     @property
     def duration_s(self) -> float:
         """s during which messages were offered."""
@@ -393,6 +398,11 @@ class Robot:
         yield from ((now, self, event) for event in self._events)
         self._events.clear()
         self.due = self._next(now)
+
+    def end(self, now: float) -> None:
+        """Take no further message."""
+        self._messages, self._coming = iter(()), None
+        self.duration_s = min(self.duration_s, now)
 
     def receive(self, reception: Reception) -> Iterator[TimedEvent]:
         """Take what has come out of the receiver."""

@@ -86,6 +86,8 @@ def run_simulated(
         for number, timed_event in enumerate(run.events()):
             clock.now, robot, _ = timed_event
             pass_on(seen[robot.number], timed_event)
+            if task is not None and task.over and clock.now < run.duration_s:
+                run.end(clock.now)
             if not number % _CHECKED:  # every robot has a recorder
                 records.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:

@@ -96,11 +96,18 @@ class TaskRun:
     def _of(self, number: int, duration_s: float) -> Iterator[_Made]:
         measure = partial(self._measure, number)
         for at in self._robots.times(number, duration_s):
+            if self.over:
+                return
             yield _Made(at, *self._topics[number], measure)
 
     def _measure(self, number: int, at: float) -> bytes:
         with self._lock:
             return self._robots.odometry(number, at)
+
+    @property
+    def over(self) -> bool:
+        """Whether all is done: they send nothing more."""
+        return self._robots.over
 
     # ---- what they act on
 

@@ -53,9 +53,11 @@ class Task:
     :param robots: how many there are; they are numbered from 0
     :param rng: for their places
     :cvar scripted: robots that the task drives itself, whoever controls the others
+    :ivar over: whether all is done, which ends the run
     """
 
     scripted: Collection[int] = ()
+    over = False
 
     def __init__(self, robots: int, rng: random.Random) -> None:
         self.robots, self.rng = robots, rng
@@ -127,15 +129,14 @@ class Formation(Task):
 class Rendezvous(Task):
     """Robots that start anywhere in a square meet: each drives to the middle of all that it knows of, itself included.
 
-    Result: ``time_to_meet_s``, when the last of them was within ``MEET_M`` of the middle of all; the duration so far
-    where they have not met (``met`` is 0 then).
+    Result: ``time_to_meet_s``, when the last of them was within ``MEET_M`` of the middle of all, which ends the run;
+    the duration where they have not met (``met`` is 0 then).
     """
 
     SIDE_M, MEET_M, SPEED = 60.0, 2.0, 2.0
 
     def __init__(self, robots: int, rng: random.Random) -> None:
         super().__init__(robots, rng)
-        self._met: float | None = None
         self._now = 0.0
 
     def start(self, number: int) -> State:  # noqa: ARG002
@@ -150,13 +151,13 @@ class Rendezvous(Task):
         return towards(own, x - own.x, y - own.y, self.SPEED)
 
     def watch(self, now: float, states: Sequence[State]) -> None:
-        self._now = now
-        x, y = (sum(state[axis] for state in states) / len(states) for axis in (0, 1))
-        if self._met is None and all(math.hypot(one.x - x, one.y - y) <= self.MEET_M for one in states):
-            self._met = now
+        if not self.over:
+            self._now = now
+            x, y = (sum(state[axis] for state in states) / len(states) for axis in (0, 1))
+            self.over = all(math.hypot(one.x - x, one.y - y) <= self.MEET_M for one in states)
 
     def numbers(self) -> dict[str, float | None]:
-        return {"time_to_meet_s": self._now if self._met is None else self._met, "met": float(self._met is not None)}
+        return {"time_to_meet_s": self._now, "met": float(self.over)}
 
 
 BUILT_IN = {"formation": Formation, "rendezvous": Rendezvous}
@@ -262,6 +263,11 @@ class TaskRobots:
         while (at := (count + phase) / rate) < duration_s:
             yield at
             count += 1
+
+    @property
+    def over(self) -> bool:
+        """See :class:`Task`."""
+        return self._task.over
 
     def numbers(self) -> dict[str, float | None]:
         """See :meth:`Task.numbers`."""

@@ -64,7 +64,10 @@ def test_followers_keep_their_places_by_the_link_alone() -> None:
 
 @pytest.mark.slow
 def test_robots_meet_in_slots_and_not_where_nothing_arrives() -> None:
-    assert result("rendezvous", "robots=3", "duration_s=30").task["met"] == 1
+    met = result("rendezvous", "robots=3", "duration_s=30")
+    assert met.task["met"] == 1
+    assert met.duration_s == pytest.approx(met.task["time_to_meet_s"], abs=0.1), "their meeting ends the run"
+    assert all(sum(topic.ledger.values()) == topic.sent > 0 for topic in met.topics)
     alone = result("rendezvous", "robots=3", "duration_s=30", "channel.packet_loss=1")
     assert alone.task == {"time_to_meet_s": pytest.approx(30), "met": 0}
 
