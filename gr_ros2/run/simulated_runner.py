@@ -68,7 +68,7 @@ def run_simulated(
                 ids, names = source_names(way, registry).values(), published_names(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
         task = TaskRun(scenario, registry) if scenario.task else None
-        run = Simulation(scenario, registry, phys, messages=None if task is None else task.offered())
+        run = Simulation(scenario, registry, phys, task=task)
         run_observers = run_observers or RunObservers(threaded=False)
         records = RunRecords(
             scenario,

@@ -25,6 +25,7 @@ from gr_ros2.run.scenario import Scenario
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.sensors import TYPES, read_command
 from gr_ros2.sim.tasks import TaskRobots, make_task
+from gr_ros2.sim.world import Floats, World
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,16 @@ class TaskRun:
     def over(self) -> bool:
         """Whether all is done: they send nothing more."""
         return self._robots.over
+
+    @property
+    def world(self) -> World:
+        """The obstacles between them."""
+        return self._robots.world
+
+    def at(self, now: float) -> tuple[Floats, Floats]:
+        """Where they are, see :meth:`gr_ros2.sim.tasks.TaskRobots.at`."""
+        with self._lock:
+            return self._robots.at(now)
 
     # ---- what they act on
 

@@ -21,7 +21,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.sim.motion import MAX_TURN, TICK, State
 from gr_ros2.sim.sensors import Sensors, read_odometry
 from gr_ros2.sim.sim_settings import SimSettings
-from gr_ros2.sim.world import World
+from gr_ros2.sim.world import Floats, World
 
 Command = tuple[float, float]
 """Speed in m/s and turn rate in rad/s."""
@@ -194,15 +194,18 @@ def make_task(name: str, robots: int, seed: int) -> Task:
 
 
 class TaskRobots:
-    """Robots on an open plane, moved by a task, and their odometry.
+    """Robots on an open plane, moved by a task, and their odometry. Obstacles stop nobody.
 
-    :param settings: rate and noise of the odometry, and the seed
+    :param settings: rate and noise of the odometry, the seed, and the obstacles
     :param commanded: robots that do what :meth:`follow` tells them, and nothing before
+    :ivar world: obstacles between them
     """
 
     def __init__(self, task: Task, settings: SimSettings, commanded: Collection[int] = ()) -> None:
         self._task, self._settings, self._tick = task, settings, 0
+        self.world = World(settings.size_m, settings.obstacles, np.random.default_rng([settings.seed, 0]))
         self._states = [task.start(number) for number in range(task.robots)]
+        self._log: list[list[State]] = []
         self._heard: list[dict[int, LastHeard]] = [{} for _ in self._states]
         self._commands = dict.fromkeys(commanded, (-math.inf, (0.0, 0.0)))
         self.stamp_from(settings.start_time_s)
@@ -211,9 +214,8 @@ class TaskRobots:
     def stamp_from(self, start_time_s: float) -> None:
         """Stamp odometry with this + t, s. To be called before anything is measured."""
         self._start_s = start_time_s
-        world = World(self._settings.size_m, 0, np.random.default_rng(0))
         self._sensors = [
-            Sensors(self._settings, world, number + 1, state, round(start_time_s * 1e9))
+            Sensors(self._settings, self.world, number + 1, state, round(start_time_s * 1e9))
             for number, state in enumerate(self._states)
         ]
 
@@ -229,6 +231,13 @@ class TaskRobots:
         self._task.watch(now, states)
         commands = [self._command(number, now, own) for number, own in enumerate(states)]
         self._states = [_following(own, *command) for own, command in zip(states, commands, strict=True)]
+        self._log.append(self._states)
+
+    def at(self, now: float) -> tuple[Floats, Floats]:
+        """Places in m and velocities in m/s of all robots at the last full period, each of shape (robots, 2)."""
+        self.advance(now)
+        x, y, heading, speed = np.array([state[:4] for state in self._log[int(now / TICK + 1e-9)]]).T
+        return np.stack([x, y], 1), np.stack([speed * np.cos(heading), speed * np.sin(heading)], 1)
 
     def _command(self, number: int, now: float, own: State) -> Command:
         if number not in self._commands:
