@@ -205,7 +205,7 @@ class Recorder:
             left_out_sent=sent.left_out,
             left_out_received=received.left_out,
             ledger=dict(sorted(book.fates.items())),
-            hops={str(hops): count for hops, count in sorted(book.hops.items())},
+            hops={str(hops): count for hops, count in sorted(Counter(book.hops).items()) if hops >= 0},
             corrupt=book.corrupt,
             repeats_delivered=book.repeats_delivered,
             negative_latencies=numbers.negative_latencies,
