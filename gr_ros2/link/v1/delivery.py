@@ -28,7 +28,7 @@ MAX_AGE_S = 15.0
 next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
 
 
-class Deliveries:
+class DeliveryRules:
     """See the module.
 
     :param marks: CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as
@@ -57,7 +57,7 @@ class Deliveries:
         """A message has come over another robot."""
         self._over.append((ready.topic_id, ready.order))
 
-    def adopt(self, far: Deliveries) -> None:
+    def adopt(self, far: DeliveryRules) -> None:
         """Go on from what has come over other robots."""
         self.newest.update(far.newest)
         self._over.extend(far._over)

@@ -21,7 +21,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.announced import AnnouncedTopics
 from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
-from gr_ros2.link.v1.delivery import Deliveries, passed_over
+from gr_ros2.link.v1.delivery import DeliveryRules, passed_over
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready
@@ -112,7 +112,7 @@ class Inbox:
         self.src_id, self.boot = src_id, boot
         self.counts: Counter[str] = Counter()
         """Packets by result: ``packets``, ``duplicate``, ``late``, ``missing``, ``repaired``."""
-        self.deliveries = Deliveries(settings, marks)
+        self.deliveries = DeliveryRules(settings, marks)
         self._room = room
         self._control, self._relaying = control, relaying
         self._stats = stats
