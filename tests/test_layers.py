@@ -6,8 +6,9 @@ import ast
 import functools
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -111,16 +112,25 @@ def part(module: str) -> str:
     return module.split("/", maxsplit=1)[0].removesuffix(".py")
 
 
-def imports(tree: ast.Module) -> Iterator[str]:
+@functools.cache
+def imports(module: str) -> tuple[str, ...]:
     """Dotted names of everything imported anywhere in a module, in functions too."""
-    for node in ast.walk(tree):
+    found = []
+    for node in ast.walk(parsed(module)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, "imports are absolute"
             assert node.module is not None
             # `from gr_ros2 import core` names a part too.
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    return tuple(found)
+
+
+def breaking(rule: Callable[[str], Any], modules: Iterable[str] = MODULES) -> dict[str, Any]:
+    """The modules that break a rule, and what the rule says of each."""
+    said = {module: rule(module) for module in modules}
+    return {module: found for module, found in said.items() if found}
 
 
 def level(name: str) -> int:
@@ -135,29 +145,32 @@ def dotted(node: ast.expr) -> str:
     return node.id if isinstance(node, ast.Name) else "?"
 
 
-def calls_and_uses(tree: ast.Module) -> Iterator[str]:
+@functools.cache
+def calls_and_uses(module: str) -> set[str]:
     """Dotted names as they stand in the source: ``sys.exit``, ``print``, ``np.random.rand``."""
-    for node in ast.walk(tree):
+    found = set()
+    for node in ast.walk(parsed(module)):
         if isinstance(node, ast.Attribute):
-            yield dotted(node)
+            found.add(dotted(node))
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            yield node.func.id
+            found.add(node.func.id)
+    return found
 
 
 def ours(module: str) -> list[str]:
     """The parts of gr_ros2 that a module imports."""
-    names = [name.split(".") for name in imports(parsed(module))]
+    names = [name.split(".") for name in imports(module)]
     return [name[1] for name in names if name[0] == "gr_ros2" and len(name) > 1 and name[1] != "__version__"]
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_arrows_point_down_only(module: str) -> None:
-    own = part(module)
-    if own == "__init__":
-        assert ours(module) == []
-        return
-    up = [name for name in ours(module) if name != own and level(name) >= level(own)]
-    assert up == []
+def test_arrows_point_down_only() -> None:
+    def up(module: str) -> list[str]:
+        own = part(module)
+        if own == "__init__":
+            return ours(module)
+        return [name for name in ours(module) if name != own and level(name) >= level(own)]
+
+    assert breaking(up) == {}
 
 
 def test_no_modules_import_each_other() -> None:
@@ -166,7 +179,7 @@ def test_no_modules_import_each_other() -> None:
 
     def imported(module: str) -> set[str]:
         found = set()
-        for name in imports(parsed(module)):
+        for name in imports(module):
             inner = name.removeprefix("gr_ros2.")
             known = inner if inner in names else inner.rpartition(".")[0]
             if name.startswith("gr_ros2.") and known in names:
@@ -179,72 +192,80 @@ def test_no_modules_import_each_other() -> None:
     assert {module: sorted(others & needs.keys()) for module, others in needs.items()} == {}
 
 
-@pytest.mark.parametrize("module", [module for module in MODULES if part(module) in PURE])
-def test_wire_and_link_are_pure(module: str) -> None:
-    outside = {name.split(".")[0] for name in imports(parsed(module))} - {"gr_ros2"}
-    assert outside - set(sys.stdlib_module_names) <= PURE_CODECS
-    assert not outside & {"threading", "time", "socket", "asyncio", "logging", "subprocess"}
+def test_wire_and_link_are_pure() -> None:
+    def impure(module: str) -> set[str]:
+        outside = {name.split(".")[0] for name in imports(module)} - {"gr_ros2"}
+        foreign = outside - set(sys.stdlib_module_names) - PURE_CODECS
+        return foreign | outside & {"threading", "time", "socket", "asyncio", "logging", "subprocess"}
+
+    assert breaking(impure, [module for module in MODULES if part(module) in PURE]) == {}
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_nothing_but_its_engines_knows_a_version_of_the_wire_format(module: str) -> None:
-    inside = [name for name in imports(parsed(module)) if name.startswith("gr_ros2.wire.")]
+def test_nothing_but_its_engines_knows_a_version_of_the_wire_format() -> None:
     public = {f"gr_ros2.wire.{name}" for name in gr_ros2.wire.__all__}
-    known = module.startswith(KNOW_THEIR_VERSION) or module in COMPARES_WITH_VERSION_0
-    assert known or set(inside) <= public
+
+    def inside(module: str) -> set[str]:
+        known = module.startswith(KNOW_THEIR_VERSION) or module in COMPARES_WITH_VERSION_0
+        return set() if known else {name for name in imports(module) if name.startswith("gr_ros2.wire.")} - public
+
+    assert breaking(inside) == {}
 
 
-@pytest.mark.parametrize("module", [module for module in MODULES if part(module) not in {"wire", "link"}])
-def test_one_factory_knows_the_engine_of_a_version(module: str) -> None:
+def test_one_factory_knows_the_engine_of_a_version() -> None:
     """All others work with the two sides of an Endpoint (``link/endpoint.py``)."""
-    engines = [name for name in imports(parsed(module)) if name.startswith("gr_ros2.link.v1")]
-    assert (engines != []) == (module == FACTORY)
+
+    def engines(module: str) -> list[str]:
+        return [name for name in imports(module) if name.startswith("gr_ros2.link.v1")]
+
+    assert list(breaking(engines, [m for m in MODULES if part(m) not in {"wire", "link"}])) == [FACTORY]
 
 
-@pytest.mark.parametrize(
-    "module", [m for m in MODULES if part(m) in SPEAKS_OF_PACKETS and not m.startswith(("link/v1/", "link/reader.py"))]
-)
-def test_no_width_of_a_field_stands_outside_of_the_wire(module: str) -> None:
+def test_no_width_of_a_field_stands_outside_of_the_wire() -> None:
     """``x & 255``, ``x % 256``, ``randrange(256)``, ``x << 4``: written by who knows that a field has 8 or 4 bits."""
     widths = {15, 16, 255, 256, 0xFFFF, 1 << 16}
-    found = []
-    for node in ast.walk(parsed(module)):
-        if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.BitAnd, ast.Mod, ast.LShift, ast.RShift)):
-            operands = [side.value for side in (node.left, node.right) if isinstance(side, ast.Constant)]
-            if any(isinstance(value, int) and (value in widths or value in (4, 8)) for value in operands):
-                found.append(ast.unparse(node))
-        elif isinstance(node, ast.Call) and dotted(node.func).endswith("randrange"):
-            found += [ast.unparse(node) for arg in node.args if isinstance(arg, ast.Constant) and arg.value in widths]
-    assert found == []
+
+    def written(module: str) -> list[str]:
+        found = []
+        for node in ast.walk(parsed(module)):
+            if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.BitAnd, ast.Mod, ast.LShift, ast.RShift)):
+                operands = [side.value for side in (node.left, node.right) if isinstance(side, ast.Constant)]
+                if any(isinstance(value, int) and (value in widths or value in (4, 8)) for value in operands):
+                    found.append(ast.unparse(node))
+            elif isinstance(node, ast.Call) and dotted(node.func).endswith("randrange"):
+                given = [arg.value for arg in node.args if isinstance(arg, ast.Constant)]
+                found += [ast.unparse(node) for value in given if value in widths]
+        return found
+
+    speaking = [m for m in MODULES if part(m) in SPEAKS_OF_PACKETS and not m.startswith(("link/v1/", "link/reader.py"))]
+    assert breaking(written, speaking) == {}
 
 
 @pytest.mark.parametrize("package", CONFINED)
 def test_back_end_packages_are_imported_in_their_adapters_only(package: str) -> None:
-    users = [module for module in MODULES if package in {name.split(".")[0] for name in imports(parsed(module))}]
+    users = [module for module in MODULES if package in {name.split(".")[0] for name in imports(module)}]
     assert users, f"nothing imports {package}"
     assert [module for module in users if not module.startswith(CONFINED[package])] == []
 
 
-@pytest.mark.parametrize("module", [module for module in MODULES if part(module) not in MAY_PRINT])
-def test_library_code_never_prints_asks_exits_or_reads_argv(module: str) -> None:
+def test_library_code_never_prints_asks_exits_or_reads_argv() -> None:
     forbidden = {"print", "input", "exit", "quit", "breakpoint", "sys.exit", "sys.argv", "os._exit"}
-    assert forbidden & set(calls_and_uses(parsed(module))) == set()
+    library = [module for module in MODULES if part(module) not in MAY_PRINT]
+    assert breaking(lambda module: forbidden & calls_and_uses(module), library) == {}
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_no_module_draws_from_a_global_generator(module: str) -> None:
-    uses = [use.split(".") for use in calls_and_uses(parsed(module))]
-    drawn = [use for use in uses if use[0] == "random" or use[:2] in (["np", "random"], ["numpy", "random"])]
-    names = {use[-1] for use in drawn} - {"random"}
-    assert names <= _GENERATORS | _STATE
-    from_random = {name for name in imports(parsed(module)) if name.startswith(("random.", "numpy.random."))}
-    assert {name.rsplit(".", 1)[1] for name in from_random} <= _GENERATORS
+def test_no_module_draws_from_a_global_generator() -> None:
+    def draws(module: str) -> set[str]:
+        uses = [use.split(".") for use in calls_and_uses(module)]
+        drawn = [use for use in uses if use[0] == "random" or use[:2] in (["np", "random"], ["numpy", "random"])]
+        names = {use[-1] for use in drawn} - {"random"} - _STATE
+        from_random = {name for name in imports(module) if name.startswith(("random.", "numpy.random."))}
+        return (names | {name.rsplit(".", 1)[1] for name in from_random}) - _GENERATORS
+
+    assert breaking(draws) == {}
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_every_module_says_what_it_is(module: str) -> None:
-    tree = parsed(module)
-    assert not tree.body or ast.get_docstring(tree)
+def test_every_module_says_what_it_is() -> None:
+    assert breaking(lambda module: parsed(module).body and not ast.get_docstring(parsed(module))) == {}
 
 
 def test_everything_but_the_adapters_imports_without_any_back_end() -> None:

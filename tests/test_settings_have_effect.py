@@ -6,6 +6,7 @@ it does. A row without an entry fails, and so does an entry whose two outcomes a
 
 from __future__ import annotations
 
+import functools
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -52,6 +53,7 @@ def rows() -> Iterator[Row]:
             yield section, found[1]
 
 
+@functools.cache
 def outcome(scenario: str, *settings: str) -> tuple[Any, ...]:
     """What a scenario sends in two simulated seconds, and what comes of it."""
     sent: list[bytes] = []
@@ -66,12 +68,15 @@ def run(setting: str, *others: str, scenario: str = "six-topics-paced") -> Outco
     return lambda: (outcome(scenario, *others), outcome(scenario, *others, setting))
 
 
+@functools.cache
+def driven(**changed: Any) -> list[tuple[float, str, bytes]]:
+    """What the simulated robots send in a second."""
+    return [(m.t, m.topic, m.payload) for m in Fleet(SimSettings(**{"map_rate": 1.0, **changed})).messages(1.0)]
+
+
 def drives(**changed: Any) -> Outcomes:
     """The simulated robots' messages, without and with a change."""
-    return lambda: tuple(
-        [(m.t, m.topic, m.payload) for m in Fleet(SimSettings(**{"map_rate": 1.0, **values})).messages(1.0)]
-        for values in ({}, changed)
-    )  # type: ignore[return-value]
+    return lambda: (driven(), driven(**changed))
 
 
 def sealed() -> Outcomes:

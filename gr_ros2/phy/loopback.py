@@ -1,4 +1,4 @@
-"""One simulated link in one flowgraph: source, gate, transmitter, channel, receiver, losses, delay, sink; and further
+"""A simulated link in a flowgraph: source, gate, transmitter, channel, receiver, losses, delay, sink; and further
 receivers, each with a channel and a sink of its own.
 
 Invariants: any PHY of the table works here; a PHY without samples skips transmitter, channel and receiver; a block that
@@ -25,8 +25,8 @@ from gr_ros2.settings.airtime import AirtimeRule
 from gr_ros2.settings.config import ChannelConfig
 
 
-class LoopbackLink(PacketPath, Flowgraph):
-    """A flowgraph from a source's message port `pdus` to a sink's.
+class SimulatedLink(PacketPath):
+    """A path from a source's message port `pdus` to those of sinks, in a flowgraph that may have others.
 
     :param phy: which physical layer
     :param source: block with message port `pdus` out, whose PDUs it counts in ``emitted``
@@ -41,6 +41,8 @@ class LoopbackLink(PacketPath, Flowgraph):
     :param instrumented: build in what the dashboard uses: packet loss that can be set on any PHY, a channel that can be
         changed, and taps for spectrum and constellation
     :param further: the channel and the sink of each further receiver
+    :param within: the flowgraph; None: this object is one
+    :param shared: whether the sink gets packets of other paths too, so that its counts say nothing of this one
     :raises ConfigError: for a channel that this PHY does not support
     """
 
@@ -57,12 +59,14 @@ class LoopbackLink(PacketPath, Flowgraph):
         delay_s: float = 0.0,
         instrumented: bool = False,
         further: Sequence[tuple[ChannelConfig, Any]] = (),
+        within: Flowgraph | None = None,
+        shared: bool = False,
     ) -> None:
-        super().__init__("gr_ros2_loopback", f"phy {phy.name}")
         self.phy, self.source, self.sink = phy, source, sink
         self.channel = ChannelConfig() if channel is None else channel
         phy.check_channel(self.channel)
-        self._throttled = throttled
+        self._within, self._shared = within, shared
+        graph = self._flowgraph
         last = source
         if throttled and phy.has_airtime:
             airtime_of = phy.airtime if phy.any_length else None
@@ -81,8 +85,8 @@ class LoopbackLink(PacketPath, Flowgraph):
         # memory segments.
         for hier_block in (self._transmitter, self._receiver, *self.branches):
             if hier_block is not None:
-                weakref.finalize(self, hier_block.release)
-        if self.channel.loses_packets or instrumented:
+                weakref.finalize(graph, hier_block.release)
+        if self.channel.loses_packets or instrumented or shared:
             self._loss = PacketLoss(self.channel)
             last = self._follow(last, self._loss)
         # Keep references, since GNU Radio holds none to a Python block.
@@ -93,12 +97,7 @@ class LoopbackLink(PacketPath, Flowgraph):
         self._pacer = self._gate if throttled else CreditWindow(self._progress)
         if paced and self._pacer is not None:
             source.use_credit()
-            self.msg_connect(self._pacer, "credit", source, "credit")
-
-    def start(self, max_noutput_items: int = 10_000_000) -> None:
-        super().start(max_noutput_items)
-        if self._throttled:
-            self.phy.prefer_latency()
+            graph.msg_connect(self._pacer, "credit", source, "credit")
 
     def run_began(self, now: float) -> None:
         """Count the channel's outages from ``now`` (s, monotonic) instead of from the start of the flowgraph."""
@@ -115,16 +114,22 @@ class LoopbackLink(PacketPath, Flowgraph):
         """Connect a further receiver to a block that gives samples, or packets for a PHY without samples."""
         branch = Branch(self.phy, channel)
         if self.phy.has_samples:
-            self.connect(sent, branch)
+            self._flowgraph.connect(sent, branch)
         else:
             self._follow(sent, branch)
         self._follow(branch, sink)
         return branch
 
+    @property
+    def _flowgraph(self) -> Any:
+        return self if self._within is None else self._within
+
     def _offered(self) -> int:
         return int(self.source.emitted)
 
     def _handled(self) -> int:
+        if self._shared and self._loss is not None:
+            return self._loss.received - self._loss.dropped.total()
         return int(self.sink.handled)
 
     def _progress(self) -> int:
@@ -133,3 +138,16 @@ class LoopbackLink(PacketPath, Flowgraph):
             first = self._handled() + (0 if self._loss is None else self._loss.dropped.total())
             return min([first, *(branch.received for branch in self.branches)])
         return int(self._transmitter.packets_sent())
+
+
+class LoopbackLink(SimulatedLink, Flowgraph):
+    """A flowgraph of one path; takes what that takes."""
+
+    def __init__(self, phy: Phy, source: Any, sink: Any, **options: Any) -> None:
+        Flowgraph.__init__(self, "gr_ros2_loopback", f"phy {phy.name}")
+        super().__init__(phy, source, sink, **options)
+
+    def start(self, max_noutput_items: int = 10_000_000) -> None:
+        super().start(max_noutput_items)
+        if self._gate is not None:
+            self.phy.prefer_latency()

@@ -148,6 +148,11 @@ class PacketPath:
         """Name of the medium, for errors."""
         return f"phy {self.phy.name}"
 
+    @property
+    def _flowgraph(self) -> Any:
+        """Where the parts are connected."""
+        return self
+
     def _offered(self) -> int:
         """Packets that entered the path, if there is no gate to count them."""
         return 0
@@ -164,7 +169,7 @@ class PacketPath:
     def _receive(self, samples: Any, *, faded: bool, shown: bool) -> Any:
         """Connect channel, receiver and taps to a block that gives samples; returns the block that gives the receiver's
         input."""
-        graph: Any = self
+        graph = self._flowgraph
         if faded:
             self._faded = Channel(self.channel, self.phy)
             graph.connect(samples, self._faded)
@@ -179,6 +184,5 @@ class PacketPath:
 
     def _follow(self, packets: Any, block: Any) -> Any:
         """Connect a block's port `pdus` to that of another block; returns the block."""
-        graph: Any = self
-        graph.msg_connect(packets, "pdus", block, "pdus")
+        self._flowgraph.msg_connect(packets, "pdus", block, "pdus")
         return block

@@ -138,8 +138,9 @@ class Recorder:
         }
 
     def received_at(self, src_id: int) -> Floats:
-        """s on the run's clock, when each packet of a source reached the sink; NaN for packets that did not."""
-        return self._packets[src_id].received_at()
+        """s on the run's clock, when each packet of a source reached the sink; NaN for packets that did not. Empty for
+        a source that it does not hear."""
+        return self._packets.get(src_id, PacketLog()).received_at()
 
     def trace(self, t0: float, t_end: float, published_as: Mapping[str, str]) -> Trace:
         """Every message, packet and position. To be called after :meth:`finish`.

@@ -1,14 +1,25 @@
-"""The ROS domains of a run, so that two runs on one computer do not receive each other's messages."""
+"""The ROS graphs of a run, on domains of its own, so that two runs on one computer do not receive each other's
+messages."""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import replace
 
+from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.free_domains import FREE, ReservedDomain
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.settings.config import replaced
+from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced
 from gr_ros2.settings.fields import AUTO
+
+
+def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) -> Middleware:
+    """Join the graph of one end of the link with a participant of its own.
+
+    :param node: name of the node on the graph, after ``gr_ros2_``
+    """
+    local = scenario.localhost_only
+    return join_graph(end.middleware, domain_id=end.domain_id, node_name=f"gr_ros2_{node}", localhost_only=local)
 
 
 def on_own_domains(scenario: Scenario, stack: ExitStack) -> Scenario:

@@ -87,15 +87,16 @@ def surroundings(scenario: Scenario, sample_rate: float) -> Surroundings:
     :param sample_rate: samples/s, which is the bandwidth of the noise
     :raises ConfigError: where levels follow from positions that nothing tells, or from what no link in real time has
     """
-    if not (scenario.simulated or scenario.robots):
+    if not scenario.simulated:
+        shares = scenario.duplex == "half"
         for key, wanted, alone in (
-            ("duplex", scenario.duplex == "half", "full"),
-            ("channel.from", scenario.channel.from_positions, "settings"),
+            ("duplex", shares and not scenario.robots, "full"),
+            ("channel.from", scenario.channel.from_positions and not shares, "settings"),
         ):
             if wanted:
                 raise ConfigError(
-                    f"{key}: time = {scenario.time!r} has that for robots alone; set robots, or time to packets or "
-                    f"samples, or leave it {alone}"
+                    f"{key}: time = {scenario.time!r} has that for robots with duplex = 'half' alone; set both, or "
+                    f"time to packets or samples, or leave it {alone}"
                 )
     fixed = _between(scenario, sample_rate) if scenario.robots else _directed(scenario)
     return _placed(scenario, fixed, sample_rate) if scenario.channel.from_positions else FixedPaths(fixed)

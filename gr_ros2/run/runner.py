@@ -1,4 +1,4 @@
-"""Runs one scenario with one or two directions, observed by a Recorder.
+"""Runs a scenario, in real time here, observed by a Recorder.
 
 Invariants: everything that was started is stopped in reverse order, also after an error; a run that is interrupted
 still closes its ledger and writes its result.
@@ -13,23 +13,20 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from shutil import copyfile
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.core.files import make_folder, write_whole
 from gr_ros2.core.guard import Guard, one_line
-from gr_ros2.link.lateness import Lateness
-from gr_ros2.medium.base import Surroundings
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.phy import Phy
 from gr_ros2.record.lateness import lateness_result
 from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
-from gr_ros2.run.domains import on_own_domains
+from gr_ros2.run.domains import on_own_domains, open_graph
 from gr_ros2.run.load import make_phys, recording
-from gr_ros2.run.observers import LiveLink, RunObserver, RunObservers
+from gr_ros2.run.observers import RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2.run.pulse import Pulse
 from gr_ros2.run.recorders import RunRecords
@@ -41,9 +38,6 @@ from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.config import replaced
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
-
-if TYPE_CHECKING:
-    from gr_ros2.gr import RosSink, RosSource
 
 __all__ = ["DELIVERED_BAG", "Outcome", "Progress", "run_repetitions", "run_scenario"]
 
@@ -177,51 +171,6 @@ def run_repetitions(
     return results
 
 
-class Way(Protocol):
-    """A robot that offers messages, and where they come out: :class:`gr_ros2.run.direction.Direction` or
-    :class:`gr_ros2.run.team.LiveRobot`."""
-
-    scenario: Scenario
-    src_id: int
-    source: RosSource
-    sink: RosSink
-
-    @property
-    def topics(self) -> Mapping[str, int]: ...
-    @property
-    def input(self) -> Middleware: ...
-    @property
-    def output(self) -> Middleware: ...
-    def output_topics(self) -> dict[str, str]: ...
-    def empty(self, unresolved: bool) -> bool: ...
-
-
-class Links(Protocol):
-    """The links of a run: :class:`gr_ros2.run.direction.Directions` or :class:`gr_ros2.run.team.LiveTeam`.
-
-    :ivar listened: of the ways, the first ones whose output is recorded
-    :ivar channels: how many they use
-    """
-
-    @property
-    def ways(self) -> Sequence[Way]: ...
-    @property
-    def links(self) -> Sequence[LiveLink]: ...
-    @property
-    def graphs(self) -> tuple[tuple[str, int | None], ...]: ...
-
-    listened: int
-    channels: int
-    clock: Callable[[], float]
-
-    def start(self) -> None: ...
-    def run_began(self, now: float) -> None: ...
-    def check(self) -> None: ...
-    def stop(self) -> None: ...
-    def lateness(self, records: RunRecords) -> dict[str, list[Lateness]] | None: ...
-    def counters(self) -> dict[str, Any]: ...
-
-
 class _Run:
     def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, run_observers: RunObservers) -> None:
         self.registry = registry = scenario.load_registry()
@@ -239,56 +188,30 @@ class _Run:
         self.listener: DeliveryRecorder | None = None
         self.sim: SimPublisher | None = None
         try:
-            self.links = self._links(phys, around, stack)
-            self.ways, self.clock = self.links.ways, self.links.clock
+            from gr_ros2.run.live import LiveRobots  # only a run in real time needs GNU Radio
+
+            self.live = LiveRobots(scenario, registry, phys, around, records=self.records, stack=stack)
+            self.medium, self.clock = self.live.medium, self.live.medium.clock
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)
-            sources = {way.src_id: way.source for way in self.ways}
-            run_observers.run_started(self.records.live_run(self.clock, sources, self.links.links))
+            run_observers.run_started(self.records.live_run(self.clock, self.live.sources, self.medium.links))
             if scenario.bag_path is None:
                 fleet = self.task or Fleet(scenario.sim)
                 if isinstance(fleet, Fleet):
                     fleet.state(1, min(scenario.duration_s, _DRIVEN_S))
-                robots = self._robots(fleet.robot_ids, stack)
-                self.sim = SimPublisher(fleet, robots, scenario.duration_s, clock=self.clock)
+                graphs = {src_id: self.live.graph_of(src_id, stack) for src_id in fleet.robot_ids}
+                self.sim = SimPublisher(fleet, graphs, scenario.duration_s, clock=self.clock)
                 stack.callback(self.sim.close)
                 if self.task is not None:
-                    self.task.join(robots, self.clock)
+                    self.task.join(graphs, self.clock)
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
 
-    def _links(self, phys: Sequence[Phy], around: Surroundings, stack: ExitStack) -> Links:
-        # Only a run in real time needs GNU Radio.
-        from gr_ros2.run.direction import Directions
-        from gr_ros2.run.team import LiveTeam
-
-        common: dict[str, Any] = {"records": self.records, "stack": stack}
-        if self.scenario.robots:
-            return LiveTeam(self.scenario, self.registry, phys, around, **common)
-        return Directions(self.scenario, self.registry, phys, **common)
-
-    def _robots(self, ids: Iterable[int], stack: ExitStack) -> dict[int, Middleware]:
-        """The graph of every simulated robot: that of its source, or else the graph at the other end of the link."""
-        from gr_ros2.run.direction import open_graph
-
-        robots = dict.fromkeys(ids, self.ways[0].output)
-        for way in self.ways:
-            if way.src_id in robots:
-                end = way.scenario.ros_source
-                robots[way.src_id] = stack.enter_context(open_graph(self.scenario, end, f"robot_{way.src_id}"))
-        return robots
-
-    @property
-    def _listened(self) -> Sequence[Way]:
-        return self.ways[: self.links.listened]
-
     def _listen(self, out: Path, stack: ExitStack) -> DeliveryRecorder:
-        from gr_ros2.run.direction import open_graph
-
         graphs = {}
-        for way in self._listened:
-            end = replaced(way.scenario.ros_sink, middleware=way.output.name, domain_id=way.output.domain_id)
-            graphs[stack.enter_context(open_graph(self.scenario, end, "listener"))] = way.output_topics()
+        for robot in self.live.recorded:
+            end = replaced(self.scenario.ros_sink, middleware=robot.graph.name, domain_id=robot.graph.domain_id)
+            graphs[stack.enter_context(open_graph(self.scenario, end, "listener"))] = robot.heard
         listener = DeliveryRecorder(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)
         return listener
@@ -298,14 +221,14 @@ class _Run:
         wall = time.monotonic()
         begin = end = self.clock()
         try:
-            self.links.start()
+            self.medium.start()
             self._wait_matched(on_progress)
             begin = end = self.clock()
             self.pulse.start()
             if self.task is not None:
                 self.task.begin(begin)
-            self.links.run_began(begin)
-            (self.sim or self.ways[0].input).start()
+            self.medium.run_began(begin)
+            (self.sim or self.live.robots[0].graph).start()
             while not self._submitted(begin):
                 time.sleep(_POLL_S)
                 self._report(on_progress, begin)
@@ -318,10 +241,10 @@ class _Run:
             end = self.clock()
         except MiddlewareError as error:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
-        drained = not self.interrupted and all(way.empty(bool(self.records.unresolved())) for way in self.ways)
+        drained = not self.interrupted and self.live.empty(bool(self.records.unresolved()))
         self.pulse.close()
         stopped = self.clock()
-        self.links.stop()
+        self.medium.stop()
         self.run_observers.settle()
         self.records.check()
         self._check_alone()
@@ -333,7 +256,7 @@ class _Run:
             end=end,
             played=played,
             drained=drained,
-            channels=self.links.channels,
+            channels=self.medium.channels,
             began=wall,
             lateness=partial(self._lateness, begin, stopped),
             interrupted=self.interrupted,
@@ -343,7 +266,7 @@ class _Run:
 
     def _lateness(self, begin: float, end: float, trace: Trace) -> LatenessResult | None:
         """How late the computer was; None where the links wait for the computer."""
-        parts = self.links.lateness(self.records)
+        parts = self.medium.lateness(self.records)
         if parts is None:
             return None
         return lateness_result({"threads": [self.pulse.lateness], **parts}, begin, end, trace)
@@ -374,13 +297,14 @@ class _Run:
     def _sim_matched(self) -> bool:
         if (sim := self.sim) is None:
             return True
-        wanted = [name for way in self.ways for name in way.topics if name in sim.publishers]
-        return all(sim.publishers[name].matched() for name in wanted) and all(way.source.matched for way in self.ways)
+        wanted = [name for robot in self.live.offering for name in robot.topics if name in sim.publishers]
+        matched = all(sim.publishers[name].matched() for name in wanted)
+        return matched and all(source.matched for source in self.live.sources.values())
 
     def _submitted(self, begin: float) -> bool:
         if self.sim is not None:
             return self.sim.finished
-        bag = self.ways[0].input
+        bag = self.live.robots[0].graph
         assert isinstance(bag, BagMiddleware)
         if bag.error is not None:
             raise bag.error
@@ -405,13 +329,14 @@ class _Run:
         :raises RunError: when another program is on one of the graphs
         """
         heard = {} if self.listener is None else dict(self.listener.received)
-        for way in self.ways:
-            sent = {name: topic["submitted"] for name, topic in way.source.stats()["topics"].items()}
+        for source in self.live.sources.values():
+            sent = {name: topic["submitted"] for name, topic in source.stats()["topics"].items()}
             own = {} if self.sim is None else self.sim.published
-            self._compare(way.input, sent, own, own.keys())
-        for way in self._listened:
-            came_out = {name: topic["delivered"] for name, topic in way.sink.stats()["topics"].items()}
-            self._compare(way.output, heard, came_out, way.output_topics())
+            self._compare(source.middleware, sent, own, own.keys())
+        for robot in self.live.recorded:
+            assert robot.sink is not None
+            came_out = {name: topic["delivered"] for name, topic in robot.sink.stats()["topics"].items()}
+            self._compare(robot.graph, heard, came_out, robot.heard)
 
     def _compare(
         self, graph: Middleware, found: Mapping[str, int], own: Mapping[str, int], names: Iterable[str]
@@ -426,10 +351,10 @@ class _Run:
 
     def _report(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
         self.records.check()
-        self.links.check()
+        self.medium.check()
         if on_progress is not None:
             sent, delivered = self.records.recorder.progress()
-            now = Progress(self.clock() - begin, self.scenario.duration_s, sent, delivered, self.links.graphs)
+            now = Progress(self.clock() - begin, self.scenario.duration_s, sent, delivered, self.live.graphs)
             self.progress_guard(on_progress, now)
 
     def _incomplete(self) -> list[str]:
@@ -443,7 +368,7 @@ class _Run:
         heard = {} if self.listener is None else dict(self.listener.received)
         unheard = {} if self.listener is None else self.listener.lost()
         return {
-            **self.links.counters(),
+            **self.live.counters(),
             "listener": heard,
             **({"commands": dict(self.task.commands)} if self.task is not None else {}),
             **({"listener_lost": unheard} if unheard else {}),

@@ -110,8 +110,8 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     :param reports: the reverse direction for reports alone (version 1); null = there is none
     :param receivers: channels of further receivers of the same sender; what is not set in one is as in ``channel``, but
         for the seed
-    :param robots: robots that all send and receive, in real time each with a link and a ROS graph of
-        its own; a number stands for as many that differ in their names alone
+    :param robots: robots that all send and receive, in real time each with a ROS graph of its own; a number stands for
+        as many that differ in their names alone
     :param duplex: full = each robot sends on a channel of its own, and hears while it sends; half = all use one
         channel: who sends hears nothing meanwhile, and packets that overlap at a receiver disturb each other
     :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
@@ -214,26 +214,26 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
 
     def _check_live_robots(self) -> None:
         """Whether the robots fit the medium that carries them in real time."""
-        if self.time != "real" or self.duplex != "half":
-            raise ValueError(
-                f"robots: time = {self.time!r} with duplex = {self.duplex!r}; robots with links of their own share one "
-                "channel at its pace: set time: real and duplex: half, or time to packets or samples; two robots on a "
-                "channel of their own each are back"
-            )
-        if not PHY.load(self.phy.name).has_samples:
-            raise ValueError(
-                f"robots: phy {self.phy.name} has no samples, which they share in real time; choose another"
-            )
-        if not self.version:
-            raise ValueError("robots: in real time they need version 1; set version to 1, or time to packets")
-        if self.channel.loses_packets:
-            raise ValueError("channel: bursts cross as samples, so none is dropped whole; leave these settings out")
         own = [robot.ros_source.domain_id for robot in self.robots]
         graphs = [domain for domain in own if domain != AUTO or not self.own_domains]
         if len(set(graphs)) < len(graphs):
             raise ValueError(
                 "robots: each has a ROS graph of its own; set own_domains: true, or another domain_id for each"
             )
+        if self.duplex == "full":
+            return
+        if self.time != "real":
+            raise ValueError(
+                f"robots: time = {self.time!r} with duplex = 'half': they share one channel at its pace; set time: real"
+            )
+        if not PHY.load(self.phy.name).has_samples:
+            raise ValueError(
+                f"robots: phy {self.phy.name} has no samples, which they share in real time; choose another"
+            )
+        if not self.version:
+            raise ValueError("robots: on one channel in real time they need version 1; set version: 1")
+        if self.channel.loses_packets:
+            raise ValueError("channel: bursts cross as samples, so none is dropped whole; leave these settings out")
 
     def _check_back(self, back: Back) -> None:
         if self.source != "sim":

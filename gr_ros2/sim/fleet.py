@@ -43,6 +43,23 @@ class SimMessage:
     payload: bytes
 
 
+@lru_cache(maxsize=8)
+def _room(seed: int, size_m: float, obstacles: int, robots: int) -> tuple[World, Roadmap, Sequence[int]]:
+    """The world, its ways, and where the robots start, at a distance from each other. Nothing in it ever changes, and
+    a run asks several times: for the load, for each direction, for what the channel does."""
+    rng = np.random.default_rng([seed, 0])
+    world = World(size_m, obstacles, rng)
+    roadmap = Roadmap(world, RADIUS + 0.25, rng, robots)
+    places: list[int] = []
+    for node in rng.permutation(roadmap.reachable).tolist():
+        away = [math.hypot(*(roadmap.nodes[node] - roadmap.nodes[other])) for other in places]
+        if min(away, default=math.inf) >= _START_GAP_M:
+            places.append(node)
+        if len(places) == robots:
+            return world, roadmap, places
+    raise ConfigError(f"robots = {robots}: no room to start in size_m = {size_m:g}; use fewer robots or a larger room")
+
+
 class Fleet:
     """Robots 1, 2, ... driving in one world.
 
@@ -53,28 +70,12 @@ class Fleet:
     def __init__(self, settings: SimSettings | None = None) -> None:
         self.settings = settings = settings or SimSettings()
         self.robot_ids = tuple(range(1, settings.robots + 1))
-        rng = np.random.default_rng([settings.seed, 0])
-        self.world = World(settings.size_m, settings.obstacles, rng)
-        roadmap = Roadmap(self.world, RADIUS + 0.25, rng, settings.robots)
+        self.world, roadmap, places = _room(settings.seed, settings.size_m, settings.obstacles, settings.robots)
         self._drivers = [
             Driver(self.world, roadmap, node, settings.max_speed, np.random.default_rng([settings.seed, 1, robot_id]))
-            for robot_id, node in zip(self.robot_ids, self._places(roadmap, rng), strict=True)
+            for robot_id, node in zip(self.robot_ids, places, strict=True)
         ]
         self._log: list[list[State]] = [[] for _ in self._drivers]
-
-    def _places(self, roadmap: Roadmap, rng: np.random.Generator) -> Sequence[int]:
-        """Start places of the robots, at a distance from each other."""
-        places: list[int] = []
-        for node in rng.permutation(roadmap.reachable).tolist():
-            away = [math.hypot(*(roadmap.nodes[node] - roadmap.nodes[other])) for other in places]
-            if min(away, default=math.inf) >= _START_GAP_M:
-                places.append(node)
-            if len(places) == len(self.robot_ids):
-                return places
-        raise ConfigError(
-            f"robots = {self.settings.robots}: no room to start in size_m = {self.settings.size_m:g}; "
-            "use fewer robots or a larger room"
-        )
 
     @staticmethod
     @lru_cache(maxsize=2)

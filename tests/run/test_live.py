@@ -1,4 +1,4 @@
-"""Robots in real time: a link and a ROS graph for each, and one channel between them."""
+"""Robots in real time: a ROS graph for each, and between them one channel or one of its own for each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import Middleware, Qos, join_graph
 from gr_ros2.middleware.bag_files import bag_contents
-from gr_ros2.record.result import read_result
+from gr_ros2.record.result import Result, TopicResult, read_result
 from gr_ros2.record.team import read_team
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2.run.runner import run_scenario
@@ -55,7 +55,7 @@ def test_each_robot_has_a_link_and_a_graph_on_which_a_program_hears_the_others(t
     assert len({domain for _, domain in controller.graphs}) == len(controller.graphs) == 3
     assert controller.heard
     result = read_result(tmp_path)
-    heard = [result.topics, *(receiver.topics for receiver in result.receivers)]
+    heard = _tables(result)
     assert [len(topics) for topics in heard] == [2, 2, 2]
     assert min(topic.delivered for topics in heard for topic in topics) >= 0.9 * 40
     assert result.counters["medium"]["bursts"] >= result.packets["sent"]
@@ -86,12 +86,12 @@ def test_robots_that_drive_begin_to_do_so_with_the_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["duplex=full", "medium=exclusive"], "set time: real and duplex: half"),
-        (["time=unthrottled"], "set time: real and duplex: half"),
-        (["version=0", "medium=exclusive"], "in real time they need version 1"),
+        (["time=unthrottled"], "they share one channel at its pace; set time: real"),
+        (["version=0", "medium=exclusive"], "on one channel in real time they need version 1"),
         (["phy={name: modem, options: {bit_rate: 1e5}}"], "phy modem has no samples"),
         (["channel.packet_loss=0.1"], "bursts cross as samples, so none is dropped whole"),
         (["own_domains=false"], "each has a ROS graph of its own"),
+        (["own_domains=false", "duplex=full", "medium=exclusive"], "each has a ROS graph of its own"),
     ],
 )
 def test_what_no_robot_in_real_time_has_is_refused_in_a_line(overrides: list[str], said: str) -> None:
@@ -102,5 +102,31 @@ def test_what_no_robot_in_real_time_has_is_refused_in_a_line(overrides: list[str
 
 def test_one_channel_in_real_time_is_for_robots() -> None:
     scenario = load_scenario("team", ["time=real", "robots=0", "gains_db=null", "medium=exclusive"])
-    with pytest.raises(ConfigError, match=r"^duplex: time = 'real' has that for robots alone"):
+    with pytest.raises(ConfigError, match=r"^duplex: time = 'real' has that for robots with"):
         run_scenario(scenario)
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_robots_on_channels_of_their_own_hear_whom_they_can_and_send_meanwhile(tmp_path: Path) -> None:
+    gains = "[[null, -90, null], [-90, null, -90], [null, -90, null]]"
+    own = ["duplex=full", "medium=exclusive", "duration_s=2", f"gains_db={gains}"]
+    run_scenario(load_scenario("team", [*LIVE, *own]), tmp_path)
+    result = read_result(tmp_path)
+    heard = [{topic.src_id for topic in topics} for topics in _tables(result)]
+    assert heard == [{2}, {1, 3}, {2}]
+    assert min(topic.delivered for topics in _tables(result) for topic in topics) >= 0.9 * 20
+    assert result.phy["channels"] == 3
+    assert result.lateness is not None
+    assert len(result.counters["robots"]) == 2
+
+
+def test_a_channel_of_its_own_that_nobody_hears_is_refused_in_real_time() -> None:
+    gains = "[[null, null, null], [-90, null, -90], [null, -90, null]]"
+    scenario = load_scenario("team", [*LIVE, "duplex=full", "medium=exclusive", f"gains_db={gains}"])
+    with pytest.raises(ConfigError, match=r"^gains_db: nobody hears /robot_1"):
+        run_scenario(scenario)
+
+
+def _tables(result: Result) -> list[tuple[TopicResult, ...]]:
+    return [result.topics, *(receiver.topics for receiver in result.receivers)]
