@@ -284,9 +284,8 @@ class Slots:
             self._start_over(slot)
         if slot is None or src_id == self.src_id:
             return
-        ahead = [slot + block.ahead[0]] if block.ahead[0] else []
-        if ahead and block.ahead[1]:
-            ahead.append(ahead[0] + block.ahead[1])
+        first, second = block.ahead
+        ahead = (slot + first, slot + first + second)[: 2 if first and second else 1 if first else 0]
         if not trusted:
             for at in ahead:
                 self._taken.setdefault(at, src_id)
@@ -304,9 +303,10 @@ class Slots:
                 del self._taken[at]
             if at not in ahead and self._conflicts.get(at) == src_id:
                 del self._conflicts[at]
-        robot.last, robot.ahead, robot.heard, robot.weight = slot, tuple(ahead), block.heard, block.weight
+        robot.last, robot.ahead, robot.heard, robot.weight = slot, ahead, block.heard, block.weight
         for at in ahead:
-            self._claim(at, src_id)
+            if self._taken.setdefault(at, src_id) != src_id or at in self._mine:
+                self._claim(at, src_id)
         self._named(block.names, slot)
         if block.expected is None:
             robot.deaf = self.src_id not in block.names
@@ -314,7 +314,7 @@ class Slots:
             self._mapped(robot, block.expected, block.conflict)
 
     def _claim(self, slot: int, src_id: int) -> None:
-        owner = self._taken.get(slot, src_id)
+        owner = self._taken[slot]
         if owner != src_id:
             self._conflicts[slot] = max(owner, src_id)
         self._taken[slot] = min(owner, src_id)
