@@ -94,10 +94,9 @@ class CollisionTable:
 
 def _between(values: Floats, grid: tuple[float, ...] | tuple[int, ...]) -> tuple[Any, Floats]:
     """For each value the place in a grid before it, and how far it is from there to the next, 0..1."""
-    points = np.array(grid, float)
-    inside = np.clip(values, points[0], points[-1])
-    place = np.minimum(np.searchsorted(points, inside, "right") - 1, len(points) - 2)
-    return place, (inside - points[place]) / (points[place + 1] - points[place])
+    at = np.interp(values, grid, range(len(grid)))
+    place = np.minimum(at.astype(int), len(grid) - 2)
+    return place, at - place
 
 
 def collision_table(

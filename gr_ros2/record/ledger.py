@@ -51,9 +51,9 @@ class TopicLedger:
     :param corrupt: deliveries that match no message; a number above 0 indicates a serious fault
     :param repeats_delivered: deliveries of repeats whose message already had its fate
     :param fates: fate -> messages
-    :param hops: robots that have sent a message on -> messages delivered
     :param t_sent: s, time of submission; NaN for a message refused before it was queued
     :param t_delivered: s, time of delivery; NaN where it was not delivered
+    :param hops: how many robots sent it on; -1 where it was not delivered
     :param size: serialized bytes; 0 where refused before it was queued
     :param serial: the sender's number of the message
     :param fate: its fate, as its index in ``list(codes)``; _OPEN while its result is open
@@ -66,9 +66,9 @@ class TopicLedger:
     corrupt: int = 0
     repeats_delivered: int = 0
     fates: Counter[str] = field(default_factory=Counter)
-    hops: Counter[int] = field(default_factory=Counter)
     t_sent: array[float] = field(default_factory=lambda: array("d"))
     t_delivered: array[float] = field(default_factory=lambda: array("d"))
+    hops: array[int] = field(default_factory=lambda: array("b"))
     size: array[int] = field(default_factory=lambda: array("L"))
     serial: array[int] = field(default_factory=lambda: array("q"))
     fate: array[int] = field(default_factory=lambda: array("B"))
@@ -132,7 +132,9 @@ class Ledger:
         with self._lock:
             if self._finished:
                 return
-            source = self._sources.setdefault(src_id, _SourceBook(src_id))
+            source = self._sources.get(src_id)
+            if source is None:
+                source = self._sources[src_id] = _SourceBook(src_id)
             if isinstance(event, SentPacket):
                 self._sent(source, event)
             elif isinstance(event, Accepted):
@@ -242,6 +244,7 @@ class Ledger:
         topic.sent += 1
         topic.t_sent.append(t)
         topic.t_delivered.append(nan)
+        topic.hops.append(-1)
         topic.size.append(size)
         topic.serial.append(serial)
         topic.fate.append(_OPEN)
@@ -300,7 +303,7 @@ class Ledger:
     def _deliver(self, source: _SourceBook, message: _OpenMessage, event: Delivered, now: float, fate: Fate) -> float:
         topic = self._topic(source.src_id, message.topic_id)
         topic.t_delivered[message.position] = now
-        topic.hops[event.hops] += 1
+        topic.hops[message.position] = event.hops
         self._close(source, message, fate)
         return message.t_sent
 

@@ -6,7 +6,7 @@ and the reading of one position; it stores only numbers in arrays for each messa
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from math import inf
@@ -40,12 +40,12 @@ class Recorder:
         on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
     ) -> None:
         self.ledger = Ledger()
-        self.sent: dict[tuple[int, int], Track] = {}
-        self.received: dict[tuple[int, int], Track] = {}
+        self.sent: dict[tuple[int, int], Track] = defaultdict(Track)
+        self.received: dict[tuple[int, int], Track] = defaultdict(Track)
         self._lengths: Counter[tuple[int, AirKind, int, int]] = Counter()
         """Number of packets sent, by their sender, what they were for, their length in bytes and their MCS."""
         self._air_from, self._air_to = inf, -inf
-        self._packets = {src_id: PacketLog() for src_id in namespaces}
+        self._packets = defaultdict(PacketLog, {src_id: PacketLog() for src_id in namespaces})
         self._books: list[TopicLedger] = []
         self._registry = registry
         self._namespaces = dict(namespaces)
@@ -59,7 +59,7 @@ class Recorder:
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         """Take an event of the sender with this source id."""
         if isinstance(event, SentPacket):
-            self._packets.setdefault(src_id, PacketLog()).sent(event)
+            self._packets[src_id].sent(event)
             self._air_from, self._air_to = min(self._air_from, event.now), max(self._air_to, event.now)
             self._lengths[src_id, event.kind, len(event.data), event.mcs] += 1
         self.ledger.sender_event(src_id, event)
@@ -167,7 +167,7 @@ class Recorder:
         read = self._readers.get(topic_id)
         if read is None:
             return
-        track = tracks.setdefault((src_id, topic_id), Track())
+        track = tracks[src_id, topic_id]
         position = read(payload)
         if position is None:
             track.left_out += 1
@@ -205,7 +205,7 @@ class Recorder:
             left_out_sent=sent.left_out,
             left_out_received=received.left_out,
             ledger=dict(sorted(book.fates.items())),
-            hops={str(hops): count for hops, count in sorted(book.hops.items())},
+            hops={str(hops): count for hops, count in sorted(Counter(book.hops).items()) if hops >= 0},
             corrupt=book.corrupt,
             repeats_delivered=book.repeats_delivered,
             negative_latencies=numbers.negative_latencies,

@@ -45,6 +45,7 @@ SCHEMAS = {
             "serial": pa.int64(),  # the sender's number of the message, from 0
             "t_sent": pa.float64(),  # null: refused before it was queued
             "t_delivered": pa.float64(),
+            "hops": pa.int8(),  # robots that sent it on; null: it was not delivered
             "size": pa.int64(),  # serialized bytes
             "fate": _TEXT,  # of the loss ledger
         }
@@ -356,6 +357,7 @@ def _message_columns(book: TopicLedger, topic: str, t0: float) -> dict[str, Any]
         "serial": np.array(book.serial, dtype=np.int64),
         "t_sent": np.array(book.t_sent) - t0,
         "t_delivered": np.array(book.t_delivered) - t0,
+        "hops": np.where(np.array(book.hops) < 0, nan, book.hops),
         "size": np.array(book.size, dtype=np.int64),
         "fate": _named(np.array(book.fate, dtype=np.int64), {code: fate for fate, code in book.codes.items()}),
     }

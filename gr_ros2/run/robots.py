@@ -20,6 +20,7 @@ from gr_ros2.medium.gains import paths_between
 from gr_ros2.medium.positions import Motion, Positions
 from gr_ros2.run.load import source_names
 from gr_ros2.run.scenario import RobotConfig, Scenario
+from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.config import ChannelConfig, ScenarioChannel, SinkConfig, SourceConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.sim.fleet import Fleet
@@ -81,10 +82,11 @@ def halves_of_robots(ways: Sequence[Scenario]) -> list[Halves]:
     return halves
 
 
-def surroundings(scenario: Scenario, sample_rate: float) -> Surroundings:
+def surroundings(scenario: Scenario, sample_rate: float, task: TaskRun | None = None) -> Surroundings:
     """Who hears whom among the robots of a scenario.
 
     :param sample_rate: samples/s, which is the bandwidth of the noise
+    :param task: moves them; None, where the scenario has one: as they move if they hear nothing
     :raises ConfigError: where levels follow from positions that nothing tells, or from what no link in real time has
     """
     if not scenario.simulated:
@@ -99,16 +101,16 @@ def surroundings(scenario: Scenario, sample_rate: float) -> Surroundings:
                     f"time to packets or samples, or leave it {alone}"
                 )
     fixed = _between(scenario, sample_rate) if scenario.robots else _directed(scenario)
-    return _placed(scenario, fixed, sample_rate) if scenario.channel.from_positions else FixedPaths(fixed)
+    return _placed(scenario, fixed, sample_rate, task) if scenario.channel.from_positions else FixedPaths(fixed)
 
 
-def _placed(scenario: Scenario, paths: Sequence[Sequence[Path]], sample_rate: float) -> Positions:
+def _placed(scenario: Scenario, paths: Sequence[Sequence[Path]], sample_rate: float, task: TaskRun | None) -> Positions:
     """The robots of a scenario where they are."""
     channel = scenario.channel
     # The losses of a path are measured at levels that its channel must be able to have.
     bare = [[replace(path, channel=_on_the_way(path.channel)) for path in heard] for heard in paths]
     robots = scenario.robots or (RobotConfig(),) * len(paths)
-    motion, world = _motion(scenario, len(paths))
+    motion, world = _motion(scenario, len(paths), task)
     return Positions(
         channel,
         motion,
@@ -123,8 +125,11 @@ def _on_the_way(channel: ChannelConfig) -> ChannelConfig:
     return channel.on_the_way if isinstance(channel, ScenarioChannel) else channel
 
 
-def _motion(scenario: Scenario, count: int) -> tuple[Motion, World | None]:
+def _motion(scenario: Scenario, count: int, task: TaskRun | None) -> tuple[Motion, World | None]:
     """Where the robots of a scenario are, and among which obstacles."""
+    if scenario.task:
+        task = task or TaskRun(scenario, scenario.load_registry())
+        return task.at, task.world
     named: list[str | None] = [way.ros_source.namespace for way in scenario.directions()]
     named += [None] * (count - len(named))
     if scenario.bag_path is not None:

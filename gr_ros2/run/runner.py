@@ -175,8 +175,8 @@ class _Run:
     def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, run_observers: RunObservers) -> None:
         self.registry = registry = scenario.load_registry()
         phys = make_phys(scenario.directions(), registry)
-        around = surroundings(scenario, phys[0].sample_rate)
         self.task = TaskRun(scenario, registry) if scenario.task else None
+        around = surroundings(scenario, phys[0].sample_rate, self.task)
         ears = ears_of(scenario, around)
         self.records = RunRecords(scenario, registry, phys, ears, run_observers=run_observers, task=self.task)
         self.scenario = scenario = on_own_domains(scenario, stack)
@@ -250,7 +250,8 @@ class _Run:
         self._check_alone()
         played = end - begin
         if scenario.duration_s and not self.interrupted:
-            played = min(scenario.duration_s, played) if scenario.bag_path is not None else scenario.duration_s
+            ends = scenario.bag_path is not None or (self.task is not None and self.task.over)
+            played = min(scenario.duration_s, played) if ends else scenario.duration_s
         return self.records.outcome(
             begin=begin,
             end=end,

@@ -185,10 +185,10 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError("channel.walls_db: a recording has no world to count walls in; leave it out")
 
     def _check_robots(self) -> None:
-        if self.task and (not self.robots or self.time == "samples" or self.channel.from_positions):
+        if self.task and (not self.robots or self.time == "samples"):
             raise ValueError(
-                f"task = {self.task!r}: robots act on what they hear in real time or at packets, on channels that do "
-                "not follow from positions; set robots, time: real or packets, and gains_db"
+                f"task = {self.task!r}: robots act on what they hear in real time or at packets; set robots, and time: "
+                "real or packets"
             )
         if self.controller != "task" and (not self.task or self.time != "real"):
             raise ValueError(

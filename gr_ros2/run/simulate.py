@@ -38,6 +38,7 @@ from gr_ros2.run.load import make_phys, recorded_names, source_names
 from gr_ros2.run.recorders import make_recorder
 from gr_ros2.run.robots import Halves, halves_of_robots, start_of_run, surroundings
 from gr_ros2.run.scenario import Scenario
+from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.config import robot_of
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet, SimMessage
@@ -233,6 +234,7 @@ class Simulation:
 
     :param phys: one per direction, see :func:`gr_ros2.run.load.make_phys`
     :param messages: those that each direction is offered, in time order; None takes the scenario's source
+    :param task: offers them instead, and moves the robots
     :param codec: of all messages; None makes one
     :param ideal: the PHY loses nothing
     :raises ConfigError: for time ``unthrottled``, in which messages have no times
@@ -245,6 +247,7 @@ class Simulation:
         phys: Sequence[Phy],
         *,
         messages: Sequence[Iterator[Upcoming]] | None = None,
+        task: TaskRun | None = None,
         codec: MessageCodec | None = None,
         ideal: bool = False,
     ) -> None:
@@ -254,7 +257,9 @@ class Simulation:
                 "be simulated; set time to real, samples or packets"
             )
         ways = scenario.directions()
-        coming: list[Iterator[Upcoming]] = list(messages or offered_by(ways, registry))
+        if messages is None:
+            messages = offered_by(ways, registry) if task is None else task.offered()
+        coming: list[Iterator[Upcoming]] = list(messages)
         shared = scenario.duplex == "half"
         any_length = all(phy.any_length for phy in phys)
         start = start_of_run(
@@ -283,7 +288,7 @@ class Simulation:
             )
             self.robots.append(robot)
         all_phys = [phys[number if number < len(ways) else 0] for number in range(len(self.robots))]
-        self.around = around = surroundings(scenario, phys[0].sample_rate)
+        self.around = around = surroundings(scenario, phys[0].sample_rate, task)
         if ideal:
             self.medium: Medium = PacketMedium(around, all_phys, shared=shared, ideal=True)
         else:
@@ -300,6 +305,11 @@ class Simulation:
     def events(self) -> Iterator[TimedEvent]:
         """Everything that happens, in the order of time. To be called only once."""
         return EventLoop(self.robots, self.medium).run()
+
+    def end(self, now: float) -> None:
+        """Offer nothing more; what has been offered is still sent."""
+        for robot in self.robots:
+            robot.end(now)
 
     @property
     def duration_s(self) -> float:
@@ -393,6 +403,11 @@ class Robot:
         yield from ((now, self, event) for event in self._events)
         self._events.clear()
         self.due = self._next(now)
+
+    def end(self, now: float) -> None:
+        """Take no further message."""
+        self._messages, self._coming = iter(()), None
+        self.duration_s = min(self.duration_s, now)
 
     def receive(self, reception: Reception) -> Iterator[TimedEvent]:
         """Take what has come out of the receiver."""

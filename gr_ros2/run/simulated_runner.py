@@ -68,7 +68,7 @@ def run_simulated(
                 ids, names = source_names(way, registry).values(), published_names(way, registry).values()
                 bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
         task = TaskRun(scenario, registry) if scenario.task else None
-        run = Simulation(scenario, registry, phys, messages=None if task is None else task.offered())
+        run = Simulation(scenario, registry, phys, task=task)
         run_observers = run_observers or RunObservers(threaded=False)
         records = RunRecords(
             scenario,
@@ -86,6 +86,8 @@ def run_simulated(
         for number, timed_event in enumerate(run.events()):
             clock.now, robot, _ = timed_event
             pass_on(seen[robot.number], timed_event)
+            if task is not None and task.over and clock.now < run.duration_s:
+                run.end(clock.now)
             if not number % _CHECKED:  # every robot has a recorder
                 records.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:

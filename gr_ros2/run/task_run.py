@@ -25,6 +25,7 @@ from gr_ros2.run.scenario import Scenario
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.sensors import TYPES, read_command
 from gr_ros2.sim.tasks import TaskRobots, make_task
+from gr_ros2.sim.world import Floats, World
 
 
 @dataclass(frozen=True)
@@ -96,11 +97,28 @@ class TaskRun:
     def _of(self, number: int, duration_s: float) -> Iterator[_Made]:
         measure = partial(self._measure, number)
         for at in self._robots.times(number, duration_s):
+            if self.over:
+                return
             yield _Made(at, *self._topics[number], measure)
 
     def _measure(self, number: int, at: float) -> bytes:
         with self._lock:
             return self._robots.odometry(number, at)
+
+    @property
+    def over(self) -> bool:
+        """Whether all is done: they send nothing more."""
+        return self._robots.over
+
+    @property
+    def world(self) -> World:
+        """The obstacles between them."""
+        return self._robots.world
+
+    def at(self, now: float) -> tuple[Floats, Floats]:
+        """Where they are, see :meth:`gr_ros2.sim.tasks.TaskRobots.at`."""
+        with self._lock:
+            return self._robots.at(now)
 
     # ---- what they act on
 

@@ -21,7 +21,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.sim.motion import MAX_TURN, TICK, State
 from gr_ros2.sim.sensors import Sensors, read_odometry
 from gr_ros2.sim.sim_settings import SimSettings
-from gr_ros2.sim.world import World
+from gr_ros2.sim.world import Floats, World
 
 Command = tuple[float, float]
 """Speed in m/s and turn rate in rad/s."""
@@ -53,9 +53,11 @@ class Task:
     :param robots: how many there are; they are numbered from 0
     :param rng: for their places
     :cvar scripted: robots that the task drives itself, whoever controls the others
+    :ivar over: whether all is done, which ends the run
     """
 
     scripted: Collection[int] = ()
+    over = False
 
     def __init__(self, robots: int, rng: random.Random) -> None:
         self.robots, self.rng = robots, rng
@@ -127,15 +129,14 @@ class Formation(Task):
 class Rendezvous(Task):
     """Robots that start anywhere in a square meet: each drives to the middle of all that it knows of, itself included.
 
-    Result: ``time_to_meet_s``, when the last of them was within ``MEET_M`` of the middle of all; the duration so far
-    where they have not met (``met`` is 0 then).
+    Result: ``time_to_meet_s``, when the last of them was within ``MEET_M`` of the middle of all, which ends the run;
+    the duration where they have not met (``met`` is 0 then).
     """
 
     SIDE_M, MEET_M, SPEED = 60.0, 2.0, 2.0
 
     def __init__(self, robots: int, rng: random.Random) -> None:
         super().__init__(robots, rng)
-        self._met: float | None = None
         self._now = 0.0
 
     def start(self, number: int) -> State:  # noqa: ARG002
@@ -150,13 +151,13 @@ class Rendezvous(Task):
         return towards(own, x - own.x, y - own.y, self.SPEED)
 
     def watch(self, now: float, states: Sequence[State]) -> None:
-        self._now = now
-        x, y = (sum(state[axis] for state in states) / len(states) for axis in (0, 1))
-        if self._met is None and all(math.hypot(one.x - x, one.y - y) <= self.MEET_M for one in states):
-            self._met = now
+        if not self.over:
+            self._now = now
+            x, y = (sum(state[axis] for state in states) / len(states) for axis in (0, 1))
+            self.over = all(math.hypot(one.x - x, one.y - y) <= self.MEET_M for one in states)
 
     def numbers(self) -> dict[str, float | None]:
-        return {"time_to_meet_s": self._now if self._met is None else self._met, "met": float(self._met is not None)}
+        return {"time_to_meet_s": self._now, "met": float(self.over)}
 
 
 BUILT_IN = {"formation": Formation, "rendezvous": Rendezvous}
@@ -193,15 +194,18 @@ def make_task(name: str, robots: int, seed: int) -> Task:
 
 
 class TaskRobots:
-    """Robots on an open plane, moved by a task, and their odometry.
+    """Robots on an open plane, moved by a task, and their odometry. Obstacles stop nobody.
 
-    :param settings: rate and noise of the odometry, and the seed
+    :param settings: rate and noise of the odometry, the seed, and the obstacles
     :param commanded: robots that do what :meth:`follow` tells them, and nothing before
+    :ivar world: obstacles between them
     """
 
     def __init__(self, task: Task, settings: SimSettings, commanded: Collection[int] = ()) -> None:
         self._task, self._settings, self._tick = task, settings, 0
+        self.world = World(settings.size_m, settings.obstacles, np.random.default_rng([settings.seed, 0]))
         self._states = [task.start(number) for number in range(task.robots)]
+        self._log: list[list[State]] = []
         self._heard: list[dict[int, LastHeard]] = [{} for _ in self._states]
         self._commands = dict.fromkeys(commanded, (-math.inf, (0.0, 0.0)))
         self.stamp_from(settings.start_time_s)
@@ -210,9 +214,8 @@ class TaskRobots:
     def stamp_from(self, start_time_s: float) -> None:
         """Stamp odometry with this + t, s. To be called before anything is measured."""
         self._start_s = start_time_s
-        world = World(self._settings.size_m, 0, np.random.default_rng(0))
         self._sensors = [
-            Sensors(self._settings, world, number + 1, state, round(start_time_s * 1e9))
+            Sensors(self._settings, self.world, number + 1, state, round(start_time_s * 1e9))
             for number, state in enumerate(self._states)
         ]
 
@@ -228,6 +231,13 @@ class TaskRobots:
         self._task.watch(now, states)
         commands = [self._command(number, now, own) for number, own in enumerate(states)]
         self._states = [_following(own, *command) for own, command in zip(states, commands, strict=True)]
+        self._log.append(self._states)
+
+    def at(self, now: float) -> tuple[Floats, Floats]:
+        """Places in m and velocities in m/s of all robots at the last full period, each of shape (robots, 2)."""
+        self.advance(now)
+        x, y, heading, speed = np.array([state[:4] for state in self._log[int(now / TICK + 1e-9)]]).T
+        return np.stack([x, y], 1), np.stack([speed * np.cos(heading), speed * np.sin(heading)], 1)
 
     def _command(self, number: int, now: float, own: State) -> Command:
         if number not in self._commands:
@@ -262,6 +272,11 @@ class TaskRobots:
         while (at := (count + phase) / rate) < duration_s:
             yield at
             count += 1
+
+    @property
+    def over(self) -> bool:
+        """See :class:`Task`."""
+        return self._task.over
 
     def numbers(self) -> dict[str, float | None]:
         """See :meth:`Task.numbers`."""

@@ -330,6 +330,51 @@ def test_a_run_captures_every_packet_at_both_ends(tmp_path: Path, capsys: pytest
     assert capsys.readouterr().out.count("CRC ok") == packets["sent"] + packets["received"] > 0
 
 
+@pytest.fixture(scope="module")
+def relayed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The capture of four robots, of which each hears the next one alone."""
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    from gr_ros2.run.observers import RunObservers
+    from gr_ros2.run.simulated_runner import run_simulated
+
+    gains = [[-100 if abs(one - other) < 2 else None for other in range(4)] for one in range(4)]
+    scenario = load_scenario("line", ["robots=4", "duration_s=8", f"gains_db={json.dumps(gains)}"])
+    path = tmp_path_factory.mktemp("relayed") / "run.pcapng"
+    with PacketCapture(path, clock=lambda: 0.0) as writing:
+        ran = run_simulated(scenario, run_observers=RunObservers([writing], threaded=False)).result
+    assert {hops for topic in ran.topics for hops in topic.hops} == {"0", "1", "2"}
+    return path
+
+
+def test_a_capture_says_whose_messages_a_robot_sent_on_and_over_how_many_hops(
+    relayed_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["packet", "decode", "--packet-len", "96", str(relayed_run)]) == 0
+    lines, src, found = capsys.readouterr().out.splitlines(), 0, set()
+    for line in lines:
+        if sender := re.search(r", src (\d+),", line):
+            src = int(sender[1])
+        if relayed := re.search(r"relayed: robot (\d+)'s .* hop (\d+)", line):
+            found.add((src, int(relayed[1]), int(relayed[2])))
+    assert {(2, 1, 1), (3, 1, 2), (3, 4, 1), (2, 4, 2)} <= found
+    assert all(hops == abs(src - origin) for src, origin, hops in found), "on the only way there is"
+
+
+@needs_tshark
+def test_wireshark_shows_the_same_of_relayed_messages(relayed_run: Path) -> None:
+    whose = [
+        argument for name in ("src_id", "relayed.origin", "relayed.hops") for argument in ("-e", f"gr_ros2.{name}")
+    ]
+    length = "-o", "gr_ros2.packet_len:96"
+    rows = tshark(relayed_run, *length, "-Y", "gr_ros2.relayed.hops", "-T", "fields", *whose).splitlines()
+    found = set()
+    for src, origins, hops in (row.split("\t") for row in rows):
+        found |= {(int(src), *map(int, pair)) for pair in zip(origins.split(","), hops.split(","), strict=True)}
+    assert {(2, 1, 1), (3, 1, 2), (3, 4, 1), (2, 4, 2)} <= found
+    assert all(hops == abs(src - origin) for src, origin, hops in found)
+    assert not tshark(relayed_run, *length, "-Y", "_ws.expert")
+
+
 def test_a_capture_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no-such-folder"):
         PacketCapture(tmp_path / "no-such-folder" / "x.pcapng")

@@ -29,6 +29,7 @@ def trace(*messages: tuple[float, Fate]) -> Trace:
     for number, (t, fate) in enumerate(messages):
         book.t_sent.append(BEGIN + t)
         book.t_delivered.append(BEGIN + t + 0.1 if fate is Fate.DELIVERED else nan)
+        book.hops.append(0 if fate is Fate.DELIVERED else -1)
         book.size.append(100)
         book.serial.append(number)
         book.fate.append(0)

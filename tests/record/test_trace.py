@@ -64,8 +64,9 @@ def test_anyone_can_read_the_csv(tmp_path: Path) -> None:
     with open(tmp_path / "messages.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == ODOM + IMU
-    assert list(lines[0]) == ["topic", "src_id", "serial", "t_sent", "t_delivered", "size", "fate"]
-    assert (lines[0]["t_delivered"], lines[0]["fate"]) == ("", "too_large")
+    assert list(lines[0]) == ["topic", "src_id", "serial", "t_sent", "t_delivered", "hops", "size", "fate"]
+    assert (lines[0]["t_delivered"], lines[0]["hops"], lines[0]["fate"]) == ("", "", "too_large")
+    assert {line["hops"] for line in lines if line["t_delivered"]} == {"0"}
     table = pa_parquet.read_table(tmp_path / "messages.parquet").to_pylist()
     assert [line["fate"] for line in lines] == [line["fate"] for line in table]
 

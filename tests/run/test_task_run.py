@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
@@ -18,7 +21,9 @@ from gr_ros2.run.outcome import Progress
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulated_runner import run_simulated
-from gr_ros2.sim.tasks import Rendezvous
+from gr_ros2.sim.motion import State
+from gr_ros2.sim.tasks import Command, LastHeard, Rendezvous, Task
+from gr_ros2.sim.world import World
 from tests.docs.pages import blocks
 
 PROGRAMS = [block for block in blocks("python") if block.page.endswith("teams.md")]
@@ -29,6 +34,23 @@ class Near(Rendezvous):
     """Robots that need not go far."""
 
     SIDE_M = 8.0
+
+
+class Behind(Task):
+    """Robot 1 stands before a box, robot 2 drives from its side until it is behind it, out of sight."""
+
+    world = World(20.0, 1, np.random.default_rng([1, 0]))
+
+    def start(self, number: int) -> State:
+        x, y, *_ = self.world.boxes[0]
+        return State(x + (2 * number - 1) * 2, y - 6 * number, math.pi / 2, 0.0, 0.0)
+
+    def command(self, number: int, now: float, own: State, heard: Mapping[int, LastHeard]) -> Command:  # noqa: ARG002
+        self.newest = heard[1] if not number and 1 in heard else getattr(self, "newest", None)
+        return (0.0 if not number or own.y >= self.world.boxes[0, 1] else 1.0), 0.0
+
+    def numbers(self) -> dict[str, float | None]:
+        return {"last_heard_s": self.newest and self.newest.made_s, "was_at_m": self.newest and self.newest.state.y}
 
 
 class Nodes:
@@ -64,9 +86,25 @@ def test_followers_keep_their_places_by_the_link_alone() -> None:
 
 @pytest.mark.slow
 def test_robots_meet_in_slots_and_not_where_nothing_arrives() -> None:
-    assert result("rendezvous", "robots=3", "duration_s=30").task["met"] == 1
+    met = result("rendezvous", "robots=3", "duration_s=30")
+    assert met.task["met"] == 1
+    assert met.duration_s == pytest.approx(met.task["time_to_meet_s"], abs=0.1), "their meeting ends the run"
+    assert all(sum(topic.ledger.values()) == topic.sent > 0 for topic in met.topics)
     alone = result("rendezvous", "robots=3", "duration_s=30", "channel.packet_loss=1")
     assert alone.task == {"time_to_meet_s": pytest.approx(30), "met": 0}
+
+
+@pytest.mark.parametrize("walls_db", [0, 100])
+def test_a_robot_that_drives_behind_a_wall_is_heard_no_more(walls_db: float) -> None:
+    settings = "robots=2", "duration_s=10", "gains_db=null", "sim.obstacles=1", f"task={__name__}:Behind"
+    channel = f"channel={{from: positions, walls_db: {walls_db}, tx_power_dbm: 0, noise_figure_db: 6}}"
+    ran = result("formation", *settings, channel)
+    x, y, *_ = Behind.world.boxes[0]
+    here, there = np.array([x - 2, y]), np.array([[x + 2, ran.task["was_at_m"]]])
+    assert ((ran.task["last_heard_s"] or 0) > 9.5) == (not walls_db)
+    if walls_db:
+        step = np.array([0.0, 0.3])
+        assert Behind.world.crossed(here, there - step) == 0 < Behind.world.crossed(here, there + step)
 
 
 def test_the_numbers_of_a_team_are_those_of_its_pairs() -> None:
@@ -94,7 +132,8 @@ def test_the_controller_of_the_documentation_stands_in(tmp_path: Path, monkeypat
 @pytest.mark.real_time
 @pytest.mark.parametrize("controller", ["task", "ros"])
 def test_robots_meet_in_real_time_whoever_drives_them(tmp_path: Path, controller: str) -> None:
-    settings = "robots=2", "time=real", "duration_s=4", f"task={__name__}:Near", f"controller={controller}"
+    settings = ["robots=2", "time=real", "duration_s=4", f"task={__name__}:Near", f"controller={controller}"]
+    settings += ["gains_db=null", "channel={from: positions, walls_db: 6, tx_power_dbm: 0, noise_figure_db: 6}"]
     with closing(Nodes(tmp_path)) as nodes:
         ran = run_scenario(load_scenario("rendezvous", settings), on_progress=nodes if controller == "ros" else None)
     assert ran.result.task["met"] == 1

@@ -24,6 +24,11 @@ def test_a_grid_is_all_combinations(tmp_path: Path) -> None:
     assert scenario.time == "packets"
 
 
+def test_a_number_of_robots_stays_a_number(tmp_path: Path) -> None:
+    made = plan(tmp_path, scenario="formation", description=None, grid={"robots": [2, 3]}, repetitions=1)
+    assert [(cell.values["robots"], len(cell.runs[0].robots)) for cell in made.cells] == [(2, 2), (3, 3)]
+
+
 def test_a_list_is_run_at_every_point_of_the_grid_and_says_what_it_leaves_as_it_is(tmp_path: Path) -> None:
     entries = [{"phy.name": "direct"}, {"phy.name": "gfsk", "phy.options": {"sps": 4}, "phy.sample_rate": 1e5}]
     made = plan(tmp_path, list=entries, grid={"packet_len": [64, 128]})

@@ -334,5 +334,8 @@ class ReceivingSide:
                 stats.delivered[event.src_id, event.topic_id] += 1
                 stats.repaired[event.src_id, event.topic_id] += event.repaired
             elif isinstance(event, Lost):
+                if event.reason is Fate.NOT_FOR_US:  # nothing is missed here
+                    stats.dropped["not_for_us"] += 1
+                    continue
                 stats.lost[event.src_id, event.topic_id, str(event.reason)] += 1
                 stats.message_loss_est += 1

@@ -224,7 +224,7 @@ def _cells(sweep: Sweep, folder: Path, overrides: Sequence[str], where: str) -> 
         except ConfigError as error:
             raise ConfigError(f"{where}: cell {number} of {len(points)} ({label(point)}): {error}") from error
         config = dump(first)
-        cells.append(SweepCell(number, point, {key: _plain(_at(config, key)) for key in sweep.keys}, runs))
+        cells.append(SweepCell(number, point, {key: _value(config, point, key) for key in sweep.keys}, runs))
     return cells
 
 
@@ -264,5 +264,9 @@ def _at(values: Any, key: str) -> Any:
     return values
 
 
-def _plain(value: Any) -> Any:
+def _value(config: Any, point: Overrides, key: str) -> Any:
+    """The value of a key in a cell. A number that stands for a list (`robots`) stays a number."""
+    value = _at(config, key)
+    if isinstance(value, list) and isinstance(point.get(key), int):
+        return point[key]
     return value if value is None or isinstance(value, (bool, int, float, str)) else _json(value)
