@@ -26,7 +26,6 @@ from gr_ros2.record.team_numbers import jain
 from gr_ros2.relay.traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.run.simulate import EventLoop
 from gr_ros2.settings.config import ChannelConfig
-from gr_ros2.wire.mac_block import Block
 
 
 @dataclass
@@ -118,10 +117,8 @@ Received = Callable[[Reception, int, float], None]
 """Is told of a packet, who made the message in it, and when, s."""
 
 
-@lru_cache(maxsize=64)
-def _read(block: bytes) -> Block:
-    """Read once for all robots that hear it."""
-    return read_block(block)[0]
+_read = lru_cache(maxsize=64)(read_block)
+"""A block is read once for all robots that hear it."""
 
 
 class SwarmRobot:
@@ -202,7 +199,7 @@ class SwarmRobot:
     def _hear(self, reception: Reception) -> tuple[int, float]:
         data, sender = reception.data, reception.sent.sender
         end = 1 + data[0]
-        block = _read(data[1:end]) if data[0] else None
+        block = _read(data[1:end])[0] if data[0] else None
         self.access.hear(sender, block, reception.sent.start * self._ppm + self._offset)
         return self.traffic.take(sender, block, data[end:], self._local(reception.at))
 
