@@ -64,6 +64,8 @@ GROUPS = {
     "cluster": "Dask with two workers",
     "installed": "a wheel and a virtual environment",
     "platform": "GRC with all its blocks",
+    "walked": "the commands of a page, one after another",
+    "arm": "kernels compiled for ARM",
 }
 """Fixtures that are dear to make, and markers: tests that share one run one after another, in one worker."""
 

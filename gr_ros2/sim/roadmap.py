@@ -49,10 +49,10 @@ class Roadmap:
         lengths = np.hypot(*(nodes[:, None] - nodes[None]).transpose(2, 0, 1))
         distance = np.full((count, count), np.inf)
         np.fill_diagonal(distance, 0.0)
-        for one in range(count):
-            for two in range(one + 1, count):
-                if lengths[one, two] <= _NEIGHBOUR_M and self._world.clear_line(nodes[one], nodes[two], self.clearance):
-                    distance[one, two] = distance[two, one] = lengths[one, two]
+        ones, twos = np.nonzero(np.triu(lengths <= _NEIGHBOUR_M, 1))
+        clear = self._world.clear_lines(nodes[ones], nodes[twos], self.clearance)
+        ones, twos = ones[clear], twos[clear]
+        distance[ones, twos] = distance[twos, ones] = lengths[ones, twos]
         step = np.where(np.isfinite(distance), np.arange(count)[None], -1)
         for middle in range(count):
             through = distance[:, middle, None] + distance[None, middle]

@@ -93,6 +93,17 @@ class World:
         line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
         return bool(self.clearance(line).min() >= clearance)
 
+    def clear_lines(self, starts: Floats, ends: Floats, clearance: float) -> NDArray[np.bool_]:
+        """The same of many lines, by their ends of shape (n, 2); those of one length are checked at once."""
+        way = ends - starts
+        counts = np.maximum(2, np.ceil(np.hypot(*way.T) / _STEP_M).astype(int) + 1)
+        clear = np.empty(len(way), bool)
+        for count in set(counts.tolist()):
+            some = counts == count
+            lines = starts[some, None] + np.linspace(0.0, 1.0, count)[:, None] * way[some, None]
+            clear[some] = self.clearance(lines).min(axis=1) >= clearance
+        return clear
+
     def cast(self, x: float, y: float, angles: Floats, others: Floats | None = None) -> Floats:
         """Distance along each ray to the first wall, obstacle or other robot.
 

@@ -11,14 +11,17 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from io import StringIO
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.cli import main as command_line
 from tests.radio.cables import free_ports
 from tests.waiting import PATIENCE_S, wait_for
 
@@ -55,7 +58,12 @@ class Ends:
         return process
 
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([*COMMAND, *words], env=self.env, capture_output=True, text=True, check=False)
+        """What a command says and how it ends; in this process, but for another link."""
+        if words[0] == "link":
+            return subprocess.run([*COMMAND, *words], env=self.env, capture_output=True, text=True, check=False)
+        with patch.dict(os.environ, self.env), redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+            status = command_line.run(words)
+        return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())
 
     def heard(self) -> bool:
         answer = self.run("peers", "--json", "--pid", str(self.running[0].pid))

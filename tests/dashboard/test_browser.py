@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
-pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("selenium", reason="needs selenium")
 
 from selenium import webdriver
@@ -147,18 +147,29 @@ SNR, OFFSET, LOSS = range(3)
 ODOM = "/robot_1/odom"
 
 
-@pytest.fixture
-def viewer(tmp_path: Path) -> Iterator[Viewer]:
-    viewer = Viewer(tmp_path / "profile")
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
+    viewer = Viewer(tmp_path_factory.mktemp("profile"))
     yield viewer
     viewer.driver.quit()
+
+
+@pytest.fixture
+def viewer(browser: Viewer) -> Iterator[Viewer]:
+    """A new page of the browser."""
+    blank = browser.driver.current_window_handle
+    browser.driver.switch_to.new_window("tab")
+    browser.driver.get_log("browser")  # what it said of earlier pages
+    yield browser
+    browser.driver.close()
+    browser.driver.switch_to.window(blank)
 
 
 @contextmanager
 def program(out: Path, port: int = 0, *more: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A long run over OFDM with a dashboard, and where that is."""
     settings = ["ros_source.middleware=memory", "ros_sink.middleware=memory", "packet_len=220", "phy.name=ofdm"]
-    settings += ["phy.sample_rate=5e5", "channel.snr_db=30", "sim.odom_rate=15", *more]
+    settings += ["phy.sample_rate=2.5e5", "channel.snr_db=30", "sim.odom_rate=10", *more]
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--duration", "3600"]
     command += ["--out", str(out), f"--dashboard={port}", *(word for one in settings for word in ("--set", one))]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

@@ -20,7 +20,7 @@ from tests.once import once
 pytestmark = pytest.mark.slow
 
 PAGE = "docs/four-robots.md"
-SHORTER = ("--duration", "20")
+SHORTER = ("--duration", "12")
 """Instead of a minute: what the page says holds for it as well."""
 NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets", "live")
 
@@ -96,6 +96,6 @@ def test_samples_and_packets_agree_at_20_db(walked: Path) -> None:
 
 def test_the_page_says_the_figures_of_its_commands(walked: Path) -> None:
     text = (Path(__file__).parents[2] / PAGE).read_text("utf-8")
-    said = [int(number) for number in re.findall(r"(\d+) % of the messages arrive", text)]
-    measured = [round(100 * share(of(walked, name)[0])) for name in ("team", "at-once", "aloha")]
-    assert said == measured
+    said = [int(number) for number in re.findall(r"about (\d+) % of the messages arrive", text)]
+    measured = [100 * share(of(walked, name)[0]) for name in ("at-once", "aloha")]
+    assert said == pytest.approx(measured, abs=5)

@@ -39,7 +39,7 @@ def names(node: ast.Assign) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def arm(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The command that runs the kernels on ARM."""
     emulator = shutil.which(EMULATOR) or shutil.which(f"{EMULATOR}-static")
     if shutil.which(COMPILER) is None or emulator is None:
@@ -71,12 +71,12 @@ def written(path: Path, constants: ModemConstants, samples: Samples) -> None:
     path.write_bytes(b"".join([*parts, samples.tobytes()]))
 
 
-def test_it_is_compiled_for_neon(program: list[str]) -> None:
-    assert subprocess.run(program, capture_output=True, text=True, check=True).stdout.strip() == "NEON"
+def test_it_is_compiled_for_neon(arm: list[str]) -> None:
+    assert subprocess.run(arm, capture_output=True, text=True, check=True).stdout.strip() == "NEON"
 
 
 @pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
-def test_same_as_numpy(name: str, options: dict[str, Any], program: list[str], tmp_path: Path) -> None:
+def test_same_as_numpy(name: str, options: dict[str, Any], arm: list[str], tmp_path: Path) -> None:
     phy = make(name, options)
     modem: BurstModem = phy.modem
     packets, samples = bursts(phy, 1)
@@ -85,7 +85,7 @@ def test_same_as_numpy(name: str, options: dict[str, Any], program: list[str], t
     constants = modem.constants()
     assert constants is not None
     written(tmp_path / "burst", constants, stream)
-    out = subprocess.run([*program, str(tmp_path / "burst")], capture_output=True, check=True).stdout
+    out = subprocess.run([*arm, str(tmp_path / "burst")], capture_output=True, check=True).stdout
     searched, start, read = np.frombuffer(out, "<i8", 3).tolist()
     snr = float(np.frombuffer(out, "<f8", 1, 24)[0])
     told = np.frombuffer(out, "<i8", 5, 32).tolist()
