@@ -4,15 +4,16 @@ A topic is declared with a descriptor of one octet. The library keeps what follo
 type passes as opaque bytes, under whatever type name the topic carries. Most functions used are the library's
 documented C API (dds.h); those of the serdata family are not, and the layouts here are those of version 11.0.
 
-Invariants: entities are plain integers and every function may be called from any thread; calls release the GIL; every
-error of the library is a DdsError that names call and code. Calls with an entity that another thread has deleted fail,
-but never crash.
+Invariants: entities are plain integers and every function may be called from any thread; calls that may wait release
+the GIL; every error of the library is a DdsError that names call and code. Calls with an entity that another thread has
+deleted fail, but never crash.
 """
 
 from __future__ import annotations
 
 import ctypes as c
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 from gr_ros2.core.errors import MiddlewareError
@@ -148,10 +149,19 @@ class _Status(c.Structure):
 _LIBRARY = dds_library.load()
 
 
-def _function(name: str, result: Any, *arguments: Any) -> Any:
-    function = _LIBRARY[name]
+_BRIEF = c.PyDLL(_LIBRARY._name, handle=_LIBRARY._handle)
+"""The same for calls that never wait: they keep Python's lock. On a computer that is too slow a thread waits for every
+lock that it gives up, and a message takes seven calls; the library calls no Python, so nothing inside it waits for that
+lock."""
+
+
+def _function(name: str, result: Any, *arguments: Any, library: c.CDLL = _LIBRARY) -> Any:
+    function = library[name]
     function.restype, function.argtypes = result, list(arguments)
     return function
+
+
+_brief = partial(_function, library=_BRIEF)
 
 
 _i32, _u32, _i64, _ptr, _size = c.c_int32, c.c_uint32, c.c_int64, c.c_void_p, c.c_size_t
@@ -165,8 +175,8 @@ _create_reader = _function("dds_create_reader", _i32, _i32, _i32, _ptr, _ptr)
 _create_writer = _function("dds_create_writer", _i32, _i32, _i32, _ptr, _ptr)
 _create_readcondition = _function("dds_create_readcondition", _i32, _i32, _u32)  # true while samples wait
 _create_guardcondition = _function("dds_create_guardcondition", _i32, _i32)  # wakes a waiting thread
-_set_guardcondition = _function("dds_set_guardcondition", _i32, _i32, c.c_bool)
-_take_guardcondition = _function("dds_take_guardcondition", _i32, _i32, c.POINTER(c.c_bool))
+_set_guardcondition = _brief("dds_set_guardcondition", _i32, _i32, c.c_bool)
+_take_guardcondition = _brief("dds_take_guardcondition", _i32, _i32, c.POINTER(c.c_bool))
 _create_waitset = _function("dds_create_waitset", _i32, _i32)
 _waitset_attach = _function("dds_waitset_attach", _i32, _i32, _i32, c.c_ssize_t)
 _waitset_wait = _function("dds_waitset_wait", _i32, _i32, c.POINTER(c.c_ssize_t), _size, _i64)
@@ -175,13 +185,13 @@ _get_guid = _function("dds_get_guid", _i32, _i32, c.c_char_p)
 _set_status_mask = _function("dds_set_status_mask", _i32, _i32, _u32)  # which statuses wake the waitset
 _take = _function("dds_take", _i32, _i32, c.POINTER(_ptr), c.POINTER(_SampleInfo), _size, _u32)  # built-in topics
 _return_loan = _function("dds_return_loan", _i32, _i32, c.POINTER(_ptr), _i32)
-_takecdr = _function("dds_takecdr", _i32, _i32, c.POINTER(_ptr), _u32, c.POINTER(_SampleInfo), _u32)
+_takecdr = _brief("dds_takecdr", _i32, _i32, c.POINTER(_ptr), _u32, c.POINTER(_SampleInfo), _u32)
 _writecdr = _function("dds_writecdr", _i32, _i32, _ptr)  # consumes the serdata, whatever it returns
 _get_sertype = _function("dds_get_entity_sertype", _i32, _i32, c.POINTER(_ptr))  # a serdata is made for its type
-_serdata_from = _function("ddsi_serdata_from_ser_iov", _ptr, _ptr, c.c_int, _size, c.POINTER(_Buffer), _size)
-_serdata_size = _function("ddsi_serdata_size", _u32, _ptr)
-_serdata_to = _function("ddsi_serdata_to_ser", None, _ptr, _size, _size, _ptr)
-_serdata_unref = _function("ddsi_serdata_unref", None, _ptr)
+_serdata_from = _brief("ddsi_serdata_from_ser_iov", _ptr, _ptr, c.c_int, _size, c.POINTER(_Buffer), _size)
+_serdata_size = _brief("ddsi_serdata_size", _u32, _ptr)
+_serdata_to = _brief("ddsi_serdata_to_ser", None, _ptr, _size, _size, _ptr)
+_serdata_unref = _brief("ddsi_serdata_unref", None, _ptr)
 _matched_endpoints = {
     name: (
         _function(f"dds_get_matched_{name}s", _i32, _i32, c.POINTER(c.c_uint64), _size),
@@ -212,7 +222,7 @@ _get_history = _function("dds_qget_history", c.c_bool, _ptr, c.POINTER(c.c_int),
 _get_lifespan = _function("dds_qget_lifespan", c.c_bool, _ptr, c.POINTER(_i64))
 _get_deadline = _function("dds_qget_deadline", c.c_bool, _ptr, c.POINTER(_i64))
 _status = {
-    name: _function(f"dds_get_{name}_status", _i32, _i32, c.POINTER(_Status))
+    name: _brief(f"dds_get_{name}_status", _i32, _i32, c.POINTER(_Status))
     for name in (
         "publication_matched",
         "subscription_matched",

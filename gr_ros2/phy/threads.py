@@ -19,9 +19,11 @@ from typing import Any, ClassVar
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import PhyError
 
-SWITCH_INTERVAL_S = 5e-5
-"""Two busy Python threads wait a whole switch interval for each other at every hop: 10 ms per packet with Python's
-default of 5 ms (two hops), 0.2 ms with this."""
+SWITCH_INTERVAL_S = 2e-3
+"""Two busy Python threads wait a whole switch interval for each other at every hop. But who waits also wakes up once in
+each interval: with 50 µs the demo's 50 threads switched 30,000 times a second, with this 11,000 times, and a computer
+with a third of the processor time that the demo needs sends up to twice the packets (``python -m bench
+slow_computer``). In the demo ages are the same with both, and with Python's default of 5 ms."""
 
 _MAX_MESSAGES = "GR_CONF_DEFAULT_MAX_MESSAGES"
 """Environment variable of GNU Radio's setting ``max_messages``, read when a flowgraph starts."""
