@@ -26,7 +26,7 @@ from tests.packets import data_of
 from tests.waiting import wait_for
 
 GROWTH_BYTES = 2_000_000
-"""33 bytes a message: a number of each, kept in a list, is more and would show."""
+"""33 bytes a message: an event or the bytes of each, if kept, would show."""
 
 
 @pytest.mark.slow
