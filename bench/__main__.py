@@ -43,14 +43,22 @@ BENCHMARKS = {
     "compression": "bench.compression",
     "sweep": "bench.sweep",
     "mac": "bench.mac",
+    "cells": "bench.mac",
+    "hidden": "bench.mac",
+    "changes": "bench.mac",
+    "scale": "bench.mac",
+    "energy": "bench.mac",
     "shared": "bench.shared",
     "relay": "bench.relay",
     "carried": "bench.relay",
     "reliable": "bench.reliable",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
-LONG = ("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable")
-"""Many minutes: only when named."""
+LONG = (
+    *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
+    *("cells", "hidden", "changes", "scale", "energy"),
+)
+"""Many minutes, or parts of ``mac``: only when named."""
 
 
 def main(names: list[str]) -> int:

@@ -10,6 +10,7 @@ import random
 import resource
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from statistics import mean
 
 from bench.mac_rivals import Csma, Sotdma
@@ -19,6 +20,7 @@ from gr_ros2.run.load import make_phys
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import Simulation, offered_by
 from gr_ros2.run.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
+from gr_ros2.run.task_run import TaskRun
 
 AIRTIME_S = 1 / 75
 SLOT_S = AIRTIME_S + 0.001
@@ -231,6 +233,27 @@ def energy() -> list[Row]:
     return rows
 
 
+def whole() -> list[Row]:
+    """20 s of 255 robots with whole endpoints, each of which hears about eleven."""
+    near = at_random(255, 0.125, 1)
+    gains = tuple(tuple(-100.0 if other in heard else None for other in range(255)) for heard in near)
+    sizes = ["robots=255", "ros_sink.max_sources=255", "duration_s=20", "sim.odom_rate=2"]
+    scenario = load_scenario("formation", sizes)
+    scenario, registry = replace(scenario, gains_db=gains), scenario.load_registry()
+    phys = make_phys(scenario.directions(), registry)
+    run = Simulation(scenario, registry, phys, task=TaskRun(scenario, registry))
+    began = time.process_time()
+    for _ in run.events():
+        pass
+    spent = 1000 * (time.process_time() - began)
+    heard = sum(robot.endpoint.received.packets for robot in run.robots)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return [
+        Row("255 whole robots: ms of a core per packet", spent / heard, "ms", "", 0, "{:.3f}", f"{heard:,} of them"),
+        Row("255 whole robots: memory", memory, "GB", "", 0, "{:.2f}"),
+    ]
+
+
 def mac() -> list[Row]:
     """All of it."""
-    return [*cells(), *hidden(), *changes(), *scale(), *energy()]
+    return [*cells(), *hidden(), *changes(), *scale(), *energy(), *whole()]

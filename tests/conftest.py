@@ -23,8 +23,10 @@ pytest.register_assert_rewrite("tests.e2e.support", "tests.middleware.support", 
 
 # Machines are shared and noisy: no example has a deadline. CI draws the same examples each time, so that a red run
 # means a change; `make test` elsewhere draws new ones.
-settings.register_profile("here", deadline=None)
-settings.register_profile("ci", deadline=None, derandomize=True)
+# 40 of each are enough to meet a mistake of today; `--hypothesis-profile=thorough` looks for what is rare.
+settings.register_profile("here", deadline=None, max_examples=40)
+settings.register_profile("ci", deadline=None, max_examples=40, derandomize=True)
+settings.register_profile("thorough", deadline=None, max_examples=2000)
 settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 # A test that names no domain is on one of this process's own, and tests never meet robots on the network.

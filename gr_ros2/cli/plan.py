@@ -107,7 +107,8 @@ def _tell(planner: Planner, advise: bool) -> None:
         console.print("To make it fit:", soft_wrap=True)
         for cut in cuts:
             console.print(f"  {_cut(cut)}", soft_wrap=True)
-        console.print(f"As settings: {' '.join(map(_set, cuts[-1].settings))}", soft_wrap=True, markup=False)
+        settings = " ".join(f"--set {quote(setting)}" for setting in cuts[-1].settings)
+        console.print(f"As settings: {settings}", soft_wrap=True, markup=False)
     found = [advice for advice in planner.advice() if not cuts or "packet_len" not in advice.setting]
     for advice in found[:_ADVICE]:
         console.print(_line(advice), soft_wrap=True)
@@ -120,10 +121,6 @@ def _tell(planner: Planner, advise: bool) -> None:
 def _cut(cut: Cut) -> str:
     what = f"limit {cut.topic} to {cut.rate_hz:g} Hz" if cut.rate_hz else f"drop {cut.topic}"
     return f"{what}: load {cut.load:.0%}"
-
-
-def _set(setting: str) -> str:
-    return f"--set {quote(setting)}"
 
 
 def _table(forecast: Forecast) -> Table:

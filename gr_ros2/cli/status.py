@@ -61,7 +61,7 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
             str(peer["robot"]),
             "silent" if peer["silent"] else f"over {peer['over']}, hop {peer['hops']}" if peer["hops"] else "heard",
             _seconds(peer["heard_s"]),
-            _decibels(peer["snr_db"]),
+            "" if peer["snr_db"] is None else f"{peer['snr_db']:.1f} dB",
             f"{peer['lost']} ({peer['loss']:.1%} lately)",
             str(peer["topics"]),
             "yes" if peer["sealed"] else "no",
@@ -128,10 +128,6 @@ def _reasons(counts: Mapping[str, int]) -> str:
 
 def _seconds(value: float) -> str:
     return f"{value:.1f} s" if value >= 1 else f"{value * 1e3:.0f} ms"
-
-
-def _decibels(value: float | None) -> str:
-    return "" if value is None else f"{value:.1f} dB"
 
 
 def find_link(pid: int | None) -> int:

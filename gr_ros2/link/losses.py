@@ -34,14 +34,12 @@ class PduLosses:
         """
         by_chance = self._random.random() < self.packet_loss
         in_burst = self._bursts is not None and self._bursts.loses()
-        for name, lost in (("outages", self._unplugged(now)), ("burst_loss", in_burst), ("packet_loss", by_chance)):
+        unplugged = any(begin <= now < end for begin, end in self._outages)
+        for name, lost in (("outages", unplugged), ("burst_loss", in_burst), ("packet_loss", by_chance)):
             if lost:
                 self.dropped[name] += 1
                 return False
         return True
-
-    def _unplugged(self, now: float) -> bool:
-        return any(begin <= now < end for begin, end in self._outages)
 
 
 class GilbertElliott:

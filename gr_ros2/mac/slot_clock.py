@@ -5,7 +5,8 @@ clock expects by less than ``TOLERANCE`` moves it by ``GAIN`` of the difference,
 greater difference has one of three causes:
 
 - *The two robots have not met before.* Numbers are compared as on a circle: who is behind moves to the other's slots,
-  so one of two groups moves and the other stays.
+  so one of two groups moves and the other stays. Who hears nobody that agrees, and is confirmed by nobody, moves to the
+  slots of any group. It does so once: between two groups it would move to and fro, and neither would move.
 - *The other robot's clock has jumped*: it agreed before, and others still agree. It will notice, so wait for
   ``PATIENCE_S``, and compare as above if it has not.
 - *This clock has jumped*: two robots that agreed before differ by the same, and nobody has agreed since. Move.
@@ -90,7 +91,8 @@ class SlotClock:
                 self._agreed[src_id] = self._agreed_at = began
                 self._odd.pop(src_id, None)
             return slot
-        if not (free and trusted) and not self._moves(src_id, error, began, trusted=trusted):
+        free = free and trusted and not self._agreeing(began)
+        if not free and not self._moves(src_id, error, began, trusted=trusted):
             return None
         self._zero += error * self.slot_s
         self.jumps += 1

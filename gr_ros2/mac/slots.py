@@ -104,13 +104,15 @@ class Slots:
         """The slot of the newest packet."""
         self._taken: dict[int, int] = {}
         """Slot -> the robot that has announced it."""
-        self._expected: set[int] = set()
-        """Slots in which a neighbour expects to receive."""
+        self._expected = 0
+        """Bit i: a neighbour expects to receive in slot ``_swept`` + i."""
         self._conflicts: dict[int, int] = {}
         """Slot that two robots want -> the one of them that gives it up."""
         self._robots: dict[int, _HeardRobot] = {}
-        self._named_at = self._confirmed_at = self._heard_at = self._swept = _NEVER
+        self._named_at = self._confirmed_at = self._heard_at = _NEVER
         """Slots: a neighbour last named another robot; this robot; anybody was heard."""
+        self._swept = 0
+        """The slot at which what had passed was forgotten."""
         self._entered_at: int | None = None
         """The slot of the first send since the entry; None outside."""
         self._rate = _ENTRY_RATE
@@ -187,7 +189,7 @@ class Slots:
         return first + LONGEST_AHEAD
 
     def _free(self, slot: int) -> bool:
-        return slot not in self._taken and slot not in self._expected
+        return slot not in self._taken and not (slot > self._swept and self._expected >> slot - self._swept & 1)
 
     def _pick(self, base: int, now: int) -> int:
         """The slot to send in after ``base``."""
@@ -248,7 +250,7 @@ class Slots:
         around = {load + self._weight, *(robot.heard + robot.weight for robot in heard.values())}
         if self._weight == 1 and self._named_at < oldest and len(around) == 1:
             return short
-        expected = sum(1 << n for n in range(MAP_SLOTS) if slot + 1 + n in self._taken)
+        expected = sum(1 << at - slot - 1 for at in self._taken if 0 < at - slot <= MAP_SLOTS)
         wanted = min((at for at in self._conflicts if slot + 1 < at < slot + SLOT_NUMBERS), default=None)
         conflict = (0, NOBODY) if wanted is None else (wanted - slot, self._conflicts.pop(wanted))
         return short._replace(expected=expected, conflict=conflict, weight=self._weight)
@@ -261,9 +263,9 @@ class Slots:
         """Forget what has passed."""
         if now < self._swept + _SWEEP:
             return
+        self._expected >>= now - self._swept
         self._swept = now
         self._taken = {slot: owner for slot, owner in self._taken.items() if slot > now}
-        self._expected = {slot for slot in self._expected if slot > now}
         self._conflicts = {slot: loser for slot, loser in self._conflicts.items() if slot > now}
         oldest = now - 2 * self._memory()
         self._robots = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= oldest}
@@ -278,13 +280,12 @@ class Slots:
         settled = self._entered_at is not None and self._confirmed_at >= self._entered_at
         free = not settled and block.heard > 0
         slot = self.clock.heard(src_id, block.slot, began, trusted=trusted, free=free)
-        if self.clock.jumps > jumps:
-            self._start_over()
+        if slot is not None and self.clock.jumps > jumps:
+            self._start_over(slot)
         if slot is None or src_id == self.src_id:
             return
-        ahead = [slot + block.ahead[0]] if block.ahead[0] else []
-        if ahead and block.ahead[1]:
-            ahead.append(ahead[0] + block.ahead[1])
+        first, second = block.ahead
+        ahead = (slot + first, slot + first + second)[: 2 if first and second else 1 if first else 0]
         if not trusted:
             for at in ahead:
                 self._taken.setdefault(at, src_id)
@@ -296,14 +297,16 @@ class Slots:
         elif slot not in robot.ahead:
             robot.named = _NEVER
         self._heard_at = max(self._heard_at, slot)
+        self._sweep(slot)
         for at in robot.ahead:
             if at not in ahead and self._taken.get(at) == src_id:
                 del self._taken[at]
             if at not in ahead and self._conflicts.get(at) == src_id:
                 del self._conflicts[at]
-        robot.last, robot.ahead, robot.heard, robot.weight = slot, tuple(ahead), block.heard, block.weight
+        robot.last, robot.ahead, robot.heard, robot.weight = slot, ahead, block.heard, block.weight
         for at in ahead:
-            self._claim(at, src_id)
+            if self._taken.setdefault(at, src_id) != src_id or at in self._mine:
+                self._claim(at, src_id)
         self._named(block.names, slot)
         if block.expected is None:
             robot.deaf = self.src_id not in block.names
@@ -311,7 +314,7 @@ class Slots:
             self._mapped(robot, block.expected, block.conflict)
 
     def _claim(self, slot: int, src_id: int) -> None:
-        owner = self._taken.get(slot, src_id)
+        owner = self._taken[slot]
         if owner != src_id:
             self._conflicts[slot] = max(owner, src_id)
         self._taken[slot] = min(owner, src_id)
@@ -337,23 +340,22 @@ class Slots:
         at = slot + 1
         if self._sent < slot - 1 and self._announced and 0 <= self._announced[0] - at < MAP_SLOTS:
             robot.deaf = not expected >> self._announced[0] - at & 1
-        while expected:
-            skip = (expected & -expected).bit_length()
-            at += skip
-            expected >>= skip
-            if at - 1 not in self._mine:
-                self._expected.add(at - 1)
+        skip = at - self._swept
+        expected = expected << skip if skip > 0 else expected >> -skip
+        for mine in self._mine:
+            expected &= ~(1 << max(mine - self._swept, 0))
+        self._expected |= expected
         ahead, loser = conflict
         if ahead and loser == self.src_id and slot + ahead in self._mine:
             self._mine.remove(slot + ahead)
 
-    def _start_over(self) -> None:
-        """The clock has moved: what was known by slot is void."""
+    def _start_over(self, slot: int) -> None:
+        """The clock has moved to a slot: what was known by slot is void."""
         self._leave()
         self._taken.clear()
-        self._expected.clear()
+        self._expected = 0
         self._conflicts.clear()
         self._robots.clear()
         self._heard_at = self._confirmed_at = self._named_at = _NEVER
-        self._swept = _NEVER
+        self._swept = slot - 1
         self._rate = _ENTRY_RATE

@@ -229,7 +229,7 @@ class Medium(ABC):
     def __init__(self, around: Surroundings, *, shared: bool) -> None:
         self.shared, self.around = shared, around
         self.lost = Losses(around.robots)
-        self._due: list[tuple[float, int, Transmission | Reception]] = []
+        self._due: list[tuple[float, int, Transmission | list[Reception]]] = []
         self._order = count()
         self._sent: Counter[int] = Counter()
         self._recent: deque[Transmission] = deque()
@@ -255,10 +255,7 @@ class Medium(ABC):
         """What has been received by ``now`` since the call before."""
         while self._due and self._due[0][0] <= now:
             _, _, item = heapq.heappop(self._due)
-            if isinstance(item, Reception):
-                yield item
-                continue
-            yield from self.passed(self.outcome(item))
+            yield from self.passed(self.outcome(item)) if isinstance(item, Transmission) else item
 
     @abstractmethod
     def outcome(self, sent: Transmission) -> Iterable[Reception]:
@@ -295,15 +292,18 @@ class Medium(ABC):
         if self.around.passes:
             yield from received
             return
+        later: dict[float, list[Reception]] = {}
         for reception in received:
             path = self.around.path(reception.sent.sender, reception.receiver)
             if path.channel.loses_packets and not self._losses_of(path, reception).passes(reception.at):
                 continue
             if path.delay_s:
-                later = reception._replace(at=reception.at + path.delay_s)
-                heapq.heappush(self._due, (later.at, next(self._order), later))
+                at = reception.at + path.delay_s
+                later.setdefault(at, []).append(reception._replace(at=at))
             else:
                 yield reception
+        for at, receptions in later.items():
+            heapq.heappush(self._due, (at, next(self._order), receptions))
 
     def _losses_of(self, path: Path, reception: Reception) -> PduLosses:
         key = reception.sent.sender, path.receiver

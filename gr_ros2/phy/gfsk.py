@@ -18,7 +18,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.phy.burst import Frames, Samples
-from gr_ros2.phy.linear import LinearModem, LinearOptions, LinearPhy, Reals, preamble_steps, shape
+from gr_ros2.phy.linear import LinearModem, LinearOptions, LinearPhy, Reals, shape
+from gr_ros2.phy.preamble import preamble_steps
 
 _PULSE_SYMBOLS = 4
 """Length of the Gaussian frequency pulse."""
@@ -48,7 +49,7 @@ class GfskModem(LinearModem):
         self.taps: NDArray[np.float32] = wiener(main_pulse(self._pulse, options.sps), options.sps).astype(np.float32)
         self._head = np.concatenate((np.tile([1.0, -1.0], _LEAD // 2), preamble_steps()))
         self.last_bit = int(np.prod(preamble_steps()) < 0)
-        self._prepare_estimate()
+        self.head.prepare(self.preamble, self.taps)
 
     @property
     def symbol_energy(self) -> float:

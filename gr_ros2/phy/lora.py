@@ -21,8 +21,8 @@ from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
 from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
-from gr_ros2.phy.linear import parabola_peak
 from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
+from gr_ros2.phy.preamble import parabola_peak
 from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
 from gr_ros2.settings.config import OnCarrier
 from gr_ros2.settings.fields import AUTO, Auto

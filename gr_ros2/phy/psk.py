@@ -43,7 +43,7 @@ class PskModem(LinearModem):
         self.taps: NDArray[np.float32] = pulse.astype(np.float32)
         self.pulse = pulse  # whose length gives the energy of a symbol
         self.pulse = pulse * np.sqrt(self.symbol_energy)
-        self._prepare_estimate()
+        self.head.prepare(self.preamble, self.taps)
 
     @property
     def symbol_energy(self) -> float:

@@ -155,10 +155,7 @@ class FrameDecoder:
 
     def __init__(self, decoders: Decoders = GNU_RADIO) -> None:
         self._decoders = decoders
-        self._code = lru_cache(maxsize=_CODES)(self._make)
-
-    def _make(self, bits: int) -> Convolutional:
-        return Convolutional(bits, self._decoders)
+        self._code = lru_cache(maxsize=_CODES)(lambda bits: Convolutional(bits, self._decoders))
 
     def decode(self, encoding: Encoding, length: int, symbols: NDArray[np.uint8]) -> bytes | None:
         """The frame of these symbols without its FCS; None if the FCS is wrong.

@@ -62,10 +62,8 @@ class RaceChannel:
 
     def report(self) -> LinkReport:
         """The traffic on the air so far. There is no way back: all robots are on one channel."""
-        return LinkReport(self._log, LinkLog(), {**self._drops, "on_air": self._lost()})
-
-    def _lost(self) -> int:
-        return sum(losses.dropped.total() for losses in self._losses.values())
+        lost = sum(losses.dropped.total() for losses in self._losses.values())
+        return LinkReport(self._log, LinkLog(), {**self._drops, "on_air": lost})
 
     def _run(self) -> None:
         free, last = time.monotonic(), 0

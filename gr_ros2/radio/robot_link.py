@@ -279,9 +279,6 @@ class RobotLink(Flowgraph):
         open_to_all = self.config.version and not self.config.key
         return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)" if open_to_all else ""
 
-    def _lost_devices(self) -> dict[str, int]:
-        return {"interruptions": self._interruptions} if self._interruptions else {}
-
     def findings(self) -> list[str]:
         """What a person should know about this link and its surroundings: one line each, mostly none."""
         now, own = self._clock(), self.config.ros_source.src_id()
@@ -315,6 +312,7 @@ class RobotLink(Flowgraph):
         """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
         end, and :meth:`incomplete`."""
         phy, counts, front_end = self.phy, self.radio.counts(), self.front_end.counters()
+        vanished = {"interruptions": self._interruptions} if self._interruptions else {}
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
@@ -342,7 +340,7 @@ class RobotLink(Flowgraph):
             "front_end": {
                 "name": self.front_end.name,
                 "passed": front_end.passed,
-                "lost": {**front_end.lost, **self._lost_devices(), **self.radio.recorded()},
+                "lost": {**front_end.lost, **vanished, **self.radio.recorded()},
             },
             "airtime": self.radio.gate.account(),
             "incomplete": self.incomplete(),

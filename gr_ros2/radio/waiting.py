@@ -106,7 +106,8 @@ class Waiting:
         :raises MiddlewareError: when the graph cannot be asked
         """
         missing = self._source.found.unmatched()
-        line = waiting_line(missing, self._types(), self._others()) if missing else self._sent()
+        types = {name: topic.type_name for name, topic in self._source.subscriptions.subscribed.items()}
+        line = waiting_line(missing, types, self._others()) if missing else self._sent()
         if line == self._last:
             return None
         self._last = line
@@ -125,9 +126,6 @@ class Waiting:
         found = self._source.found.offered
         offered = f"; services and actions: {_listed(sorted(found))}" if found else ""
         return f"{ALL_THERE}: {_listed(topics)}{offered}"
-
-    def _types(self) -> dict[str, str]:
-        return {name: topic.type_name for name, topic in self._source.subscriptions.subscribed.items()}
 
 
 def waiting_line(missing: Sequence[str], types: dict[str, str], found: Sequence[TopicInfo]) -> str:

@@ -29,6 +29,8 @@ HEARD_S = 3.0
 """s for which a robot that was heard counts as a neighbour."""
 OWN, OTHERS = 0.7, 0.9
 """Share of the way from what a neighbour was taken to have to a message that it should have heard just now."""
+LIKELY = 0.5
+"""Messages by which all neighbours together are taken to be behind, from which on one is likely to lack the newest."""
 UNKNOWN_S = 10.0
 """By how much younger a stream's first message is taken to make a robot."""
 FIRST_PERIOD_S = 0.1
@@ -160,6 +162,10 @@ class Gains:
         """By how many s sending its newest message makes the neighbours younger, all together."""
         state = self._streams[stream]
         return self._gain(stream, state, self._neighbours(now))
+
+    def lacks(self, stream: Stream, now: float) -> bool:
+        """Whether a neighbour is likely to lack its newest message."""
+        return self.gain(stream, now) >= LIKELY * self._streams[stream].period
 
     def best(self, now: float, cost: Callable[[Stream], float] = lambda _: 1.0) -> tuple[Stream | None, float]:
         """The stream whose gain squared is largest for its cost, and its gain in s; None where nothing is gained.

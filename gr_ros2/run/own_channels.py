@@ -12,14 +12,11 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.ends import EndpointSetup, LiveEnd, make_endpoint, own_settings
-from gr_ros2.link.endpoint import Endpoint
-from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.medium.base import Surroundings
 from gr_ros2.middleware import Middleware
@@ -141,10 +138,11 @@ class OwnChannels:
                 f"gains_db: nobody hears {source.namespace}, whose channel in real time would have no receiver; set "
                 "duplex: half, or time to packets or samples"
             )
-        make = partial(_endpoint, registry, (source, sink), start, random.Random(scenario.seed))
+        rng = random.Random(scenario.seed)
+        end = LiveEnd(lambda events: make_endpoint(registry, *halves, start=start, rng=rng, observer=events))
         src_id = robot_of(source, sink)
         bare: dict[str, Any] = {"version": scenario.version, "packet_len": scenario.packet_len, "robot_id": src_id}
-        common: dict[str, Any] = {"end": LiveEnd(make), "observer": self._records.of(number, src_id)}
+        common: dict[str, Any] = {"end": end, "observer": self._records.of(number, src_id)}
         here, there = self._graphs(source, sink)
         sending = receiving = None
         if sends:
@@ -197,16 +195,6 @@ class OwnChannels:
             within=self._flowgraph,
             shared=self._hearing[first.receiver] > 1,
         )
-
-
-def _endpoint(
-    registry: Registry,
-    halves: Halves,
-    start: EndpointSetup,
-    rng: random.Random,
-    observer: Callable[[SenderEvent], None],
-) -> Endpoint:
-    return make_endpoint(registry, *halves, start=start, rng=rng, observer=observer)
 
 
 def _apart(config: SinkConfig, registry: Registry, number: int) -> SinkConfig:

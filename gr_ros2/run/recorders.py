@@ -7,13 +7,13 @@ Invariant: each recorder gets the events of all senders, and those of its own re
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from gr_ros2.core.guard import Guard
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
-from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.phy import Phy
 from gr_ros2.record.positions import position_reader
 from gr_ros2.record.recorder import Recorder
@@ -66,97 +66,6 @@ def make_team(registry: Registry, ways: Sequence[Scenario], phy: Phy) -> TeamRec
     return TeamRecord([way.ros_source.src_id() for way in ways], phy.airtime, readers)
 
 
-class Ear:
-    """Passes on what one receiver can hear: the events of some senders, and all of its own.
-
-    :param sources: source ids of those senders
-    """
-
-    def __init__(self, observer: LinkObserver, sources: Collection[int]) -> None:
-        self._observer, self._sources = observer, frozenset(sources)
-
-    def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        if src_id in self._sources:
-            self._observer.sender_event(src_id, event)
-
-    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        self._observer.receiver_event(event, now)
-
-
-class FurtherRecorders:
-    """The recorders of the further receivers. Attach it as an observer of the run, from which it takes what is sent.
-
-    :param registry, ways: see :func:`make_recorder`
-    :param ears: for each further receiver the directions that it can hear; None: each receiver of the first direction
-        hears all
-    :param names: of the receivers; None numbers them
-    """
-
-    def __init__(
-        self,
-        registry: Registry,
-        ways: Sequence[Scenario],
-        ears: Sequence[Sequence[int]] | None = None,
-        names: Sequence[str] | None = None,
-    ) -> None:
-        if ears is None:
-            ears = [range(len(ways)) for _ in ways[0].receivers]
-        self._recorders = [make_recorder(registry, [ways[number] for number in heard]) for heard in ears]
-        self._names = names or [""] * len(ears)
-        self._observers = [Observers[LinkObserver]() for _ in self._recorders]
-        self._guards = [
-            observers.add(recorder, needed=True)
-            for observers, recorder in zip(self._observers, self._recorders, strict=True)
-        ]
-
-        self._hearing: dict[int, list[Observers[LinkObserver]]] = {}
-        for observers, heard in zip(self._observers, ears, strict=True):
-            for number in heard:
-                self._hearing.setdefault(ways[number].ros_source.src_id(), []).append(observers)
-        self._offering = {way.ros_source.src_id() for way in ways}
-
-    def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        for observers in self._hearing.get(src_id, self._observers if src_id not in self._offering else ()):
-            observers.sender_event(src_id, event)
-
-    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """Ignore what the first receiver gets."""
-
-    def at(self, number: int) -> LinkObserver:
-        """What observes a further receiver.
-
-        :param number: from 1
-        """
-        return self._observers[number - 1]
-
-    def check(self) -> None:
-        """:raises GrRos2Error: if a recorder has failed, see :meth:`gr_ros2.core.guard.Guard.check`"""
-        for guard in self._guards:
-            guard.check()
-
-    def unresolved(self) -> int:
-        """See :meth:`gr_ros2.record.ledger.Ledger.unresolved`."""
-        return sum(recorder.ledger.unresolved() for recorder in self._recorders)
-
-    def finish(
-        self, duration_s: float, t_end: float, drained: bool, numbers: Callable[[Recorder], dict[str, Any]]
-    ) -> tuple[ReceiverResult, ...]:
-        """See :meth:`gr_ros2.record.recorder.Recorder.finish`.
-
-        :param numbers: of the PHY, by the recorder of a receiver
-        """
-        return tuple(
-            ReceiverResult(
-                number,
-                recorder.finish(duration_s, t_end, drained),
-                name,
-                packets=recorder.ledger.packets(),
-                phy=numbers(recorder),
-            )
-            for number, (recorder, name) in enumerate(zip(self._recorders, self._names, strict=True), 2)
-        )
-
-
 class RunRecords:
     """Who observes what of a run, and its result.
 
@@ -181,29 +90,43 @@ class RunRecords:
         self._config = dump(scenario)
         self.ways = ways = scenario.directions()
         self.run_observers = run_observers
-        heard = [ways[number] for number in ears[0]]
-        self.recorder = make_recorder(registry, heard, on_delivery)
-        called = [robot.ros_source.namespace for robot in scenario.robots] if len(ears) == len(ways) else None
-        self.further = FurtherRecorders(registry, ways, ears[1:], called and called[1:])
+        heard = [[ways[number] for number in ear] for ear in ears]
+        self.recorder = make_recorder(registry, heard[0], on_delivery)
+        self._recorders = [self.recorder, *(make_recorder(registry, others) for others in heard[1:])]
+        self._guards = [Guard("Recorder", needed=True) for _ in self._recorders]
+        self._hearing: dict[int, list[int]] = {way.ros_source.src_id(): [] for way in ways}
+        """Which recorders get what a robot sends; all that of one that offers nothing."""
+        for place, others in enumerate(heard):
+            for way in others:
+                self._hearing[way.ros_source.src_id()].append(place)
         self.team = make_team(registry, ways, phys[0])
         self._task, self._acting = task, Guard(f"task {scenario.task}", needed=True)
-        self.all = Observers[LinkObserver]()
-        """Observes the first receiver, and what everybody sends."""
-        own = self.recorder if len(ways) < 3 else Ear(self.recorder, [way.ros_source.src_id() for way in heard])
-        self._recorded = self.all.add(own, needed=True)
-        self.all.add(self.further)
-        self.all.add(run_observers)
 
-    def of(self, number: int, src_id: int) -> LinkObserver:
+    def of(self, number: int, src_id: int) -> RobotObserver:
         """What observes a robot.
 
         :param number: its place among the robots of the run
         :param src_id: -1 for none
         """
-        recorder = recorder_of(self._scenario, number)
-        receiving = self.further.at(recorder) if recorder else self.all
-        act = None if self._task is None else partial(self._acting, self._task.delivered, number)
-        return RobotObserver(self.all, receiving, self.team, src_id, act)
+        return RobotObserver(self, number, src_id, recorder_of(self._scenario, number))
+
+    def sent(self, src_id: int, event: SenderEvent) -> None:
+        """An event of a robot's sending half."""
+        for place in self._hearing.get(src_id, range(len(self._recorders))):
+            self._guards[place](self._recorders[place].sender_event, src_id, event)
+        self.run_observers.sender_event(src_id, event)
+        if self.team is not None:
+            self.team.sender_event(src_id, event)
+
+    def received(self, robot: RobotObserver, event: ReceiverEvent, now: float) -> None:
+        """An event of a robot's receiving half."""
+        self._guards[robot.place](self._recorders[robot.place].receiver_event, event, now)
+        if not robot.place:
+            self.run_observers.receiver_event(event, now)
+        if self.team is not None:
+            self.team.receiver_event(robot.src_id, event, now)
+        if self._task is not None and isinstance(event, Delivered):
+            self._acting(self._task.delivered, robot.number, event, now)
 
     def live_run(
         self,
@@ -234,13 +157,12 @@ class RunRecords:
 
     def check(self) -> None:
         """:raises GrRos2Error: if a recorder has failed, see :meth:`gr_ros2.core.guard.Guard.check`"""
-        self._recorded.check()
-        self._acting.check()
-        self.further.check()
+        for guard in (*self._guards, self._acting):
+            guard.check()
 
     def unresolved(self) -> int:
         """Messages whose result is open, at all receivers together."""
-        return self.recorder.ledger.unresolved() + self.further.unresolved()
+        return sum(recorder.ledger.unresolved() for recorder in self._recorders)
 
     def outcome(
         self,
@@ -273,7 +195,16 @@ class RunRecords:
             duration_s=played,
             config=self._config,
             topics=topics,
-            receivers=self.further.finish(played, end, drained, numbers),
+            receivers=tuple(
+                ReceiverResult(
+                    number,
+                    recorder.finish(played, end, drained),
+                    self._scenario.robots[number - 1].ros_source.namespace if self._scenario.robots else "",
+                    packets=recorder.ledger.packets(),
+                    phy=numbers(recorder),
+                )
+                for number, recorder in enumerate(self._recorders[1:], 2)
+            ),
             packets=self.recorder.ledger.packets(),
             phy=numbers(self.recorder),
             wall_s=time.monotonic() - began,
@@ -284,32 +215,22 @@ class RunRecords:
         return Outcome(result, trace, self.team)
 
 
+@dataclass(frozen=True)
 class RobotObserver:
     """Passes on what one robot sends and receives.
 
-    :param sending, receiving: observe its two halves
-    :param team: follows it, where it shares a channel
-    :param act: is called with what is delivered to it
+    :param number: its place among the robots of the run
+    :param src_id: -1 for none
+    :param place: of its recorder
     """
 
-    def __init__(
-        self,
-        sending: LinkObserver,
-        receiving: LinkObserver,
-        team: TeamRecord | None,
-        src_id: int,
-        act: Callable[[Delivered, float], None] | None,
-    ) -> None:
-        self._sending, self._receiving, self._team, self._src_id, self._act = sending, receiving, team, src_id, act
+    records: RunRecords
+    number: int
+    src_id: int
+    place: int
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        self._sending.sender_event(src_id, event)
-        if self._team is not None:
-            self._team.sender_event(src_id, event)
+        self.records.sent(src_id, event)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        self._receiving.receiver_event(event, now)
-        if self._team is not None:
-            self._team.receiver_event(self._src_id, event, now)
-        if self._act is not None and isinstance(event, Delivered):
-            self._act(event, now)
+        self.records.received(self, event, now)

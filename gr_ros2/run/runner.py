@@ -48,10 +48,6 @@ _MATCH_S = 20.0
 _CONTROLLERS_S = 60.0
 """s within which controllers have to be there. Somebody starts them by hand, once the run says on which graphs."""
 _POLL_S = 0.05
-_DRIVEN_S = 30.0
-"""s that simulated robots drive before a run begins, so that planning takes no time from the links: with a third of the
-processor time that the demo needs, its messages were published .4 to 2.5 s late, and are .1 s late
-(``python -m bench slow_computer``)."""
 
 
 class DeliveryRecorder:
@@ -197,8 +193,7 @@ class _Run:
             run_observers.run_started(self.records.live_run(self.clock, self.live.sources, self.medium.links))
             if scenario.bag_path is None:
                 fleet = self.task or Fleet(scenario.sim)
-                if isinstance(fleet, Fleet):
-                    fleet.state(1, min(scenario.duration_s, _DRIVEN_S))
+                fleet.drive_ahead(scenario.duration_s)
                 graphs = {src_id: self.live.graph_of(src_id, stack) for src_id in fleet.robot_ids}
                 self.sim = SimPublisher(fleet, graphs, scenario.duration_s, clock=self.clock)
                 stack.callback(self.sim.close)

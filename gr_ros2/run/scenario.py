@@ -369,7 +369,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
     :raises ConfigError: when there is no such scenario, or a setting is wrong
     """
     path = BUILTIN_DIR / f"{name_or_path}.yaml"
-    if not _is_builtin(str(name_or_path)):
+    if str(name_or_path) not in _builtin_names():
         path = Path(name_or_path)
         if not path.is_file():
             raise ConfigError(
@@ -389,7 +389,3 @@ def builtin_scenarios() -> Iterator[Scenario]:
 
 def _builtin_names() -> list[str]:
     return [path.stem for path in BUILTIN_DIR.glob("*.yaml")]
-
-
-def _is_builtin(name: str) -> bool:
-    return name in _builtin_names()

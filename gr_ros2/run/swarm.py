@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -116,6 +117,10 @@ Received = Callable[[Reception, int, float], None]
 """Is told of a packet, who made the message in it, and when, s."""
 
 
+_read = lru_cache(maxsize=64)(read_block)
+"""A block is read once for all robots that hear it."""
+
+
 class SwarmRobot:
     """One robot of a swarm, as the event loop sees it."""
 
@@ -158,12 +163,12 @@ class SwarmRobot:
         if self.due > min(self._until, self._end):
             self.over, self.due = True, math.inf
 
-    def step(self, now: float, medium: Medium) -> Iterator[Any]:
+    def step(self, now: float, medium: Medium) -> Iterable[Any]:
         """Send what may leave."""
-        end = self._asleep(now)
+        end = self._asleep(now) if self._frozen else None
         if end is not None:
             self.due = end
-            return
+            return ()
         late, self._late = self._late, []
         for _, reception in late:
             self._hear(reception)
@@ -178,28 +183,28 @@ class SwarmRobot:
                 medium.send(self.number, packet, start, self._config.airtime_s)
                 self.left.append((now, self.traffic.relays))
         self._plan(now)
-        yield from ()
+        return ()
 
-    def receive(self, reception: Reception) -> Iterator[Any]:
+    def receive(self, reception: Reception) -> Iterable[Any]:
         """Take a packet."""
         if self.begin <= reception.at < self._end:
-            if self._asleep(reception.at) is not None:
+            if self._frozen and self._asleep(reception.at) is not None:
                 self._late.append((reception.at, reception))
-                return
+                return ()
             self._on(reception, *self._hear(reception))
             if not self.over:
                 self._plan(reception.at)
-        yield from ()
+        return ()
 
     def _hear(self, reception: Reception) -> tuple[int, float]:
         data, sender = reception.data, reception.sent.sender
         end = 1 + data[0]
-        block = read_block(data[1:end])[0] if data[0] else None
+        block = _read(data[1:end])[0] if data[0] else None
         self.access.hear(sender, block, reception.sent.start * self._ppm + self._offset)
         return self.traffic.take(sender, block, data[end:], self._local(reception.at))
 
-    def expire(self, now: float) -> Iterator[Any]:  # noqa: ARG002
-        yield from ()
+    def expire(self, now: float) -> Iterable[Any]:  # noqa: ARG002
+        return ()
 
     def wake(self, now: float) -> None:
         """Nothing waits for what is received."""

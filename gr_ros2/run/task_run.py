@@ -88,6 +88,9 @@ class TaskRun:
         """What each robot offers, in the order of time."""
         return [self._of(number, self._duration_s) for number in range(len(self._topics))]
 
+    def drive_ahead(self, duration_s: float) -> None:
+        """Nothing: the robots act on what they hear."""
+
     def messages(self, duration_s: float, start_time_s: float | None = None) -> Iterator[_Made]:
         """All of them together, see :meth:`gr_ros2.sim.fleet.Fleet.messages`."""
         if start_time_s is not None:

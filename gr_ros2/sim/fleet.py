@@ -24,6 +24,8 @@ from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.world import Floats, World
 
 _START_GAP_M = 3.0
+_DRIVEN_S = 30.0
+"""s that robots drive ahead of a run at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +104,10 @@ class Fleet:
             for driver, log in zip(self._drivers, self._log, strict=True):
                 log.append(driver.drive([other for other in self._drivers if other is not driver]))
         return self._log[self.robot_ids.index(robot_id)][tick].after(min(TICK, max(0.0, t - tick * TICK)))
+
+    def drive_ahead(self, duration_s: float) -> None:
+        """Drive now for up to so many s of simulated time; see :class:`gr_ros2.sim.publisher.Robots`."""
+        self.state(1, min(duration_s, _DRIVEN_S))
 
     def true_pose(self, robot_id: int, t: float) -> tuple[float, float, float]:
         """x and y, m, and heading, rad (not wrapped), in the map frame."""

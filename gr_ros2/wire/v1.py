@@ -549,7 +549,8 @@ class FormatV1:
         free = header.room(packet_len)
         for entry in packet.body:
             written = len(write_body([entry], free))
-            spans.append(Span("entry" if isinstance(entry, Part) else "control", written, *_shown(entry)))
+            shown = (entry,) if isinstance(entry, Part) else ()
+            spans.append(Span("entry" if shown else "control", written, *shown))
             free -= written
         if packet.combined:
             spans.append(Span("repair", len(packet.combined)))
@@ -559,10 +560,6 @@ class FormatV1:
     def decode(self, data: bytes, packet_len: int) -> PacketV1:
         """See ``decode`` of this module."""
         return decode(data, packet_len)
-
-
-def _shown(entry: EntryV1) -> tuple[Part, ...]:
-    return (entry,) if isinstance(entry, Part) else ()
 
 
 V1 = FormatV1()

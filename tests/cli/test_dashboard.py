@@ -96,7 +96,10 @@ def test_beside_what_was_started_without(what: str, tmp_path: Path, capsys: pyte
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     config = tmp_path / "link.yaml"
     config.write_text("registry: odom\nros_source: {namespace: /robot_1}\nphy: {name: direct}\n")
-    started = {"run": ["run", "paper-direct", "--out", str(tmp_path / "out")], "link": ["link", str(config)]}[what]
+    started = {
+        "run": ["run", "paper-direct", "--no-report", "--out", str(tmp_path / "out")],
+        "link": ["link", str(config)],
+    }[what]
     command = [sys.executable, "-m", "gr_ros2.cli", *started, "--duration", "600", *MEMORY]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
         try:

@@ -30,7 +30,9 @@ def test_repetitions_end_in_means_and_one_report(tmp_path: Path, capsys: pytest.
 
 
 def test_one_repetition_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.run(["run", "paper-direct", "--repetitions", "1", *LOSSY, "--out", str(tmp_path)]) == 0
+    assert (
+        command.run(["run", "paper-direct", "--repetitions", "1", *LOSSY, "--no-report", "--out", str(tmp_path)]) == 0
+    )
     assert (tmp_path / "result.json").is_file()
     assert not (tmp_path / "repetitions.json").exists()
     out = capsys.readouterr().out
@@ -58,7 +60,7 @@ def test_progress_is_told_where_the_output_is_no_terminal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("gr_ros2.cli.run.LOG_S", 0.0)
-    words = ["run", "paper-direct", "--duration", "10", "--set", "time=packets", "--out", str(tmp_path)]
+    words = ["run", "paper-direct", "--duration", "10", "--set", "time=packets", "--no-report", "--out", str(tmp_path)]
     assert command.run(words) == 0
     told = [line for line in capsys.readouterr().out.splitlines() if " s of 10 s, " in line]
     assert told

@@ -322,7 +322,7 @@ def test_a_run_captures_every_packet_at_both_ends(tmp_path: Path, capsys: pytest
 
     path = tmp_path / "run.pcapng"
     command = ["run", "paper-direct", "--duration", "0.5", "--out", str(tmp_path / "out"), "--pcap", str(path)]
-    assert run([*command, *memory]) == 0
+    assert run([*command, "--no-report", *memory]) == 0
     packets = json.loads((tmp_path / "out" / "result.json").read_text())["packets"]
     assert (tmp_path / "out" / REGISTRY_FILE).read_bytes() == Path(load_scenario("paper-direct").registry).read_bytes()
     capsys.readouterr()

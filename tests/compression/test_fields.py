@@ -37,7 +37,7 @@ def test_every_type_comes_back(type_name: str) -> None:
 
 @pytest.mark.parametrize("mode", ["fields", "zstd", "auto"])
 @given(st.sampled_from(COMMON), st.integers(0, 1 << 32), st.sampled_from("<>"), st.integers(0, 3))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_any_message_comes_back(mode: str, type_name: str, seed: int, order: str, tail: int) -> None:
     payload, clean = Writer(random.Random(seed), order).message(type_name, tail)
     codec = codec_for(type_name, codec=mode)
@@ -48,7 +48,7 @@ def test_any_message_comes_back(mode: str, type_name: str, seed: int, order: str
 
 
 @given(st.sampled_from(COMMON), st.integers(0, 1 << 32), st.integers(0, 400), st.binary(max_size=3), st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_a_payload_that_is_no_such_message_comes_back_as_it_is(
     type_name: str, seed: int, cut: int, more: bytes, data: st.DataObject
 ) -> None:

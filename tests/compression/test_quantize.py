@@ -23,7 +23,7 @@ def poses(values: list[float], order: str) -> bytes:
 
 
 @given(st.lists(st.floats(), min_size=7, max_size=7), st.integers(0, 6), st.sampled_from("<>"))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_doubles_stay_within_half_a_step(values: list[float], decimals: int, order: str) -> None:
     step = 10.0**-decimals
     codec = codec_for(POSE, quantize=f"position={step:f} orientation.z={step:f}")
@@ -39,7 +39,7 @@ def test_doubles_stay_within_half_a_step(values: list[float], decimals: int, ord
 
 
 @given(st.lists(st.floats(width=32), min_size=1, max_size=60), st.integers(0, 4), st.sampled_from("<>"))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_ranges_stay_within_half_a_step(values: list[float], decimals: int, order: str) -> None:
     step = 10.0**-decimals
     codec = codec_for("sensor_msgs/LaserScan", quantize=f"ranges={step:f}")

@@ -118,7 +118,7 @@ def test_a_dictionary_of_a_user(tmp_path: Path) -> None:
 
 
 @given(st.sampled_from(TYPES), st.sampled_from(VECTORS["messages"]), st.integers(0, 1 << 32), st.data())
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_whatever_the_bytes_both_say_the_same(type_name: str, case: dict[str, str], seed: int, data: Any) -> None:
     rng = random.Random(seed)
     if rng.randrange(2) and type_name in STORE.fielddefs:
@@ -134,7 +134,7 @@ def test_whatever_the_bytes_both_say_the_same(type_name: str, case: dict[str, st
 
 
 @given(st.sampled_from(STRUCTURED), st.integers(0, 1 << 32), st.text("dfqQiIhHBsTR()*0123456789", max_size=40))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_structures(type_name: str, seed: int, text: str) -> None:
     """Those of real types, and any text."""
     payload, clean = Writer(random.Random(seed)).message(type_name)

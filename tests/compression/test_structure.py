@@ -47,7 +47,7 @@ def test_a_sequence_of_messages_with_one_member_is_no_sequence_of_its_member() -
 
 
 @given(st.sampled_from(TYPES), st.integers(0, 1 << 32), st.sampled_from("<>"))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_both_ends_code_alike(type_name: str, seed: int, order: str) -> None:
     known = tree(type_name)
     assert known is not None
@@ -72,7 +72,7 @@ def test_other_texts_are_refused(text: str) -> None:
 
 
 @given(st.text("dfqQiIhHBsTR()*0123456789", max_size=255), st.binary(max_size=200), st.booleans())
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_whatever_is_announced_ends_in_a_message_or_a_codec_error(text: str, coded: bytes, more: bool) -> None:
     try:
         made = read_structure(text)

@@ -171,7 +171,13 @@ def program(out: Path, port: int = 0, *more: str) -> Iterator[tuple[subprocess.P
     settings = ["ros_source.middleware=memory", "ros_sink.middleware=memory", "packet_len=220", "phy.name=ofdm"]
     settings += ["phy.sample_rate=2.5e5", "channel.snr_db=30", "sim.odom_rate=10", *more]
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--duration", "3600"]
-    command += ["--out", str(out), f"--dashboard={port}", *(word for one in settings for word in ("--set", one))]
+    command += [
+        "--no-report",
+        "--out",
+        str(out),
+        f"--dashboard={port}",
+        *(word for one in settings for word in ("--set", one)),
+    ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         assert process.stdout is not None

@@ -59,8 +59,7 @@ class Run:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("name", ["paper-direct", "paper-ofdm"])
+@pytest.mark.parametrize(("name", "number"), [("paper-direct", signal.SIGINT), ("paper-ofdm", signal.SIGTERM)])
 def test_a_run_that_is_stopped_writes_its_result(tmp_path: Path, name: str, number: signal.Signals) -> None:
     out = tmp_path / "out"
     run = Run(name, "--duration", "600", "--out", str(out), *set_options(on_free_domains()))

@@ -135,7 +135,7 @@ def test_senseless_times_are_refused(airtime: float, lead: float) -> None:
         AirtimeClock(airtime, lead)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     airtime=st.floats(0.0005, 0.5),
     lead=st.floats(0, 0.02),

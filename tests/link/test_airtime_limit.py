@@ -43,7 +43,7 @@ def most_in_a_window(sent: list[tuple[float, float]], window: float) -> float:
     return largest
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.floats(0.001, 0.5),
     st.floats(1.0, 4000.0),

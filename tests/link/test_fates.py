@@ -41,14 +41,13 @@ def test_what_a_codec_cannot_decode_ends_in_a_fate() -> None:
     assert [FATES[kind.fate].value for kind in kinds] == ["unsupported", "unknown_dictionary", "damaged"]
 
 
-@pytest.mark.parametrize("fate", Fate)
-def test_fates_are_not_written_out_where_they_are_meant(fate: Fate) -> None:
+def test_fates_are_not_written_out_where_they_are_meant() -> None:
     """``Lost``, ``Refused`` and ``Dropped`` are made with a Fate, so that none can be misspelt."""
     made = 0
     for path in (*(ROOT / "link").glob("*.py"), *(ROOT / "gr").glob("*.py"), *(ROOT / "record").glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in MADE_WITH_A_FATE:
-                assert not [arg for arg in node.args if isinstance(arg, ast.Constant) and arg.value == fate.value], path
+                assert not {arg.value for arg in node.args if isinstance(arg, ast.Constant)} & set(Fate), path
                 made += 1
     assert made
 

@@ -15,7 +15,7 @@ from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 from tests.link.engines import delivered, receiver, registry
 from tests.link.test_receiver import packet
 
-MESSAGES = 1_000
+MESSAGES = 500
 PACKET_RATE = 100.0
 
 

@@ -87,3 +87,5 @@ def test_packets_that_are_not_checked_move_nobody_who_hears_others() -> None:
 def test_who_is_followed_by_nobody_follows_a_group() -> None:
     made = clock()
     assert made.heard(1, 3, made.begin(3) + 0.4, trusted=True, free=True) is not None
+    assert made.heard(2, 4, made.begin(4) + 0.4, trusted=True, free=True) is None, "it would move to and fro"
+    assert made.jumps == 1

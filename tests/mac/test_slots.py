@@ -217,7 +217,7 @@ def test_robots_that_left_are_forgotten() -> None:
     assert block.heard == 0
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     st.lists(
         st.tuples(st.integers(0, 254), st.floats(0, 20), st.binary(min_size=12, max_size=12), st.booleans()),

@@ -214,43 +214,56 @@ def test_a_half_duplex_robot_hardly_hears_itself(driver: Path) -> None:
     assert result["blanked"] > result["packets"]["out"] * result["layout"] / 2
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"args": "driver=loopback,rate=7e5"}, r"the device runs at 700,000 samples/s, not at 2,000,000; set phy"),
-        ({"args": "driver=loopback", "antenna_tx": "UP"}, r"antenna_tx = 'UP': the device has LEFT, RIGHT"),
-        ({"args": "driver=loopback", "antenna_rx": "UP"}, r"antenna_rx = 'UP': the device has LEFT, RIGHT"),
-        (
-            {"args": "driver=loopback,tuned=99e6"},
-            r"the device is tuned to 99,000,000 Hz, not to 100,000,000; set frequency to one it has",
-        ),
-        (
-            {"args": "driver=loopback,tuned=1e8", "frequency_rx": 1.0002e8},
-            r"the device is tuned to 100,000,000 Hz, not to 100,020,000; set frequency_rx to one it has",
-        ),
-        ({"args": "driver=loopback", "gain_tx": 61}, r"gain_tx = 61 dB: the device has 0 to 60 dB"),
-        ({"args": "driver=loopback", "gain_rx": -1}, r"gain_rx = -1 dB: the device has 0 to 60 dB"),
-        (
-            {"args": "driver=loopback,most=12", "gain_tx": 13},
-            r"the device has a gain of 12 dB, not of 13; set gain_tx to one it has",
-        ),
-        (
-            {"args": "driver=loopback,most=12"},
-            r"the device has a gain of 12 dB, not of 30; set gain_rx to one it has",
-        ),
-        ({"args": "driver=loopback,breaks=rate"}, r"no such rate; is the device plugged in, and free\?"),
-    ],
-)
-def test_what_a_device_cannot_do_is_said_in_a_line(
-    driver: Path, tmp_path: Path, change: dict[str, Any], said: str
-) -> None:
-    log = tmp_path / "log"
-    front_end = {"name": "soapy", "frequency": 1e8, **change, "args": f"{change['args']},log={log}"}
-    code = f"from tests.radio.robots import *; RobotLink(config(1, {front_end!r}))"
+CANNOT: list[tuple[dict[str, Any], str]] = [
+    ({"args": "driver=loopback,rate=7e5"}, r"the device runs at 700,000 samples/s, not at 2,000,000; set phy"),
+    ({"args": "driver=loopback", "antenna_tx": "UP"}, r"antenna_tx = 'UP': the device has LEFT, RIGHT"),
+    ({"args": "driver=loopback", "antenna_rx": "UP"}, r"antenna_rx = 'UP': the device has LEFT, RIGHT"),
+    (
+        {"args": "driver=loopback,tuned=99e6"},
+        r"the device is tuned to 99,000,000 Hz, not to 100,000,000; set frequency to one it has",
+    ),
+    (
+        {"args": "driver=loopback,tuned=1e8", "frequency_rx": 1.0002e8},
+        r"the device is tuned to 100,000,000 Hz, not to 100,020,000; set frequency_rx to one it has",
+    ),
+    ({"args": "driver=loopback", "gain_tx": 61}, r"gain_tx = 61 dB: the device has 0 to 60 dB"),
+    ({"args": "driver=loopback", "gain_rx": -1}, r"gain_rx = -1 dB: the device has 0 to 60 dB"),
+    (
+        {"args": "driver=loopback,most=12", "gain_tx": 13},
+        r"the device has a gain of 12 dB, not of 13; set gain_tx to one it has",
+    ),
+    (
+        {"args": "driver=loopback,most=12"},
+        r"the device has a gain of 12 dB, not of 30; set gain_rx to one it has",
+    ),
+    ({"args": "driver=loopback,breaks=rate"}, r"no such rate; is the device plugged in, and free\?"),
+]
+"""What is asked of the device, and the end of the line that says why not."""
+
+
+def test_what_a_device_cannot_do_is_said_in_a_line(driver: Path, tmp_path: Path) -> None:
+    logs = [tmp_path / f"log-{number}" for number in range(len(CANNOT))]
+    front_ends = [
+        {"name": "soapy", "frequency": 1e8, **change, "args": f"{change['args']},log={log}"}
+        for (change, _), log in zip(CANNOT, logs, strict=True)
+    ]
+    code = (
+        "import json\n"
+        "from gr_ros2.core.errors import RadioError\n"
+        "from tests.radio.robots import *\n"
+        f"for front_end in {front_ends!r}:\n"
+        "    try:\n"
+        "        RobotLink(config(1, front_end))\n"
+        "    except RadioError as error:\n"
+        "        print(json.dumps(str(error)))\n"
+    )
     done = python(driver, code)
-    assert done.stderr.splitlines()[-1].startswith("gr_ros2.core.errors.RadioError: front_end soapy: ")
-    assert re.search(said, done.stderr.splitlines()[-1])
-    assert log.read_text().splitlines()[-1] == "tx closed"
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('"')]
+    for line, (_, said), log in zip(lines, CANNOT, logs, strict=True):
+        assert line.startswith("front_end soapy: ")
+        assert re.search(said, line)
+        assert log.read_text().splitlines()[-1] == "tx closed"
 
 
 @pytest.mark.slow

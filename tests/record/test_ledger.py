@@ -269,7 +269,7 @@ _EVENTS = st.lists(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(_EVENTS, st.booleans())
 def test_fates_add_up_whatever_happens(events: list[tuple[str, int, int, list[int]]], drained: bool) -> None:
     """Any order of events that names each serial once: every message has exactly one fate."""

@@ -41,6 +41,17 @@ def test_the_gain_is_the_time_that_a_neighbour_is_behind() -> None:
     assert gains.gain(ODOM, 1.0) == pytest.approx(0.6 * (1 - OWN))
 
 
+def test_what_was_sent_is_likely_there_until_the_neighbour_tells_that_it_is_not() -> None:
+    gains = hearing(2, 3)
+    gains.told(3, Newest(7, 0xFE, 0, 9))
+    assert gains.lacks(ODOM, 1.0)
+    gains.sent(ODOM, 1.0)
+    assert not gains.lacks(ODOM, 1.0)
+    assert gains.best(1.0)[0] == ODOM
+    gains.told(3, Newest(7, 0xFE, 0, 9))
+    assert gains.lacks(ODOM, 1.0)
+
+
 def test_the_weight_grows_with_the_messages_that_wait_to_be_relayed() -> None:
     gains = hearing(2, 3)
     for topic_id in range(1, 30):

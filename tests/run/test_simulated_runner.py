@@ -68,7 +68,10 @@ def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-ofdm-paced", *settings]
     out = tmp_path / "out"
     subprocess.run(
-        [*command, "--duration", "3", "--seed", "0", "--out", str(out)], check=True, env=os.environ, capture_output=True
+        [*command, "--duration", "3", "--seed", "0", "--no-report", "--out", str(out)],
+        check=True,
+        env=os.environ,
+        capture_output=True,
     )
     other = numbers(read_result(out))
     heard = other["counters"].pop("listener")

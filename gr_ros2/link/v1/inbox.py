@@ -1,8 +1,8 @@
 """The receiving side for one robot: it turns packets into messages.
 
-Which messages wait for an earlier one says ``order``, which for the table of topics says ``announced``, and when the
-sender is told what has arrived says ``reports``. Messages of topics without reliable publishers are delivered as they
-arrive, but never after a later message of the same topic.
+Which messages wait for an earlier one says ``order``, which for the table of topics says ``announced``, which are
+delivered says ``delivery``, and when the sender is told what has arrived says ``reports``. Messages of topics without
+reliable publishers are delivered as they arrive, but never after a later message of the same topic.
 
 Invariants: no message is delivered twice, or after a later message of its topic; every message of which a part arrived
 ends in one Delivered or Lost; memory is bounded.
@@ -10,10 +10,9 @@ ends in one Delivered or Lost; memory is bounded.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
-from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met
@@ -22,6 +21,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.announced import AnnouncedTopics
 from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
+from gr_ros2.link.v1.delivery import DeliveryRules, passed_over
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready
@@ -29,27 +29,17 @@ from gr_ros2.link.v1.peers import MAP
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
 from gr_ros2.link.v1.sent_packets import SPAN
-from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
-from gr_ros2.settings.config import NOBODY
-from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire.control import Control
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, TABLE_TOPIC, EntryV1, Part, read_body
+from gr_ros2.wire.v1 import CARRIED_TOPIC, TABLE_TOPIC, EntryV1, Part, read_body
 
 Events = list[Delivered | Lost | Announced | Met | Gone]
 
 _PACKET_COST, _EQUATION_COST = 250, 350
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
 of the list of gaps)."""
-_REACHED = 256
-"""Arrivals remembered, from which the age of a command follows."""
-_OVER = 256
-"""Messages over other robots that are remembered, because the origin's own packets may bring them too."""
 _INCOMPLETE_S = 60.0
 """s that an incomplete message waits for its next fragment."""
-MAX_AGE_S = 15.0
-"""Default of ``max_age_s``. How long ago a packet was sealed is known to the time from one hello to the echo of the
-next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
 
 
 class Bounds(NamedTuple):
@@ -102,6 +92,7 @@ class Inbox:
     :ivar reports: what the robot is told of its packets
     :ivar announced: its topics
     :ivar order: which of its messages wait for an earlier one
+    :ivar deliveries: which of them are delivered
     """
 
     def __init__(
@@ -121,11 +112,8 @@ class Inbox:
         self.src_id, self.boot = src_id, boot
         self.counts: Counter[str] = Counter()
         """Packets by result: ``packets``, ``duplicate``, ``late``, ``missing``, ``repaired``."""
-        self.marks = marks
-        self.sealed_after: Callable[[int], float] | None = None
-        """Tells the time in s after which a packet was sealed; None where this cannot be proven."""
-        self._max_age_s, self._max_ages = settings.max_age_s, settings.max_ages
-        self._room, self._own = room, settings.src_id
+        self.deliveries = DeliveryRules(settings, marks)
+        self._room = room
         self._control, self._relaying = control, relaying
         self._stats = stats
         bounds = Bounds.of(settings.max_source_bytes, room)
@@ -141,14 +129,7 @@ class Inbox:
             if settings.shares
             else Reporter(of, self.decoder, self.order, half_duplex=settings.half_duplex, airtime_share=share)
         )
-        self._commands, self._deadlines = settings.commands, settings.deadlines
-        self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
-        """Numbers that its packets have reached, and when, s."""
         self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
-        self._last: dict[int, tuple[int, int]] = {}
-        """The newest message that was delivered, by topic."""
-        self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
-        """Messages that came over other robots, by topic id and order: they may come again."""
         self._events: Events = []
         self._now = 0.0
 
@@ -249,12 +230,10 @@ class Inbox:
     def lacks(self, mark: tuple[int, int], number: int, now: float) -> bool:
         """Whether a latched message, named in a hello at a packet number, is neither here, nor a newer one of its
         topic, nor arriving."""
-        topic_id, value = mark
-        topic = self.announced.topics.get(topic_id)
-        if topic is not None and topic.dst_id not in (BROADCAST, self._own):
+        topic = self.announced.topics.get(mark[0])
+        if topic is not None and not self.deliveries.is_for_us(topic):
             return False
-        here = value in self.marks.get(topic_id, ()) or self._last.get(topic_id, (-1, -1))[0] > number
-        return not here and not self._reassembly.growing(topic_id, now - 1.0)
+        return self.deliveries.lacks(mark, number) and not self._reassembly.growing(mark[0], now - 1.0)
 
     def _settled(self) -> Events:
         """Deliver the messages that waited for what is here or given up now; everything that happened since the last
@@ -281,7 +260,7 @@ class Inbox:
         if number <= newest:
             return
         gone = number - newest - here
-        self._reached.append((number, now))
+        self.deliveries.reached(number, now)
         self.decoder.advance(number)
         if gone:
             self.counts["missing"] += gone
@@ -312,7 +291,7 @@ class Inbox:
 
     def _fragment(self, part: Part, number: int, place: int, qos: int, *, repaired: bool) -> None:
         begin = number - part.back
-        if begin < self._last.get(part.topic_id, (0, 0))[0] or begin < 0:
+        if begin < self.deliveries.newest.get(part.topic_id, (0, 0))[0] or begin < 0:
             self.counts["overtaken"] += 1
             return
         whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
@@ -338,7 +317,8 @@ class Inbox:
         if self._relaying is not None:
             self._relaying.direct(self.src_id, self.boot, ready, self._now)
         if ready.topic_id == TABLE_TOPIC:
-            self._last[TABLE_TOPIC] = max(ready.order, self._last.get(TABLE_TOPIC, ready.order))
+            newest = self.deliveries.newest
+            newest[TABLE_TOPIC] = max(ready.order, newest.get(TABLE_TOPIC, ready.order))
             self._table(ready.payload)
             return
         self._known(ready)
@@ -372,69 +352,36 @@ class Inbox:
         if ready.topic_id == TABLE_TOPIC:
             self._table(ready.payload)
         else:
-            self._over.append((ready.topic_id, ready.order))
+            self.deliveries.came_over(ready)
             self._known(ready)
         events, self._events = self._events, []
         return events
 
     def adopt(self, far: Inbox) -> None:
         """Go on from what has come of this start over other robots."""
-        self._last.update(far._last)
-        self._over.extend(far._over)
+        self.deliveries.adopt(far.deliveries)
         if not self.announced.topics:
             self.announced = far.announced
 
     def _deliver(self, ready: Ready, topic: AnnouncedTopic) -> None:
-        topic_id, order = ready.topic_id, ready.order
-        if topic.dst_id not in (BROADCAST, self._own) and self._own != NOBODY:
-            self._give_up([ready], Fate.NOT_FOR_US)
+        refusal = self.deliveries.refusal(ready, topic, self._now)
+        if refusal is not None:
+            self._give_up([ready], refusal)
             return
-        if self.sealed_after is not None and self._old(order[0], topic):
-            self._give_up([ready], Fate.NOT_FRESH)
+        new = self.deliveries.takes(ready, topic)
+        for partial in self._reassembly.overtaken(ready.topic_id, ready.order[0]):
+            self._lose(partial, passed_over(topic))
+        if not new:
+            self._stats.repeats += 1
             return
-        if topic.fresh and self._late(order[0], topic):
-            self._give_up([ready], Fate.LATE)
-            return
-        if order <= self._last.get(topic_id, (-1, -1)):
-            if (topic_id, order) in self._over:
-                self._stats.repeats += 1
-            else:
-                self._give_up([ready], _passed_over(topic))
-            return
-        self._last[topic_id] = order
-        for partial in self._reassembly.overtaken(topic_id, order[0]):
-            self._lose(partial, _passed_over(topic))
-        if topic.latched:
-            mark, marks = crc32(ready.payload), self.marks.get(topic_id, ())
-            if mark in marks:
-                self._stats.repeats += 1
-                return
-            self.marks[topic_id] = (*marks, mark)[-max(topic.depth, 1) :]
         try:
             payload = self.announced.decode(ready) if ready.coded else ready.payload
         except CodecError as error:
             self._give_up([ready], FATES[error.fate])
             return
         qos = ready.qos if ready.qos >= 0 else topic.qos
-        key = Key(self.boot, *order)
-        self._events.append(Delivered(self.src_id, topic_id, payload, qos, key, ready.repaired, ready.hops, ready.over))
-
-    def _old(self, number: int, topic: AnnouncedTopic) -> bool:
-        """Whether a message may be older than its topic allows, because nothing proves that it is not."""
-        most = self._max_ages.get(topic.name.lstrip("/"), self._max_age_s) if self._max_ages else self._max_age_s
-        if most == AUTO:
-            most = MAX_AGE_S if topic.fresh else 0.0
-        return most > 0 and self.sealed_after is not None and self._now - self.sealed_after(number) > most
-
-    def _late(self, number: int, topic: AnnouncedTopic) -> bool:
-        """Whether a command has been under way for longer than it is good for: at least since a packet arrived that
-        left after it."""
-        name = topic.name.lstrip("/")
-        deadline = self._deadlines.get(name, 0.0)
-        if name not in self._deadlines and is_command(name, topic.type_name, self._commands):
-            deadline = COMMAND_DEADLINE_S
-        since = next((at for reached, at in self._reached if reached >= number), self._now)
-        return 0 < deadline < self._now - since
+        key, way = Key(self.boot, *ready.order), (ready.repaired, ready.hops, ready.over)
+        self._events.append(Delivered(self.src_id, ready.topic_id, payload, qos, key, *way))
 
     def _table(self, payload: bytes) -> None:
         try:
@@ -457,8 +404,3 @@ class Inbox:
     def _give_up(self, messages: Iterable[Ready], reason: Fate) -> None:
         for ready in messages:
             self._events.append(Lost(self.src_id, ready.topic_id, reason, Key(self.boot, *ready.order)))
-
-
-def _passed_over(topic: AnnouncedTopic) -> Fate:
-    """The fate of a message that is not delivered because a later one of its topic was."""
-    return Fate.GIVEN_UP if topic.reliable else Fate.OVERTAKEN

@@ -345,7 +345,7 @@ class Neighbours:
         inbox, proofs = self._make_inbox(src_id, hello.boot, first, room), Proofs(before)
         met = Neighbour(src_id, hello.boot, trailer, inbox, hello, number, now, Floor(src_id, hello.boot), proofs)
         if self.proves(hello):
-            inbox.sealed_after = proofs.sealed_after
+            inbox.deliveries.sealed_after = proofs.sealed_after
         self._met_at[src_id] = now
         met.new(number, repair.repair_id)
         self._known[src_id] = met

@@ -134,7 +134,7 @@ class Order:
                 while passed <= newest and (passed in here or passed in void or not may_carry(passed, topic_id)):
                     passed += 1
                 self._passed[topic_id] = passed
-                line.sort(key=_in_order)
+                line.sort(key=lambda ready: ready.order)
                 while line and line[0].order[0] <= passed:
                     due.append(line.pop(0))
                     self.held -= len(due[-1].payload) + _COST
@@ -168,7 +168,3 @@ class Order:
         if gaps and self._recovery < 0.5:
             low = max(low, gaps[-1][2] + 1)
         return low
-
-
-def _in_order(ready: Ready) -> tuple[int, int]:
-    return ready.order

@@ -107,9 +107,10 @@ class Peers:
         self.urges: list[tuple[bool, int]] = []
         self._times: dict[int, float] = {}
         """When the newest packets left, s."""
-        self._ordered = -1
+        self._ordered: float = -1 if shared is None else inf
         """The newest packet of a message that is delivered in order. A peer cannot know what a missing packet carried:
-        this message waits for every packet before it."""
+        this message waits for every packet before it. Infinite on a shared channel, where repairs are few: there only
+        packets with a part of such a message are urgent."""
         self._served: set[int] = set()
         """Peers that lack the packet that was urgent last."""
         self._period = 0.0
@@ -122,7 +123,7 @@ class Peers:
     def sent(self, number: int, lifetimes: tuple[Lifetime, ...], now: float) -> None:
         """A source packet leaves, after ``SentPackets.newest``."""
         if any(lifetime.in_order for lifetime in lifetimes):
-            self._ordered = number
+            self._ordered = max(self._ordered, number)
         before = self._times.get(self._packets.newest)
         if before is not None:
             self._period += (now - before - self._period) / 8
@@ -208,13 +209,13 @@ class Peers:
             if record.number not in peer.lost:
                 peer.lost.add(record.number)
                 heappush(self._resend, -record.number)
-                if self._shared is None or any(lifetime.in_order for lifetime in record.lifetimes):
+                if self._ordered < inf or any(lifetime.in_order for lifetime in record.lifetimes):
                     heappush(self.urges, (all(lifetime.long for lifetime in record.lifetimes), record.number))
 
     def urgent(self, now: float) -> Sent | None:
         """The oldest packet that a report names as lost and for which later messages wait; packets of long messages go
         after others. It is returned once."""
-        while self.urges and (self._shared is not None or self.urges[0][1] <= self._ordered):
+        while self.urges and self.urges[0][1] <= self._ordered:
             _, number = heappop(self.urges)
             record = self._packets.records.get(number)
             lacking = [peer for peer in self.all.values() if number in peer.lost]

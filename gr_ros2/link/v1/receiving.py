@@ -149,7 +149,7 @@ class ReceivingSide:
         """Count a message that was delivered but not published on the ROS graph. A latched message may come again."""
         neighbour = self.neighbours.get(event.src_id)
         if neighbour is not None:
-            neighbour.inbox.marks.pop(event.topic_id, None)
+            neighbour.inbox.deliveries.marks.pop(event.topic_id, None)
         self.stats.lost[event.src_id, event.topic_id, Fate.PUBLISH_FAILED.value] += 1
         return Lost(event.src_id, event.topic_id, Fate.PUBLISH_FAILED, event.key)
 

@@ -29,6 +29,7 @@ from gr_ros2.link.v1.sent_topics import SentTopic
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.routes import STALE_S
 from gr_ros2.settings.registry import CALLS_TYPE
+from gr_ros2.wire import QOS_BULK, QOS_DEFAULT
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import NOBODY, Block
 from gr_ros2.wire.relayed import MOST_HOPS, RELAYED_LEN, Relayed, read_carried, read_relayed, write_relayed
@@ -252,7 +253,8 @@ class Relaying:
     def offer(self, topic: SentTopic, now: float) -> None:
         """Let the message that is worth most compete for the next packet, unless one is leaving.
 
-        Its value is ``g^2 / c`` as for own messages, with g the gain per neighbour.
+        Its value is ``g^2 / c`` as for own messages, with g the gain per neighbour. What every neighbour is likely to
+        have goes after all others: there is always some such message, and long ones would wait for their turns.
 
         :param topic: the queue of relayed messages
         """
@@ -265,7 +267,8 @@ class Relaying:
         message = self._newest[self._chosen]
         payload = write_relayed(message._replace(hops=min(message.hops + 1, MOST_HOPS)))
         topic.newest = now - gain / max(self.gains.neighbours(now), 1)
-        topic.queue.append(Message(-1, RELAYED_TOPIC, payload, 0, now, repeat=True))
+        qos = QOS_DEFAULT if self.gains.lacks(self._chosen, now) else QOS_BULK
+        topic.queue.append(Message(-1, RELAYED_TOPIC, payload, qos, now, repeat=True))
 
     def _cost(self, stream: Stream) -> float:
         message = self._newest.get(stream)

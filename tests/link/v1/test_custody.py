@@ -96,7 +96,7 @@ def test_what_the_next_robot_has_not_taken_goes_over_another_one() -> None:
     (taker,) = {held.taker for held in custody_of(line.robots[0])._held.values()}
     gone = taker - 1
     heard.update({gone: [], 0: [3 - gone], 3: [3 - gone]})
-    until(line, 150, lambda: whole in line.robots[-1].delivered(1))
+    until(line, 60, lambda: whole in line.robots[-1].delivered(1))
     assert line.robots[-1].delivered(1).count(whole) == 1
 
 

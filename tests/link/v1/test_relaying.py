@@ -18,7 +18,7 @@ ODOM = registry(odom=TopicOptions(queue="latest"))
 
 
 def robot(src_id: int, mode: SealMode = "none", topics: Registry = ODOM, **settings: Any) -> Robot:
-    access = Slots(src_id, SLOT_S, random.Random(src_id), period_s=0.1)
+    access = Slots(src_id, SLOT_S, random.Random(src_id), period_s=0.0)
     common = {"packet_len": 96, "hears": True, "relay": True}
     return Robot(src_id, topics, mode=mode, access=access, **{**common, **settings})
 

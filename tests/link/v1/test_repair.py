@@ -42,7 +42,7 @@ def known(found: list[tuple[int, bytes]]) -> set[int]:
     return {number for number, _ in found}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     st.integers(1, 70_000), st.integers(20, 300), st.sampled_from((0.05, 0.2, 0.4)), st.integers(1, 127), st.randoms()
 )
@@ -103,7 +103,7 @@ def test_equations_that_contradict_each_other_are_dropped() -> None:
     assert (receiver.equations, receiver.counts["implausible"]) == (0, 1)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.integers(2, 60), st.data())
 def test_packets_that_are_still_worth_it_are_recovered_without_the_others(count: int, data: st.DataObject) -> None:
     """Repairs that name all packets, fewer than these; then repairs that name some: as many as these need, and one."""

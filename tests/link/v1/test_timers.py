@@ -35,7 +35,7 @@ _SETTINGS = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     steps=_STEPS,
     options=_SETTINGS,

@@ -6,6 +6,7 @@ import pickle
 import random
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -28,6 +29,24 @@ EXACT = 1e-3
 @pytest.fixture(params=VARIANTS)
 def functions(request: pytest.FixtureRequest) -> Any:
     return variant(request.param)
+
+
+@pytest.fixture
+def every() -> list[Any]:
+    """The functions of all variants that this machine has."""
+    found = []
+    for name in VARIANTS:
+        with suppress(pytest.skip.Exception):
+            found.append(variant(name))
+    return found or pytest.skip("no variant was built")
+
+
+def all_of(
+    name: str, options: dict[str, Any], every: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> tuple[Any, list[BurstModem]]:
+    """A PHY in numpy, and its modem on each variant."""
+    phy = make(name, options)
+    return phy, [with_kernel(phy.modem, functions, monkeypatch) for functions in every]
 
 
 def both(name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, BurstModem]:
@@ -58,9 +77,9 @@ def each_burst(modem: BurstModem, samples: Samples) -> Iterator[int]:
 
 @pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
 def test_same_packets_at_the_same_sample_and_the_same_damage(
-    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+    name: str, options: dict[str, Any], every: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    phy, fast = both(name, options, functions, monkeypatch)
+    phy, modems = all_of(name, options, every, monkeypatch)
     count = 4 if name == "lora" else 10
     middle = half_point(phy.computed_pdr)
     draw = random.Random(5)
@@ -69,7 +88,7 @@ def test_same_packets_at_the_same_sample_and_the_same_damage(
         cuts = [draw.randrange(1, 5000) for _ in range(20)]
         stream = received(phy, samples)
         heard = hear(phy.modem, stream, cuts)
-        assert hear(fast, stream, cuts) == heard
+        assert [hear(fast, stream, cuts) for fast in modems] == [heard] * len(modems)
     assert [packet for _, packet in heard.packets] == packets
 
 
@@ -108,24 +127,25 @@ def test_same_soft_bits_within_rounding(
 
 @pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
 def test_same_with_packets_of_all_lengths(
-    name: str, options: dict[str, Any], functions: Any, monkeypatch: pytest.MonkeyPatch
+    name: str, options: dict[str, Any], every: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    phy, fast = both(name, options, functions, monkeypatch)
+    phy, modems = all_of(name, options, every, monkeypatch)
     draw = random.Random(8)
-    rates = list(zip(phy.modem.rates, fast.rates, strict=True))
+    rates = list(zip(phy.modem.rates, *(fast.rates for fast in modems), strict=True))
     packets = [draw.randbytes(length) for length in (1, 64, 13, 40, 2, 33, 7, 58)]
     parts = []
     for number, packet in enumerate(packets):
-        mcs, fast_mcs = rates[number % len(rates)]
+        mcs, *fast_ones = rates[number % len(rates)]
         wanted = mcs.modulate(packet)
-        assert fast_mcs.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
+        for fast_mcs in fast_ones:
+            assert fast_mcs.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
         parts += [wanted, np.zeros(phy.gap)]
     samples = delayed(np.concatenate((np.zeros(400), *parts, np.zeros(400))), 0.3)
     for snr_db in (half_point(phy.computed_pdr), 40):
         stream = received(phy, samples + noise(len(samples), snr_db, 3) * phy.burst_power() ** 0.5)
         cuts = [draw.randrange(1, 3000) for _ in range(20)]
         heard = hear(phy.modem, stream, cuts)
-        assert hear(fast, stream, cuts) == heard
+        assert [hear(fast, stream, cuts) for fast in modems] == [heard] * len(modems)
     assert [packet for _, packet in heard.packets] == packets
 
 
@@ -142,9 +162,9 @@ def test_same_samples_are_sent(
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
 @pytest.mark.parametrize(("name", "options"), NAMES, ids=str)
 def test_same_with_a_sample_that_is_no_number(
-    name: str, options: dict[str, Any], value: float, functions: Any, monkeypatch: pytest.MonkeyPatch
+    name: str, options: dict[str, Any], value: float, every: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    phy, fast = both(name, options, functions, monkeypatch)
+    phy, modems = all_of(name, options, every, monkeypatch)
     packets, samples = bursts(phy, 12)
     clean = received(phy, samples)
     length, draw = phy.airtime_samples(), random.Random(3)
@@ -155,7 +175,7 @@ def test_same_with_a_sample_that_is_no_number(
         cuts = [draw.randrange(1, 5000) for _ in range(20)]
         with np.errstate(all="ignore"):
             heard = hear(phy.modem, stream, cuts)
-            assert hear(fast, stream, cuts) == heard
+            assert [hear(fast, stream, cuts) for fast in modems] == [heard] * len(modems)
         assert [packet for _, packet in heard.packets][-3:] == packets[-3:]
 
 
