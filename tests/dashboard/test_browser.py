@@ -147,22 +147,11 @@ SNR, OFFSET, LOSS = range(3)
 ODOM = "/robot_1/odom"
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
-    viewer = Viewer(tmp_path_factory.mktemp("profile"))
+@pytest.fixture
+def viewer(tmp_path: Path) -> Iterator[Viewer]:
+    viewer = Viewer(tmp_path / "profile")
     yield viewer
     viewer.driver.quit()
-
-
-@pytest.fixture
-def viewer(browser: Viewer) -> Iterator[Viewer]:
-    """A new page of the browser."""
-    blank = browser.driver.current_window_handle
-    browser.driver.switch_to.new_window("tab")
-    browser.driver.get_log("browser")  # what it said of earlier pages
-    yield browser
-    browser.driver.close()
-    browser.driver.switch_to.window(blank)
 
 
 @contextmanager
