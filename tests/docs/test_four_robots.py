@@ -37,7 +37,7 @@ def walk(folder: Path) -> None:
     assert len(runs) == len(NAMES)
     for words in runs:
         drawn = () if words[1] == "demo" else ("--no-report",)
-        shorter = SHORTER if {"demo", "--duration"} & set(words) else ()
+        shorter = SHORTER if {"demo", "time=real"} & set(words) else ()
         ours(*words[1:], *shorter, *drawn, folder=folder)
 
 
