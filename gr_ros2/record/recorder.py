@@ -115,13 +115,13 @@ class Recorder:
         longest = total = mean = None
         sent_bytes = sum(length * count for (_, _, length, _), count in self._lengths.items())
         spent: Counter[str] = Counter()
-        senders: dict[str, Counter[str]] = {}
+        senders: dict[int, Counter[str]] = {}
         if of_packet is not None:
             longest = of_packet(None, 0)
             for (src_id, kind, length, mcs), count in self._lengths.items():
                 seconds = of_packet(length, mcs) * count
                 spent[kind] += seconds  # type: ignore[assignment]
-                senders.setdefault(str(src_id), Counter())[kind] += seconds  # type: ignore[assignment]
+                senders.setdefault(src_id, Counter())[kind] += seconds  # type: ignore[assignment]
             total = float(spent.total())
             mean = total / self._lengths.total() if total else longest
         return {
@@ -132,7 +132,7 @@ class Recorder:
             if total is not None and self._delivered_bytes
             else None,
             **({"airtime_of_kinds_s": dict(spent)} if len(spent) > 1 else {}),
-            "airtime_of_senders_s": {src_id: dict(kinds) for src_id, kinds in senders.items()},
+            "airtime_of_senders_s": {str(src_id): dict(senders[src_id]) for src_id in sorted(senders)},
             "air_span_s": self._air_to - self._air_from + (mean or 0) if self._lengths else 0.0,
             "bytes_per_message": sent_bytes / self._delivered if self._delivered else None,
         }

@@ -64,7 +64,7 @@ def talk(robots: list[Robot], begin: float, seconds: float) -> list[tuple[float,
 
 
 def state(access: Slots) -> tuple[object, ...]:
-    known = sorted(access._robots), dict(access._taken), set(access._expected), dict(access._conflicts)
+    known = sorted(access._robots), dict(access._taken), access._expected, dict(access._conflicts)
     return access.clock.begin(0), access.clock.jumps, list(access._mine), *known
 
 
