@@ -165,7 +165,7 @@ def test_a_recording_tells_places_by_its_odometry() -> None:
         (["channel={from: positions}", "phy={name: direct}"], "phy direct has no samples, so no level"),
         (
             ["channel={from: positions}", "robots=0", "time=real", "duplex=full"],
-            "time = 'real' has that for robots alone",
+            "channel.from: time = 'real' has that for robots with duplex = 'half' alone",
         ),
         (["channel={from: positions}", "sim.robots=1"], "/robot_2 is none of the 1 simulated robots, so nobody knows"),
     ],
