@@ -61,6 +61,8 @@ EASED = 0.97
 _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 64.0, 64.0
 _NEVER = -1 << 40
 _SWEEP = 64
+_SILENT = 4096
+"""Slots after which a robot that does not send forgets what has passed."""
 
 
 class _HeardRobot:
@@ -105,13 +107,14 @@ class Slots:
         self._taken: dict[int, int] = {}
         """Slot -> the robot that has announced it."""
         self._expected = 0
-        """Bit i: a neighbour expects to receive in slot ``_swept`` + i."""
+        """Bit i: a neighbour expects to receive in slot ``_base`` + i."""
+        self._base = 0
         self._conflicts: dict[int, int] = {}
         """Slot that two robots want -> the one of them that gives it up."""
         self._robots: dict[int, _HeardRobot] = {}
         self._named_at = self._confirmed_at = self._heard_at = _NEVER
         """Slots: a neighbour last named another robot; this robot; anybody was heard."""
-        self._swept = 0
+        self._swept = _NEVER
         """The slot at which what had passed was forgotten."""
         self._entered_at: int | None = None
         """The slot of the first send since the entry; None outside."""
@@ -189,7 +192,7 @@ class Slots:
         return first + LONGEST_AHEAD
 
     def _free(self, slot: int) -> bool:
-        return slot not in self._taken and not (slot > self._swept and self._expected >> slot - self._swept & 1)
+        return slot not in self._taken and not (slot > self._base and self._expected >> slot - self._base & 1)
 
     def _pick(self, base: int, now: int) -> int:
         """The slot to send in after ``base``."""
@@ -263,8 +266,8 @@ class Slots:
         """Forget what has passed."""
         if now < self._swept + _SWEEP:
             return
-        self._expected >>= now - self._swept
-        self._swept = now
+        self._expected >>= max(now - self._base, 0)
+        self._swept = self._base = now
         self._taken = {slot: owner for slot, owner in self._taken.items() if slot > now}
         self._conflicts = {slot: loser for slot, loser in self._conflicts.items() if slot > now}
         oldest = now - 2 * self._memory()
@@ -297,7 +300,8 @@ class Slots:
         elif slot not in robot.ahead:
             robot.named = _NEVER
         self._heard_at = max(self._heard_at, slot)
-        self._sweep(slot)
+        if slot > self._base + _SILENT:
+            self._sweep(slot)
         for at in robot.ahead:
             if at not in ahead and self._taken.get(at) == src_id:
                 del self._taken[at]
@@ -340,10 +344,10 @@ class Slots:
         at = slot + 1
         if self._sent < slot - 1 and self._announced and 0 <= self._announced[0] - at < MAP_SLOTS:
             robot.deaf = not expected >> self._announced[0] - at & 1
-        skip = at - self._swept
+        skip = at - self._base
         expected = expected << skip if skip > 0 else expected >> -skip
         for mine in self._mine:
-            expected &= ~(1 << max(mine - self._swept, 0))
+            expected &= ~(1 << max(mine - self._base, 0))
         self._expected |= expected
         ahead, loser = conflict
         if ahead and loser == self.src_id and slot + ahead in self._mine:
@@ -357,5 +361,5 @@ class Slots:
         self._conflicts.clear()
         self._robots.clear()
         self._heard_at = self._confirmed_at = self._named_at = _NEVER
-        self._swept = slot - 1
+        self._swept, self._base = _NEVER, slot - 1
         self._rate = _ENTRY_RATE
