@@ -77,9 +77,9 @@ class Robot:
 
     def publish(self, payload: bytes) -> None:
         """Publish a message, which the link has then taken."""
-        before = self._taken()
+        before = self.taken()
         self._chat.publish(payload)
-        wait_for(lambda: self._taken() == before + 1, "the link to take what was said")
+        wait_for(lambda: self.taken() == before + 1, "the link to take what was said")
 
     def counters(self) -> dict[str, int]:
         """Counters of the front end: what passed, and what was lost."""
@@ -92,7 +92,8 @@ class Robot:
         packets = self.link.stats()["packets"]
         return self.link.source.idle and packets["out"] == self.link.source.stats()["packets"]
 
-    def _taken(self) -> int:
+    def taken(self) -> int:
+        """Messages that the link has taken."""
         return int(self.link.source.stats()["topics"][f"/robot_{self.link.source.src_id}/chat"]["submitted"])
 
     def __enter__(self) -> Robot:

@@ -120,10 +120,11 @@ def test_who_sends_alone_is_heard_and_who_send_together_collide(medium: Start, t
 
         def collide() -> bool:
             """Both say 20 messages; whether fewer than half of them come. A busy computer may let one speak first."""
-            before = len(one.heard) + len(two.heard)
+            before, taken = len(one.heard) + len(two.heard), one.taken() + two.taken()
             for number in range(20):
                 one._chat.publish(message(number, 400))
                 two._chat.publish(message(number, 400))
+            wait_for(lambda: one.taken() + two.taken() == taken + 40, "the links to take all")
             wait_for(lambda: one.silent and two.silent, "all to be sent")
             return len(one.heard) + len(two.heard) - before < 20
 
