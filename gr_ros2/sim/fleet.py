@@ -17,7 +17,7 @@ import numpy as np
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.sim.driver import Driver
-from gr_ros2.sim.motion import RADIUS, TICK, State
+from gr_ros2.sim.motion import RADIUS, TICK, State, places_and_velocities
 from gr_ros2.sim.roadmap import Roadmap
 from gr_ros2.sim.sensors import ALL_TYPES, TYPES, Sensors
 from gr_ros2.sim.sim_settings import SimSettings
@@ -116,9 +116,7 @@ class Fleet:
 
     def at(self, now: float, robot_ids: Sequence[int]) -> tuple[Floats, Floats]:
         """Places in m and velocities in m/s of robots at simulated time ``now``, each of shape (robots, 2)."""
-        states = [self.state(robot_id, now) for robot_id in robot_ids]
-        x, y, heading, speed = np.array([state[:4] for state in states]).T
-        return np.stack([x, y], 1), np.stack([speed * np.cos(heading), speed * np.sin(heading)], 1)
+        return places_and_velocities(self.state(robot_id, now) for robot_id in robot_ids)
 
     def messages(
         self, duration_s: float, start_time_s: float | None = None, topics: Collection[str] | None = None

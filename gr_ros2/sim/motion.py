@@ -8,6 +8,7 @@ corners.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -73,6 +74,12 @@ class State(NamedTuple):
         """Speed and turn rate at the next tick when the robot brakes as hard as it can."""
         turn = math.copysign(max(0.0, abs(self.turn) - TURN_ACCELERATION * TICK), self.turn)
         return max(0.0, self.speed - ACCELERATION * TICK), turn
+
+
+def places_and_velocities(states: Iterable[State]) -> tuple[Floats, Floats]:
+    """Places in m and velocities in m/s of robots, each of shape (robots, 2)."""
+    x, y, heading, speed = np.array([state[:4] for state in states]).T
+    return np.stack([x, y], 1), np.stack([speed * np.cos(heading), speed * np.sin(heading)], 1)
 
 
 def stopping_paths(state: State, speeds: Floats, turns: Floats, longest: int) -> Floats:

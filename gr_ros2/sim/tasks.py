@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.sim.motion import MAX_TURN, TICK, State
+from gr_ros2.sim.motion import MAX_TURN, TICK, State, places_and_velocities
 from gr_ros2.sim.sensors import Sensors, read_odometry
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.world import Floats, World
@@ -236,8 +236,7 @@ class TaskRobots:
     def at(self, now: float) -> tuple[Floats, Floats]:
         """Places in m and velocities in m/s of all robots at the last full period, each of shape (robots, 2)."""
         self.advance(now)
-        x, y, heading, speed = np.array([state[:4] for state in self._log[int(now / TICK + 1e-9)]]).T
-        return np.stack([x, y], 1), np.stack([speed * np.cos(heading), speed * np.sin(heading)], 1)
+        return places_and_velocities(self._log[int(now / TICK + 1e-9)])
 
     def _command(self, number: int, now: float, own: State) -> Command:
         if number not in self._commands:
