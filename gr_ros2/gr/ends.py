@@ -254,18 +254,25 @@ class LiveEnd:
         self.lock = threading.Lock()
         self.work = threading.Condition(self.lock)
         self.sleeps_until = self.looked = -inf
+        self._foreseen = False
+        """Whether the sending thread sleeps until the next packet may leave, a credit for it provided."""
         self.observer: Callable[[SenderEvent], None] | None = None
         self.endpoint = make(self._tell)
 
-    def wake(self) -> None:
+    def wake(self, *, credited: bool = False) -> None:
         """Wake the sending thread if a packet may leave before it looks again; the caller holds the lock.
 
         A needless wake-up takes as much time as several packets.
+
+        :param credited: whether nothing has come but a credit
         """
-        if self.sleeps_until > -inf:
-            at = self.endpoint.next_departure()
-            if at is not None and (at < self.sleeps_until or self.endpoint.urged):
-                self.work.notify()
+        if self.sleeps_until == -inf or (credited and self._foreseen):
+            return
+        at = self.endpoint.next_departure()
+        if at is None:
+            self._foreseen = False
+        elif at < self.sleeps_until or self.endpoint.urged:
+            self.work.notify()
 
     def sleep(self, clock: Callable[[], float]) -> None:
         """Wait, as the sending thread, until a packet may leave; the caller holds the lock.
@@ -273,11 +280,11 @@ class LiveEnd:
         :param clock: gives the time in s
         """
         now = clock()
-        at = self.endpoint.next_departure()
-        if at is None:
-            # What is due later anyway is waited for now, so that a credit that comes before need not wake the thread.
-            later = self.endpoint.next_departure(credited=True)
-            at = later if later is not None and later > now else None
+        # What is due later is waited for also without a credit, so that one that comes before need not wake the thread.
+        at = self.endpoint.next_departure(credited=True)
+        self._foreseen = at is not None and at > now
+        if not self._foreseen:
+            at = self.endpoint.next_departure()
         self.sleeps_until = inf if at is None else at
         self.work.wait(None if at is None else max(SHORTEST_WAIT_S, at - now))
         self.looked = clock()  # before it counts as awake: `stalled_s` takes no lock

@@ -267,7 +267,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             since = None  # whoever waits for room in a queue wants nothing dropped
         with self._lock:
             self._end.pace.credit(max(0, packets), since)
-            self._live.wake()
+            self._live.wake(credited=True)
 
     def _pump(self) -> None:
         while self._running:
