@@ -12,7 +12,7 @@ from statistics import mean
 
 from bench.mac import SEEDS, Graph, at_random, joined, line, swarm, within
 from bench.rows import Row
-from gr_ros2.run.swarm import Swarm, SwarmConfig, fully_meshed
+from bench.swarm import Swarm, SwarmConfig, fully_meshed
 from gr_ros2.settings.config import TopicOptions
 from tests.link.v1.air import registry
 from tests.link.v1.test_relaying import Line, robot
