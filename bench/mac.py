@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 from bench.mac_rivals import Csma, Sotdma
 from bench.rows import Row
+from bench.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 from gr_ros2.mac import Aloha, Slots
 from gr_ros2.run.load import make_phys
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import Simulation, offered_by
-from gr_ros2.run.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 from gr_ros2.run.task_run import TaskRun
 
 AIRTIME_S = 1 / 75

@@ -13,7 +13,7 @@ from statistics import mean
 
 from bench.mac import MANY_SEEDS, Graph, Measured, at_random, joined, line, measured, within
 from bench.rows import Row
-from gr_ros2.run.swarm import SwarmConfig, fully_meshed
+from bench.swarm import SwarmConfig, fully_meshed
 from gr_ros2.settings.config import TopicOptions
 from tests.link.v1.air import registry
 from tests.link.v1.test_relaying import Line, robot
