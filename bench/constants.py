@@ -64,7 +64,7 @@ CONSTANTS = (
     ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"), ("freshness", "FIRST_AGE_S"),
     ("freshness", "LARGE"), ("packing", "SHARE"), ("packing", "MIN_FRAGMENT"), ("packing", "LONG"),
     ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
-    ("reports", "_CALM"), ("reports", "_SLOWER"), ("hold", "OVERLAP"), ("hold", "WAITED"), ("hold", "_STEADY"),
+    ("reports", "CALM"), ("reports", "_SLOWER"), ("hold", "OVERLAP"), ("hold", "WAITED"), ("hold", "_STEADY"),
 )  # fmt: skip
 RATE = (
     "GAIN_UP", "GAIN_DOWN", "SETTLED", "_HASTY", "_MOST_PATIENCE", "MOST_SILENT_S", "_GAPS", "_UNANSWERED",
