@@ -17,7 +17,7 @@ import click
 
 from gr_ros2 import __version__
 from gr_ros2.cli.ending import BAD_INPUT, FAILED, INTERRUPTED, on_signals
-from gr_ros2.core.errors import BackendMissingError, BagError, ConfigError, GrRos2Error, WireError
+from gr_ros2.core.errors import BackendMissingError, BagError, ConfigError, GrRos2Error, WireError, shortened
 from gr_ros2.core.preferences import check_home
 
 _BAD_INPUT_ERRORS = (ConfigError, WireError, BagError, BackendMissingError)
@@ -153,5 +153,5 @@ def _drop_output() -> None:
 
 
 def _fail(message: str, status: int) -> int:
-    print(f"gr-ros2: {' '.join(message.split())}", file=sys.stderr)
+    print(f"gr-ros2: {shortened(' '.join(message.split()))}", file=sys.stderr)
     return status

@@ -21,16 +21,27 @@
     ├── BackendMissingError (ImportError)  a back-end's package is not installed; names it
     └── RunError (RuntimeError)         an experiment could not be completed: exit status 1
 
-Invariant: a message names the object, its value and the remedy, in one line.
+Invariant: a message names the object, its value and the remedy, in one line. A long value is shown without its middle.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+_BEGIN, _END = 300, 900
+"""Characters of a long message that are shown: it begins with the object and its value, and ends with the remedy."""
+
+
+def shortened(message: str) -> str:
+    """A message of which at most 1,203 characters are shown; ``...`` stands for those in the middle."""
+    return message if len(message) <= _BEGIN + _END else f"{message[:_BEGIN]}...{message[-_END:]}"
+
 
 class GrRos2Error(Exception):
     """Root of the tree: catch this to catch everything gr-ros2 raises on purpose."""
+
+    def __str__(self) -> str:
+        return shortened(super().__str__())
 
 
 class ConfigError(GrRos2Error, ValueError):

@@ -14,14 +14,13 @@ from gr_ros2.phy.pdus import AirPacket, pdu_to_send
 from gr_ros2.wire import Packet
 
 _SRC, _DST, _SEQ, _QOS, _WALL = (pmt.intern(name) for name in ("src_id", "dst_id", "seq", "qos", "t_src_wall"))
-_CACHED_HEADERS = 4096
 
 
 class PduMaker:
     """Makes PDUs from packets, and caches the metadata that repeats."""
 
     def __init__(self) -> None:
-        self._metadata: dict[tuple[int, ...], Any] = {}
+        self._metadata: dict[tuple[int, int, int], Any] = {}
 
     def pdu(self, packet: Packet, on_air: AirPacket, wall: float) -> Any:
         """One packet as a PDU.
@@ -30,18 +29,17 @@ class PduMaker:
         :param on_air: its bytes, and how and when they leave
         :param wall: s since 1970, for ``t_src_wall``
         """
-        header = (packet.src_id, packet.dst_id, packet.seq, packet.qos)
+        header = (packet.src_id, packet.dst_id, packet.qos)
         metadata = self._metadata.get(header)
         if metadata is None:
-            if len(self._metadata) >= _CACHED_HEADERS:
-                self._metadata.clear()
             metadata = self._metadata[header] = _header_metadata(header)
+        metadata = pmt.dict_add(metadata, _SEQ, pmt.from_long(packet.seq))
         metadata = pmt.dict_add(metadata, _WALL, pmt.from_double(wall))
         return pdu_to_send(on_air, metadata)
 
 
-def _header_metadata(header: tuple[int, ...]) -> Any:
+def _header_metadata(header: tuple[int, int, int]) -> Any:
     metadata = pmt.make_dict()
-    for key, value in zip((_SRC, _DST, _SEQ, _QOS), header, strict=True):
+    for key, value in zip((_SRC, _DST, _QOS), header, strict=True):
         metadata = pmt.dict_add(metadata, key, pmt.from_long(value))
     return metadata

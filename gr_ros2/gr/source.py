@@ -108,8 +108,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._lock, self._work = end.lock, end.work
         self._running = False
         self._thread = BlockThread()
-        self._looked = -inf
-        """When the sending thread last began to look for packets, s."""
         self._unread = False
         self._counters: Counter[str] = Counter()
         self.composed = self.emitted = 0
@@ -151,17 +149,13 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         return not self.found.unmatched()
 
     def stalled_s(self, now: float) -> float:
-        """s for which the sending thread has been at one thing, or asleep beyond the time at which it meant to look
-        again; infinite if it has ended. Takes no lock, which that thread may hold.
+        """As :meth:`LiveEnd.stalled_s`; infinite if the sending thread has ended.
 
         :param now: s of this block's clock
         """
         if not self._running:
             return 0.0
-        if not self._thread.alive:
-            return inf
-        awake = self._live.sleeps_until == -inf
-        return max(0.0, now - (self._looked if awake else self._live.sleeps_until))
+        return self._live.stalled_s(now) if self._thread.alive else inf
 
     def due(self, now: float) -> bool:
         """Whether a packet has to be composed by now. For an end that knows when its packets leave."""
@@ -183,7 +177,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._unread = not self._port.find_readers()
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
-        self._looked = self.clock()
+        self._live.looked = self.clock()
         with self._lock:
             self._running = True
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
@@ -273,11 +267,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             since = None  # whoever waits for room in a queue wants nothing dropped
         with self._lock:
             self._end.pace.credit(max(0, packets), since)
-            self._live.wake()
+            self._live.wake(credited=True)
 
     def _pump(self) -> None:
         while self._running:
-            self._looked = self.clock()
+            self._live.looked = self.clock()
             try:
                 if packets := self._compose():
                     self._emit(packets)
@@ -299,7 +293,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 self._mcs = packets[-1].mcs
                 self._room.notify_all()
             elif self._running:
-                self._live.sleep(self.clock())
+                self._live.sleep(self.clock)
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:

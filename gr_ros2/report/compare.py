@@ -13,7 +13,7 @@ from gr_ros2.link.fates import Fate, fate_order
 from gr_ros2.record.result import TopicResult
 from gr_ros2.record.trace import Messages
 from gr_ros2.report.figures import latency_figure, ledger_figure
-from gr_ros2.report.page import Picture, Run, Section, drawing, latencies, lead_of, render_page, save, write_summary
+from gr_ros2.report.page import Drawings, Picture, Run, Section, drawing, latencies, lead_of, render_page, write_summary
 from gr_ros2.report.table import Grid, milliseconds, number
 from gr_ros2.report.timelines import Deliveries, age_figure, delivery_figure
 
@@ -121,7 +121,7 @@ def write_comparison(
         )
 
 
-def _draw(runs: Sequence[Run], out: Path) -> list[Picture]:
+def _draw(runs: Sequence[Run], out: Drawings) -> list[Picture]:
     messages = {run.label: run.messages() for run in runs}
     panels: dict[str, dict[str, Messages]] = {}
     for label, topics in messages.items():
@@ -137,12 +137,11 @@ def _draw(runs: Sequence[Run], out: Path) -> list[Picture]:
     }
     deliveries = {label: Deliveries.of(topics) for label, topics in messages.items()}
     return [
-        save(latency_figure(latencies(runs)), out, "latency", "End-to-end latency"),
-        save(ledger_figure(ledgers), out, "ledger", "Where every sent message went; in brackets how many were sent"),
-        save(delivery_figure(deliveries, duration), out, "delivery", "PDR and goodput over time, all topics together"),
-        save(
+        out.save(latency_figure(latencies(runs)), "latency", "End-to-end latency"),
+        out.save(ledger_figure(ledgers), "ledger", "Where every sent message went; in brackets how many were sent"),
+        out.save(delivery_figure(deliveries, duration), "delivery", "PDR and goodput over time, all topics together"),
+        out.save(
             age_figure(panels, {run.label: run.trace.t_end for run in runs}),
-            out,
             "age",
             "Age of the newest message delivered, per topic",
         ),

@@ -158,23 +158,27 @@ def air_figure(uses: Sequence[AirUse]) -> Figure:
     return figure
 
 
-def save_figure(figure: Figure, directory: str | Path, name: str) -> list[Path]:
-    """Write NAME.png and NAME.svg.
+def save_figure(figure: Figure, directory: str | Path, name: str, largest_svg: int = 0) -> list[Path]:
+    """Write NAME.svg, and NAME.png beside it.
 
+    :param largest_svg: bytes up to which an SVG is enough, and no PNG is written; 0 writes both always
+    :return: the files written, the PNG first
     :raises ConfigError: when they cannot be written
     """
-    paths = [Path(directory) / f"{name}.png", Path(directory) / f"{name}.svg"]
+    png, svg = Path(directory) / f"{name}.png", Path(directory) / f"{name}.svg"
     try:
         Path(directory).mkdir(parents=True, exist_ok=True)
-        canvas = FigureCanvasAgg(figure)
+        FigureCanvasAgg(figure)
         figure.set_dpi(_DPI)
         # The layout is computed once, here. With a layout engine, matplotlib draws every file twice.
         layout = figure.get_layout_engine()
         if layout is not None:
             layout.execute(figure)
             figure.set_layout_engine(None)
-        canvas.print_figure(paths[0], dpi=_DPI)
-        FigureCanvasSVG(figure).print_figure(paths[1], metadata={"Date": None})
+        FigureCanvasSVG(figure).print_figure(svg, metadata={"Date": None})
+        if svg.stat().st_size <= largest_svg:
+            return [svg]
+        FigureCanvasAgg(figure).print_figure(png, dpi=_DPI)
     except OSError as error:
         raise ConfigError(f"{directory}: cannot be written ({error.strerror or error})") from error
-    return paths
+    return [png, svg]

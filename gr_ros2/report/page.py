@@ -74,18 +74,39 @@ class Run:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure that was written."""
+    """A figure that was written.
+
+    :param files: one, or a PNG and an SVG
+    """
 
     caption: str
-    png: Path
-    svg: Path
+    files: Sequence[Path]
     wide: bool = False
 
     def data_uri(self) -> str:
         """The picture itself as a data URI, for embedding in HTML."""
-        svg = self.svg.stat().st_size <= _LARGEST_SVG
-        kind, path = ("svg+xml", self.svg) if svg else ("png", self.png)
+        path = next((file for file in reversed(self.files) if file.stat().st_size <= _LARGEST_SVG), self.files[0])
+        kind = "svg+xml" if path.suffix == ".svg" else "png"
         return f"data:image/{kind};base64,{b64encode(path.read_bytes()).decode('ascii')}"
+
+
+@dataclass(frozen=True)
+class Drawings:
+    """Where the figures of a page are written.
+
+    :param kept: write each as PNG and SVG; otherwise only the one that the page embeds
+    """
+
+    folder: Path
+    kept: bool = True
+
+    def save(self, figure: Figure, name: str, caption: str, wide: bool = False) -> Picture:
+        """Write a figure.
+
+        :raises ConfigError: when it cannot be written
+        """
+        files = save_figure(figure, self.folder, name, largest_svg=0 if self.kept else _LARGEST_SVG)
+        return Picture(caption, files, wide)
 
 
 @dataclass(frozen=True)
@@ -135,10 +156,10 @@ def write_report(runs: Sequence[Run], out: Path, *, pictures: bool = False) -> l
         return _write_report(runs, out, drawn, several or pictures)
 
 
-def _write_report(runs: Sequence[Run], out: Path, drawn: Path, tables: bool) -> list[Path]:
+def _write_report(runs: Sequence[Run], out: Path, drawn: Drawings, tables: bool) -> list[Path]:
     several = len(runs) > 1
     results = [replace(run.result, scenario=run.label) for run in runs]
-    joint = [save(latency_figure(latencies(runs)), drawn, "latency", _LATENCY)] if several else []
+    joint = [drawn.save(latency_figure(latencies(runs)), "latency", _LATENCY)] if several else []
     papers = [paper_grid(results)] if paper_results([run.result for run in runs]) else []
     sections = [Section(grids=[*papers, summary_grid(results)], pictures=joint)]
     sections += [_run_section(run, drawn, f"{stem(run.label)}_" if several else "", several) for run in runs]
@@ -148,16 +169,16 @@ def _write_report(runs: Sequence[Run], out: Path, drawn: Path, tables: bool) -> 
 
 
 @contextmanager
-def drawing(out: Path, pictures: bool) -> Iterator[Path]:
-    """The folder for the figures of a page: the page's own, or one that is removed when the page is written.
+def drawing(out: Path, pictures: bool) -> Iterator[Drawings]:
+    """The figures of a page: in the page's own folder, or in one that is removed when the page is written.
 
     :param pictures: whether the figures stay
     """
     if pictures:
-        yield out
+        yield Drawings(out)
         return
     with TemporaryDirectory(prefix="gr-ros2-") as folder:
-        yield Path(folder)
+        yield Drawings(Path(folder), kept=False)
 
 
 def render_page(path: Path, title: str, lead: str, sections: Sequence[Section], tables: Sequence[Path]) -> list[Path]:
@@ -178,17 +199,8 @@ def render_page(path: Path, title: str, lead: str, sections: Sequence[Section], 
         files=f"Beside it: {', '.join(table.name for table in tables)} with every number." if tables else "",
     )
     write_whole(path, text, write_text)
-    pictures = [file for section in sections for picture in section.pictures for file in (picture.png, picture.svg)]
+    pictures = [file for section in sections for picture in section.pictures for file in picture.files]
     return [path, *tables, *(file for file in pictures if file.parent == path.parent)]
-
-
-def save(figure: Figure, out: Path, name: str, caption: str, wide: bool = False) -> Picture:
-    """Write a figure as PNG and SVG.
-
-    :raises ConfigError: when it cannot be written
-    """
-    png, svg = save_figure(figure, out, name)
-    return Picture(caption, png, svg, wide)
 
 
 def latencies(runs: Sequence[Run]) -> dict[str, Sequence[float]]:
@@ -226,7 +238,7 @@ _GRIDS: tuple[Callable[[Result], Grid | None], ...] = (team_grid, hops_grid, led
 _LATENCY = "End-to-end latency: share of the delivered messages that took at most so long"
 
 
-def _run_section(run: Run, out: Path, prefix: str, several: bool) -> Section:
+def _run_section(run: Run, out: Drawings, prefix: str, several: bool) -> Section:
     result = run.result
     settings = {
         "All settings": yaml.safe_dump(result.config, sort_keys=False, allow_unicode=True),
@@ -244,7 +256,7 @@ def _run_section(run: Run, out: Path, prefix: str, several: bool) -> Section:
     )
 
 
-def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
+def _draw(run: Run, out: Drawings, prefix: str) -> list[Picture]:
     result, trace = run.result, run.trace
     topics = run.messages()
     packets = trace.packets()
@@ -253,25 +265,23 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
         figure = path_figure(path.sent, path.received, path.topic, path.published_as)
         stem = "path" if not place else f"path{path.topic.replace('/', '_')}"
         caption = f"The path of {path.topic}, sent and received"
-        pictures.append(save(figure, out, prefix + stem, caption))
+        pictures.append(out.save(figure, prefix + stem, caption))
     if (world := map_of(result)) is not None:
         caption = "SNR over the world for a receiver that stands still; white: obstacles; lines: where the robots drove"
-        pictures.append(save(world, out, f"{prefix}snr-map", caption))
+        pictures.append(out.save(world, f"{prefix}snr-map", caption))
     if (team := read_team(run.directory)) is not None:
         pictures += _draw_team(team, out, prefix)
-    pictures.append(save(latency_figure(latencies([run])), out, f"{prefix}latency", _LATENCY))
+    pictures.append(out.save(latency_figure(latencies([run])), f"{prefix}latency", _LATENCY))
     pictures.append(
-        save(
+        out.save(
             delivery_figure({m.topic: Deliveries.of([m]) for m in topics}, result.duration_s),
-            out,
             f"{prefix}delivery",
             "Share delivered of the messages submitted in an interval, and bytes delivered in it",
         )
     )
     pictures.append(
-        save(
+        out.save(
             age_figure({m.topic: {run.label: m} for m in topics}, {run.label: trace.t_end}),
-            out,
             f"{prefix}age",
             "Age of what the receiving robot knows: now minus the submission of the newest message delivered",
         )
@@ -279,28 +289,25 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
     airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
     if airtime and result.config.get("time") != "unthrottled":
         pictures.append(
-            save(
+            out.save(
                 airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s),
-                out,
                 f"{prefix}airtime",
                 "Airtime of the packets that left the source and of those that arrived, without repairs and reports",
             )
         )
     pictures.append(
-        save(
+        out.save(
             ledger_figure({topic.topic: topic.ledger for topic in result.topics}),
-            out,
             f"{prefix}ledger",
             "The loss ledger: every sent message has exactly one fate; in brackets how many were sent",
         )
     )
     if uses := air_uses(result):
         caption = "What the packets sent were for, as shares of their airtime"
-        pictures.append(save(air_figure(uses), out, f"{prefix}air", caption))
+        pictures.append(out.save(air_figure(uses), f"{prefix}air", caption))
     pictures.append(
-        save(
+        out.save(
             packets_figure(packets, [m.topic for m in topics]),
-            out,
             f"{prefix}packets",
             "The first packets with new messages: which topics' entries each carries (every other message lighter), "
             "when it left, and when or whether it arrived",
@@ -310,7 +317,7 @@ def _draw(run: Run, out: Path, prefix: str) -> list[Picture]:
     return pictures
 
 
-def _draw_team(team: Team, out: Path, prefix: str) -> list[Picture]:
+def _draw_team(team: Team, out: Drawings, prefix: str) -> list[Picture]:
     """What robots on one channel saw."""
     drawn = {
         "slots": (
@@ -320,7 +327,7 @@ def _draw_team(team: Team, out: Path, prefix: str) -> list[Picture]:
         "hearing": (hearing_figure(team), "SNR with which each robot hears the others"),
         "beliefs": (belief_figure(team), "Where each robot drove, and where the others believed it to be"),
     }
-    return [save(figure, out, f"{prefix}{name}", caption, name == "slots") for name, (figure, caption) in drawn.items()]
+    return [out.save(figure, f"{prefix}{name}", caption, name == "slots") for name, (figure, caption) in drawn.items()]
 
 
 def write_summary(runs: Sequence[Run], out: Path) -> list[Path]:

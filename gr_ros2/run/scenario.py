@@ -173,14 +173,14 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             if any(getattr(channel, name) != getattr(self.channel, name) for channel in (*others, *self.receivers)):
                 key = f"channel.{name.removesuffix('_')}"
                 raise ValueError(f"{key}: one world has one; give it in channel alone, not under back or receivers")
-        if not self.channel.from_positions:
+        placed, gains = self.channel.from_positions, self.gains_db is not None
+        if (placed or gains) and not PHY.load(self.phy.name).has_samples:
+            key = "channel.from = 'positions'" if placed else "gains_db"
+            raise ValueError(f"{key}: phy {self.phy.name} has no samples, so no level; choose another")
+        if not placed:
             return
-        if self.gains_db is not None:
+        if gains:
             raise ValueError("gains_db: levels follow from positions; leave it out, or set channel.from: settings")
-        if not PHY.load(self.phy.name).has_samples:
-            raise ValueError(
-                f"channel.from = 'positions': phy {self.phy.name} has no samples, so no level; choose another"
-            )
         if self.channel.walls_db and self.bag_path is not None:
             raise ValueError("channel.walls_db: a recording has no world to count walls in; leave it out")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -90,6 +91,23 @@ def test_errors_end_in_a_status(
     assert command.run(["fails"]) == status
     lines = capsys.readouterr().err.splitlines()
     assert ["gr-ros2: " in line for line in lines if line] == [True] * (status != 0)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("--set ros_source.robot_id={}", "'x...x': must be a whole number (the robot's own id"),
+        ("--set {}", "gr-ros2: --set x...x: write key=value"),
+        ("--set ros_source.{}=1", "gr-ros2: demo: unknown key ros_source.x...x; known are packet_len"),
+        ("--set registry={}", "gr-ros2: x...x: File name too long"),
+        ("--{}", "x...x; see gr-ros2 run --help"),
+    ],
+)
+def test_a_long_value_is_shown_without_its_middle(words: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.run(["run", "demo", *words.format("x" * 20_000).split()]) != 0
+    said = capsys.readouterr().err
+    assert says in re.sub("x+", "x", said)
+    assert len(said) < 1300
 
 
 def test_the_program_exits_with_the_status() -> None:

@@ -49,7 +49,7 @@ def test_it_says_what_does_not_fit_and_what_to_change(capsys: pytest.CaptureFixt
 
 
 def test_it_says_what_gets_better_by_how_much_and_what_gets_worse(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["plan", "demo", "--duration", "3", "--set", "ros_source.compression=false"]) == 0
+    assert run(["plan", "demo", "--duration", "1", "--set", "ros_source.compression=false"]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if " --set " in line]
     assert lines
     for line in lines:

@@ -102,7 +102,6 @@ NAMES = {*MIDDLEWARE.own, *PHY.own, *FRONT_ENDS.own}
 MEANT = {
     "settings/config.py": {"sim", "direct"},  # the simulated robots; the one PHY of this package without airtime
     "report/snr_map.py": {"sim"},  # the simulated robots
-    "run/swarm.py": {"direct"},  # a medium needs a PHY, and these packets are as long as the swarm says
     "doctor/ros.py": {"rclpy", "zenoh"},  # the Python module, and a part of the name of an RMW
     "race/endpoints.py": {"dds", "zenoh"},  # these very stacks are what races
     "race/race_settings.py": {"zenoh"},

@@ -36,7 +36,7 @@ def walk(folder: Path) -> None:
     runs = list(step("gr-ros2", "run"))
     assert len(runs) == 2
     for words in runs:
-        ours(*words[1:], "--no-report", "--set", "time=samples", folder=folder)
+        ours(*words[1:], "--duration", "10", "--no-report", "--set", "time=samples", folder=folder)
     first, last = step("gr-ros2", "registry", "from-bag")
     (replay,) = step("gr-ros2", "replay")
     for name, words in (("first", first), ("replay", replay), ("last", last)):

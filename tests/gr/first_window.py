@@ -12,14 +12,14 @@ from pathlib import Path
 from PyQt5 import Qt
 
 from tests.gr.probe import Probe
-from tests.gr.test_grc import in_memory
+from tests.gr.test_grc import in_memory, make_platform
 from tests.waiting import wait_for
 
 
 def main(path: Path, folder: Path) -> None:
     """Asserts what the window shows while the sliders are moved."""
     application = Qt.QApplication([])
-    top = in_memory(path, folder)
+    top = in_memory(make_platform(), path, folder)
     points = Probe()
     try:
         assert {name for name in vars(top) if name.startswith("_") and name.endswith("_win")} == {

@@ -228,8 +228,8 @@ def test_options_are_the_tables() -> None:
         ]
 
 
-@pytest.fixture(scope="module")
-def platform() -> Platform:
+def make_platform() -> Platform:
+    """GRC without a window, which knows our blocks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GRC_BLOCKS_PATH", str(grc_path()))
         platform = Platform(
@@ -240,6 +240,11 @@ def platform() -> Platform:
         )
         platform.build_library()
     return platform
+
+
+@pytest.fixture(scope="module")
+def platform() -> Platform:
+    return make_platform()
 
 
 def test_grc_lists_the_blocks(platform: Platform) -> None:
@@ -287,15 +292,9 @@ def test_grc_offers_clock_sources_and_takes_others(platform: Platform) -> None:
     assert {"auto", "internal", "external", "gpsdo"} <= set(offered["options"])
 
 
-def compiled(path: Path, folder: Path) -> ModuleType:
-    """The program GRC makes of a flowgraph, imported."""
-    grcc = shutil.which("grcc")
-    assert grcc is not None, "grcc is missing; it comes with GNU Radio"
-    environ = {**os.environ, "GRC_BLOCKS_PATH": str(grc_path())}
-    done = subprocess.run(
-        [sys.executable, grcc, "-o", str(folder), str(path)], env=environ, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+def compiled(platform: Platform, path: Path, folder: Path) -> ModuleType:
+    """The program GRC makes of a flowgraph, imported. The command ``grcc`` does the same."""
+    platform.load_and_generate_flow_graph(str(path), str(folder))
     spec = importlib.util.spec_from_file_location(path.stem, folder / f"{path.stem}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -304,18 +303,18 @@ def compiled(path: Path, folder: Path) -> ModuleType:
     return module
 
 
-def in_memory(path: Path, folder: Path) -> Any:
+def in_memory(platform: Platform, path: Path, folder: Path) -> Any:
     """An example's flowgraph on the graph of tests, which needs no discovery time, and at addresses of its own."""
     copy = folder / path.name
     text = path.read_text().replace("'\"dds\"'", "'\"memory\"'")
     copy.write_text(text.replace("tcp://127.0.0.1:", f"ipc://{folder}/"))
     assert "memory" in copy.read_text()
-    return getattr(compiled(copy, folder), path.stem)()
+    return getattr(compiled(platform, copy, folder), path.stem)()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ON_THE_AIR)
-def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: Path) -> None:
+def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, platform: Platform, tmp_path: Path) -> None:
     copy = tmp_path / f"{name}.grc"
     text = example(f"{name}.grc").read_text().replace("'\"dds\"'", "'\"memory\"'")
     front_end = name.removesuffix("_radio")
@@ -324,15 +323,15 @@ def test_an_example_that_needs_a_radio_says_so_in_one_line(name: str, tmp_path: 
         ("'True'", f"RadioError: front_end {front_end}: args = "),
     ):
         copy.write_text(text.replace("transmit: '\"auto\"'", f"transmit: {word}"))
-        program = Path(str(compiled(copy, tmp_path).__file__))
+        program = Path(str(compiled(platform, copy, tmp_path).__file__))
         done = subprocess.run([sys.executable, program], capture_output=True, text=True, check=False)
         assert done.returncode != 0
         assert said in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.slow
-def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(tmp_path: Path) -> None:
-    top = in_memory(example("sim_radio.grc"), tmp_path)
+def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(platform: Platform, tmp_path: Path) -> None:
+    top = in_memory(platform, example("sim_radio.grc"), tmp_path)
     heard: list[bytes] = []
     try:
         with MemoryMiddleware(domain_id=41) as robot, MemoryMiddleware(domain_id=42) as other:
@@ -357,12 +356,14 @@ def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(tmp_path:
         top.radio.close()
 
 
-def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_file_example_records_is_received_again(
+    platform: Platform, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     copy = tmp_path / "file_radio.grc"
     text = example("file_radio.grc").read_text().replace("'\"dds\"'", "'\"memory\"'")
     copy.write_text(text.replace("queue_depth: '100'", "queue_depth: '100'\n    repair: '\"off\"'"))
-    top = compiled(copy, tmp_path).file_radio()
+    top = compiled(platform, copy, tmp_path).file_radio()
     sent = [b"\0\1\0\0" + bytes([number]) * 720 for number in range(10)]
     try:
         with MemoryMiddleware(domain_id=41) as robot:
@@ -395,8 +396,8 @@ def test_what_the_file_example_records_is_received_again(tmp_path: Path, monkeyp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", CARRYING, ids=lambda path: path.stem)
-def test_an_example_compiles_and_carries_messages(path: Path, tmp_path: Path) -> None:
-    top = in_memory(path, tmp_path)
+def test_an_example_compiles_and_carries_messages(path: Path, platform: Platform, tmp_path: Path) -> None:
+    top = in_memory(platform, path, tmp_path)
     heard: list[bytes] = []
     try:
         with MemoryMiddleware(domain_id=41) as robot, MemoryMiddleware(domain_id=42) as other:

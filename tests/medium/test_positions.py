@@ -163,6 +163,7 @@ def test_a_recording_tells_places_by_its_odometry() -> None:
         ),
         (["channel={from: positions}", "gains_db=-100"], "gains_db: levels follow from positions"),
         (["channel={from: positions}", "phy={name: direct}"], "phy direct has no samples, so no level"),
+        (["gains_db=-100", "phy={name: direct}"], "gains_db: phy direct has no samples, so no level"),
         (
             ["channel={from: positions}", "robots=0", "time=real", "duplex=full"],
             "channel.from: time = 'real' has that for robots with duplex = 'half' alone",

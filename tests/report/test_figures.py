@@ -44,6 +44,13 @@ def test_files_are_png_and_svg(tmp_path: Path) -> None:
     assert "<svg" in svg.read_text()
 
 
+def test_a_png_is_left_out_where_a_small_svg_is_enough(tmp_path: Path) -> None:
+    for largest, suffixes in ((10**6, [".svg"]), (1000, [".png", ".svg"])):
+        written = save_figure(path_figure(PATH, PATH, "a", "b"), tmp_path / str(largest), "path", largest)
+        assert [path.suffix for path in written] == suffixes
+        assert sorted((tmp_path / str(largest)).iterdir()) == written
+
+
 def test_the_layout_is_the_one_that_matplotlib_computes(tmp_path: Path) -> None:
     own, other = (path_figure(PATH, PATH[::20], "a", "b") for _ in range(2))
     png, _ = save_figure(own, tmp_path, "path")

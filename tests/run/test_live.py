@@ -121,6 +121,29 @@ def test_robots_on_channels_of_their_own_hear_whom_they_can_and_send_meanwhile(t
     assert len(result.counters["robots"]) == 2
 
 
+@pytest.mark.slow
+@pytest.mark.real_time
+@pytest.mark.parametrize(
+    ("overrides", "arrives"),
+    [
+        (["version=0", "phy.options.detection_threshold=stock"], False),
+        (["phy={name: direct}", "gains_db=null"], True),
+    ],
+    ids=["version 0, stock receiver", "version 1, no radio"],
+)
+def test_what_channels_lose_between_robots_in_real_time_is_repaired_by_version_1(
+    tmp_path: Path, overrides: list[str], arrives: bool
+) -> None:
+    lossy = ["robots=2", "duration_s=1", "duplex=full", "medium=exclusive", "channel.packet_loss=0.2"]
+    run_scenario(load_scenario("team", [*LIVE, *lossy, *overrides]), tmp_path)
+    result = read_result(tmp_path)
+    lost = sum(counted["channel"]["packet_loss"] for counted in (result.counters, result.counters["back"]))
+    assert lost > 0
+    assert result.packets["sent"] == result.packets["received"] + lost
+    assert all(sum(topic.ledger.values()) == topic.sent == 10 for topic in result.topics)
+    assert all(topic.delivered == topic.sent for topic in result.topics) == arrives
+
+
 def test_a_channel_of_its_own_that_nobody_hears_is_refused_in_real_time() -> None:
     gains = "[[null, null, null], [-90, null, -90], [null, -90, null]]"
     scenario = load_scenario("team", [*LIVE, "duplex=full", "medium=exclusive", f"gains_db={gains}"])

@@ -188,7 +188,7 @@ class Outbox:
         self._owner.submitted(topic_id, now)
         if topic.queue and topic.is_stream and self._owner.behind(now):
             self.drop(list(topic.queue.shed(now)))
-        if not (topic.is_stream and self._owner.slow):
+        if not (waited_s and topic.is_stream and self._owner.slow):
             waited_s = 0.0  # one delay of a computer that keeps up costs no message
         over = waited_s > STANDING_S
         self.packing.turns.join(topic_id)

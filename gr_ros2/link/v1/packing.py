@@ -132,12 +132,14 @@ class Packing:
             return None
         return self._take(picks, number, used, now)
 
-    def next_timeout(self, now: float) -> float | None:
-        """When ``fill`` may have something; None if nothing waits."""
-        times = [
-            opens if (opens := topic.queue.opens(now)) < inf else now for topic in self._topics.values() if topic.queue
-        ]
-        return min(times) if times else None
+    def next_timeout(self, now: float) -> float:
+        """When ``fill`` may have something, s; inf if nothing waits."""
+        soonest = inf
+        for topic in self._topics.values():
+            if topic.queue:
+                opens = topic.queue.opens(now)
+                soonest = min(soonest, opens if opens < inf else now)
+        return soonest
 
     @property
     def urgent(self) -> bool:

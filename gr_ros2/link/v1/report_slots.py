@@ -71,8 +71,11 @@ class ReportSlots:
 
     def next(self, now: float) -> float:
         """When a report may leave, s; inf for never."""
-        reports = [neighbour.inbox.reports for neighbour in self._neighbours]
-        return min([min(now, report.due(now)) if report.helps else report.due(now) for report in reports], default=inf)
+        soonest = inf
+        for neighbour in self._neighbours:
+            report = neighbour.inbox.reports
+            soonest = min(soonest, now if report.unreported and report.helps else report.due(now))
+        return soonest
 
     def add(self, entries: list[EntryV1], free: int, due: Iterable[Reporter], now: float) -> None:
         """Add reports to the entries of a packet of messages, as far as they fit.

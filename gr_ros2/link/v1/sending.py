@@ -84,8 +84,7 @@ class SendingSide:
             self._start(now)
         messages, packing, hellos, reports = self._messages, self._messages.packing, self.hellos, self.reports
         if now >= hellos.due:
-            waiting = packing.next_timeout(now)
-            idle = waiting is None or waiting > now
+            idle = packing.next_timeout(now) > now
             if hellos.urgent(now, idle=idle, latency=packing.urgent, heard=bool(self._window.peers)):
                 return self._hello(now)
         if now >= self.pings.due:
@@ -131,10 +130,9 @@ class SendingSide:
         """When ``packet`` may have something, s; without regard to credits."""
         if self._alone(now):
             return max(self._beacon_at, self.pace.slot)
-        leaving = min(self.hellos.due, self.pings.due, self._repeat_at, self.reports.next(now))
-        waiting = self._messages.packing.next_timeout(now)
-        if waiting is not None:
-            leaving = min(leaving, waiting)
+        leaving = self._messages.packing.next_timeout(now)
+        if leaving > now:
+            leaving = min(leaving, self.hellos.due, self.pings.due, self._repeat_at, self.reports.next(now))
         if leaving > now:
             leaving = min(leaving, self.repairs.next(now))
         return max(leaving, self.pace.slot)

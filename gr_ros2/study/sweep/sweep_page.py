@@ -12,7 +12,7 @@ from pathlib import Path
 import yaml
 
 from gr_ros2.record.statistics import Estimate
-from gr_ros2.report.page import Picture, Section, render_page, save
+from gr_ros2.report.page import Drawings, Picture, Section, render_page
 from gr_ros2.report.table import Grid, number
 from gr_ros2.study.sweep.definition import PDR, VALUES, SweepPlan
 from gr_ros2.study.sweep.figures import curves_figure, heat_figure
@@ -93,7 +93,7 @@ def _draw(plan: SweepPlan, found: Sequence[Summary], folder: Path) -> tuple[list
             continue
         figure, left_out = drawn
         caption = f"{VALUES[plan.sweep.value]}, " + ("with 95 % intervals" if name == "curves" else "over two settings")
-        pictures.append(save(figure, folder, name, caption, wide=True))
+        pictures.append(Drawings(folder).save(figure, name, caption, wide=True))
         if left_out:
             notes.append(f"{name}: {left_out} further panels are in the tables only; name fewer keys, or set by")
     return pictures, notes

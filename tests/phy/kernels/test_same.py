@@ -80,7 +80,7 @@ def test_same_packets_at_the_same_sample_and_the_same_damage(
     name: str, options: dict[str, Any], every: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     phy, modems = all_of(name, options, every, monkeypatch)
-    count = 4 if name == "lora" else 10
+    count = 4 if name == "lora" else 6
     middle = half_point(phy.computed_pdr)
     draw = random.Random(5)
     for seed, snr_db in enumerate((middle + 0.7, middle + 3, middle + 20)):

@@ -11,9 +11,9 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from bench.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 from gr_ros2.link.access import Access
 from gr_ros2.mac import Aloha, Slots
-from gr_ros2.run.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 from gr_ros2.wire.mac_block import Block
 
 AIRTIME = 1 / 75
