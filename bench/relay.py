@@ -8,11 +8,12 @@ line of which each hears the next.
 from __future__ import annotations
 
 import random
+from itertools import repeat
 from statistics import mean
 
-from bench.mac import SEEDS, Graph, at_random, joined, line, swarm, within
+from bench.mac import MANY_SEEDS, Graph, Measured, at_random, joined, line, measured, within
 from bench.rows import Row
-from bench.swarm import Swarm, SwarmConfig, fully_meshed
+from bench.swarm import SwarmConfig, fully_meshed
 from gr_ros2.settings.config import TopicOptions
 from tests.link.v1.air import registry
 from tests.link.v1.test_relaying import Line, robot
@@ -32,11 +33,11 @@ MAP_LOSS, MOST_S = 0.1, 900.0
 """Loss at every hop, and s after which the map counts as lost."""
 
 
-def relaying(graph: Graph, *, relay: bool = True) -> list[Swarm]:
-    return [swarm(graph, SwarmConfig(seed=seed, loss=0.1, relay=relay)) for seed in SEEDS]
+def relaying(graph: Graph, *, relay: bool = True) -> list[Measured]:
+    return measured(repeat(graph), [SwarmConfig(seed=seed, loss=0.1, relay=relay) for seed in MANY_SEEDS])
 
 
-def share(swarms: list[Swarm]) -> float:
+def share(swarms: list[Measured]) -> float:
     """Share of the packets that carry another robot's message, in %."""
     return 100 * mean(one.relayed for one in swarms)
 
@@ -46,7 +47,7 @@ def relay() -> list[Row]:
     rows = []
     for name, (graph, most) in TOPOLOGIES.items():
         ran = relaying(graph)
-        collided, worst = 100 * mean(one.collided for one in ran), mean(one.ages[-1] for one in ran)
+        collided, worst = 100 * mean(one.collided for one in ran), mean(one.worst for one in ran)
         note = f"worst pair {worst:.2f} s, {share(ran):.0f} % relayed, {collided:.1f} % collide"
         rows.append(Row(f"{name}: mean age", mean(one.age for one in ran), "s", "≤", most, "{:.2f}", note))
     rows.append(Row(f"{name}: worst pair", worst, "s", "≤", WORST_S, "{:.1f}"))

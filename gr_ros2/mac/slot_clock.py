@@ -2,14 +2,15 @@
 
 Each packet names the number of its slot mod 256 and begins when this slot begins. A packet that differs from what this
 clock expects by less than ``TOLERANCE`` moves it by ``GAIN`` of the difference, so clocks of ±50 ppm stay together. A
-greater difference has one of three causes:
+greater difference means that the other robot belongs to another group, or that a clock has jumped:
 
-- *The two robots have not met before.* Numbers are compared as on a circle: who is behind moves to the other's slots,
-  so one of two groups moves and the other stays. Who hears nobody that agrees, and is confirmed by nobody, moves to the
-  slots of any group. It does so once: between two groups it would move to and fro, and neither would move.
-- *The other robot's clock has jumped*: it agreed before, and others still agree. It will notice, so wait for
-  ``PATIENCE_S``, and compare as above if it has not.
-- *This clock has jumped*: two robots that agreed before differ by the same, and nobody has agreed since. Move.
+- *A robot that did not agree before is ahead* (numbers are compared as on a circle): move to its slots, so that one of
+  two groups moves and the other stays.
+- *Two robots differ by the same, and nobody has agreed since*: this clock has jumped, or it is alone. Move.
+- *Another robot differs for longer than ``PATIENCE_S``*: it agreed before and its clock has jumped, but it has not
+  noticed; or it is behind and does not hear this robot. Move, and stay for ``MEMORY_S`` if it is behind. A group whose
+  slots are all in use hears nobody whose packets begin between two of them. It has to be told in its own slots that
+  there are more robots; then it leaves room and hears the group that is ahead.
 
 Invariants: all times are those of the caller's clock; a robot that is heard can move this clock only as above; the work
 for a packet is bounded by the number of robots heard.
@@ -26,7 +27,7 @@ GAIN = 0.2
 TOLERANCE = 0.25
 """Slots. Sender and receiver still agree on the number of a slot, whatever the jitter within the guard."""
 PATIENCE_S = 1.5
-"""s for which a robot whose clock has jumped may take to notice: some packets of two others."""
+"""s for which a robot that differs may take to notice: some packets of two others."""
 MEMORY_S = 3.0
 """s for which a robot that agreed counts as one that agrees."""
 
@@ -52,6 +53,8 @@ class SlotClock:
         self._agreed: dict[int, float] = {}
         self._agreed_at = float("-inf")
         self._odd: dict[int, _Odd] = {}
+        self._stays_until = float("-inf")
+        """s, until which this clock does not move, because it has moved to a group that is behind."""
 
     @property
     def runs(self) -> bool:
@@ -72,7 +75,7 @@ class SlotClock:
         assert self._zero is not None
         return int((now - self._zero) // self.slot_s)
 
-    def heard(self, src_id: int, number: int, began: float, *, trusted: bool, free: bool = False) -> int | None:
+    def heard(self, src_id: int, number: int, began: float, *, trusted: bool) -> int | None:
         """Follow a packet of slot ``number`` mod 256 whose burst began at ``began`` s.
 
         :param trusted: its trailer has been checked. Other packets move nobody who hears a robot that agrees
@@ -91,9 +94,10 @@ class SlotClock:
                 self._agreed[src_id] = self._agreed_at = began
                 self._odd.pop(src_id, None)
             return slot
-        free = free and trusted and not self._agreeing(began)
-        if not free and not self._moves(src_id, error, began, trusted=trusted):
+        if began < self._stays_until or not self._moves(src_id, error, began, trusted=trusted):
             return None
+        if error > 0:
+            self._stays_until = began + MEMORY_S
         self._zero += error * self.slot_s
         self.jumps += 1
         self._agreed = {src_id: began} if trusted else {}
@@ -111,15 +115,7 @@ class SlotClock:
         odd = self._odd.get(src_id)
         if odd is None or now - odd.since > MEMORY_S or abs(odd.error - error) > 2 * TOLERANCE:
             odd = self._odd[src_id] = _Odd(error, now)
-        if now - self._agreed.get(src_id, float("-inf")) >= MEMORY_S:
-            return error < 0
-        alike = [
-            other
-            for other, (by, since) in self._odd.items()
-            if abs(by - error) <= TOLERANCE and since > self._agreed_at and other in self._agreed
-        ]
-        if len(alike) > 1:
+        if error < 0 and now - self._agreed.get(src_id, float("-inf")) >= MEMORY_S:
             return True
-        if len(self._agreed) == 1:
-            return error < 0  # nobody else can tell whose clock has jumped
-        return error < 0 and now - odd.since > PATIENCE_S
+        alike = sum(abs(by - error) <= TOLERANCE and since > self._agreed_at for by, since in self._odd.values())
+        return alike > 1 or now - odd.since > PATIENCE_S

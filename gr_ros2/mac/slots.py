@@ -112,6 +112,8 @@ class Slots:
         self._conflicts: dict[int, int] = {}
         """Slot that two robots want -> the one of them that gives it up."""
         self._robots: dict[int, _HeardRobot] = {}
+        self._elsewhere: dict[int, float] = {}
+        """Robot with other slots than this one -> when it was last heard, s."""
         self._named_at = self._confirmed_at = self._heard_at = _NEVER
         """Slots: a neighbour last named another robot; this robot; anybody was heard."""
         self._swept = _NEVER
@@ -220,8 +222,10 @@ class Slots:
         return max(math.ceil(self._period - 1e-9), most + 1)
 
     def _load(self, oldest: int) -> int:
-        """Sum of the weights of the robots heard since a slot."""
-        return sum(robot.weight for robot in self._robots.values() if robot.last >= oldest)
+        """Sum of the weights of the robots heard since a slot. Those of another group count too, see ``SlotClock``."""
+        since = self.clock.begin(oldest)
+        others = sum(at >= since and src_id not in self._robots for src_id, at in self._elsewhere.items())
+        return others + sum(robot.weight for robot in self._robots.values() if robot.last >= oldest)
 
     def _memory(self) -> int:
         """Slots for which a robot that was heard counts as heard."""
@@ -277,15 +281,8 @@ class Slots:
 
     def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:
         """See :class:`gr_ros2.link.access.Access`. Who says nothing about slots cannot be avoided."""
-        if block is None:
-            return
-        jumps = self.clock.jumps
-        settled = self._entered_at is not None and self._confirmed_at >= self._entered_at
-        free = not settled and block.heard > 0
-        slot = self.clock.heard(src_id, block.slot, began, trusted=trusted, free=free)
-        if slot is not None and self.clock.jumps > jumps:
-            self._start_over(slot)
-        if slot is None or src_id == self.src_id:
+        slot = None if block is None else self._placed(src_id, block.slot, began, trusted=trusted)
+        if block is None or slot is None or src_id == self.src_id:
             return
         first, second = block.ahead
         ahead = (slot + first, slot + first + second)[: 2 if first and second else 1 if first else 0]
@@ -316,6 +313,20 @@ class Slots:
             robot.deaf = self.src_id not in block.names
         else:
             self._mapped(robot, block.expected, block.conflict)
+
+    def _placed(self, src_id: int, number: int, began: float, *, trusted: bool) -> int | None:
+        """The slot of a packet; None where its sender has other slots."""
+        jumps = self.clock.jumps
+        slot = self.clock.heard(src_id, number, began, trusted=trusted)
+        if self.clock.jumps > jumps:
+            assert slot is not None
+            self._elsewhere = dict.fromkeys(self._robots, began)
+            self._start_over(slot)
+        if trusted and slot is None and src_id != self.src_id:
+            self._elsewhere[src_id] = began
+        elif trusted:
+            self._elsewhere.pop(src_id, None)
+        return slot
 
     def _claim(self, slot: int, src_id: int) -> None:
         owner = self._taken[slot]

@@ -84,8 +84,21 @@ def test_packets_that_are_not_checked_move_nobody_who_hears_others() -> None:
     assert hear(made, 2, late, -0.7, trusted=False) is not None
 
 
-def test_who_is_followed_by_nobody_follows_a_group() -> None:
+def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:
     made = clock()
-    assert made.heard(1, 3, made.begin(3) + 0.4, trusted=True, free=True) is not None
-    assert made.heard(2, 4, made.begin(4) + 0.4, trusted=True, free=True) is None, "it would move to and fro"
+    slots = round(PATIENCE_S / SLOT)
+    for n in range(0, 2 * slots, 2):
+        hear(made, 1, n)
+        if hear(made, 2, n + 1, 0.4) is not None:
+            break
+    assert n == pytest.approx(slots, abs=2)
     assert made.jumps == 1
+    late = n + round(MEMORY_S / SLOT)
+    assert hear(made, 1, late - 9, -0.4) is None, "it would leave before it is heard"
+    assert hear(made, 1, late + 40, -0.4) is not None
+
+
+def test_who_hears_nobody_that_agrees_moves_to_a_group_that_is_behind() -> None:
+    made = clock()
+    assert hear(made, 1, 3, 0.4) is None
+    assert hear(made, 2, 4, 0.4) is not None
