@@ -19,8 +19,8 @@ _ENOUGH = 0.05
 """Expected number of lost packets that is too small for a repair. With 0, odometry takes 8 % more packets at 1 % loss
 and is no younger."""
 _UNDER_WAY_S = 1e-3
-"""s for which a packet and a repair are under way at least. Without it, a sender with no pace would repair without end where a report
-comes at once."""
+"""s for which a packet or a repair is under way at least. Without it, a sender with no pace would repair without end
+where a report comes at once."""
 
 
 class Thrift:
