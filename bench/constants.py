@@ -50,9 +50,7 @@ def _scaled(module: str, name: str, *factors: float) -> Iterator[tuple[str, list
 
 RULES: dict[str, list[Patch]] = {
     "no waiting for a message that is due": [("hold", "Hold.until", lambda _self, now, _end, _airtime: now)],
-    "no repair ahead of reports": [("thrift", "AHEAD", 0.0)],
     "no early reports": [("peers", "PROMPT", 2.0), ("reports", "PROMPT", 2.0)],
-    "no share of repairs for short messages": [("combining", "TURN", 1 << 30)],
     "no resending before new packets": [("repair", "RepairWindow.urgent", lambda _self, _now: None)],
     "no turns of topics": [("freshness", "TURN", 1 << 30)],
     "long messages by value alone": [("packing", "LONG", 1 << 30)],
@@ -60,11 +58,11 @@ RULES: dict[str, list[Patch]] = {
 }
 CONSTANTS = (
     ("lifetime", "GROUP"), ("lifetime", "WORTH"), ("lifetime", "REPORTED_DEPTH"), ("lifetime", "UNREPORTED_DEPTH"),
-    ("thrift", "AHEAD"), ("thrift", "_ENOUGH"), ("thrift", "_MOST_AHEAD"), ("combining", "TURN"),
+    ("thrift", "_ENOUGH"),
     ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"), ("freshness", "FIRST_AGE_S"),
     ("freshness", "LARGE"), ("packing", "SHARE"), ("packing", "MIN_FRAGMENT"), ("packing", "LONG"),
     ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
-    ("reports", "_CALM"), ("reports", "_SLOWER"), ("hold", "OVERLAP"), ("hold", "WAITED"), ("hold", "_STEADY"),
+    ("reports", "CALM"), ("reports", "_SLOWER"), ("hold", "OVERLAP"), ("hold", "WAITED"), ("hold", "_STEADY"),
 )  # fmt: skip
 RATE = (
     "GAIN_UP", "GAIN_DOWN", "SETTLED", "_HASTY", "_MOST_PATIENCE", "MOST_SILENT_S", "_GAPS", "_UNANSWERED",

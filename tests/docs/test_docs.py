@@ -118,7 +118,7 @@ SHORTER = {
     "plan": ("--duration", "2"),
     "replay": ("--duration", "1"),
     "losses": ("--packets", "20"),
-    "sweep": ("--set", "duration_s=0.5"),
+    "sweep": ("--set", "duration_s=0.5", "--workers", "1"),
 }
 """What is added to a command so that it ends soon."""
 REPORTING = "README.md"

@@ -179,7 +179,7 @@ def test_ids_that_come_round_during_an_outage_of_exactly_256_messages() -> None:
 @pytest.mark.parametrize("loss", [0.05, 0.1])
 def test_random_ids_of_the_papers_sender_are_mixed_far_less_than_by_the_papers_rules(loss: float) -> None:
     """FACTS: 12 % corrupt at 5 % packet loss, 23 % at 10 %, with 15 fragments a message and a 2 s timeout."""
-    link = Link(loss, seed=6, sizes=(700, 724), timeout=2.0, entry_ids="random").run(4_000)
+    link = Link(loss, seed=6, sizes=(700, 724), timeout=2.0, entry_ids="random").run(2_000)
     share = link.corrupt / len(link.got)
     print(f"random ids at {loss:.0%} packet loss: {link.corrupt} of {len(link.got)} delivered corrupt ({share:.3%})")
     assert share < 0.005

@@ -89,7 +89,7 @@ def test_nothing_is_lost_back_to_back_and_the_air_is_as_long_and_strong_as_claim
     name: str, options: dict[str, Any], packet_len: int
 ) -> None:
     phy = make(name, options, packet_len)
-    count = 2 if phy.airtime_samples() > 300_000 else 5 if packet_len > 1000 else 20
+    count = 2 if phy.airtime_samples() > 300_000 else 5 if packet_len > 1000 else 12
     recording = record(phy, count)
     samples = recording.samples
     assert len(samples) == count * phy.airtime_samples()

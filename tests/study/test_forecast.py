@@ -181,7 +181,7 @@ def test_what_is_proposed(effects: list[Effect], used: tuple[float, float], wort
 def test_nothing_is_called_better_that_makes_more_topics_older_than_younger(
     name: str, settings: tuple[str, ...]
 ) -> None:
-    proposed = planner(name, *settings, duration=3.0).advice()
+    proposed = planner(name, *settings, duration=2.0).advice()
     assert proposed
     for advice in proposed:
         younger, older = ([e for e in advice.effects if getattr(e, word)] for word in ("younger", "older"))

@@ -10,7 +10,6 @@ Invariant: no two repairs of the same packets have the same coefficients.
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import NamedTuple
 
 from gr_ros2.link.v1.gf256 import combine
@@ -18,8 +17,6 @@ from gr_ros2.link.v1.lifetime import GROUP
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.wire.v1 import MAX_WINDOW
 
-TURN = 3
-"""While a long message is alive, one repair in this many is for short messages."""
 _GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -48,7 +45,6 @@ class Combining:
     def __init__(self, packets: SentPackets, room: int) -> None:
         self._packets = packets
         self._room = room
-        self._turn = 0
         self._place = 0.0
 
     def window(self, now: float) -> list[Sent]:
@@ -72,16 +68,7 @@ class Combining:
             free -= 1
             if not free:
                 break
-        if not self._packets.many(now):
-            return found
-        # A long message must not delay the repair of short ones, and short ones must not prevent that of a long one.
-        self._turn += 1
-        counts = Counter(lifetime for record in found for lifetime in record.lifetimes)
-        longest = max(counts, key=lambda lifetime: counts[lifetime])
-        short = [record for record in found if record.lifetimes != (longest,)]
-        if short and self._turn % TURN == 0:
-            return short
-        return self.in_turn(now)
+        return self.in_turn(now) if self._packets.many(now) else found
 
     def newest(self, now: float) -> list[Sent]:
         """The window of the newest numbers."""

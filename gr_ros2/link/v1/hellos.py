@@ -1,9 +1,9 @@
 """When a robot sends hellos, and what they contain.
 
 Hellos are sent at the start, several in the first second because any of them may be lost; whenever the table of topics
-changes; at once to answer a robot that is heard for the first time; and otherwise every ``PERIOD_S``, or less and less
-often while nobody is heard. While messages wait, hellos are delayed: by half a second, or by two seconds if receivers
-report.
+changes; at once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about
+50 bytes/s, every two where nothing is lost, or less and less often while nobody is heard. While messages wait, hellos
+are delayed: by half a second, or by two seconds if receivers report.
 
 Invariant: a hello names a kept message only after the receivers had time to get it when it was first sent.
 """
@@ -19,6 +19,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbours
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.reports import CALM
 from gr_ros2.wire.control import (
     CAN_HEAR,
     ENCRYPTS,
@@ -35,10 +36,9 @@ _T = TypeVar("_T")
 
 STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
 """Times in s after the start at which hellos are sent."""
-PERIOD_S = 2.0
-"""s between two hellos. On a calm link they are one packet in seventy beside odometry at 35 Hz."""
-DELAY_S, REPORTED_DELAY_S = 0.5, 2.0
-"""s for which a hello lets messages go first; the second one while receivers report."""
+HELLO_BYTES_S = 50.0
+"""Bytes/s that hellos take, as far as the interval stays between ``OFTEN_S`` and ``SELDOM_S``."""
+OFTEN_S, SELDOM_S = 1.0, 2.0
 LONE_S = 10.0
 """Most s between two hellos of a robot that hears nobody: the time doubles with each hello, as in Trickle (RFC 6206). A
 robot that starts is met at once, by its own hellos."""
@@ -72,7 +72,7 @@ class Hellos:
         self._capabilities = settings.hears * CAN_HEAR | encrypts * ENCRYPTS
         self._rarer = 1 / settings.airtime_share
         """By how much longer all times between hellos are than on a channel without a limit."""
-        self._period = PERIOD_S * self._rarer
+        self._period = min(max(OFTEN_S, settings.packet_len / HELLO_BYTES_S), SELDOM_S) * self._rarer
         self._pause = self._period
         """s to the next hello."""
         self._starting: deque[float] = deque()
@@ -120,12 +120,18 @@ class Hellos:
             return late >= 0
         if self._starting:
             return late >= latency * LATENCY_S
-        return late > (REPORTED_DELAY_S if heard else DELAY_S) * self._rarer + latency * LATENCY_S
+        return late > (SELDOM_S if heard else OFTEN_S / 2) * self._rarer + latency * LATENCY_S
 
     @property
     def lone(self) -> bool:
         """Whether no robot is heard, though one could be."""
         return self._settings.hears and all(neighbour.gone for neighbour in self._neighbours)
+
+    @property
+    def _calm(self) -> bool:
+        """Whether a robot is heard, and nothing is lost either way."""
+        losses = [self._window.peers.loss, *(neighbour.inbox.reports.loss for neighbour in self._neighbours)]
+        return len(losses) > 1 and max(losses) < CALM
 
     def entries(self, room: int, now: float) -> list[Control]:
         """The entries of a hello; also sets the time of the next one.
@@ -143,7 +149,8 @@ class Hellos:
             return apart
         free = room - HELLO_LEN
         lone = self.lone and not self._starting
-        self._pause = min(2 * self._pause, max(LONE_S, self._period)) if lone else self._period
+        period = SELDOM_S * self._rarer if self._calm else self._period
+        self._pause = min(2 * self._pause, max(LONE_S, self._period)) if lone else period
         marks, heard = self._messages.kept.marks(now), neighbours.heard(window.packets.newest)
         proofs, self._heard = _in_turn(heard, self._heard, max(free // HEARD_LEN - bool(marks), 1))
         if free < HEARD_LEN:

@@ -78,8 +78,6 @@ class RepairWindow:
             self._unreported.sent(number, lifetimes)
         elif self._shared is not None:
             self._shared.sent(number, lifetimes, self.peers.loss)
-        if lifetimes:
-            self.thrift.sent()
         self.packets.add(number, body, data, lifetimes, now)
 
     def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
@@ -180,7 +178,6 @@ class RepairWindow:
     def _again(self, record: Sent, now: float) -> Sent:
         record.at = now
         self.counts["resent"] += 1
-        self.thrift.repaired()
         self.peers.once.discard(record.number)
         return record
 
@@ -197,5 +194,4 @@ class RepairWindow:
             self.thrift.combined(now, first, repair.number)
         self.peers.once.difference_update(range(first, repair.number + 1))
         self.counts["combined"] += 1
-        self.thrift.repaired()
         return repair

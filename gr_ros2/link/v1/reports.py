@@ -41,7 +41,7 @@ _PAUSE_S, _CALM_S = 0.1, 1.0
 the reports of a link without losses cost as much again, and at .2 to 2 % loss messages of 2 to 35 Hz are no younger."""
 _AGAIN_S = 0.5
 """s after which a report is repeated while messages wait for an earlier one."""
-_CALM = 1 / 128
+CALM = 1 / 128
 """Share of lost packets up to which reports become rarer."""
 CONFIRM_S = 1.0
 """s between two reports to a sender of which nothing is missed or heard since, on a channel that many share."""
@@ -152,7 +152,7 @@ class Reporter:
 
     def make(self, now: float) -> Report:
         """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
-        calm = not self._missed and self.loss < _CALM and self._arrived > MAP
+        calm = not self._missed and self.loss < CALM and self._arrived > MAP
         self._pause = min(self._pause * _SLOWER, max(_CALM_S, self._shortest)) if calm else self._shortest
         self.unreported = 0
         self._missed = False

@@ -3,8 +3,7 @@
 A peer that loses packets reports every packet at once if that takes no slot from anything. The sender then knows when a
 report is overdue: the packet or its report was lost, and a repair is due. From other peers, whose reports are rare or
 take long, it cannot know that so soon: it sends about as many repairs as losses are to be expected, before a report
-names them. Where reports come at once, the sender may also repair before it knows of a loss, as often as ``AHEAD``
-allows: a message that waits for a repair delays all later ones of its topic.
+names them.
 """
 
 from __future__ import annotations
@@ -15,23 +14,13 @@ from math import inf
 from gr_ros2.link.v1.lifetime import GROUP
 from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
-from gr_ros2.link.v1.unreported import MOST_LOSS
 
-AHEAD = 1.2
-"""Most repairs per new packet that are sent before a report calls for them, divided by ``loss / (1 - loss)^3``: a
-packet, its repair and the report that would call for another one are all lost with that probability. Without them,
-odometry in order is 9.5 % older (± 2.6 %) at 20 % loss, for 5 % fewer packets."""
-_MOST_AHEAD = 2.0
-"""Bound of what is saved up for that, and of what is owed. It is no gain where losses are steady: without it, odometry
-is 3.9 % younger (± 3.4 %) at 20 % loss both ways, for 2 % more packets. But a sender that nobody has heard for ten
-minutes would then repair ahead 10,000 times.
-"""
 _ENOUGH = 0.05
 """Expected number of lost packets that is too small for a repair. With 0, odometry takes 8 % more packets at 1 % loss
 and is no younger."""
 _UNDER_WAY_S = 1e-3
-"""s for which a repair is under way at least. Without it, a sender with no pace would repair without end where a report
-comes at once."""
+"""s for which a packet or a repair is under way at least. Without it, a sender with no pace would repair without end
+where a report comes at once."""
 
 
 class Thrift:
@@ -41,23 +30,6 @@ class Thrift:
         self._packets, self._peers = packets, peers
         self._flight: deque[tuple[float, int, int]] = deque()
         """The time until which a repair may be on its way without a report about it, and its window."""
-        self._loss = self._gain = 0.0
-        """Loss for which it is known by how much ``_ahead`` grows with a packet."""
-        self._ahead = 0.0
-        """Number of repairs that may be sent before a report calls for them."""
-
-    def sent(self) -> None:
-        """A new packet left that is worth repairing."""
-        if self._ahead < _MOST_AHEAD:
-            if self._peers.loss != self._loss:
-                loss = self._loss = self._peers.loss
-                loss = min(loss, MOST_LOSS)
-                self._gain = AHEAD * loss / (1 - loss) ** 3
-            self._ahead = min(self._ahead + self._gain, _MOST_AHEAD)
-
-    def repaired(self) -> None:
-        """A repair leaves, of any kind."""
-        self._ahead = max(self._ahead - 1, -_MOST_AHEAD)
 
     def combined(self, now: float, first: int, newest: int) -> None:
         """A combination of these numbers leaves."""
@@ -75,15 +47,15 @@ class Thrift:
             loss = self._peers.loss
             return len(window) * loss > under_way * (1 - loss) + _ENOUGH
         for peer in self._peers.all.values():
-            expected = 0.0 if peer.prompt and self._ahead < 1 else peer.loss
-            patience, doubt = peer.patience, peer.doubt
+            expected = 0.0 if peer.prompt else peer.loss
+            patience, doubt = max(peer.patience, _UNDER_WAY_S), peer.doubt
             need = 0.0
             for record in window:
                 if not record.confirmed & peer.bit:
                     if record.number in peer.lost:
                         need += 1
                     else:
-                        need += doubt if now - record.at > patience else expected
+                        need += doubt if now >= record.at + patience else expected
             if need > under_way * (1 - peer.loss) + _ENOUGH:
                 return True
         return False
@@ -92,7 +64,7 @@ class Thrift:
         """When a report about one of the newest packets, or about a repair, is overdue next, s; inf if none is
         expected."""
         soonest = next((at for at, _, _ in self._flight if at > now), inf)
-        waits = [(peer.bit, peer.patience) for peer in self._peers.all.values()]
+        waits = [(peer.bit, max(peer.patience, _UNDER_WAY_S)) for peer in self._peers.all.values()]
         for record in reversed(self._packets.records.values()):
             if record.number <= self._packets.newest - GROUP:
                 break

@@ -15,7 +15,6 @@ from gr_ros2.link.v1.gf256 import combine
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.repair import RepairMode, RepairWindow
 from gr_ros2.link.v1.sent_packets import Sent
-from gr_ros2.link.v1.thrift import AHEAD
 from gr_ros2.wire.v1 import MAX_WINDOW, REPAIR_IDS
 
 ROOM = 24
@@ -188,17 +187,6 @@ def test_more_than_a_group_is_repaired_in_windows_that_move_over_it() -> None:
     assert seen == set(range(1, 301))
 
 
-def test_short_messages_are_repaired_beside_a_long_one() -> None:
-    sender = window(expected_loss=0.5)
-    long, short = Lifetime(), Lifetime()
-    for number in range(1, 301):
-        sender.sent(number, body(number), b"", (long,), 0.0)
-    sender.sent(301, b"short", b"", (short,), 0.0)
-    repairs = [sender.next(0.0) for _ in range(30)]
-    alone = [repair for repair in repairs if isinstance(repair, Repair) and (repair.number, repair.mask) == (301, 1)]
-    assert len(alone) == 10
-
-
 def test_a_repair_id_is_used_once_per_number() -> None:
     sender = window(count=1)
     repair_ids = [sender.packets.take_repair_id(1) for _ in range(REPAIR_IDS)]
@@ -262,7 +250,6 @@ def prompt(count: int, delay: float = 0.01) -> RepairWindow:
 def test_a_report_that_does_not_come_is_noticed_when_it_is_overdue() -> None:
     sender = prompt(4)
     sender.sent(5, body(5), b"packet 5", (Lifetime(),), 0.5)
-    assert isinstance(sender.next(0.5), Repair), "ahead of any report"
     assert sender.next(0.5) is None
     overdue = sender.thrift.next_doubt(0.5)
     assert overdue == pytest.approx(0.51)
@@ -279,16 +266,13 @@ def test_a_report_that_does_not_come_is_noticed_when_it_is_overdue() -> None:
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.2])
-def test_repairs_that_no_report_calls_for_are_few(loss: float) -> None:
-    sender, ahead, count = window("thrifty"), 0, 400
-    for number in range(1, count + 1):
+def test_nothing_is_repaired_before_a_report_that_comes_at_once_is_overdue(loss: float) -> None:
+    sender = window("thrifty")
+    for number in range(1, 100):
         at = number / 10
         sender.sent(number, body(number), b"packet %d" % number, (Lifetime(),), at)
-        while sender.next(at) is not None:
-            ahead += 1
+        assert sender.next(at) is None or number < 4  # the first reports tell how long one takes
         sender.peers.report(9, number, (1 << 64) - 1, settled=True, loss=loss, now=at + 0.01)
-    most = AHEAD * loss / (1 - loss) ** 3 * count
-    assert 0.9 * most <= ahead <= most + 2
 
 
 def test_reports_that_take_long_are_not_waited_for() -> None:
