@@ -8,10 +8,10 @@ greater difference means that the other robot belongs to another group, or that 
   two groups moves and the other stays.
 - *Two robots that agreed before differ by the same, and nobody has agreed since*: this clock has jumped. Move.
 - *A robot that agreed before is ahead*: its clock has jumped. Move if it has not noticed after ``PATIENCE_S``.
-- *A robot is behind*: if it still is after ``MEMORY_S``, it does not hear this robot. A group whose slots are all in use
-  hears nobody whose packets begin between two of them. Move there, and stay for ``MEMORY_S``: told in its own slots that
-  there are more robots, the group leaves room, and then hears the one that is ahead. Sooner, or more often, robots of a
-  large network move back as fast as others move on.
+- *A robot is behind*: if it still is after ``MEMORY_S``, it does not hear this robot. A group whose slots are all in
+  use hears nobody whose packets begin between two of them. Move there, and stay for ``MEMORY_S``: told in its own slots
+  that there are more robots, the group leaves room, and then hears the one that is ahead. Sooner, or more often, robots
+  of a large network move back as fast as others move on.
 
 Invariants: all times are those of the caller's clock; a robot that is heard can move this clock only as above; the work
 for a packet is bounded by the number of robots heard.
