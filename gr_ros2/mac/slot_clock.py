@@ -6,11 +6,12 @@ greater difference means that the other robot belongs to another group, or that 
 
 - *A robot that did not agree before is ahead* (numbers are compared as on a circle): move to its slots, so that one of
   two groups moves and the other stays.
-- *Two robots differ by the same, and nobody has agreed since*: this clock has jumped, or it is alone. Move.
-- *Another robot differs for longer than ``PATIENCE_S``*: it agreed before and its clock has jumped, but it has not
-  noticed; or it is behind and does not hear this robot. Move, and stay for ``MEMORY_S`` if it is behind. A group whose
-  slots are all in use hears nobody whose packets begin between two of them. It has to be told in its own slots that
-  there are more robots; then it leaves room and hears the group that is ahead.
+- *Two robots that agreed before differ by the same, and nobody has agreed since*: this clock has jumped. Move.
+- *A robot that agreed before is ahead*: its clock has jumped. Move if it has not noticed after ``PATIENCE_S``.
+- *A robot is behind*: if it still is after ``MEMORY_S``, it does not hear this robot. A group whose slots are all in
+  use hears nobody whose packets begin between two of them. Move there, and stay for ``MEMORY_S``: told in its own slots
+  that there are more robots, the group leaves room, and then hears the one that is ahead. Sooner, or more often, robots
+  of a large network move back as fast as others move on.
 
 Invariants: all times are those of the caller's clock; a robot that is heard can move this clock only as above; the work
 for a packet is bounded by the number of robots heard.
@@ -27,9 +28,9 @@ GAIN = 0.2
 TOLERANCE = 0.25
 """Slots. Sender and receiver still agree on the number of a slot, whatever the jitter within the guard."""
 PATIENCE_S = 1.5
-"""s for which a robot that differs may take to notice: some packets of two others."""
+"""s for which a robot whose clock has jumped may take to notice: some packets of two others."""
 MEMORY_S = 3.0
-"""s for which a robot that agreed counts as one that agrees."""
+"""s for which a robot that agreed counts as one that agrees, and one that is behind may take to follow."""
 
 
 class _Odd(NamedTuple):
@@ -113,9 +114,13 @@ class SlotClock:
         if not trusted:
             return not self._agreeing(now) and error < 0
         odd = self._odd.get(src_id)
-        if odd is None or now - odd.since > MEMORY_S or abs(odd.error - error) > 2 * TOLERANCE:
+        if odd is None or now - odd.since > 2 * MEMORY_S or abs(odd.error - error) > 2 * TOLERANCE:
             odd = self._odd[src_id] = _Odd(error, now)
         if error < 0 and now - self._agreed.get(src_id, float("-inf")) >= MEMORY_S:
             return True
-        alike = sum(abs(by - error) <= TOLERANCE and since > self._agreed_at for by, since in self._odd.values())
-        return alike > 1 or now - odd.since > PATIENCE_S
+        alike = [
+            other
+            for other, (by, since) in self._odd.items()
+            if abs(by - error) <= TOLERANCE and since > self._agreed_at and other in self._agreed
+        ]
+        return len(alike) > 1 or now - odd.since > (PATIENCE_S if error < 0 else MEMORY_S)

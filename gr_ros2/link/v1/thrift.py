@@ -19,8 +19,8 @@ _ENOUGH = 0.05
 """Expected number of lost packets that is too small for a repair. With 0, odometry takes 8 % more packets at 1 % loss
 and is no younger."""
 _UNDER_WAY_S = 1e-3
-"""s for which a repair is under way at least. Without it, a sender with no pace would repair without end where a report
-comes at once."""
+"""s for which a packet or a repair is under way at least. Without it, a sender with no pace would repair without end
+where a report comes at once."""
 
 
 class Thrift:
@@ -48,7 +48,7 @@ class Thrift:
             return len(window) * loss > under_way * (1 - loss) + _ENOUGH
         for peer in self._peers.all.values():
             expected = 0.0 if peer.prompt else peer.loss
-            patience, doubt = peer.patience, peer.doubt
+            patience, doubt = max(peer.patience, _UNDER_WAY_S), peer.doubt
             need = 0.0
             for record in window:
                 if not record.confirmed & peer.bit:
@@ -64,7 +64,7 @@ class Thrift:
         """When a report about one of the newest packets, or about a repair, is overdue next, s; inf if none is
         expected."""
         soonest = next((at for at, _, _ in self._flight if at > now), inf)
-        waits = [(peer.bit, peer.patience) for peer in self._peers.all.values()]
+        waits = [(peer.bit, max(peer.patience, _UNDER_WAY_S)) for peer in self._peers.all.values()]
         for record in reversed(self._packets.records.values()):
             if record.number <= self._packets.newest - GROUP:
                 break
