@@ -375,7 +375,8 @@ def test_what_the_file_example_records_is_received_again(
             wait_for(lambda: taken() == len(sent), "every message")
             wait_for(lambda: top.ros2_source_0.idle and top.radio.counts().backlog == 0, "every packet to leave")
             packets = top.ros2_source_0.stats()["packets"]
-            wait_for(lambda: top.radio.counts().transmitted >= packets, "every sample")
+            whole = packets * top.radio.phy.airtime_samples() * 8  # bytes; the transmitter is some samples ahead
+            wait_for(lambda: Path("sent.sigmf-data").stat().st_size >= whole, "every sample")
     finally:
         top.stop()
         top.wait()

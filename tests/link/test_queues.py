@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from math import inf
 from typing import Any
 
 import pytest
@@ -289,7 +290,7 @@ def test_a_capped_message_says_when_it_may_go() -> None:
     assert leave(source, 0.0) == [b"a"]
     assert source.end.messages.packing.next_timeout(0.0) == pytest.approx(0.1)
     assert leave(source, 0.1) == [b"b"]
-    assert source.end.messages.packing.next_timeout(0.1) is None
+    assert source.end.messages.packing.next_timeout(0.1) == inf
 
 
 @given(
