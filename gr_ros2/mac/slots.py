@@ -9,7 +9,8 @@ frame has a slot for each packet around the one of this robot and its neighbours
 It lasts at least the period of the messages.
 
 *Choice.* The first free slot after an equal part of the frame. Slots go on from frame to frame, so one counts as free
-only if nobody else is known to send in the slot one frame before.
+only if nobody else is known to send in the slot one frame before (without this 6 instead of 2 % of the receptions in a
+grid of 5 × 4 collide).
 
 *Entry.* A robot without slots sends in a free slot with probability 1 / v. v grows when no neighbour names the robot
 by its next send, and shrinks with each newcomer that gets in. A neighbour names two robots a packet, newcomers first.
