@@ -169,6 +169,7 @@ class Slots:
         self.reserved = slot in self._announced
         if alone:
             self._rate = min(2 * self._rate, _DEAF_RATE)
+        frame = self._frame(slot)
         kept: list[int] = []
         for mine in self._mine:
             base = kept[-1] if kept else slot
@@ -176,9 +177,9 @@ class Slots:
                 kept.append(mine)
         self._mine = kept
         while len(kept) < 2:
-            kept.append(self._pick(kept[-1] if kept else slot, slot))
+            kept.append(self._pick(kept[-1] if kept else slot, slot, frame))
         self._announced, self._sent = tuple(kept), slot
-        return write_block(self._content(slot))
+        return write_block(self._content(slot, frame))
 
     def _leave(self) -> None:
         self._mine.clear()
@@ -197,10 +198,9 @@ class Slots:
     def _free(self, slot: int) -> bool:
         return slot not in self._taken and not (slot > self._base and self._expected >> slot - self._base & 1)
 
-    def _pick(self, base: int, now: int) -> int:
+    def _pick(self, base: int, now: int, frame: int) -> int:
         """The slot to send in after ``base``."""
         alone = self._alone(now)
-        frame = self._frame(now)
         step = max(round(frame / self._weight), 1)
         if alone:
             step = round(max(step, self._rate) * self._rng.uniform(0.5, 1.5))
@@ -244,10 +244,10 @@ class Slots:
         oldest = now - self._lately()
         return any(robot.last >= oldest and robot.deaf for robot in self._robots.values())
 
-    def _content(self, slot: int) -> Block:
+    def _content(self, slot: int, frame: int) -> Block:
         oldest = slot - self._memory()
         heard = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= oldest}
-        fresh = slot - NAMED * self._frame(slot)
+        fresh = slot - NAMED * frame
         names = nsmallest(2, (n for n in heard if heard[n].last >= fresh), key=lambda src_id: heard[src_id].named)
         for src_id in names:
             heard[src_id].named = self._turn(slot) if heard[src_id].named == _NEVER else slot

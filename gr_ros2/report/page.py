@@ -85,7 +85,8 @@ class Picture:
 
     def data_uri(self) -> str:
         """The picture itself as a data URI, for embedding in HTML."""
-        path = next((file for file in reversed(self.files) if file.stat().st_size <= _LARGEST_SVG), self.files[0])
+        svg = self.files[-1]
+        path = svg if svg.stat().st_size <= _LARGEST_SVG else self.files[0]
         kind = "svg+xml" if path.suffix == ".svg" else "png"
         return f"data:image/{kind};base64,{b64encode(path.read_bytes()).decode('ascii')}"
 

@@ -91,7 +91,7 @@ def test_a_slot_in_whose_place_somebody_sends_one_frame_before_is_passed_over() 
     hear(made, 7, 60, Block(0, (300, 300), 1, (5, NOBODY)))
     made._confirmed_at, frame = 70, made._frame(70)
     made._taken |= {77 + frame: 7, 78: 7}
-    assert made._pick(77, 70) == 77 + frame + 2
+    assert made._pick(77, 70, frame) == 77 + frame + 2
 
 
 def test_who_is_not_in_the_map_of_a_neighbour_picks_at_random() -> None:

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from itertools import count
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -114,16 +113,10 @@ def test_who_sends_alone_is_heard_and_who_send_together_collide(medium: Start, t
         for robot, other in ((one, two), (two, one)):
             wait_for(lambda: robot.say(1000) and bool(other.heard), "the other to hear")  # noqa: B023 - called at once
         wait_for(lambda: one.silent and two.silent, "silence")
-        firsts = count(2000, 20)
-
-        def alone() -> bool:
-            """One says ten messages; whether all come. At first a packet of the other may still be on the air."""
-            first = next(firsts)
-            said = one.say(*range(first, first + 10))
-            wait_for(lambda: set(one.say(first + 10)) <= set(two.heard), "a message after them")
-            return set(said) <= set(two.heard)
-
-        wait_for(alone, "every message of a robot that sends alone")
+        wait_for(lambda: set(one.say(1001)) <= set(two.heard), "the last of the other to leave the air")
+        wait_for(lambda: one.silent, "silence")
+        said = set(one.say(*range(10)))
+        wait_for(lambda: said <= set(two.heard), "every message of a robot that sends alone")
         wait_for(lambda: one.silent, "silence")
 
         def collide() -> bool:

@@ -49,6 +49,8 @@ class Combining:
 
     def window(self, now: float) -> list[Sent]:
         """The next window."""
+        if self._packets.many(now):
+            return self.in_turn(now)
         found: list[Sent] = []
         everybody = self._packets.everybody
         before, free = -1, GROUP
@@ -68,7 +70,7 @@ class Combining:
             free -= 1
             if not free:
                 break
-        return self.in_turn(now) if self._packets.many(now) else found
+        return found
 
     def newest(self, now: float) -> list[Sent]:
         """The window of the newest numbers."""

@@ -17,6 +17,9 @@ from gr_ros2.link.v1.unreported import Unreported
 
 START = 64
 """If a robot is first heard within this number of packets of its start, its packets count from its start on."""
+UNDER_WAY_S = 1e-3
+"""s for which a packet or a repair is under way at least. Without it, a sender with no pace would repair without end
+where a report comes at once."""
 MAP = 64
 """Number of packets that a report covers."""
 PROMPT = 1 / 64
@@ -71,7 +74,7 @@ class Peer:
     @property
     def patience(self) -> float:
         """Time in s after which a packet that no report covers counts as lost, with ``doubt``."""
-        return self.answer if self.prompt else 2 * self.answer
+        return max(self.answer if self.prompt else 2 * self.answer, UNDER_WAY_S)
 
     @property
     def doubt(self) -> float:

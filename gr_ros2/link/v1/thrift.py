@@ -12,15 +12,12 @@ from collections import deque
 from math import inf
 
 from gr_ros2.link.v1.lifetime import GROUP
-from gr_ros2.link.v1.peers import Peers
+from gr_ros2.link.v1.peers import UNDER_WAY_S, Peers
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 
 _ENOUGH = 0.05
 """Expected number of lost packets that is too small for a repair. With 0, odometry takes 8 % more packets at 1 % loss
 and is no younger."""
-_UNDER_WAY_S = 1e-3
-"""s for which a packet or a repair is under way at least. Without it, a sender with no pace would repair without end
-where a report comes at once."""
 
 
 class Thrift:
@@ -34,7 +31,7 @@ class Thrift:
     def combined(self, now: float, first: int, newest: int) -> None:
         """A combination of these numbers leaves."""
         wait = max((peer.answer for peer in self._peers.all.values()), default=inf)
-        self._flight.append((now + max(wait, _UNDER_WAY_S), first, newest))
+        self._flight.append((now + max(wait, UNDER_WAY_S), first, newest))
 
     def worth(self, window: list[Sent], now: float) -> bool:
         """Whether a combination of a window is worth its slot."""
@@ -48,7 +45,7 @@ class Thrift:
             return len(window) * loss > under_way * (1 - loss) + _ENOUGH
         for peer in self._peers.all.values():
             expected = 0.0 if peer.prompt else peer.loss
-            patience, doubt = max(peer.patience, _UNDER_WAY_S), peer.doubt
+            patience, doubt = peer.patience, peer.doubt
             need = 0.0
             for record in window:
                 if not record.confirmed & peer.bit:
@@ -64,7 +61,7 @@ class Thrift:
         """When a report about one of the newest packets, or about a repair, is overdue next, s; inf if none is
         expected."""
         soonest = next((at for at, _, _ in self._flight if at > now), inf)
-        waits = [(peer.bit, max(peer.patience, _UNDER_WAY_S)) for peer in self._peers.all.values()]
+        waits = [(peer.bit, peer.patience) for peer in self._peers.all.values()]
         for record in reversed(self._packets.records.values()):
             if record.number <= self._packets.newest - GROUP:
                 break
