@@ -25,9 +25,6 @@ MOST_LIFETIMES = 4096
 UNREPORTED_DEPTH = 48
 """Newer messages of the same topic after which a message is not repaired any more, while no robot reports. It applies
 to topics without lifespan."""
-GROUP = 64
-"""Number of packets that a repair combines, as long as no more are alive. Where repair cannot keep up with the losses,
-no smaller number does better (55 messages/s of 75 slots, 20 to 40 % lost)."""
 
 
 @dataclass(slots=True, eq=False)
@@ -56,16 +53,11 @@ class Lifetimes:
     """The messages of one topic that have left and are not replaced yet."""
 
     def __init__(self) -> None:
-        self._left: deque[tuple[Lifetime, int]] = deque()
-        """Their lifetimes, and the packets of each."""
-        self._packets = 0
+        self._left: deque[Lifetime] = deque()
 
-    def left(
-        self, lifetime: Lifetime, packets: int, *, policy: QueuePolicy, depth: int, reported: bool, waited_for: float
-    ) -> None:
+    def left(self, lifetime: Lifetime, *, policy: QueuePolicy, depth: int, reported: bool, waited_for: float) -> None:
         """A message has left whole: older messages that it replaces are over.
 
-        :param packets: in which it left
         :param depth: of the publishers' history, 0 for unbounded or unknown
         :param reported: whether receivers report
         :param waited_for: time in s until which receivers that do not report wait for the message before it
@@ -76,11 +68,7 @@ class Lifetimes:
         elif reported:
             most = MOST_LIFETIMES if lifetime.in_order else depth or REPORTED_DEPTH
         elif earlier:
-            before, _ = earlier[-1]
-            before.expires = min(before.expires, waited_for)
-        earlier.append((lifetime, packets))
-        self._packets += packets
-        while len(earlier) > 1 and (len(earlier) > most or (self._packets - earlier[0][1] > GROUP and not reported)):
-            replaced, count = earlier.popleft()
-            replaced.end()
-            self._packets -= count
+            earlier[-1].expires = min(earlier[-1].expires, waited_for)
+        earlier.append(lifetime)
+        while len(earlier) > most:
+            earlier.popleft().end()
