@@ -58,8 +58,7 @@ RULES: dict[str, list[Patch]] = {
     "no knowledge of what gaps held": [("gap_contents", "GapContents.learn", lambda _self, _number: None)],
 }
 CONSTANTS = (
-    ("lifetime", "WORTH"), ("lifetime", "REPORTED_DEPTH"), ("lifetime", "UNREPORTED_DEPTH"),
-    ("thrift", "_ENOUGH"),
+    ("lifetime", "WORTH"), ("thrift", "_ENOUGH"),
     ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"), ("freshness", "FIRST_AGE_S"),
     ("freshness", "LARGE"), ("packing", "SHARE"), ("packing", "MIN_FRAGMENT"), ("packing", "LONG"),
     ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
@@ -109,6 +108,7 @@ def promises(seed: int) -> dict[str, float]:
     add("odometry, bursts", loss=0.2, back=0.2, burst=3.0)
     add("odometry, 5 %", loss=0.05, back=0.05)
     add("busy", hz=55.0, loss=0.1, back=0.1)
+    add("busy, one way", hz=55.0, loss=0.2)
     add("15 packets", hz=3.0, size=700, loss=0.2, back=0.2)
     add("15 packets, one way", hz=3.0, size=700, loss=0.2)
     for reports in (True, False):

@@ -17,14 +17,8 @@ from gr_ros2.settings.config import QueuePolicy
 WORTH = 0.85
 """Part of ``hold_s`` for which a message is repaired after the next one of its topic has left, while nobody reports. A
 receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
-REPORTED_DEPTH = 160
-"""Newer messages after which a message of a best-effort topic is not repaired any more, where receivers report and the
-publishers' depth is not known."""
 MOST_LIFETIMES = 4096
-"""The same for a topic that is delivered in order: a bound on memory. Its receivers wait for the message."""
-UNREPORTED_DEPTH = 48
-"""Newer messages of the same topic after which a message is not repaired any more, while no robot reports. It applies
-to topics without lifespan."""
+"""Newer messages of the same topic after which a message is not repaired any more: a bound on memory."""
 
 
 @dataclass(slots=True, eq=False)
@@ -62,11 +56,11 @@ class Lifetimes:
         :param reported: whether receivers report
         :param waited_for: time in s until which receivers that do not report wait for the message before it
         """
-        earlier, most = self._left, UNREPORTED_DEPTH
+        earlier, most = self._left, MOST_LIFETIMES
         if policy == "latest":
             most = 1
         elif reported:
-            most = MOST_LIFETIMES if lifetime.in_order else depth or REPORTED_DEPTH
+            most = most if lifetime.in_order else depth or most  # what comes in order is waited for
         elif earlier:
             earlier[-1].expires = min(earlier[-1].expires, waited_for)
         earlier.append(lifetime)
