@@ -121,6 +121,20 @@ def _domains_of_one_test() -> Iterator[None]:
 
 
 @pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures of reports stay empty files, for tests of what stands around them: drawing takes most of the time."""
+
+    def empty(_figure: object, directory: str | Path, name: str, largest_svg: int = 0) -> list[Path]:
+        files = [Path(directory) / f"{name}.{kind}" for kind in (("svg",) if largest_svg else ("png", "svg"))]
+        Path(directory).mkdir(parents=True, exist_ok=True)
+        for file in files:
+            file.write_text("<svg/>")
+        return files
+
+    monkeypatch.setattr("gr_ros2.report.page.save_figure", empty)
+
+
+@pytest.fixture
 def result() -> Result:
     """One topic with numbers and one on which nothing was sent."""
     return RESULT
