@@ -305,14 +305,14 @@ class Medium(ABC):
             return
         later: dict[float, list[Reception]] = {}
         for reception in received:
-            receiver, sent, at, *rest = reception
+            receiver, sent, at, data, snr_db, sinr_db, measured_db = reception
             pair = sent.sender, receiver
             losses, delay_s = self._ways.get(pair) or self._way(pair)
             if losses is not None and not losses.passes(at):
                 continue
             if delay_s:
                 at += delay_s
-                later.setdefault(at, []).append(Reception(receiver, sent, at, *rest))
+                later.setdefault(at, []).append(Reception(receiver, sent, at, data, snr_db, sinr_db, measured_db))
             else:
                 yield reception
         for at, receptions in later.items():
