@@ -33,7 +33,7 @@ come: three of 141 on ``paper-ofdm-paced`` without losses."""
 _SOON = 2
 """Mean times between two new packets within which a report must come to be waited for. Where reports take eight slots
 at 20 % loss both ways, odometry is 14 % older without it; where they come at once or take 20 slots, it changes nothing
-(``python -m bench constants``)."""
+(``python -m bench constants``). With 1, odometry beside 1 MB at 20 % loss is 4 to 22 % older."""
 
 
 @dataclass(slots=True, eq=False)
