@@ -12,7 +12,6 @@ import pytest
 from bench.hostile import GROWTH, Kind, attack
 from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered
-from gr_ros2.link.v1.lifetime import GROUP
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, write_body
@@ -41,7 +40,7 @@ class Weather:
     def __init__(self, rng: random.Random, loss: float) -> None:
         self.happened: Counter[str] = Counter()
         self._rng, self._loss = rng, loss
-        self._troubles = cycle((("outage", 10), ("half", GROUP // 2), ("outage", 200), ("outage", 2000)))
+        self._troubles = cycle((("outage", 10), ("half", 32), ("outage", 200), ("outage", 2000)))
         self._outage = self._thinned = 0
 
     def lost(self) -> bool:
@@ -53,7 +52,7 @@ class Weather:
             self._outage = length
         if rng.random() < 1 / 2_500:
             self.happened["thinned"] += 1
-            self._thinned = GROUP
+            self._thinned = 64
         self._outage -= self._outage > 0
         self._thinned -= self._thinned > 0
         return bool(self._outage or self._thinned % 2 or rng.random() < self._loss)
