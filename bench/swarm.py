@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.swarm_traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.link.access import Access
 from gr_ros2.mac import read_block
 from gr_ros2.medium.base import Hearers, Medium, Path, Reception, Surroundings, Transmission
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.record.team_numbers import jain
-from gr_ros2.relay.traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.run.simulate import EventLoop
 from gr_ros2.settings.config import ChannelConfig
+from gr_ros2.wire.mac_block import Block
 
 
 @dataclass
@@ -117,8 +118,11 @@ Received = Callable[[Reception, int, float], None]
 """Is told of a packet, who made the message in it, and when, s."""
 
 
-_read = lru_cache(maxsize=64)(read_block)
-"""A block is read once for all robots that hear it."""
+@lru_cache(maxsize=64)
+def _read(packet: bytes) -> tuple[Block | None, bytes]:
+    """The block and the content of a packet, read once for all robots that hear it."""
+    end = 1 + packet[0]
+    return (read_block(packet[1:end])[0] if packet[0] else None), packet[end:]
 
 
 class SwarmRobot:
@@ -197,11 +201,11 @@ class SwarmRobot:
         return ()
 
     def _hear(self, reception: Reception) -> tuple[int, float]:
-        data, sender = reception.data, reception.sent.sender
-        end = 1 + data[0]
-        block = _read(data[1:end])[0] if data[0] else None
-        self.access.hear(sender, block, reception.sent.start * self._ppm + self._offset)
-        return self.traffic.take(sender, block, data[end:], self._local(reception.at))
+        sent = reception.sent
+        sender = sent.sender
+        block, content = _read(reception.data)
+        self.access.hear(sender, block, sent.start * self._ppm + self._offset)
+        return self.traffic.take(sender, block, content, self._local(reception.at))
 
     def expire(self, now: float) -> Iterable[Any]:  # noqa: ARG002
         return ()
@@ -225,6 +229,25 @@ class _CountedMedium(PacketMedium):
             self._t0 = 0.0
             self.lost.clear()
         yield from super().outcome(sent)
+
+
+class _Age:
+    """How old the newest message of one robot is at another one.
+
+    :ivar made: s, when it was made; nothing counts as older than the run
+    :ivar since: s, until when ``area``, the sum of the ages over time in s², counts
+    """
+
+    __slots__ = ("area", "made", "since")
+
+    def __init__(self, t0: float) -> None:
+        self.made, self.since, self.area = -1.0, t0, 0.0
+
+    def settle(self, at: float) -> None:
+        """Count until ``at`` s."""
+        if at > self.since:
+            self.area += (at - self.since) * ((self.since + at) / 2 - max(self.made, 0.0))
+            self.since = at
 
 
 class Swarm:
@@ -257,9 +280,7 @@ class Swarm:
         self.first_heard: dict[int, float] = {}
         self.received = 0
         self.got = [[0] * count for _ in range(count)]
-        self._newest: dict[tuple[int, int], float] = {}
-        self._marks: dict[tuple[int, int], float] = {}
-        self._areas: dict[tuple[int, int], float] = {}
+        self._ages: dict[tuple[int, int], _Age] = {}
 
     def run(self) -> Swarm:
         for robot in self.robots:
@@ -268,7 +289,7 @@ class Swarm:
         for _ in loop.run():
             pass
         for pair in self.pairs:
-            self._settle(pair, self.t1)
+            self._age_of(pair).settle(self.t1)
         return self
 
     def _received(self, reception: Reception, origin: int, made: float) -> None:
@@ -279,20 +300,16 @@ class Swarm:
             self.received += 1
         if origin == receiver:
             return
-        pair = origin, receiver
-        if made <= self._newest.get(pair, -1.0):
+        age = self._age_of((origin, receiver))
+        if made <= age.made:
             return
-        self._settle(pair, at)
-        self._newest[pair] = made
+        age.settle(min(at, self.t1))
+        age.made = made
         if self.t0 <= at <= self.t1:
             self.got[origin][receiver] += 1
 
-    def _settle(self, pair: tuple[int, int], at: float) -> None:
-        mark, at = self._marks.get(pair, self.t0), min(at, self.t1)
-        if at > mark:
-            made = self._newest.get(pair, 0.0)
-            self._areas[pair] = self._areas.get(pair, 0.0) + (at - mark) * ((mark + at) / 2 - made)
-            self._marks[pair] = at
+    def _age_of(self, pair: tuple[int, int]) -> _Age:
+        return self._ages.get(pair) or self._ages.setdefault(pair, _Age(self.t0))
 
     def lost(self, *reasons: str) -> int:
         """Packets that one robot did not receive from another, after ``t0``, for these reasons."""
@@ -323,7 +340,7 @@ class Swarm:
     @property
     def ages(self) -> list[float]:
         """Mean age of every pair in range, s, in order."""
-        return sorted(area / (self.t1 - self.t0) for area in self._areas.values())
+        return sorted(age.area / (self.t1 - self.t0) for age in self._ages.values() if age.since > self.t0)
 
     @property
     def age(self) -> float:

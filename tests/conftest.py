@@ -83,7 +83,8 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """In several processes, groups stay together, and slow tests begin first, so that none is waited for at the end."""
+    """In several processes, groups stay together and begin first, then slow tests, so that none is waited for at the
+    end."""
     if not config.pluginmanager.hasplugin("xdist"):
         return
     for item in items:
@@ -91,7 +92,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for name in GROUPS.keys() & names:
             item.add_marker(pytest.mark.xdist_group(name))
     if os.environ.get("PYTEST_XDIST_WORKER"):
-        items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+        items.sort(key=lambda item: [item.get_closest_marker(name) is None for name in ("xdist_group", "slow")])
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -118,6 +119,20 @@ def _domains_of_one_test() -> Iterator[None]:
     """DDS domains are a test's own until it ends."""
     yield
     domains.give_back()
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures of reports stay empty files, for tests of what stands around them: drawing takes most of the time."""
+
+    def empty(_figure: object, directory: str | Path, name: str, largest_svg: int = 0) -> list[Path]:
+        files = [Path(directory) / f"{name}.{kind}" for kind in (("svg",) if largest_svg else ("png", "svg"))]
+        Path(directory).mkdir(parents=True, exist_ok=True)
+        for file in files:
+            file.write_text("<svg/>")
+        return files
+
+    monkeypatch.setattr("gr_ros2.report.page.save_figure", empty)
 
 
 @pytest.fixture

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import math
 import random
-from heapq import nsmallest
 
 from gr_ros2.mac.slot_clock import SlotClock
 from gr_ros2.wire.mac_block import (
@@ -145,10 +144,12 @@ class Slots:
             if now < self._since + LISTEN_S:
                 return self._since + LISTEN_S
             self.clock.start(now)
-        while self._mine and self.clock.begin(self._mine[0]) < now - self.clock.slot_s / 2:
+        while self._mine:
+            begin = self.clock.begin(self._mine[0])
+            if begin >= now - self.clock.slot_s / 2:
+                return begin
             self._mine.pop(0)  # the host was late
-        if not self._mine:
-            self._mine.append(self._entry(self.clock.slot(max(now, self._since + LISTEN_S)) + 1))
+        self._mine.append(self._entry(self.clock.slot(max(now, self._since + LISTEN_S)) + 1))
         return self.clock.begin(self._mine[0])
 
     def block(self, weight: int = 1) -> bytes | None:
@@ -172,7 +173,8 @@ class Slots:
         self.reserved = slot in self._announced
         if alone:
             self._rate = min(2 * self._rate, _DEAF_RATE)
-        frame = self._frame(slot)
+        loads = self._loads(slot)
+        frame = self._frame(loads)
         kept: list[int] = []
         for mine in self._mine:
             base = kept[-1] if kept else slot
@@ -182,7 +184,7 @@ class Slots:
         while len(kept) < 2:
             kept.append(self._pick(kept[-1] if kept else slot, slot, frame))
         self._announced, self._sent = tuple(kept), slot
-        return write_block(self._content(slot, frame))
+        return write_block(self._content(slot, frame, loads))
 
     def _leave(self) -> None:
         self._mine.clear()
@@ -218,18 +220,19 @@ class Slots:
             ahead = announceable(ahead + 1) if ahead < LONGEST_AHEAD else ahead + 1
         return self._rng.choice(places) if places else base + announceable(step)
 
-    def _frame(self, now: int) -> int:
-        """Slots in which every robot around sends as often as its weight says."""
+    def _loads(self, now: int) -> list[int]:
+        """The sum of the weights of this robot and those it hears, and the same of each robot that it hears. Robots of
+        another group count too, see ``SlotClock``."""
         oldest = now - self._memory()
-        heard = [robot for robot in self._robots.values() if robot.last >= oldest]
-        most = max([self._load(oldest) + self._weight, *(robot.heard + robot.weight for robot in heard)])
-        return max(math.ceil(self._period - 1e-9), most + 1)
-
-    def _load(self, oldest: int) -> int:
-        """Sum of the weights of the robots heard since a slot. Those of another group count too, see ``SlotClock``."""
         since = self.clock.begin(oldest)
+        heard = [robot for robot in self._robots.values() if robot.last >= oldest]
         others = sum(at >= since and src_id not in self._robots for src_id, at in self._elsewhere.items())
-        return others + sum(robot.weight for robot in self._robots.values() if robot.last >= oldest)
+        own = self._weight + others + sum([robot.weight for robot in heard])
+        return [own, *[robot.heard + robot.weight for robot in heard]]
+
+    def _frame(self, loads: list[int]) -> int:
+        """Slots in which every robot around sends as often as its weight says."""
+        return max(math.ceil(self._period - 1e-9), max(loads) + 1)
 
     def _memory(self) -> int:
         """Slots for which a robot that was heard counts as heard."""
@@ -247,19 +250,17 @@ class Slots:
         oldest = now - self._lately()
         return any(robot.last >= oldest and robot.deaf >= DEAF for robot in self._robots.values())
 
-    def _content(self, slot: int, frame: int) -> Block:
+    def _content(self, slot: int, frame: int, loads: list[int]) -> Block:
         oldest = slot - self._memory()
-        heard = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= oldest}
-        fresh = slot - NAMED * frame
-        names = nsmallest(2, (n for n in heard if heard[n].last >= fresh), key=lambda src_id: heard[src_id].named)
+        lately = max(oldest, slot - NAMED * frame)
+        fresh = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= lately}
+        names = sorted(fresh, key=lambda src_id: fresh[src_id].named)[:2]
         for src_id in names:
-            heard[src_id].named = self._turn(slot) if heard[src_id].named == _NEVER else slot
+            fresh[src_id].named = self._turn(slot) if fresh[src_id].named == _NEVER else slot
         first, second = [*names, NOBODY, NOBODY][:2]
         ahead = self._mine[0] - slot, self._mine[1] - self._mine[0]
-        load = self._load(oldest)
-        short = Block(slot % SLOT_NUMBERS, ahead, load, (first, second))
-        around = {load + self._weight, *(robot.heard + robot.weight for robot in heard.values())}
-        if self._weight == 1 and self._named_at < oldest and len(around) == 1:
+        short = Block(slot % SLOT_NUMBERS, ahead, loads[0] - self._weight, (first, second))
+        if self._weight == 1 and self._named_at < oldest and len(set(loads)) == 1:
             return short
         expected = sum(1 << at - slot - 1 for at in self._taken if 0 < at - slot <= MAP_SLOTS)
         wanted = min((at for at in self._conflicts if slot + 1 < at < slot + SLOT_NUMBERS), default=None)

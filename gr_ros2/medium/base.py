@@ -57,6 +57,16 @@ class Hearers:
     robots: int
 
     @cached_property
+    def receivers(self) -> list[int]:
+        """``ids`` as a list."""
+        return [int(one) for one in self.ids]
+
+    @cached_property
+    def noiseless(self) -> bool:
+        """Whether no receiver has noise."""
+        return not self.noise.any()
+
+    @cached_property
     def noise(self) -> Floats:
         """1, or 0 for a receiver without noise, shape (n,)."""
         return np.isfinite(self.snr_db).astype(float)
@@ -190,7 +200,7 @@ class Losses:
         self._counts: dict[str, Ints] = {}
         self.dropped: dict[tuple[int, int], Counter[str]] = defaultdict(Counter)
 
-    def add(self, reason: str, sender: int, receivers: int | Ints, count: int = 1) -> None:
+    def add(self, reason: str, sender: int, receivers: int | Ints | list[int], count: int = 1) -> None:
         """A packet, or ``count``, was not received by these robots."""
         if reason not in self._counts:
             self._counts[reason] = np.zeros((self._robots, self._robots), int)
@@ -234,7 +244,8 @@ class Medium(ABC):
         self._sent: Counter[int] = Counter()
         self._recent: deque[Transmission] = deque()
         self._longest = 0.0
-        self._losses: dict[tuple[int, int], PduLosses] = {}
+        self._ways: dict[tuple[int, int], tuple[PduLosses | None, float]] = {}
+        """What drops whole packets from a sender to a receiver, and by how many s it delays the others."""
 
     def send(self, sender: int, data: bytes, start: float, airtime: float, mcs: int = 0) -> Transmission:
         """Take a packet that starts at ``start`` s and lasts for ``airtime`` s."""
@@ -294,21 +305,23 @@ class Medium(ABC):
             return
         later: dict[float, list[Reception]] = {}
         for reception in received:
-            path = self.around.path(reception.sent.sender, reception.receiver)
-            if path.channel.loses_packets and not self._losses_of(path, reception).passes(reception.at):
+            receiver, sent, at, data, snr_db, sinr_db, measured_db = reception
+            pair = sent.sender, receiver
+            losses, delay_s = self._ways.get(pair) or self._way(pair)
+            if losses is not None and not losses.passes(at):
                 continue
-            if path.delay_s:
-                at = reception.at + path.delay_s
-                later.setdefault(at, []).append(reception._replace(at=at))
+            if delay_s:
+                at += delay_s
+                later.setdefault(at, []).append(Reception(receiver, sent, at, data, snr_db, sinr_db, measured_db))
             else:
                 yield reception
         for at, receptions in later.items():
             heapq.heappush(self._due, (at, next(self._order), receptions))
 
-    def _losses_of(self, path: Path, reception: Reception) -> PduLosses:
-        key = reception.sent.sender, path.receiver
-        losses = self._losses.get(key)
-        if losses is None:
-            losses = self._losses[key] = PduLosses(path.channel)
-            losses.dropped = self.lost.dropped[key]
-        return losses
+    def _way(self, pair: tuple[int, int]) -> tuple[PduLosses | None, float]:
+        path = self.around.path(*pair)
+        losses = PduLosses(path.channel) if path.channel.loses_packets else None
+        if losses is not None:
+            losses.dropped = self.lost.dropped[pair]
+        way = self._ways[pair] = losses, path.delay_s
+        return way

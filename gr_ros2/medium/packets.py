@@ -122,6 +122,11 @@ class PacketMedium(Medium):
         if not len(heard.ids):
             return
         reach = self._reached(sent, heard)
+        others = self.others(sent)
+        self.examined += len(heard.ids) + len(others)
+        if heard.noiseless and self._certain(reach):
+            yield from self._in_reach(sent, heard, others)
+            return
         draw = self._random[sent.sender]
         chances, errors = draw.random(len(heard.ids)), draw.normal(0, _ERROR_DB, len(heard.ids))
         levels = heard.levels
@@ -130,8 +135,6 @@ class PacketMedium(Medium):
             for place, fading in reach.fading.items():
                 levels[place] *= 10 ** (fading.gain_db(sent.end) / 10)
         clear = self._clear(reach, sent, levels)
-        others = self.others(sent)
-        self.examined += len(heard.ids) + len(others)
         alone = chances < clear
         for place, bursts in reach.bursts.items():
             alone[place] = bursts.passes(sent.end)
@@ -155,6 +158,24 @@ class PacketMedium(Medium):
         for receiver, snr_db, sinr_db, measured_db in zip(*(row[arrived].tolist() for row in rows), strict=True):
             yield Reception(receiver, sent, sent.end, sent.data, snr_db, sinr_db, measured_db)
 
+    def _in_reach(self, sent: Transmission, heard: Hearers, others: Sequence[Transmission]) -> Iterator[Reception]:
+        """The outcome where nothing is known of levels: whoever hears one packet alone receives it."""
+        end = self._end(sent)
+        others = [other for other in others if other.start < end and sent.start < self._end(other)]
+        sending = {other.sender for other in others}
+        disturbed = {one for other in others for one in self.around.hearers(other.sender, sent.start).receivers}
+        lost: dict[str, list[int]] = {"sending": [], "collision": []}
+        for receiver in heard.receivers:
+            if receiver in sending:
+                lost["sending"].append(receiver)
+            elif receiver in disturbed:
+                lost["collision"].append(receiver)
+            else:
+                yield Reception(receiver, sent, sent.end, sent.data, measured_db=_CLEAR_DB)
+        for reason, receivers in lost.items():
+            if receivers:
+                self.lost.add(reason, sent.sender, receivers)
+
     def _reached(self, sent: Transmission, heard: Hearers) -> _Reach:
         known = self._reach.get(sent.sender)
         if known is None or (known.heard is not heard and known.fading):
@@ -164,9 +185,13 @@ class PacketMedium(Medium):
         self._reach[sent.sender] = known
         return known
 
+    def _certain(self, reach: _Reach) -> bool:
+        """Whether the PHY loses nothing where nothing disturbs."""
+        return self._ideal or not reach.phy.has_samples
+
     def _clear(self, reach: _Reach, sent: Transmission, levels: Floats) -> Floats:
         """PDR of a packet where nothing disturbs it."""
-        if self._ideal or not reach.phy.has_samples:
+        if self._certain(reach):
             return np.ones(len(levels))
         if not reach.mcs_table and not self.shared and not self.around.moves:
             return self._fixed(reach)
@@ -248,7 +273,7 @@ class PacketMedium(Medium):
         :param power: of the interference over that of the noise
         :param offset: as in :meth:`CollisionTable.survival`
         """
-        if self._ideal or not reach.phy.has_samples:
+        if self._certain(reach):
             return np.zeros(len(hit))  # nothing is known of a level: packets that overlap are lost
         noise = reach.heard.noise[hit]
         survival = np.ones(len(hit))
@@ -268,7 +293,7 @@ class PacketMedium(Medium):
     def _deaf(self, reach: _Reach, sent: Transmission, others: Sequence[Transmission]) -> list[int]:
         """The robots that send while a packet is on the air, and so long that they miss too much of it."""
         begin, end = sent.start, self._end(sent)
-        for channel in reach.groups if reach.phy.has_samples and not self._ideal else ():
+        for channel in () if self._certain(reach) else reach.groups:
             table = self._table(reach.phy.on_mcs(sent.mcs), channel, measured=not reach.mcs_table)
             if table is not None:
                 length = end - begin

@@ -488,8 +488,7 @@ class EventLoop:
             in_vain = 0 if happened or now > before else in_vain + 1
             if in_vain == _IN_VAIN:
                 raise self._stalled()
-        for reception in self._medium.rest():
-            yield from self._received(reception)
+        yield from self._received(self._medium.rest(), set())
         for robot in self._robots:
             yield from robot.expire(self.now)
 
@@ -516,27 +515,26 @@ class EventLoop:
             self._at[number] = inf
             concerned.add(number)
             if not self._medium.late:
-                yield from self._handled(self._robots[number].expire(now))
-        for reception in self._medium.receptions(now):
-            concerned.add(reception.receiver)
-            yield from self._received(reception)
+                for timed_event in self._robots[number].expire(now):
+                    yield timed_event
+                    self._robots[number].wake(now)
+        yield from self._received(self._medium.receptions(now), concerned)
         for number in sorted(concerned):
             robot = self._robots[number]
             if robot.due <= now:
                 yield from robot.step(now, self._medium)
             self._plan(robot)
 
-    def _received(self, reception: Reception) -> Iterator[TimedEvent]:
-        robot = self._robots[reception.receiver]
-        if self._medium.late:
-            yield from robot.expire(reception.at)
-        yield from self._handled(robot.receive(reception))
-
-    def _handled(self, timed_events: Iterable[TimedEvent]) -> Iterator[TimedEvent]:
-        """Pass the events on, and let a robot that has received something send."""
-        for timed_event in timed_events:
-            yield timed_event
-            timed_event[1].wake(self.now)
+    def _received(self, receptions: Iterable[Reception], concerned: set[int]) -> Iterator[TimedEvent]:
+        """Hand over what was received, and note by whom."""
+        for reception in receptions:
+            concerned.add(reception.receiver)
+            robot = self._robots[reception.receiver]
+            if self._medium.late:
+                yield from robot.expire(reception.at)
+            for timed_event in robot.receive(reception):
+                yield timed_event
+                robot.wake(self.now)
 
     def _soonest(self) -> float:
         """When a robot has something to do next."""

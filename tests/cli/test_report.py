@@ -13,6 +13,7 @@ from gr_ros2.cli import main as command
 from tests.record.runs import make_run
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_one_folder_gets_its_own_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make_run(tmp_path)
     assert command.run(["report", str(tmp_path)]) == 0
@@ -21,6 +22,7 @@ def test_one_folder_gets_its_own_report(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_several_folders_leave_theirs_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -89,6 +91,7 @@ def test_a_missing_folder_is_one_line_and_status_2(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_repetitions_are_reported_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for k in range(2):
         make_run(tmp_path / f"rep-{k}", "one")

@@ -17,6 +17,7 @@ from gr_ros2.cli import main as command
 LOSSY = ["--duration", "1", "--set", "channel.packet_loss=0.02", "--set", "time=packets"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_repetitions_end_in_means_and_one_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "paper-direct", "--repetitions", "2", "--seed", "4", *LOSSY, "--out", str(tmp_path)]
     assert command.run(words) == 0
@@ -40,6 +41,7 @@ def test_one_repetition_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "Where every sent message went" in out
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("repetitions", [1, 2])
 def test_a_report_can_wait(repetitions: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "paper-direct", "--repetitions", str(repetitions), *LOSSY, "--out", str(tmp_path)]

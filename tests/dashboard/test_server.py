@@ -86,11 +86,11 @@ def test_a_page_grows_no_larger_with_time() -> None:
     state = DashboardState(REGISTRY, NAMES, 64, name="test")
     feed = Feed(state, lost=lambda number: number % 7 == 0, packet_len=64)
     sizes: list[int] = []
-    for step in range(1200):
+    for step in range(600):
         feed.submit(0, at(step, -step), step / 2)
         feed.fly(step / 2)
         page.draw(state.tick(step / 2), dashboard.radio)
-        if step % 400 == 399:
+        if step % 200 == 199:
             everything = document.to_json()
             sizes.append(
                 len(json.dumps(everything.content, default=str)) + sum(len(b.data) for b in everything.buffers)

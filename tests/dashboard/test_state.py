@@ -232,14 +232,14 @@ def resident_mb() -> float:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc to read the memory from")
-def test_25_minutes_at_35_hz_take_no_more_memory_than_ten() -> None:
+def test_18_minutes_at_35_hz_take_no_more_memory_than_ten() -> None:
     state = make(packet_len=220)
     lost = random.Random(1)
     feed = Feed(state, lost=lambda _number: lost.random() < 0.2, packet_len=220)
     payloads = [at(step, -step) for step in range(500)]
     early: tuple[dict[str, int], float] | None = None
     tick_at = 0.0
-    for step in range(1500 * 35):
+    for step in range(1080 * 35):
         now = step / 35
         feed.submit(0, payloads[step % len(payloads)], now)
         feed.fly(now)
@@ -248,12 +248,12 @@ def test_25_minutes_at_35_hz_take_no_more_memory_than_ten() -> None:
             snapshot = state.tick(now)
         if step == 600 * 35:
             early = sizes(snapshot), resident_mb()
-    snapshot = state.tick(1500.0)
+    snapshot = state.tick(1080.0)
     assert early is not None
     assert sizes(snapshot)["paths"] <= early[0]["paths"] + 3
     assert sizes(snapshot)["packets"] == PACKETS_SHOWN
     assert sizes(snapshot)["series"] <= 2 * 360
-    assert snapshot.sent == 1500 * 35
+    assert snapshot.sent == 1080 * 35
     assert snapshot.delivered > 0.7 * snapshot.sent
     source = state._sources[SRC]
     assert len(source.messages) <= UNDER_WAY

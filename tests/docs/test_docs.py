@@ -8,6 +8,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +124,7 @@ SHORTER = {
 }
 """What is added to a command so that it ends soon."""
 REPORTING = "README.md"
-"""The page whose runs write their reports too. The others' runs do without: drawing takes longer than the run."""
+"""The page whose runs write and draw their reports too. The others' do without: drawing takes longer than the run."""
 WALKED = {
     "docs/four-robots.md": ("demo", "run"),
     "docs/tutorial.md": ("run", "compare", "registry", "replay"),
@@ -227,20 +229,33 @@ def sample_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def fill(folder: Path) -> None:
     demo = ("run", "demo", "--duration", "2", "--no-report", "--set", "time=packets")
-    ours(*demo, "--out", "clean", folder=folder)
+    here(*demo, "--out", "clean", folder=folder)
     for name in ("noisy", "results/a", "results/b"):
         shutil.copytree(folder / "clean", folder / name)
     bag = folder / "clean" / "delivered"
     (mcap,) = bag.glob("*.mcap")
     for name in ("IN.mcap", "arrived.mcap"):
         shutil.copy(mcap, folder / name)
-    ours(*demo, "--out", "robot", "--set", "ros_sink.namespace_format=/robot_{src_id}", folder=folder)
+    here(*demo, "--out", "robot", "--set", "ros_sink.namespace_format=/robot_{src_id}", folder=folder)
     shutil.copytree(folder / "robot" / "delivered", folder / "my_bag")
     shutil.copy(ROOT / "gr_ros2/scenarios/demo.yaml", folder / "my_scenario.yaml")
     shutil.copy(ROOT / "gr_ros2/examples/link-sim.yaml", folder / "my_link.yaml")
     shutil.copy(ROOT / "gr_ros2/scenarios/table4.csv", folder / "table4.csv")
     for path in (ROOT / "gr_ros2/examples").glob("link-*.yaml"):
         shutil.copy(path, folder)
+
+
+def here(*arguments: str, folder: Path) -> str:
+    """Run a command in a folder as `ours` does, but in this process, which has everything imported.
+
+    :return: what it prints
+    """
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        patch.chdir(folder)
+        patch.setenv("XDG_CACHE_HOME", str(folder.parent / "cache"))
+        status = command_line.run([*arguments])
+    assert status == 0, f"{' '.join(arguments)}: see above"
+    return said.getvalue()
 
 
 def ours(*arguments: str, folder: Path, home: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -265,7 +280,11 @@ def folder(sample_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize(("block", "words"), runnable())
-def test_every_command_runs(block: Block, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_runs(
+    block: Block, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
+) -> None:
+    if block.page != REPORTING:
+        request.getfixturevalue("undrawn")
     for other in blocks("yaml"):
         place, _, name = other.about.partition("=")
         if other.page == block.page and place == "file":

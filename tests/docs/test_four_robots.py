@@ -14,13 +14,13 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.record.result import Result, TopicResult, read_result
 from gr_ros2.record.team import Team, read_team
 from tests.docs.pages import blocks, commands
-from tests.docs.test_docs import ours
+from tests.docs.test_docs import here
 from tests.once import once
 
 pytestmark = pytest.mark.slow
 
 PAGE = "docs/four-robots.md"
-SHORTER = {"demo": "12", "at-once": "8", "samples": "30", "packets": "30", "live": "8"}
+SHORTER = {"demo": "12", "at-once": "4", "samples": "20", "packets": "20", "live": "4"}
 """s instead of a minute, or of 20 s: what the page says holds for them as well."""
 NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets", "live")
 
@@ -37,7 +37,7 @@ def walk(folder: Path) -> None:
     for words, name in zip(runs, NAMES, strict=True):
         drawn = () if words[1] == "demo" else ("--no-report",)
         shorter = ("--duration", SHORTER[name]) if name in SHORTER else ()
-        ours(*words[1:], *shorter, *drawn, folder=folder)
+        here(*words[1:], *shorter, *drawn, folder=folder)
 
 
 def topics(result: Result) -> Iterator[TopicResult]:

@@ -13,7 +13,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.record.result import read_result
 from tests.docs.pages import blocks, commands
-from tests.docs.test_docs import ours
+from tests.docs.test_docs import here
 from tests.once import once
 
 pytestmark = pytest.mark.slow
@@ -36,17 +36,17 @@ def walk(folder: Path) -> None:
     runs = list(step("gr-ros2", "run"))
     assert len(runs) == 2
     for words in runs:
-        ours(*words[1:], "--duration", "10", "--no-report", "--set", "time=samples", folder=folder)
+        here(*words[1:], "--duration", "10", "--no-report", "--set", "time=samples", folder=folder)
     first, last = step("gr-ros2", "registry", "from-bag")
     (replay,) = step("gr-ros2", "replay")
     for name, words in (("first", first), ("replay", replay), ("last", last)):
-        (folder / f"{name}.txt").write_text(ours(*words[1:], folder=folder).stdout)
+        (folder / f"{name}.txt").write_text(here(*words[1:], folder=folder))
 
 
 def test_step_1_all_arrives_and_the_papers_format_loses(tmp_path: Path) -> None:
     short = ("--duration", "10", "--no-report", "--set", "time=samples")
-    ours("demo", "--out", "new", *short, folder=tmp_path)
-    ours("demo", "--wire", "0", "--out", "old", *short, folder=tmp_path)
+    here("demo", "--out", "new", *short, folder=tmp_path)
+    here("demo", "--wire", "0", "--out", "old", *short, folder=tmp_path)
     new, old = (read_result(tmp_path / name).topics for name in ("new", "old"))
     assert all(topic.delivered == topic.sent for topic in new)
     first = sum(topic.ledger["delivered"] for topic in new if "delivered" in topic.ledger) / sum(t.sent for t in new)
@@ -83,7 +83,7 @@ def test_step_2_compare_shows_settings_first_and_only_what_differs(walked: Path,
     for name in ("clean", "noisy"):
         shutil.copytree(walked / name, tmp_path / name)
     (words,) = step("gr-ros2", "compare")
-    lines = [line.split() for line in ours(*words[1:], folder=tmp_path).stdout.splitlines()]
+    lines = [line.split() for line in here(*words[1:], folder=tmp_path).splitlines()]
     table = [line for line in lines if line and (line[0] == "setting" or line[0].startswith("/robot_1"))]
     assert table[0][:2] == ["setting", "channel.snr_db"]
     assert not any(line[1] in ("sent", "delivered", "PDR") for line in table), "they are equal"

@@ -1,4 +1,4 @@
-"""80,000 messages through source and sink; prints by how much the process has grown. Run by test_endurance.py.
+"""50,000 messages through source and sink; prints by how much the process has grown. Run by test_endurance.py.
 
 A process of its own: what other tests left to be freed, or took for good, would count otherwise.
 """
@@ -21,7 +21,7 @@ from tests.domains import free_domains
 from tests.middleware.support import STRING, message
 from tests.waiting import wait_for
 
-MESSAGES, WARM_UP, BATCH = 80_000, 20_000, 1_000
+MESSAGES, WARM_UP, BATCH = 50_000, 20_000, 1_000
 WINDOW_BYTES = 100_000
 """For packets that are remembered. A dictionary of the 30,000 that the default allows is copied every 57,000 packets;
 each copy may leave 2.6 MB of the heap unused. So few are over before the first look."""

@@ -218,6 +218,7 @@ def as_command(out: Path, *options: str, duration_s: float = 2.0) -> int:
     return command.run(["run", "paper-direct", "--duration", str(duration_s), "--out", str(out), *options, *words])
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("passing", ["real", "packets"])
 def test_a_capture_on_a_full_disk_ends_alone(
     passing: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture

@@ -35,6 +35,7 @@ from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.radio import Radio, make_radio
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from tests.gr.probe import Probe
+from tests.once import once
 from tests.waiting import wait_for
 
 DESCRIPTIONS = sorted(grc_path().glob("*.block.yml"))
@@ -430,19 +431,23 @@ def test_the_first_example_shows_its_robots_topics_and_what_the_sliders_do(tmp_p
 
 
 @pytest.fixture(scope="module")
-def drawings() -> dict[str, Any]:
+def drawings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Name and rectangle of every block of every example, px, as GNU Radio Companion draws them; and of every wire the
     blocks at its ends, and the points of its two lines and of the Bezier curve between them."""
     pytest.importorskip("gi", reason="needs GTK; Debian: apt-get install gir1.2-gtk-3.0")
     if not shutil.which("xvfb-run"):
         pytest.skip("needs a screen; Debian: apt-get install xvfb")
+    found: dict[str, Any] = json.loads((once(tmp_path_factory, "drawings", draw) / "drawings.json").read_text())
+    return found
+
+
+def draw(folder: Path) -> None:
     environ = {**os.environ, "GRC_BLOCKS_PATH": str(grc_path())}
     done = subprocess.run(
         ["xvfb-run", "-a", sys.executable, "-c", DRAW, *map(str, EXAMPLES)], env=environ, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    (folder / "drawings.json").write_text(done.stdout.splitlines()[-1])
 
 
 DRAW = """

@@ -31,6 +31,7 @@ from tests.waiting import PATIENCE_S, wait_for
 ROOT = Path(__file__).resolve().parents[2]
 GRCC = Path("/usr/bin/grcc")
 GRC = Path("/usr/bin/gnuradio-companion")
+GRC_CACHE = Path.home() / ".cache" / "grc_gnuradio"
 BLOCKS = block_folder()
 ODOM = "nav_msgs/Odometry"
 KEY_S = 5.0
@@ -53,9 +54,11 @@ def grc_path(home: Path, option: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A home folder in which --install was called."""
+    """A home folder in which --install was called. Where GRC finds no cache, it reads its descriptions for 6 s."""
     if not GRCC.is_file():
         pytest.skip("needs GNU Radio's grcc in /usr/bin")
+    if GRC_CACHE.is_dir():
+        shutil.copytree(GRC_CACHE, tmp_path / ".cache" / GRC_CACHE.name)
     done = grc_path(tmp_path, "--install")
     if "make its environment by" in done.stderr:
         pytest.skip(f"these tests run in another Python than GNU Radio: {done.stderr.strip()}")
@@ -231,17 +234,25 @@ class Keyboard:
         """The first window that is shown with this in its title; '' while there is none."""
         return self.run("search", "--onlyvisible", "--name", title).partition("\n")[0]
 
+    def opened(self, title: str) -> str:
+        """That window, once it is there."""
+        command = ["xdotool", "search", "--sync", "--onlyvisible", "--name", title]
+        done = subprocess.run(command, env=self._environ, capture_output=True, text=True, timeout=PATIENCE_S)
+        return done.stdout.partition("\n")[0]
+
     def press(self, window: str, key: str, until: Callable[[], object], what: str) -> None:
         """A key again and again, since a window takes none until it is ready; with time for what the key does."""
         again = 0.0
 
         def done() -> object:
             nonlocal again
-            if not until() and time.monotonic() > again:
+            if until():
+                return True
+            if time.monotonic() > again:
                 self.run("windowfocus", window)
                 self.run("key", key)
                 again = time.monotonic() + KEY_S
-            return until()
+            return False
 
         wait_for(done, what)
 
@@ -298,8 +309,7 @@ def test_the_window_draws_an_example_runs_it_and_closes(
         command = [GRC, path]
         grc = subprocess.Popen(command, env=environ, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=home)
     try:
-        wait_for(lambda: keyboard.window("psk_loopback.grc"), "the window")
-        window = keyboard.window("psk_loopback.grc")
+        window = keyboard.opened("psk_loopback.grc")
         wait_for(lambda: colours(pixels) > empty + 100, "blocks to be drawn")
         keyboard.press(window, F6, path.with_suffix(".py").is_file, "the flowgraph to be generated")
         wait_for(started.is_file, "the flowgraph to be run")
@@ -335,8 +345,7 @@ def test_the_first_example_runs_on_the_play_button_in_a_window_of_its_own(home: 
     with (home / "log").open("w") as log:
         grc = subprocess.Popen([GRC, path], env=environ, stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=home)
     try:
-        wait_for(lambda: keyboard.window("first_link.grc"), "the window")
-        window = keyboard.window("first_link.grc")
+        window = keyboard.opened("first_link.grc")
         wait_for(lambda: colours(pixels) > empty + 100, "blocks to be drawn")
         title = "ROS topics over OFDM"
         keyboard.press(window, F6, lambda: keyboard.window(title), "the flowgraph's window")

@@ -89,7 +89,7 @@ def test_a_robot_with_weight_sends_as_often_and_says_so() -> None:
 def test_a_slot_in_whose_place_somebody_sends_one_frame_before_is_passed_over() -> None:
     made = robot()
     hear(made, 7, 60, Block(0, (300, 300), 1, (5, NOBODY)))
-    made._confirmed_at, frame = 70, made._frame(70)
+    made._confirmed_at, frame = 70, made._frame(made._loads(70))
     made._taken |= {77 + frame: 7, 78: 7}
     assert made._pick(77, 70, frame) == 77 + frame + 2
 

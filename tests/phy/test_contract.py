@@ -51,7 +51,9 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("lora", {"implementation": "lora_sdr", "spreading_factor": 9, "coding_rate": 3, "oversampling": 4}),
     ("lora", {"implementation": "lora_sdr", "spreading_factor": 8, "coding_rate": 1, "ldro": True, "gap": 48}),
 ]
-LENGTHS = (14, 15, 16, 64, 220, 1500, 4095)
+LENGTHS = (14, 15, 64, 4095)
+MORE_LENGTHS = (16, 220, 1500)
+"""Of the settings that each PHY has by itself."""
 LONGEST = {"lora_sdr": 251, "wifi": 1492}
 """By implementation or name."""
 IDS = ["-".join([name, *(f"{key}={value}" for key, value in options.items())]) for name, options in SETTINGS]
@@ -68,7 +70,7 @@ _LONG = 10_000
 CASES = [
     pytest.param(name, options, packet_len, id=f"{packet_len}-{about}")
     for (name, options), about in zip(SETTINGS, IDS, strict=True)
-    for packet_len in LENGTHS
+    for packet_len in (*LENGTHS, *(() if options else MORE_LENGTHS))
     if packet_len <= LONGEST.get(options.get("implementation", name), max(LENGTHS))
 ]
 

@@ -113,6 +113,7 @@ def test_every_fate_of_the_ledger_is_said_in_words(tmp_path: Path) -> None:
     assert all(fate.words in outcome for fate in Fate)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_repair_did_is_told_and_tabulated(tmp_path: Path) -> None:
     out = tmp_path / "repaired"
     settings = ["version=1", "reports={}", "channel.packet_loss=0.2", "time=packets"]

@@ -59,6 +59,7 @@ def test_a_report_stands_alone(tmp_path: Path) -> None:
     assert all(path.stat().st_size for path in others)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_papers_numbers_stand_above_the_runs(tmp_path: Path) -> None:
     make_run(tmp_path)
     text = write_report(read_runs([tmp_path]), tmp_path)[0].read_text()
@@ -71,6 +72,7 @@ def test_the_papers_numbers_stand_above_the_runs(tmp_path: Path) -> None:
     assert "8 (16%) lost because a fragment did not arrive" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_other_scenarios_have_nothing_of_the_paper(tmp_path: Path) -> None:
     make_run(tmp_path, "demo")
     assert "of the paper" not in write_report(read_runs([tmp_path]), tmp_path)[0].read_text()
@@ -94,6 +96,7 @@ def test_the_same_files_give_the_same_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_several_runs_share_a_report(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "paper-ofdm")
     make_run(tmp_path / "b", "paper-direct", paced=False)
@@ -110,6 +113,7 @@ def test_several_runs_share_a_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_runs_of_one_scenario_are_called_after_their_folders(tmp_path: Path) -> None:
     paths = [tmp_path / "x" / "one", tmp_path / "x" / "two", tmp_path / "y" / "one"]
     for path in paths:
@@ -138,6 +142,7 @@ def test_files_of_two_runs_are_refused(tmp_path: Path) -> None:
         read_runs([tmp_path / "a"])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_the_sources_graph_lost_is_in_every_part(tmp_path: Path) -> None:
     make_run(tmp_path, missed=51)
     page, *_ = write_report(read_runs([tmp_path]), tmp_path, pictures=True)
@@ -146,6 +151,7 @@ def test_what_the_sources_graph_lost_is_in_every_part(tmp_path: Path) -> None:
     assert (summary["sent"], summary["ledger_lost_on_graph"]) == (ODOM + 51, 51)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     run = make_run(tmp_path / "a")
     (tmp_path / "file").touch()
@@ -153,6 +159,7 @@ def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
         write_report([run], tmp_path / "file")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_run_folder_can_be_moved(tmp_path: Path) -> None:
     make_run(tmp_path / "a")
     shutil.move(tmp_path / "a", tmp_path / "b")

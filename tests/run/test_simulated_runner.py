@@ -102,13 +102,13 @@ def test_without_noise_real_time_samples_and_packets_agree() -> None:
 
 @pytest.mark.slow
 def test_in_noise_packets_lose_what_samples_lose(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loss_table, "PACKETS", 2000)
+    monkeypatch.setattr(loss_table, "PACKETS", 1000)
     monkeypatch.setattr(loss_table, "BUILTIN_DIR", Path("none"))
     samples, packets = (run("paper-ofdm-paced", time, *PLAIN, "channel.snr_db=12.25", duration_s=20.0) for time in BOTH)
     one, other = samples.result.topics[0], packets.result.topics[0]
     assert one.sent == other.sent == 700
     assert one.pdr is not None and other.pdr is not None
-    spread = sqrt(one.pdr * (1 - one.pdr) * (1 / one.sent + 1 / other.sent + 2 / 2000))
+    spread = sqrt(one.pdr * (1 - one.pdr) * (1 / one.sent + 1 / other.sent + 2 / 1000))
     assert abs(one.pdr - other.pdr) < 2.58 * spread, "99 %, the two points of the table included"
     assert 0.3 < one.pdr < 0.9
 

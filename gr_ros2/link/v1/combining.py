@@ -1,9 +1,9 @@
 """Which packets a repair combines.
 
-A combination is of the newest live packets, up to ``GROUP``. If more packets are alive, it is taken from windows of 127
-numbers, which move over all of them and overlap. With one live packet this is repetition, which is age-optimal. Windows
-that overlap even out the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as many on
-average, and after 1.36 times as many in separate groups of 64.
+A combination is of all live packets. If they have more than 127 numbers, as many as a repair can name, it is taken from
+windows of 127, which move over all of them and overlap. With one live packet this is repetition, which is age-optimal.
+Windows that overlap even out the losses of their packets: 676 packets at 20 % loss are complete after 1.24 times as
+many on average, and after 1.36 times as many in separate groups of 64.
 
 Invariant: no two repairs of the same packets have the same coefficients.
 """
@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from gr_ros2.link.v1.gf256 import combine
-from gr_ros2.link.v1.lifetime import GROUP
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.wire.v1 import MAX_WINDOW
 
@@ -48,48 +47,9 @@ class Combining:
         self._place = 0.0
 
     def window(self, now: float) -> list[Sent]:
-        """The next window."""
-        if self._packets.many(now):
-            return self.in_turn(now)
-        found: list[Sent] = []
-        everybody = self._packets.everybody
-        before, free = -1, GROUP
-        for record in reversed(self._packets.records.values()):
-            if record.number <= before:
-                break
-            if everybody and record.confirmed & everybody == everybody:
-                continue
-            for lifetime in record.lifetimes:  # ``alive``, whose call would take half of this loop's time
-                if now < lifetime.expires:
-                    break
-            else:
-                continue
-            if not found:
-                before = record.number - MAX_WINDOW
-            found.append(record)
-            free -= 1
-            if not free:
-                break
-        return found
+        """The next of the windows over all live packets, from the oldest one kept on.
 
-    def newest(self, now: float) -> list[Sent]:
-        """The window of the newest numbers."""
-        packets = self._packets
-        return list(packets.live(max(packets.oldest, packets.newest - MAX_WINDOW + 1), packets.newest, now))[::-1]
-
-    def around(self, number: int, now: float) -> list[Sent]:
-        """The window around a number; only the oldest packet if all are newer."""
-        packets = self._packets
-        if number < packets.oldest:
-            return list(packets.live(packets.oldest, packets.oldest, now))
-        half = MAX_WINDOW // 2
-        first, last = max(number - half, packets.oldest), min(number + half, packets.newest)
-        return list(packets.live(first, last, now))[::-1]
-
-    def in_turn(self, now: float) -> list[Sent]:
-        """The next of the windows over all live packets.
-
-        The positions of the windows follow the golden section, which spreads any number of them evenly. Windows that
+        Their positions follow the golden section, which spreads any number of them evenly. Windows that
         would reach beyond the ends are moved to the ends, so that the packets there are in as many windows as others.
         """
         packets = self._packets
@@ -103,6 +63,15 @@ class Combining:
                 found = list(packets.live(record.number, last, now))
                 break
         return found[::-1]
+
+    def around(self, number: int, now: float) -> list[Sent]:
+        """The window around a number; only the oldest packet if all are newer."""
+        packets = self._packets
+        if number < packets.oldest:
+            return list(packets.live(packets.oldest, packets.oldest, now))
+        half = MAX_WINDOW // 2
+        first, last = max(number - half, packets.oldest), min(number + half, packets.newest)
+        return list(packets.live(first, last, now))[::-1]
 
     def combine(self, window: list[Sent], proven: int, now: float) -> tuple[Repair, list[Sent]] | None:
         """The combination of a window, and the packets that it combines: all in its span if a mask does not fit beside

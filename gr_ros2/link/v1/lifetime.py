@@ -17,17 +17,8 @@ from gr_ros2.settings.config import QueuePolicy
 WORTH = 0.85
 """Part of ``hold_s`` for which a message is repaired after the next one of its topic has left, while nobody reports. A
 receiver goes on without it after ``hold_s``; what comes back later than that is of no use."""
-REPORTED_DEPTH = 160
-"""Newer messages after which a message of a best-effort topic is not repaired any more, where receivers report and the
-publishers' depth is not known."""
 MOST_LIFETIMES = 4096
-"""The same for a topic that is delivered in order: a bound on memory. Its receivers wait for the message."""
-UNREPORTED_DEPTH = 48
-"""Newer messages of the same topic after which a message is not repaired any more, while no robot reports. It applies
-to topics without lifespan."""
-GROUP = 64
-"""Number of packets that a repair combines, as long as no more are alive. Where repair cannot keep up with the losses,
-no smaller number does better (55 messages/s of 75 slots, 20 to 40 % lost)."""
+"""Newer messages of the same topic after which a message is not repaired any more: a bound on memory."""
 
 
 @dataclass(slots=True, eq=False)
@@ -56,31 +47,22 @@ class Lifetimes:
     """The messages of one topic that have left and are not replaced yet."""
 
     def __init__(self) -> None:
-        self._left: deque[tuple[Lifetime, int]] = deque()
-        """Their lifetimes, and the packets of each."""
-        self._packets = 0
+        self._left: deque[Lifetime] = deque()
 
-    def left(
-        self, lifetime: Lifetime, packets: int, *, policy: QueuePolicy, depth: int, reported: bool, waited_for: float
-    ) -> None:
+    def left(self, lifetime: Lifetime, *, policy: QueuePolicy, depth: int, reported: bool, waited_for: float) -> None:
         """A message has left whole: older messages that it replaces are over.
 
-        :param packets: in which it left
         :param depth: of the publishers' history, 0 for unbounded or unknown
         :param reported: whether receivers report
         :param waited_for: time in s until which receivers that do not report wait for the message before it
         """
-        earlier, most = self._left, UNREPORTED_DEPTH
+        earlier, most = self._left, MOST_LIFETIMES
         if policy == "latest":
             most = 1
         elif reported:
-            most = MOST_LIFETIMES if lifetime.in_order else depth or REPORTED_DEPTH
+            most = most if lifetime.in_order else depth or most  # what comes in order is waited for
         elif earlier:
-            before, _ = earlier[-1]
-            before.expires = min(before.expires, waited_for)
-        earlier.append((lifetime, packets))
-        self._packets += packets
-        while len(earlier) > 1 and (len(earlier) > most or (self._packets - earlier[0][1] > GROUP and not reported)):
-            replaced, count = earlier.popleft()
-            replaced.end()
-            self._packets -= count
+            earlier[-1].expires = min(earlier[-1].expires, waited_for)
+        earlier.append(lifetime)
+        while len(earlier) > most:
+            earlier.popleft().end()

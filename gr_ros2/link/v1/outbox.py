@@ -266,7 +266,6 @@ class Outbox:
         topic = self.sent[message.topic_id]
         topic.lifetimes.left(
             message.lifetime,
-            message.index,
             policy=topic.queue.policy,
             depth=topic.publishers.depth,
             reported=self.reported,

@@ -115,7 +115,7 @@ class RepairWindow:
         if not self._unreported.due(self.packets.newest):
             return None
         self.packets.retire(now)
-        window = self._combining.in_turn(now) if self._unreported.behind else self._combining.newest(now)
+        window = self._combining.window(now)
         if not window:
             self._unreported.over()
             return None

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from math import inf
 
-from gr_ros2.link.v1.lifetime import GROUP, Lifetime
+from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.unreported import MOST_LOSS
 from gr_ros2.wire.v1 import MAX_WINDOW
@@ -20,6 +20,8 @@ TOLD = 2
 something is not repaired any more."""
 OWED = 0.5
 """Packets expected to be lost of a message in order after which a repair follows it at once."""
+WITHIN = 64
+"""Packets of a message in order from which on its repairs do not wait for its end."""
 
 
 class SharedRepairs:
@@ -52,7 +54,7 @@ class SharedRepairs:
         if ordered:
             self._ordered = number
             self._begun = 0 if all(lifetime.left for lifetime in ordered) else self._begun + 1
-            self.within = 0 < self._begun < GROUP
+            self.within = 0 < self._begun < WITHIN
             loss = min(loss, MOST_LOSS)
             self._owed += loss / (1 - loss)
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections import deque
 from math import inf
 
-from gr_ros2.link.v1.lifetime import GROUP
 from gr_ros2.link.v1.peers import UNDER_WAY_S, Peers
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
+from gr_ros2.wire.v1 import MAX_WINDOW
 
 _ENOUGH = 0.05
 """Expected number of lost packets that is too small for a repair. With 0, odometry takes 8 % more packets at 1 % loss
@@ -63,7 +63,7 @@ class Thrift:
         soonest = next((at for at, _, _ in self._flight if at > now), inf)
         waits = [(peer.bit, peer.patience) for peer in self._peers.all.values()]
         for record in reversed(self._packets.records.values()):
-            if record.number <= self._packets.newest - GROUP:
+            if record.number <= self._packets.newest - MAX_WINDOW:
                 break
             for bit, patience in waits:
                 if not record.confirmed & bit and now < record.at + patience < soonest:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import inf, sqrt
 
-from gr_ros2.link.v1.lifetime import GROUP, Lifetime
+from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.wire.v1 import MAX_WINDOW
 
@@ -51,11 +51,6 @@ class Unreported:
     def due(self, newest: int) -> bool:
         """Whether a repair of a long message goes before new packets."""
         return self._owed >= 1 and newest <= self._awaited
-
-    @property
-    def behind(self) -> bool:
-        """Whether more are due than one combination names: they began before anything waited."""
-        return self._owed > GROUP
 
     def over(self) -> None:
         """Somebody reports, or nothing is left to repair."""

@@ -25,13 +25,13 @@ def test_no_topic_is_older_than_with_version_0(name: str, loss: float) -> None:
 
 @pytest.mark.slow
 def test_no_topic_is_older_where_packets_leave_as_soon_as_the_air_is_free() -> None:
-    for topic, ratio in paced_ratios("six-topics-paced", 0.0, seeds=(1, 2)).items():
+    for topic, ratio in paced_ratios("six-topics-paced", 0.0, seeds=(1,)).items():
         assert ratio <= TOLERANCE[0.0], topic
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 def test_a_repair_that_cannot_be_interrupted_delays_no_message(loss: float) -> None:
-    (ratio,) = paced_ratios("paper-ofdm-paced", loss, seeds=(1, 2)).values()
+    (ratio,) = paced_ratios("paper-ofdm-paced", loss, seeds=(1,)).values()
     assert ratio <= TOLERANCE[loss]
 
 
@@ -40,7 +40,7 @@ def test_a_repair_that_cannot_be_interrupted_delays_no_message(loss: float) -> N
 def test_waiting_for_reports_makes_odometry_older_only_where_it_comes_in_order(
     best_effort: tuple[str, ...], most: float
 ) -> None:
-    (ratio,) = paced_ratios("paper-ofdm-paced", 0.2, back=True, seeds=(1, 2), best_effort=best_effort).values()
+    (ratio,) = paced_ratios("paper-ofdm-paced", 0.2, back=True, seeds=(1,), best_effort=best_effort).values()
     assert ratio <= most
 
 
