@@ -83,8 +83,8 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """In several processes, groups stay together and begin first, then slow tests, so that none is waited for at the
-    end."""
+    """In several processes, groups stay together, and slow tests begin first, so that none is waited for at the end;
+    groups of many tests begin first by xdist's own order."""
     if not config.pluginmanager.hasplugin("xdist"):
         return
     for item in items:
@@ -92,7 +92,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for name in GROUPS.keys() & names:
             item.add_marker(pytest.mark.xdist_group(name))
     if os.environ.get("PYTEST_XDIST_WORKER"):
-        items.sort(key=lambda item: [item.get_closest_marker(name) is None for name in ("xdist_group", "slow")])
+        items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
 @pytest.hookimpl(hookwrapper=True)

@@ -55,9 +55,9 @@ def rows() -> Iterator[Row]:
 
 @functools.cache
 def outcome(scenario: str, *settings: str) -> tuple[Any, ...]:
-    """What a scenario sends in two simulated seconds, and what comes of it."""
+    """What a scenario sends in a simulated second, and what comes of it."""
     sent: list[bytes] = []
-    words = ["duration_s=2", "seed=1", *settings]
+    words = ["duration_s=1", "seed=1", *settings]
     done = simulate(load_scenario(scenario, words), on_packet=lambda packet: sent.append(packet.data))
     topics = [(topic.topic, topic.ledger, topic.age_s.mean, topic.latency_s.max) for topic in done.topics]
     return sent, topics, done.duration_s, done.airtime_s, done.packets

@@ -34,6 +34,7 @@ def test_replay_repairs_what_is_lost(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_a_sweep_tabulates_repaired_messages_and_the_air(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="needs Dask: pip install 'gr-ros2[sweep]'")
     parquet = pytest.importorskip("pyarrow.parquet")
@@ -52,6 +53,7 @@ def test_a_sweep_tabulates_repaired_messages_and_the_air(tmp_path: Path) -> None
     assert clean["packets_air_repair"] == 0 < lossy["packets_air_repair"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_ablation_tells_what_repair_is_worth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "parts"
     command = ["ablate", "paper-ofdm-paced", "--duration", "4", "--set", "time=packets", "--out", str(out), *LOSSY]

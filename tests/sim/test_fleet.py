@@ -92,7 +92,7 @@ def test_noise_fills_the_whole_mantissa(messages: list[SimMessage]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_robots_drive_and_touch_nothing(seed: int) -> None:
     fleet = Fleet(SimSettings(seed=seed))
     times = np.arange(0, 120, 0.08)
@@ -117,7 +117,7 @@ def test_robots_drive_and_touch_nothing(seed: int) -> None:
 @pytest.mark.slow
 def test_a_crowd_touches_nothing() -> None:
     fleet = Fleet(SimSettings(seed=1, robots=8, size_m=15, obstacles=6, max_speed=2.0))
-    for t in np.arange(0, 60, 0.05):
+    for t in np.arange(0, 30, 0.05):
         here = np.array([fleet.true_pose(robot, float(t))[:2] for robot in fleet.robot_ids])
         assert fleet.world.clearance(here).min() >= RADIUS
         assert min(math.hypot(*(one - two)) for one, two in itertools.combinations(here, 2)) >= 2 * RADIUS

@@ -18,7 +18,7 @@ from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, write_body
 from tests.link.v1.air import SLOT_S, Robot, registry
 
 TOPICS = 3
-MESSAGES = 7_000
+MESSAGES = 5_000
 SHORT, BEFORE, AFTER = 3_000, 4_000, 1_000
 HALF, ROUND = 1 << 15, 1 << 16
 """Packets of a sender's lives: some are SHORT, others begin BEFORE half of the numbers, or all, and end AFTER."""
