@@ -16,8 +16,8 @@ grid of 5 × 4 collide).
 by its next send, and shrinks with each newcomer that gets in. A neighbour names two robots a packet, newcomers first.
 
 *Who is not heard.* Two robots that always collide at a third one are never heard by it: its map lacks their slots. A
-robot whose next slot is missing in three maps in a row of a neighbour, or that nobody names for a while, picks at random
-among the first free slots, and so does a robot that hears nobody.
+robot whose next slot three maps in a row of a neighbour lack, or that nobody names for a while, picks at random among
+the first free slots, and so does a robot that hears nobody.
 
 Invariants: sans-IO, the caller passes in times of its own clock, and the generator; what arrives with bytes that were
 not checked keeps its sender's announced slots free and does nothing else; the work for a packet heard is bounded by the
