@@ -47,6 +47,7 @@ BENCHMARKS = {
     "hidden": "bench.mac",
     "changes": "bench.mac",
     "scale": "bench.mac",
+    "crowd": "bench.mac",
     "energy": "bench.mac",
     "shared": "bench.shared",
     "relay": "bench.relay",
@@ -56,7 +57,7 @@ BENCHMARKS = {
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
-    *("cells", "hidden", "changes", "scale", "energy"),
+    *("cells", "hidden", "changes", "scale", "crowd", "energy"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

@@ -248,6 +248,27 @@ def scale() -> list[Row]:
     ]
 
 
+def _crowded(robots: int, every_s: float) -> list[Row]:
+    """One cell into which a robot comes every so many s; the last 20 of its 60 s after that count."""
+    begins = {number: (number * every_s, math.inf) for number in range(robots)} if every_s else {}
+    until = robots * every_s + 60
+    one = swarm(fully_meshed(robots), SwarmConfig(present=begins), t0=until - 20, t1=until)
+    what = f"{robots} robots, {f'one every {every_s:g} s' if every_s else 'all at once'}"
+    waited = max(at - number * every_s for number, at in one.first_heard.items())
+    note = f"age {one.age:.2f} s, oldest pair {one.ages[-1]:.1f} s, {100 * one.collided:.1f} % collide"
+    return [
+        Row(f"{what}: messages/s", one.rate, form="{:.1f}", note=note),
+        Row(f"{what}: heard", len(one.first_heard), note=f"the last {waited:.1f} s after its begin"),
+    ]
+
+
+def crowd() -> list[Row]:
+    """One cell of many robots that are switched on at once, or one after another."""
+    cases = ((255, 0.5), (100, 0.4), (60, 0.0), (80, 0.0), (100, 0.0))
+    with ProcessPoolExecutor() as pool:
+        return [row for rows in pool.map(_crowded, *zip(*cases, strict=True)) for row in rows]
+
+
 def energy() -> list[Row]:
     """Processor time of all that a robot does in simulated time, the medium included, per packet that it hears."""
     rows = []
@@ -290,4 +311,4 @@ def whole() -> list[Row]:
 
 def mac() -> list[Row]:
     """All of it."""
-    return [*cells(), *hidden(), *changes(), *scale(), *energy(), *whole()]
+    return [*cells(), *hidden(), *changes(), *scale(), *crowd(), *energy(), *whole()]
