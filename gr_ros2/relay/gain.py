@@ -10,7 +10,7 @@ robot that is heard, and each stream, an engine keeps the newest number that thi
 
 The gain of sending a stream's newest message is the sum over the neighbours of how much younger it makes them, in s.
 With the sum of the squares of all gains over the largest square, how many messages are worth as much as the best one is
-known. Each beyond the first adds ``WEIGHT`` to the robot's *weight*, by which it shares the channel with others.
+known. Each beyond ``EVEN`` adds 1 to the robot's *weight*, by which it shares the channel with others.
 
 Invariants: sans-IO, the caller passes in times; the work for a message heard is bounded by the robots heard, and that
 for a choice by robots times streams; equal calls give equal choices; memory is bounded by ``MOST_STREAMS`` and the ids.
@@ -40,8 +40,9 @@ ARRIVALS = 16
 TOLD = 2
 """Streams of which a packet tells the newest number."""
 MOST_STREAMS = 4096
-WEIGHT = 2
-"""With 1, messages in a line of ten robots that hear three on both sides are 16 % older: most have weight 1."""
+EVEN = 4
+"""Robots of a line or a grid have up to 4 messages of equal worth, one that joins two groups 6. Among robots that all
+have much to relay, weights gain nothing and take the slots out of their order."""
 SMOOTHING = 0.1
 """Share by which this number follows from one choice to the next."""
 _HALF = 1 << 15
@@ -188,7 +189,7 @@ class Gains:
     @property
     def weight(self) -> int:
         """Packets to send while others send one."""
-        return min(int(1 + WEIGHT * (self._worth - 1)), MOST_WEIGHT)
+        return min(max(int(1 + self._worth - EVEN), 1), MOST_WEIGHT)
 
     def neighbours(self, now: float) -> int:
         """Robots that are heard."""

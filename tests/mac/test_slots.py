@@ -94,13 +94,13 @@ def test_a_slot_in_whose_place_somebody_sends_one_frame_before_is_passed_over() 
     assert made._pick(77, 70, frame) == 77 + frame + 2
 
 
-def test_who_is_not_in_the_map_of_a_neighbour_picks_at_random() -> None:
+def test_who_is_not_in_three_maps_in_a_row_of_a_neighbour_picks_at_random() -> None:
     made = robot()
     begin, block = send(made, 1.0)
     slot = made.clock.slot(begin + SLOT / 2)
-    for expected, deaf in ((1 << block.ahead[0] - 3, False), (0, True)):
-        hear(made, 9, slot + 2, Block(0, (300, 9), 1, (5, NOBODY), expected))
-        assert made._unheard(slot + 2) is deaf
+    for later, expected, deaf in ((2, 1 << block.ahead[0] - 3, False), (3, 0, False), (4, 0, False), (5, 0, True)):
+        hear(made, 9, slot + later, Block(0, (300, 9), 1, (5, NOBODY), expected))
+        assert made._unheard(slot + later) is deaf
 
 
 def test_the_lower_id_keeps_a_slot_that_two_want() -> None:

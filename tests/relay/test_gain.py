@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.relay.gain import HEARD_S, OWN, UNKNOWN_S, WEIGHT, Gains, Stream
+from gr_ros2.relay.gain import EVEN, HEARD_S, OWN, UNKNOWN_S, Gains, Stream
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
 
@@ -58,7 +58,7 @@ def test_the_weight_grows_with_the_messages_that_wait_to_be_relayed() -> None:
         gains.message(2, Stream(7, 0xCAFE, topic_id), 1, 1.0)
         for _ in range(80):
             gains.best(1.0)
-        assert abs(gains.weight - min(1 + WEIGHT * topic_id, MOST_WEIGHT)) <= 1
+        assert abs(gains.weight - min(max(topic_id + 2 - EVEN, 1), MOST_WEIGHT)) <= 1
     gains.neighbour(2, 100.0)
     for now in range(100, 150):
         gains.best(float(now))
