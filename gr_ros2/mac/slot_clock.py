@@ -80,7 +80,6 @@ class SlotClock:
         """Follow a packet of slot ``number`` mod 256 whose burst began at ``began`` s.
 
         :param trusted: its trailer has been checked. Other packets move nobody who hears a robot that agrees
-        :param free: nobody follows this clock yet, and somebody follows that of the other robot
         :return: its slot as this clock counts, None where it does not agree
         """
         if self._zero is None:
