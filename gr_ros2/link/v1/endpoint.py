@@ -268,6 +268,8 @@ class EndpointV1:
         if (self.pace.out_of_credit and not credited) or not self.answers:
             return None
         if self._access is not None:
+            if self._now == -inf:  # a medium may ask before the sending thread has looked for the first time
+                return -inf
             return max(self._access.departure(self._now) - self._lead, self.pace.slot)
         return self._sending.next_departure(self._now)
 

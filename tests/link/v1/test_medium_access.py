@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from itertools import pairwise
+from math import inf
 
 import pytest
 
@@ -66,6 +67,14 @@ def talk(robots: list[Robot], begin: float, seconds: float) -> list[tuple[float,
 def state(access: Slots) -> tuple[object, ...]:
     known = sorted(access._robots), dict(access._taken), access._expected, dict(access._conflicts)
     return access.clock.begin(0), access.clock.jumps, list(access._mine), *known
+
+
+def test_who_is_asked_before_the_sending_thread_has_looked_listens_first_all_the_same() -> None:
+    """A medium in lock step asks each robot whether it is at rest as soon as it is connected."""
+    one, two = robot(1, "open")[0], robot(2, "open")[0]
+    assert one.end.next_departure(credited=True) == -inf
+    sent = talk([one, two], 1000.0, 5.0)
+    assert {sender.src_id for _, sender, _ in sent} == {1, 2}
 
 
 @pytest.mark.parametrize("mode", ["none", "authenticate", "encrypt"])
