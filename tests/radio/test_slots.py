@@ -88,7 +88,7 @@ def heard(folder: Path, medium: str, robots: int = 2) -> tuple[list[int], Medium
 def test_in_slots_two_links_lose_nothing_both_ways_and_at_once_most(tmp_path: Path) -> None:
     whole, process = heard(tmp_path, "slots")
     assert whole == [SAID, SAID]
-    assert process.counted["overlapping"] <= 0.02 * process.counted["bursts"]
+    assert process.counted["overlapping"] <= 0.05 * process.counted["bursts"]  # of about 100: those of the entry
     (tmp_path / "again").mkdir()
     at_once, process = heard(tmp_path / "again", "exclusive")
     assert sum(at_once) < sum(whole)
