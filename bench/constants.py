@@ -171,10 +171,10 @@ def _promises(name: str) -> Callable[[int], dict[str, float]]:
 
 @cache
 def variants() -> dict[str, list[Patch]]:
-    """What is changed, by name; the first changes nothing."""
+    """What is changed, by name."""
     every = (*CONSTANTS, *(("rate", name) for name in RATE))
     scaled = [item for module, name in every for item in _scaled(module, name)]
-    return {"": [], **RULES, **dict(scaled)}
+    return {**RULES, **dict(scaled)}
 
 
 def changes(base: Sequence[dict[str, float]], found: Sequence[dict[str, float]]) -> dict[str, tuple[float, float]]:
@@ -195,13 +195,13 @@ def changes(base: Sequence[dict[str, float]], found: Sequence[dict[str, float]])
 
 def constants(chosen: Callable[[str], bool] = lambda _: True) -> list[Row]:
     """One row per variant: the promises that it changes."""
-    names = [name for name in variants() if name and chosen(name)]
+    names = [name for name in variants() if chosen(name)]
     rows = []
     with ProcessPoolExecutor(2) as pool:
         base = list(pool.map(_base, SEEDS))
         for name, found in zip(names, pool.map(variant, names, repeat(base)), strict=True):
             shown = {p: c for p, (c, half) in changes(base, found).items() if abs(c) >= SHOWN and abs(c) > half}
             note = ", ".join(f"{promise} {change:+.1%}" for promise, change in shown.items())
-            worst = max(0.0, *shown.values()) if shown else 0.0
+            worst = max([0.0, *shown.values()])
             rows.append(Row(f"constants: {name}: worst change", worst * 100, "%", form="{:.1f}", note=note))
     return rows

@@ -49,8 +49,8 @@ class Combining:
     def window(self, now: float) -> list[Sent]:
         """The next of the windows over all live packets, from the oldest one kept on.
 
-        Their positions follow the golden section, which spreads any number of them evenly. Windows that
-        would reach beyond the ends are moved to the ends, so that the packets there are in as many windows as others.
+        Their positions follow the golden section, which spreads any number of them evenly. Windows that would reach
+        beyond the ends are moved to the ends, so that the packets there are in as many windows as others.
         """
         packets = self._packets
         self._place = (self._place + _GOLDEN) % 1

@@ -69,7 +69,7 @@ def state(access: Slots) -> tuple[object, ...]:
     return access.clock.begin(0), access.clock.jumps, list(access._mine), *known
 
 
-def test_who_is_asked_before_the_sending_thread_has_looked_listens_first_all_the_same() -> None:
+def test_who_is_asked_before_the_sending_thread_has_looked_sends_all_the_same() -> None:
     """A medium in lock step asks each robot whether it is at rest as soon as it is connected."""
     one, two = robot(1, "open")[0], robot(2, "open")[0]
     assert one.end.next_departure(credited=True) == -inf
