@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fuzz.loop import work
 from gr_ros2.core.errors import EntryBoundsError
-from gr_ros2.mac.slots import CHOICE, HEARD_S, Slots
+from gr_ros2.mac.slots import CHOICE, HEARD_S, NEWCOMER_S, Slots
 from gr_ros2.wire.mac_block import NOBODY, Block, read_block
 
 SLOT = 0.0145
@@ -76,9 +76,11 @@ def test_no_slot_is_taken_that_a_neighbour_has_announced_or_expects_to_receive_i
 
 def test_a_robot_with_weight_sends_as_often_and_says_so() -> None:
     made = robot()
+    later = round(NEWCOMER_S / SLOT) + 1
     for other in range(16):
         hear(made, 10 + other, 70 + other, Block(0, (300, 300), 8, (5, NOBODY)))
-    begin, block = send(made, 1.5, weight=4)
+        hear(made, 10 + other, 70 + other + later, Block(0, (300, 300), 8, (5, NOBODY)))
+    begin, block = send(made, 1.5 + later * SLOT, weight=4)
     assert (block.weight, block.heard) == (4, 16)
     assert (16 + 4 + 1) // 4 <= block.ahead[1] < (16 + 4 + 1) // 4 + CHOICE
     hear(made, 10, made.clock.slot(begin + SLOT / 2) + 1, Block(0, (300, 300), 8, (5, NOBODY), 0, weight=3))
@@ -86,10 +88,31 @@ def test_a_robot_with_weight_sends_as_often_and_says_so() -> None:
     assert (block.weight, block.heard) == (1, 18)
 
 
+def test_frames_have_a_slot_for_each_newcomer_until_it_is_none_any_more() -> None:
+    made = robot()
+    for other in range(16):
+        hear(made, 10 + other, 70 + other, Block(0, (300, 300), 16, (5, NOBODY)))
+    assert made._frame(90, made._loads(90)) == 17 + 1 + 16
+    late = 70 + int(NEWCOMER_S / SLOT)
+    assert made._frame(late + 8, made._loads(late + 8)) == 17 + 1 + 8
+    assert made._frame(late + 16, made._loads(late + 16)) == 17 + 1
+
+
+def test_robots_that_were_known_before_this_clock_jumped_are_no_newcomers() -> None:
+    made = robot()
+    for start, by in ((70, 0), (300, 40), (310, 40)):
+        for other in range(8):
+            slot = start + other
+            made.hear(10 + other, Block((slot + by) % 256, (300, 300), 8, (5, NOBODY)), slot * SLOT)
+    assert made.clock.jumps == 1
+    now = 320 + 40
+    assert made._frame(now, made._loads(now)) == 9 + 1 + 1  # the one that moved the clock counts
+
+
 def test_a_slot_in_whose_place_somebody_sends_one_frame_before_is_passed_over() -> None:
     made = robot()
     hear(made, 7, 60, Block(0, (300, 300), 1, (5, NOBODY)))
-    made._confirmed_at, frame = 70, made._frame(made._loads(70))
+    made._confirmed_at, frame = 70, made._frame(70, made._loads(70))
     made._taken |= {77 + frame: 7, 78: 7}
     assert made._pick(77, 70, frame) == 77 + frame + 2
 

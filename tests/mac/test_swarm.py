@@ -40,6 +40,11 @@ def test_twenty_robots_in_one_cell_share_it_without_a_collision() -> None:
     assert swarm.lost("collision", "sending") == 0
 
 
+def test_fifty_robots_that_are_switched_on_at_once_are_all_heard_within_15_seconds() -> None:
+    heard = cell(50, SwarmConfig(), t0=14, t1=15).first_heard
+    assert len(heard) == 50
+
+
 def test_slots_carry_several_times_what_aloha_does() -> None:
     config = SwarmConfig()
     both = [Swarm(make, HearingGraph(fully_meshed(20), config), config, t1=40).run() for make in (slots, aloha)]
