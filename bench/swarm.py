@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -143,7 +143,7 @@ class SwarmRobot:
         self._phase = rng.uniform(0, config.period_s)
         self._jumps = sorted((at, by) for at, robot, by in config.jumps if robot == number)
         self._frozen = [(at, at + by) for at, robot, by in config.frozen if robot == number]
-        self._late: list[tuple[float, Reception]] = []
+        self._late: list[Reception] = []
         begin, self._end = config.present.get(number, (rng.uniform(0, 0.3), math.inf))
         self.begin = self.due = begin
 
@@ -160,11 +160,12 @@ class SwarmRobot:
         number = math.floor((at - self._phase) / self._config.period_s)
         return number + 1, self._phase + number * self._config.period_s
 
-    def _plan(self, now: float) -> None:
-        self.due = max(now, (self.access.departure(self._local(now)) - self._offset) / self._ppm)
+    def _plan(self, now: float, local: float) -> None:
+        due = max(now, (self.access.departure(local) - self._offset) / self._ppm)
         if self._jumps:
-            self.due = min(self.due, max(now, self._jumps[0][0]))
-        if self.due > min(self._until, self._end):
+            due = min(due, max(now, self._jumps[0][0]))
+        self.due = due
+        if due > self._until or due > self._end:
             self.over, self.due = True, math.inf
 
     def step(self, now: float, medium: Medium) -> Iterable[Any]:
@@ -174,7 +175,7 @@ class SwarmRobot:
             self.due = end
             return ()
         late, self._late = self._late, []
-        for _, reception in late:
+        for reception in late:
             self._hear(reception)
         at = self.access.departure(self._local(now))
         if (at - self._offset) / self._ppm <= now + 1e-9:
@@ -186,26 +187,31 @@ class SwarmRobot:
                 packet = bytes((len(block),)) + block + content
                 medium.send(self.number, packet, start, self._config.airtime_s)
                 self.left.append((now, self.traffic.relays))
-        self._plan(now)
+        self._plan(now, self._local(now))
         return ()
 
     def receive(self, reception: Reception) -> Iterable[Any]:
         """Take a packet."""
-        if self.begin <= reception.at < self._end:
-            if self._frozen and self._asleep(reception.at) is not None:
-                self._late.append((reception.at, reception))
+        at = reception.at
+        if self.begin <= at < self._end:
+            if self._frozen and self._asleep(at) is not None:
+                self._late.append(reception)
                 return ()
-            self._on(reception, *self._hear(reception))
+            local, origin, made = self._hear(reception)
+            self._on(reception, origin, made)
             if not self.over:
-                self._plan(reception.at)
+                self._plan(at, local)
         return ()
 
-    def _hear(self, reception: Reception) -> tuple[int, float]:
+    def _hear(self, reception: Reception) -> tuple[float, int, float]:
+        """The time on this robot's clock, who made the message, and when."""
         sent = reception.sent
         sender = sent.sender
         block, content = _read(reception.data)
         self.access.hear(sender, block, sent.start * self._ppm + self._offset)
-        return self.traffic.take(sender, block, content, self._local(reception.at))
+        local = self._local(reception.at)
+        origin, made = self.traffic.take(sender, block, content, local)
+        return local, origin, made
 
     def expire(self, now: float) -> Iterable[Any]:  # noqa: ARG002
         return ()
@@ -224,11 +230,11 @@ class _CountedMedium(PacketMedium):
         super().__init__(around, phys, shared=True, ideal=True)
         self._t0 = t0
 
-    def outcome(self, sent: Transmission) -> Iterator[Reception]:
+    def outcome(self, sent: Transmission) -> list[Reception]:
         if sent.start >= self._t0 > 0:
             self._t0 = 0.0
             self.lost.clear()
-        yield from super().outcome(sent)
+        return super().outcome(sent)
 
 
 class _Age:

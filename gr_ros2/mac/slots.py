@@ -272,7 +272,7 @@ class Slots:
         short = Block(slot % SLOT_NUMBERS, ahead, loads[0] - self._weight, (first, second))
         if self._weight == 1 and self._named_at < oldest and len(set(loads)) == 1:
             return short
-        expected = sum(1 << at - slot - 1 for at in self._taken if 0 < at - slot <= MAP_SLOTS)
+        expected = sum([1 << at - slot - 1 for at in self._taken if slot < at <= slot + MAP_SLOTS])
         wanted = min((at for at in self._conflicts if slot + 1 < at < slot + SLOT_NUMBERS), default=None)
         conflict = (0, NOBODY) if wanted is None else (wanted - slot, self._conflicts.pop(wanted))
         return short._replace(expected=expected, conflict=conflict, weight=self._weight)
@@ -301,7 +301,7 @@ class Slots:
         if block is None or slot is None or src_id == self.src_id:
             return
         first, second = block.ahead
-        ahead = (slot + first, slot + first + second)[: 2 if first and second else 1 if first else 0]
+        ahead = (slot + first, slot + first + second) if first and second else (slot + first,) if first else ()
         if not trusted:
             for at in ahead:
                 self._taken.setdefault(at, src_id)
@@ -316,10 +316,9 @@ class Slots:
         if slot > self._base + _SILENT:
             self._sweep(slot)
         for at in robot.ahead:
-            if at not in ahead and self._taken.get(at) == src_id:
-                del self._taken[at]
-            if at not in ahead and self._conflicts.get(at) == src_id:
-                del self._conflicts[at]
+            for known in () if at in ahead else (self._taken, self._conflicts):
+                if known.get(at) == src_id:
+                    del known[at]
         robot.last, robot.ahead, robot.heard, robot.weight = slot, ahead, block.heard, block.weight
         for at in ahead:
             if self._taken.setdefault(at, src_id) != src_id or at in self._mine:
@@ -340,7 +339,7 @@ class Slots:
             self._start_over(slot)
         if trusted and slot is None and src_id != self.src_id:
             self._elsewhere[src_id] = began
-        elif trusted:
+        elif trusted and self._elsewhere:
             self._elsewhere.pop(src_id, None)
         return slot
 
@@ -374,7 +373,8 @@ class Slots:
         skip = at - self._base
         expected = expected << skip if skip > 0 else expected >> -skip
         for mine in self._mine:
-            expected &= ~(1 << max(mine - self._base, 0))
+            if mine > self._base:
+                expected &= ~(1 << mine - self._base)
         self._expected |= expected
         ahead, loser = conflict
         if ahead and loser == self.src_id and slot + ahead in self._mine:

@@ -204,7 +204,7 @@ class Losses:
         """A packet, or ``count``, was not received by these robots."""
         if reason not in self._counts:
             self._counts[reason] = np.zeros((self._robots, self._robots), int)
-        self._counts[reason][sender, receivers] += count
+        self._counts[reason][sender][receivers] += count
 
     def clear(self) -> None:
         """Count from 0 again."""
@@ -288,13 +288,14 @@ class Medium(ABC):
     def others(self, sent: Transmission) -> list[Transmission]:
         """The packets on the air meanwhile that matter to anybody who hears ``sent``."""
         recent = self._recent
-        while recent and recent[0].end < sent.end - 2 * self._longest:
+        start, end = sent.start, sent.end
+        while recent and recent[0].end < end - 2 * self._longest:
             recent.popleft()
         if len(recent) < 2:
             return []
-        found = [other for other in recent if other.start < sent.end and sent.start < other.end and other is not sent]
+        found = [other for other in recent if start < other.end and other.start < end and other is not sent]
         if found:
-            near = self.around.near(sent.sender, sent.start)
+            near = self.around.near(sent.sender, start)
             found = [other for other in found if near[other.sender] or other.sender == sent.sender]
         return found
 

@@ -14,7 +14,7 @@ reciprocal of the Doppler shift. Fading of a fixed rate is in its table, as burs
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import copy
 from itertools import pairwise
 from typing import Any
@@ -117,16 +117,15 @@ class PacketMedium(Medium):
         self.examined = 0
         """Pairs of a packet and a receiver, and of a packet and another one, that were looked at."""
 
-    def outcome(self, sent: Transmission) -> Iterator[Reception]:
+    def outcome(self, sent: Transmission) -> list[Reception]:
         heard = self.hearers(sent)
         if not len(heard.ids):
-            return
+            return []
         reach = self._reached(sent, heard)
         others = self.others(sent)
         self.examined += len(heard.ids) + len(others)
         if heard.noiseless and self._certain(reach):
-            yield from self._in_reach(sent, heard, others)
-            return
+            return self._in_reach(sent, heard, others)
         draw = self._random[sent.sender]
         chances, errors = draw.random(len(heard.ids)), draw.normal(0, _ERROR_DB, len(heard.ids))
         levels = heard.levels
@@ -155,26 +154,25 @@ class PacketMedium(Medium):
             self.lost.add("collision", sent.sender, heard.ids[alone & ~arrived & ~busy])
             self.lost.add("sending", sent.sender, heard.ids[busy])
         rows = (heard.ids, snrs, sinrs, np.where(heard.noise > 0, snrs + errors, _CLEAR_DB))
-        for receiver, snr_db, sinr_db, measured_db in zip(*(row[arrived].tolist() for row in rows), strict=True):
-            yield Reception(receiver, sent, sent.end, sent.data, snr_db, sinr_db, measured_db)
+        return [
+            Reception(receiver, sent, sent.end, sent.data, snr_db, sinr_db, measured_db)
+            for receiver, snr_db, sinr_db, measured_db in zip(*(row[arrived].tolist() for row in rows), strict=True)
+        ]
 
-    def _in_reach(self, sent: Transmission, heard: Hearers, others: Sequence[Transmission]) -> Iterator[Reception]:
+    def _in_reach(self, sent: Transmission, heard: Hearers, others: Sequence[Transmission]) -> list[Reception]:
         """The outcome where nothing is known of levels: whoever hears one packet alone receives it."""
-        end = self._end(sent)
-        others = [other for other in others if other.start < end and sent.start < self._end(other)]
-        sending = {other.sender for other in others}
-        disturbed = {one for other in others for one in self.around.hearers(other.sender, sent.start).receivers}
-        lost: dict[str, list[int]] = {"sending": [], "collision": []}
-        for receiver in heard.receivers:
-            if receiver in sending:
-                lost["sending"].append(receiver)
-            elif receiver in disturbed:
-                lost["collision"].append(receiver)
-            else:
-                yield Reception(receiver, sent, sent.end, sent.data, measured_db=_CLEAR_DB)
-        for reason, receivers in lost.items():
-            if receivers:
-                self.lost.add(reason, sent.sender, receivers)
+        receivers = heard.receivers
+        if others:
+            end = self._end(sent)
+            others = [other for other in others if other.start < end and sent.start < self._end(other)]
+            sending = {other.sender for other in others}
+            disturbed = {one for other in others for one in self.around.hearers(other.sender, sent.start).receivers}
+            for reason, ones in (("sending", sending), ("collision", disturbed - sending)):
+                lost = [receiver for receiver in receivers if receiver in ones]
+                if lost:
+                    self.lost.add(reason, sent.sender, lost)
+            receivers = [one for one in receivers if one not in sending and one not in disturbed]
+        return [Reception(one, sent, sent.end, sent.data, measured_db=_CLEAR_DB) for one in receivers]
 
     def _reached(self, sent: Transmission, heard: Hearers) -> _Reach:
         known = self._reach.get(sent.sender)

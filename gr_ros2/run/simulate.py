@@ -527,10 +527,11 @@ class EventLoop:
 
     def _received(self, receptions: Iterable[Reception], concerned: set[int]) -> Iterator[TimedEvent]:
         """Hand over what was received, and note by whom."""
+        late = self._medium.late
         for reception in receptions:
             concerned.add(reception.receiver)
             robot = self._robots[reception.receiver]
-            if self._medium.late:
+            if late:
                 yield from robot.expire(reception.at)
             for timed_event in robot.receive(reception):
                 yield timed_event
@@ -546,8 +547,10 @@ class EventLoop:
         """Note when a robot has something to do next."""
         timeout = None if self._medium.late else robot.endpoint.next_timeout()
         # A timeout that stays in the past has been handled.
-        at = min(robot.due, inf if timeout is None or timeout <= self.now else timeout)
-        if at != self._at[robot.number]:
-            self._at[robot.number] = at
-            heapq.heappush(self._agenda, (at, robot.number))
-        (self._busy.discard if robot.over else self._busy.add)(robot.number)
+        at, number = robot.due, robot.number
+        if timeout is not None and self.now < timeout < at:
+            at = timeout
+        if at != self._at[number]:
+            self._at[number] = at
+            heapq.heappush(self._agenda, (at, number))
+        (self._busy.discard if robot.over else self._busy.add)(number)
