@@ -63,6 +63,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 GROUPS = {
     "real_time": "radios that the processor must keep up with",
+    "viewer": "one Chromium",
     "cluster": "Dask with two workers",
     "installed": "a wheel and a virtual environment",
     "platform": "GRC with all its blocks",
@@ -74,11 +75,12 @@ GROUPS = {
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Workers of ``-n auto``: one more than cores, since tests often wait for radios in real time and other programs.
+    """Workers of ``-n auto``: two more than cores, since tests often wait: two groups in real time for radios and for
+    pages, others for programs.
 
     Each worker imports everything once, and tests in real time suffer from more.
     """
-    return len(os.sched_getaffinity(0)) + 1
+    return len(os.sched_getaffinity(0)) + 2
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups

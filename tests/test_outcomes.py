@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,9 @@ from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parent.parent
 TOOL = ROOT / "tools" / "repeat-failed"
-PYTEST = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+PYTEST = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "xdist.plugin"]
+BARE = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+"""Runs of a few empty tests need no other plug-in, and each of five processes would load them all."""
 CONFTEST = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
@@ -44,8 +47,9 @@ def judged(folder: Path, text: str, *options: str) -> tuple[int, list[str]]:
     (folder / "test_it.py").write_text(BEGIN + text)
     outcomes = folder / "outcomes"
     command = [*PYTEST, "-n", "2", "--dist", "loadgroup", f"--outcomes={outcomes}", *options]
-    subprocess.run(command, cwd=folder, capture_output=True, timeout=PATIENCE_S, check=False)
-    done = subprocess.run([TOOL, outcomes, *PYTEST, "-n", "0"], cwd=folder, capture_output=True, text=True, check=False)
+    subprocess.run(command, cwd=folder, env=BARE, capture_output=True, timeout=PATIENCE_S, check=False)
+    again = [TOOL, outcomes, *PYTEST, "-n", "0"]
+    done = subprocess.run(again, cwd=folder, env=BARE, capture_output=True, text=True, check=False)
     said = [line for line in done.stdout.splitlines() if line.startswith(("repeated", "failed", "the run"))]
     said.sort()
     return done.returncode, [*said, done.stdout.splitlines()[-1]]

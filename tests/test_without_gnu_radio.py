@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 DRIVE = ROOT / "tests" / "data" / "simulated_drive"
 PROGRAM = """
-import sys
+import json, sys
 
 class NotInstalled:
     def find_spec(self, name, path=None, target=None):
@@ -19,54 +20,51 @@ class NotInstalled:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, NotInstalled())
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from gr_ros2.cli.main import run
-sys.exit(run())
+said = []
+for words in json.load(sys.stdin):
+    with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+        status = run(words)
+    said.append((status, out.getvalue(), err.getvalue()))
+json.dump(said, sys.stdout)
 """
 
 
-def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", PROGRAM, *words], cwd=folder, capture_output=True, text=True)
+def commands(folder: Path, *commands: tuple[str, ...]) -> list[tuple[int, str, str]]:
+    """Run commands one after another in one process: the status of each, and what it says and complains."""
+    given = json.dumps(commands)
+    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=folder, input=given, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return [(status, out, err) for status, out, err in json.loads(done.stdout)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "words",
-    [
+def test_what_needs_none_works(tmp_path: Path) -> None:
+    topics = "/robot_1/odom,/robot_1/scan"
+    link = ("--scenario", "paper-direct", "--topics", topics, "--set", "time=packets", "--duration", "3")
+    done = commands(
+        tmp_path,
         ("plan", "demo", "--set", "phy.name=modem"),
         ("registry", "from-bag", str(DRIVE)),
         ("run", "paper-direct", "--set", "time=packets", "--duration", "2", "--out", "run"),
-    ],
-    ids=lambda words: words[0],
-)
-def test_what_needs_none_works(words: tuple[str, ...], tmp_path: Path) -> None:
-    done = command(tmp_path, *words)
-    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+        ("replay", str(DRIVE), "out.mcap", *link),
+        ("registry", "from-bag", "out.mcap"),
+    )
+    assert [(status, err) for status, _, err in done] == [(0, "")] * 5
+    assert "nav_msgs/msg/Odometry" in done[-1][1]
 
 
 @pytest.mark.slow
-def test_a_replay_by_packets(tmp_path: Path) -> None:
-    topics = "/robot_1/odom,/robot_1/scan"
-    link = ("--scenario", "paper-direct", "--topics", topics, "--set", "time=packets", "--duration", "3")
-    done = command(tmp_path, "replay", str(DRIVE), "out.mcap", *link)
-    assert done.returncode == 0, done.stderr
-    counted = command(tmp_path, "registry", "from-bag", "out.mcap")
-    assert "nav_msgs/msg/Odometry" in counted.stdout, counted.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("demo", "--out", "run"), "phy 'ofdm' needs GNU Radio 3.10 (apt install gnuradio)"),
-        (("race", "--help"), "this needs GNU Radio 3.10"),
-        (("plan", "demo"), "phy 'ofdm' needs GNU Radio 3.10 (apt install gnuradio)"),
-        (("link", "--robot", "1", "--radio", "udp", "--listen", "0", "--peer", "127.0.0.1:9"), "GNU Radio 3.10"),
-    ],
-    ids=lambda value: value[0] if isinstance(value, tuple) else "",
-)
-def test_what_needs_it_says_so_in_one_line(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
-    done = command(tmp_path, *words)
-    assert done.returncode == 2, done.stderr
-    line = done.stderr.splitlines()[-1]
-    assert said in line
-    assert "Traceback" not in done.stderr
+def test_what_needs_it_says_so_in_one_line(tmp_path: Path) -> None:
+    said = {
+        ("demo", "--out", "run"): "phy 'ofdm' needs GNU Radio 3.10 (apt install gnuradio)",
+        ("race", "--help"): "this needs GNU Radio 3.10",
+        ("plan", "demo"): "phy 'ofdm' needs GNU Radio 3.10 (apt install gnuradio)",
+        ("link", "--robot", "1", "--radio", "udp", "--listen", "0", "--peer", "127.0.0.1:9"): "GNU Radio 3.10",
+    }
+    for line, (status, _, err) in zip(said.values(), commands(tmp_path, *said), strict=True):
+        assert status == 2, err
+        assert line in err.splitlines()[-1]
+        assert "Traceback" not in err

@@ -17,13 +17,17 @@ _SHORTEST_S, _LONGEST_S = 0.001, 0.02
 
 
 def wait_for(
-    condition: Callable[[], object], what: str = "condition", progress: Callable[[], object] | None = None
+    condition: Callable[[], object],
+    what: str = "condition",
+    progress: Callable[[], object] | None = None,
+    longest_s: float = _LONGEST_S,
 ) -> None:
     """Return once a condition holds.
 
     :param condition: called again and again until it returns something true
     :param what: is waited for, as the failure says it
     :param progress: called after each look; while what it returns changes, patience begins anew
+    :param longest_s: the longest pause between two looks, where a look is dear
     :raises AssertionError: it does not hold in time, which fails the test
     """
     end = time.monotonic() + PATIENCE_S
@@ -36,4 +40,4 @@ def wait_for(
             where = "" if progress is None else f", the last step of it {reached}"
             raise AssertionError(f"waited {PATIENCE_S:g} s for {what}{where}")
         time.sleep(pause)
-        pause = min(2 * pause, _LONGEST_S)
+        pause = min(2 * pause, longest_s)

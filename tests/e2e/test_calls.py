@@ -24,7 +24,7 @@ from tests.e2e.support import COMMAND
 from tests.middleware.calling import ADD, Program
 from tests.waiting import wait_for
 
-CALLS = 150
+CALLS = 80
 AT_A_TIME = 5
 """Calls under way: fewer than the depth of a client's reader, 10 in ROS."""
 DEADLINE_S = 5.0

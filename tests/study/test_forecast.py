@@ -181,7 +181,7 @@ def test_what_is_proposed(effects: list[Effect], used: tuple[float, float], wort
 def test_nothing_is_called_better_that_makes_more_topics_older_than_younger(
     name: str, settings: tuple[str, ...]
 ) -> None:
-    proposed = planner(name, *settings, duration=2.0).advice()
+    proposed = planner(name, *settings, duration=1.0).advice()
     assert proposed
     for advice in proposed:
         younger, older = ([e for e in advice.effects if getattr(e, word)] for word in ("younger", "older"))
@@ -209,7 +209,7 @@ def test_what_cannot_be_planned(overrides: list[str], says: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "duration", "rows"), [("team", 6.0, 3), ("two-robots-half-duplex", 6.0, 2), ("twenty-robots", 2.0, 19)]
+    ("name", "duration", "rows"), [("team", 6.0, 3), ("two-robots-half-duplex", 6.0, 2), ("twenty-robots", 1.0, 19)]
 )
 def test_robots_on_one_channel_are_forecast_together(name: str, duration: float, rows: int) -> None:
     """Robot 1 of a run counts what it hears; a forecast counts what the first robot hears that hears a sender. Without
@@ -228,10 +228,10 @@ def test_robots_on_one_channel_are_forecast_together(name: str, duration: float,
 
 
 def test_slots_are_proposed_where_packets_overlap() -> None:
-    plan = planner("two-robots-half-duplex", duration=10.0)
+    plan = planner("two-robots-half-duplex", duration=5.0)
     (slots,) = (advice for advice in plan.advice() if advice.setting == "medium=slots")
     assert slots.harmless
-    followed = planner("two-robots-half-duplex", slots.setting, duration=10.0).forecast()
+    followed = planner("two-robots-half-duplex", slots.setting, duration=5.0).forecast()
     assert followed.used == pytest.approx(slots.forecast.used)
     assert (
         min(topic.result.pdr or 0 for topic in followed.topics) > 0.9 > min(effect.pdr[0] for effect in slots.effects)

@@ -32,8 +32,8 @@ from tests.waiting import wait_for
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """Two worker processes."""
-    with local_cluster(2) as made:
+    """Two worker processes; Dask's own cluster would give up a lost one at once, as it does on a busy machine."""
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": 0}), local_cluster(2) as made:
         yield made
 
 

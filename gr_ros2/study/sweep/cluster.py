@@ -20,6 +20,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
+import dask
 from distributed import Client, LocalCluster, as_completed, get_worker, wait
 from distributed.client import FuturesCancelledError
 from distributed.scheduler import KilledWorker
@@ -51,23 +52,23 @@ class Failed:
 def local_cluster(processes: int) -> Iterator[LocalCluster]:
     """Worker processes of one thread each, on this machine, reachable from this machine only.
 
-    A worker that is lost is replaced.
+    A worker that is lost is replaced, however long its successor takes to start. Dask would give up both after
+    ``lost-worker-timeout`` (15 s), which a busy machine exceeds, and a sweep without workers waits forever.
     """
-    with _interrupts_ignored():
-        cluster = LocalCluster(
-            n_workers=processes,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address=None,
-            # Dask starts an HTTP server in any case. It must not take the default port of a Dask dashboard.
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-            silence_logs=logging.CRITICAL,  # errors are returned as results
-        )
-    try:
-        yield cluster
-    finally:
-        cluster.close()
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "365 days"}):
+        with _interrupts_ignored():
+            cluster = LocalCluster(
+                n_workers=processes,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address=None,
+                # Dask starts an HTTP server in any case. It must not take the default port of a Dask dashboard.
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+                silence_logs=logging.CRITICAL,  # errors are returned as results
+            )
+        with cluster:
+            yield cluster
 
 
 @contextmanager

@@ -28,10 +28,10 @@ _TYPES = {"int32": np.dtype("<i4"), "float64": np.dtype("<f8")}
 
 
 def flags() -> list[str]:
-    """What setup.py compiles with."""
+    """What setup.py compiles with, but for the longest half of the optimiser's work."""
     tree = ast.parse((ROOT / "setup.py").read_text("utf-8"))
     (given,) = (node.value for node in tree.body if isinstance(node, ast.Assign) and names(node) == ["COMPILE"])
-    return list(ast.literal_eval(given))
+    return [flag.replace("-O3", "-O2") for flag in ast.literal_eval(given)]
 
 
 def names(node: ast.Assign) -> list[str]:
