@@ -61,8 +61,8 @@ KNOWN_LATE = 9
 """Slots that this is at least: a host knows a packet some slots after it began, and composes its own ahead. Without it
 two links on one computer (6 ms a slot) picked at random half of the time, and sent 27 instead of 41 packets/s each."""
 NEWCOMER_S = 2.0
-"""s for which a robot is a newcomer. Without slots for them, 50 robots need 18 s instead of 9 to get in from cold, and a
-robot between two full cells may be heard by nobody for a minute. 1 s takes two seconds longer, 3 s no less."""
+"""s for which a robot is a newcomer. Without slots for them, 50 robots need 18 s instead of 9 to get in from cold, and
+a robot between two full cells may be heard by nobody for a minute. 1 s takes two seconds longer, 3 s no less."""
 EASED = 0.97
 """What v is multiplied by in a free slot. With twice v after an entry in vain, about one robot enters in two slots."""
 _FIRST_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 8.0, 4.0, 64.0, 64.0
