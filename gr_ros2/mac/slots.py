@@ -296,7 +296,7 @@ class Slots:
 
     def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:
         """See :class:`gr_ros2.link.access.Access`. Who says nothing about slots cannot be avoided."""
-        known = src_id in self._elsewhere
+        before = src_id in self._elsewhere
         slot = None if block is None else self._placed(src_id, block.slot, began, trusted=trusted)
         if block is None or slot is None or src_id == self.src_id:
             return
@@ -308,7 +308,7 @@ class Slots:
             return
         robot = self._robots.get(src_id)
         if robot is None:
-            robot = self._robots[src_id] = _HeardRobot(slot, _NEVER if known else slot)
+            robot = self._robots[src_id] = _HeardRobot(slot, _NEVER if before else slot)
             self._rate = max(1.0, self._rate - 1)
         elif slot not in robot.ahead:
             robot.named = _NEVER
