@@ -134,12 +134,15 @@ def test_robots_on_channels_of_their_own_hear_whom_they_can_and_send_meanwhile(t
 def test_what_channels_lose_between_robots_in_real_time_is_repaired_by_version_1(
     tmp_path: Path, overrides: list[str], arrives: bool
 ) -> None:
-    lossy = ["robots=2", "duration_s=1", "duplex=full", "medium=exclusive", "channel.packet_loss=0.2"]
+    """A computer that is too slow has time to receive all of it. Robots with version 1 go on reporting: some of that is
+    still on its way when the run ends."""
+    lossy = ["robots=2", "duration_s=1", "drain_s=60", "duplex=full", "medium=exclusive", "channel.packet_loss=0.2"]
     run_scenario(load_scenario("team", [*LIVE, *lossy, *overrides]), tmp_path)
     result = read_result(tmp_path)
     lost = sum(counted["channel"]["packet_loss"] for counted in (result.counters, result.counters["back"]))
     assert lost > 0
-    assert result.packets["sent"] == result.packets["received"] + lost
+    ended = result.packets["received"] + lost
+    assert ended <= result.packets["sent"] if arrives else ended == result.packets["sent"]
     assert all(sum(topic.ledger.values()) == topic.sent == 10 for topic in result.topics)
     assert all(topic.delivered == topic.sent for topic in result.topics) == arrives
 
