@@ -15,6 +15,8 @@ import pytest
 import gr_ros2
 import gr_ros2.wire
 
+pytestmark = pytest.mark.xdist_group("layers")  # each module is parsed once
+
 ROOT = Path(gr_ros2.__file__).resolve().parent
 MODULES = [path.relative_to(ROOT).as_posix() for path in sorted(ROOT.rglob("*.py"))]
 

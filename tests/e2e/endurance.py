@@ -1,4 +1,4 @@
-"""50,000 messages through source and sink; prints how many more bytes are in use in the end. Run by test_endurance.py.
+"""30,000 messages through source and sink; prints how many more bytes are in use in the end. Run by test_endurance.py.
 
 A process of its own, in which Python too takes its memory from the C library (``PYTHONMALLOC=malloc``), which counts
 what is in use. The size of the process is no measure: on a busy machine more messages wait at once, and what they took
@@ -22,7 +22,7 @@ from tests.domains import free_domains
 from tests.middleware.support import STRING, message
 from tests.waiting import wait_for
 
-MESSAGES, WARM_UP, BATCH = 50_000, 20_000, 1_000
+MESSAGES, WARM_UP, BATCH = 30_000, 12_000, 500
 WINDOW_BYTES = 100_000
 """For packets that are remembered: their number no longer grows after the first messages."""
 LEAST = 0.999

@@ -6,6 +6,7 @@ import json
 import logging
 import random
 from collections import Counter
+from functools import cache
 from math import sqrt
 from pathlib import Path
 
@@ -30,6 +31,8 @@ from gr_ros2.medium.loss_table import BUILTIN_DIR
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig
+
+pytestmark = pytest.mark.xdist_group("collisions")  # what is received at samples is worked out once
 
 PACKET_LEN = 64
 
@@ -80,6 +83,12 @@ def received(medium: Medium, of: Phy, sent: list[tuple[float, int]]) -> Received
     return {(one.sent.sender, one.sent.number, one.receiver) for one in heard}
 
 
+@cache
+def received_at_samples(name: str, robots: int, load: float) -> Received:
+    of, sent = radio(name), schedule(robots, load, 1200, seed=1)
+    return received(make_medium(paths(robots, 1), [of] * robots, samples=True, shared=True), of, sent)
+
+
 CELLS = [(2, 0.3), (6, 1.0)]
 
 
@@ -90,9 +99,8 @@ def test_both_levels_receive_the_same(name: str, robots: int, load: float) -> No
     """At least 97 % of all receptions are equal, and the PDR of every pair is within its 99 % interval, over all pairs:
     each is tested at 1 % divided by their number."""
     of, sent = radio(name), schedule(robots, load, 1200, seed=1)
-    around, phys = paths(robots, 1), [of] * robots
-    at_samples = received(make_medium(around, phys, samples=True, shared=True), of, sent)
-    at_packets = received(make_medium(around, phys, samples=False, shared=True), of, sent)
+    at_samples = received_at_samples(name, robots, load)
+    at_packets = received(make_medium(paths(robots, 1), [of] * robots, samples=False, shared=True), of, sent)
     everything = len(sent) * (robots - 1)
     assert len(at_samples ^ at_packets) / everything < 0.03
     packets = Counter(sender for _, sender in sent)
@@ -109,9 +117,8 @@ def test_both_levels_receive_the_same(name: str, robots: int, load: float) -> No
 def test_taking_interference_for_noise_does_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
     """Why there are tables: without them the same schedule differs in 5 % of the receptions."""
     of, sent = radio("gfsk"), schedule(6, 1.0, 1200, seed=1)
-    around, phys = paths(6, 1), [of] * 6
-    at_samples = received(make_medium(around, phys, samples=True, shared=True), of, sent)
-    medium = PacketMedium(around, phys, shared=True)
+    at_samples = received_at_samples("gfsk", 6, 1.0)
+    medium = PacketMedium(paths(6, 1), [of] * 6, shared=True)
     monkeypatch.setattr(medium, "_table", lambda *_, **__: None)
     assert len(at_samples ^ received(medium, of, sent)) / (5 * len(sent)) > 0.04
 
