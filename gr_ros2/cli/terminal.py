@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-import plotext
 
 WIDTH, HEIGHT = 78, 22
 
@@ -15,6 +14,8 @@ def path_text(sent: npt.ArrayLike, received: npt.ArrayLike, title: str) -> str:
     :param sent: positions (x, y), m, shape (n, 2)
     :param received: the same, in the order of reception
     """
+    import plotext  # many runs draw nothing
+
     plotext.clear_figure()
     plotext.plot_size(WIDTH, HEIGHT)
     plotext.theme("clear")

@@ -24,6 +24,9 @@ MOST_PANELS = 12
 _COLUMNS = 3
 _WRITTEN_OUT = 200
 """Number of fields of a heat map up to which each field shows its number."""
+_LONGEST = 32
+"""Characters of a value at an axis or a curve. Of a longer one, such as a path, the end is shown: it would leave no room
+to draw in."""
 
 
 def curves_figure(plan: SweepPlan, found: Sequence[Summary]) -> tuple[Figure, int]:
@@ -91,7 +94,7 @@ def _draw_curves(field: Any, panel: Panel, order: Sequence[Place]) -> None:
         below = [0.0 if estimate.low is None else estimate.value - estimate.low for _, estimate in points]
         above = [0.0 if estimate.high is None else estimate.high - estimate.value for _, estimate in points]
         style: dict[str, Any] = {"marker": "o", "markersize": 3.5, "linewidth": 1.2, "capsize": 2.5}
-        field.errorbar(xs, ys, yerr=[below, above], label=name or None, color=colour, **style)
+        field.errorbar(xs, ys, yerr=[below, above], label=_text(name) if name else None, color=colour, **style)
     if not numeric:
         field.set_xticks(range(len(order)), [_text(place) for place in order])
 
@@ -116,4 +119,5 @@ def _value_name(plan: SweepPlan) -> str:
 def _text(place: Place) -> str:
     if place is None:
         return "none"
-    return f"{place:g}" if isinstance(place, (int, float)) and not isinstance(place, bool) else str(place)
+    text = f"{place:g}" if isinstance(place, (int, float)) and not isinstance(place, bool) else str(place)
+    return text if len(text) <= _LONGEST else f"…{text[1 - _LONGEST :]}"
