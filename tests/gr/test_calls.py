@@ -27,7 +27,7 @@ from tests.middleware.calling import ADD, Adder, Caller
 from tests.packets import data_of
 
 LAST = 4
-CALLS = 100
+CALLS = 50
 NEAR, FAR = f"/rx_robot_{LAST}/add", f"/robot_{LAST}/add"
 
 
@@ -67,6 +67,10 @@ class LinkedRobot:
     @property
     def end(self) -> LinkedRobot:
         return self
+
+    def next_departure(self, *, credited: bool) -> float | None:
+        """When its next packet may leave."""
+        return self._endpoint.next_departure(credited=credited)
 
     def slot(self, now: float) -> bytes | None:
         """What it sends in a slot."""
@@ -125,6 +129,6 @@ def test_calls_cross_three_hops_and_are_answered_once(line: Line) -> None:
     end = line.now + 35
     while line.now < end and len(caller.got) < CALLS:
         line.run(1)
-    assert len(caller.got) >= 0.99 * CALLS
+    assert len(caller.got) >= CALLS - 1
     assert all(totals == [number + 1000] for number, totals in caller.got.items())
     assert len(adder.taken) == len(set(adder.taken)) >= len(caller.got)

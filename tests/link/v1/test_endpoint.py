@@ -320,7 +320,7 @@ def test_a_robot_that_nobody_hears_falls_silent_and_is_there_for_a_newcomer() ->
 def test_where_nobody_reports_repair_is_bounded_by_the_losses_that_are_expected() -> None:
     """Though the receiver could be anyone: what it lacks with the loss that is expected, it gets."""
     missing = 0
-    for seed in range(200):
+    for seed in range(100):
         one, two = Robot(1, registry(), hears=False), Robot(2, hears=False)
         air = Air(one, two, loss=0.2, seed=seed)
         air.run(3.0)

@@ -65,7 +65,7 @@ def grow_old(robot: Robot, numbers: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("loss", [0.01, 0.05, 0.1, 0.3, 0.5])
+@pytest.mark.parametrize("loss", [0.01, 0.1, 0.5])
 def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -> None:
     """In each run both ends have several lives, in which packet numbers pass their half and come round."""
     rng = random.Random(int(loss * 1000))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -14,6 +15,8 @@ from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
 from tests.link.v1.air import SLOT_S, Robot, registry
 
+STEPS = 8
+"""Moments of a slot at which a packet may leave."""
 ODOM = registry(odom=TopicOptions(queue="latest"))
 
 
@@ -29,7 +32,7 @@ class Line:
     def __init__(self, *robots: Robot, loss: float = 0.0) -> None:
         self.robots = list(robots)
         self.now, self._rng, self._loss = 0.0, random.Random(1), loss
-        self._messages = 0
+        self._messages = self._steps = 0
         self.said: list[tuple[int, bytes]] = []
 
     def near(self, one: int) -> list[int]:
@@ -44,14 +47,22 @@ class Line:
                 for one in self.robots:
                     self.said.append((one.src_id, b"%d says %d" % (one.src_id, self._messages)))
                     one.end.messages.submit(0, self.said[-1][1], self.now)
-            left = {n: data for n, one in enumerate(self.robots) if (data := one.slot(self.now)) is not None}
-            for n, one in enumerate(self.robots):
+            left = {n: data for n in self._leaving() if (data := self.robots[n].slot(self.now)) is not None}
+            for n, one in enumerate(self.robots if left else ()):
                 heard = [left[near] for near in self.near(n) if near in left]
                 if len(heard) == 1 and n not in left and self._rng.random() >= self._loss:
                     one.receive(heard[0], self.now + SLOT_S, self.now)
-            self.now += SLOT_S / 8
-            for one in self.robots:
+            self._steps += 1
+            self.now += SLOT_S / STEPS
+            for one in self.robots if self._steps % STEPS == 0 else ():
                 one.events += one.end.handle_timeout(self.now)
+
+    def _leaving(self) -> Iterator[int]:
+        """The robots whose next packet may leave by now."""
+        for n, one in enumerate(self.robots):
+            departure = one.end.next_departure(credited=True)
+            if departure is not None and departure <= self.now:
+                yield n
 
 
 @pytest.mark.parametrize("mode", ["none", "authenticate", "encrypt"])
