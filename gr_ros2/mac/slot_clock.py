@@ -8,8 +8,8 @@ greater difference means that the other robot belongs to another group, or that 
   two groups moves and the other stays.
 - *Two robots that agreed before differ by the same, and nobody has agreed since*: this clock has jumped. Move.
 - *A robot that agreed before is ahead*: its clock has jumped. Move if it has not noticed after ``PATIENCE_S``.
-- *A robot is behind*: if it still is after ``MEMORY_S``, it does not hear this robot. A group whose slots are all in
-  use hears nobody whose packets begin between two of them. Move there, and stay for ``MEMORY_S``: told in its own slots
+- *A robot is behind*: if it still is after ``BEHIND_S``, it does not hear this robot. A group whose slots are all in
+  use hears nobody whose packets begin between two of them. Move there, and stay for ``STAYS_S``: told in its own slots
   that there are more robots, the group leaves room, and then hears the one that is ahead. Sooner, or more often, robots
   of a large network move back as fast as others move on.
 
@@ -30,7 +30,12 @@ TOLERANCE = 0.25
 PATIENCE_S = 1.5
 """s for which a robot whose clock has jumped may take to notice: some packets of two others."""
 MEMORY_S = 3.0
-"""s for which a robot that agreed counts as one that agrees, and one that is behind may take to follow."""
+"""s for which a robot that agreed counts as one that agrees."""
+BEHIND_S = 4.0
+"""s that one that is behind may take to follow."""
+STAYS_S = 2.0
+"""s. Clearly less than ``BEHIND_S``: with 3 s for both, the two robots of a link between two groups may change sides in
+turn for a minute (20 at random, held together by one link, are .3 s older)."""
 
 
 class _Odd(NamedTuple):
@@ -97,7 +102,7 @@ class SlotClock:
         if began < self._stays_until or not self._moves(src_id, error, began, trusted=trusted):
             return None
         if error > 0:
-            self._stays_until = began + MEMORY_S
+            self._stays_until = began + STAYS_S
         self._zero += error * self.slot_s
         self.jumps += 1
         self._agreed = {src_id: began} if trusted else {}
@@ -122,4 +127,4 @@ class SlotClock:
             for other, (by, since) in self._odd.items()
             if abs(by - error) <= TOLERANCE and since > self._agreed_at and other in self._agreed
         ]
-        return len(alike) > 1 or now - odd.since > (PATIENCE_S if error < 0 else MEMORY_S)
+        return len(alike) > 1 or now - odd.since > (PATIENCE_S if error < 0 else BEHIND_S)

@@ -18,7 +18,8 @@ by its next send, and shrinks with each newcomer that gets in. A neighbour names
 
 *Who is not heard.* Two robots that always collide at a third one are never heard by it: its map lacks their slots. A
 robot whose next slot three maps in a row of a neighbour lack, or that nobody names for a while, picks at random among
-the first free slots, and so does a robot that hears nobody.
+the first free slots. So does a robot that hears nobody, and one that hears robots with other slots: a packet that
+always falls between the same two slots of a group is never heard there.
 
 Invariants: sans-IO, the caller passes in times of its own clock, and the generator; what arrives with bytes that were
 not checked keeps its sender's announced slots free and does nothing else; the work for a packet heard is bounded by the
@@ -79,9 +80,9 @@ class _HeardRobot:
 
     __slots__ = ("ahead", "deaf", "first", "heard", "last", "named", "weight")
 
-    def __init__(self, slot: int, first: int) -> None:
-        self.first = first
-        """The slot in which it came; ``_NEVER`` if it was known before, in other slots."""
+    def __init__(self, slot: int) -> None:
+        self.first = slot
+        """The slot in which it came."""
         self.last = slot
         """The slot of its newest packet."""
         self.heard = 0
@@ -219,7 +220,8 @@ class Slots:
             step = round(max(step, self._rate) * self._rng.uniform(0.5, 1.5))
         ahead = announceable(step)
         places: list[int] = []
-        unsure = alone or self._confirmed_at < now - max(UNSURE * frame, KNOWN_LATE) or self._unheard(now)
+        unnamed = self._confirmed_at < now - max(UNSURE * frame, KNOWN_LATE)
+        unsure = alone or unnamed or self._unheard(now) or self._elsewhere
         wanted = CHOICE if unsure or self._rng.random() < MIXED else 1
         while ahead <= LONGEST_AHEAD and len(places) < wanted:
             at, before = base + ahead, base + ahead - frame
@@ -232,9 +234,8 @@ class Slots:
         """The sum of the weights of this robot and those it hears, and the same of each robot that it hears. Robots of
         another group count too, see ``SlotClock``."""
         oldest = now - self._memory()
-        since = self.clock.begin(oldest)
         heard = [robot for robot in self._robots.values() if robot.last >= oldest]
-        others = sum(at >= since and src_id not in self._robots for src_id, at in self._elsewhere.items())
+        others = sum([src_id not in self._robots for src_id in self._elsewhere])
         own = self._weight + others + sum([robot.weight for robot in heard])
         return [own, *[robot.heard + robot.weight for robot in heard]]
 
@@ -289,14 +290,15 @@ class Slots:
         self._swept = self._base = now
         self._taken = {slot: owner for slot, owner in self._taken.items() if slot > now}
         self._conflicts = {slot: loser for slot, loser in self._conflicts.items() if slot > now}
-        oldest = now - 2 * self._memory()
-        self._robots = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= oldest}
+        memory = self._memory()
+        self._robots = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= now - 2 * memory}
+        oldest = self.clock.begin(now - memory)
+        self._elsewhere = {src_id: at for src_id, at in self._elsewhere.items() if at >= oldest}
 
     # ---- what is heard
 
     def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:
         """See :class:`gr_ros2.link.access.Access`. Who says nothing about slots cannot be avoided."""
-        before = src_id in self._elsewhere
         slot = None if block is None else self._placed(src_id, block.slot, began, trusted=trusted)
         if block is None or slot is None or src_id == self.src_id:
             return
@@ -308,7 +310,7 @@ class Slots:
             return
         robot = self._robots.get(src_id)
         if robot is None:
-            robot = self._robots[src_id] = _HeardRobot(slot, _NEVER if before else slot)
+            robot = self._robots[src_id] = _HeardRobot(slot)
             self._rate = max(1.0, self._rate - 1)
         elif slot not in robot.ahead:
             robot.named = _NEVER
@@ -316,8 +318,8 @@ class Slots:
         if slot > self._base + _SILENT:
             self._sweep(slot)
         for at in robot.ahead:
-            for known in () if at in ahead else (self._taken, self._conflicts):
-                if known.get(at) == src_id:
+            for known in (self._taken, self._conflicts):
+                if at not in ahead and known.get(at) == src_id:
                     del known[at]
         robot.last, robot.ahead, robot.heard, robot.weight = slot, ahead, block.heard, block.weight
         for at in ahead:

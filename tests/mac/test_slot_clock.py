@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.mac.slot_clock import MEMORY_S, PATIENCE_S, SlotClock
+from gr_ros2.mac.slot_clock import BEHIND_S, MEMORY_S, PATIENCE_S, STAYS_S, SlotClock
 
 SLOT = 0.015
 
@@ -86,12 +86,12 @@ def test_packets_that_are_not_checked_move_nobody_who_hears_others() -> None:
 
 def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:
     made = clock()
-    slots = round(MEMORY_S / SLOT)
+    slots, stays = round(BEHIND_S / SLOT), round(STAYS_S / SLOT)
     for n in range(0, 2 * slots, 2):
         hear(made, 1, n)
         if hear(made, 2, n + 1, 0.4) is not None:
             break
     assert n == pytest.approx(slots, abs=2)
     assert made.jumps == 1
-    assert hear(made, 1, n + slots - 9, -0.4) is None, "it would leave before it is heard"
-    assert hear(made, 1, n + slots + 40, -0.4) is not None
+    assert hear(made, 1, n + stays - 9, -0.4) is None, "it would leave before it is heard"
+    assert hear(made, 1, n + round(MEMORY_S / SLOT) + 40, -0.4) is not None

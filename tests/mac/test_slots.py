@@ -98,15 +98,20 @@ def test_frames_have_a_slot_for_each_newcomer_until_it_is_none_any_more() -> Non
     assert made._frame(late + 16, made._loads(late + 16)) == 17 + 1
 
 
-def test_robots_that_were_known_before_this_clock_jumped_are_no_newcomers() -> None:
+def test_a_robot_that_hears_other_slots_counts_who_has_them_and_picks_at_random_until_it_forgets_them() -> None:
     made = robot()
-    for start, by in ((70, 0), (300, 40), (310, 40)):
-        for other in range(8):
-            slot = start + other
-            made.hear(10 + other, Block((slot + by) % 256, (300, 300), 8, (5, NOBODY)), slot * SLOT)
-    assert made.clock.jumps == 1
-    now = 320 + 40
-    assert made._frame(now, made._loads(now)) == 9 + 1 + 1  # the one that moved the clock counts
+    hear(made, 7, 60, Block(0, (300, 300), 1, (5, NOBODY)))
+    hear(made, 8, 61, Block(0, (300, 300), 1, (5, NOBODY)))
+    before = max(made._loads(70))
+    made.hear(9, Block(62, (300, 300), 1, (5, NOBODY)), 62.5 * SLOT)
+    assert max(made._loads(70)) == before + 1
+    made._confirmed_at = 70
+    assert len({made._pick(77, 70, 20) for _ in range(100)}) == CHOICE
+    made._confirmed_at = late = 70 + 2 * round(HEARD_S / SLOT)
+    made._sweep(late)
+    hear(made, 7, late, Block(0, (300, 300), 1, (5, NOBODY)))
+    assert made._loads(late)[0] == 2
+    assert len({made._pick(late + 7, late, 20) for _ in range(100)}) < CHOICE
 
 
 def test_a_slot_in_whose_place_somebody_sends_one_frame_before_is_passed_over() -> None:
