@@ -25,8 +25,8 @@ _COLUMNS = 3
 _WRITTEN_OUT = 200
 """Number of fields of a heat map up to which each field shows its number."""
 _LONGEST = 32
-"""Characters of a value at an axis or a curve. Of a longer one, such as a path, the end is shown: it would leave no room
-to draw in."""
+"""Characters of a value at an axis or a curve. Of a longer one, such as a path, the end is shown; all of it would leave
+no room to draw in."""
 
 
 def curves_figure(plan: SweepPlan, found: Sequence[Summary]) -> tuple[Figure, int]:
