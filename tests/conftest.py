@@ -13,6 +13,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# Workers share the cores: threads of theirs for linear algebra would only wait for each other. Read as numpy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from gr_ros2.record.result import Result
 from tests import domains
 from tests.outcomes import pytest_addoption, pytest_configure, pytest_xdist_make_scheduler  # noqa: F401

@@ -44,7 +44,12 @@ def typestore() -> Typestore:
 
 def known(type_name: str) -> bool:
     """Whether a distribution of ROS ships ``package/msg/Type``."""
-    return bool(typestores(type_name))
+    return _shipped(type_name) is not None
+
+
+def _shipped(type_name: str) -> Typestore | None:
+    """The types of the first distribution that has a type; others are loaded only if :func:`typestore` lacks it."""
+    return typestore() if type_name in typestore().fielddefs else next(iter(typestores(type_name)), None)
 
 
 @cache
@@ -70,8 +75,8 @@ def definition(type_name: str, text: str | None = None) -> Definition:
 
     :param text: of the type, None = as ROS ships it; one that cannot be read is as good as none
     """
-    if text is None and known(type_name):
-        return Definition(typestores(type_name)[0].generate_msgdef(type_name, ros_version=2)[0], type_hash(type_name))
+    if text is None and (store := _shipped(type_name)) is not None:
+        return Definition(store.generate_msgdef(type_name, ros_version=2)[0], _hash(store, type_name))
     digest = text_hash(type_name, text) if text is not None else ""
     return Definition(text, digest) if text is not None and digest else _unknown(type_name)
 
@@ -100,7 +105,8 @@ def same_type(type_name: str, text: str, other: str) -> bool:
 
 def type_hash(type_name: str) -> str:
     """RIHS01 hash of a type ROS ships, '' for others."""
-    return _hash(typestores(type_name)[0], type_name) if known(type_name) else ""
+    store = _shipped(type_name)
+    return "" if store is None else _hash(store, type_name)
 
 
 def text_hash(type_name: str, text: str) -> str:

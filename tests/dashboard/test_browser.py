@@ -258,7 +258,9 @@ def test_it_shows_what_the_result_says_sliders_act_and_it_returns_with_the_next_
 
 
 @pytest.mark.slow
-def test_it_shows_what_repair_does(viewer: Viewer, tmp_path: Path) -> None:
+def test_it_shows_what_repair_does_and_can_be_used_with_a_keyboard_and_a_screen_reader_and_read_in_both_modes(
+    viewer: Viewer, tmp_path: Path
+) -> None:
     lossy = ("version=1", "reports={}", "channel.packet_loss=0.3", "channel.snr_db=null", "sim.odom_rate=10")
     with program(tmp_path / "out", 0, *lossy) as (process, url):
         viewer.driver.get(url)
@@ -271,6 +273,30 @@ def test_it_shows_what_repair_does(viewer: Viewer, tmp_path: Path) -> None:
         assert tiles["air_report"] > 0
         assert sum(tiles[f"air_{kind}"] for kind in ("new", "repair", "report", "hello")) == pytest.approx(1)
         assert any("repair" in text for text in viewer.text(".topics .key"))
+
+        stops = []
+        while True:
+            webdriver.ActionChains(viewer.driver).send_keys(Keys.TAB).perform()
+            name, *ring, over = viewer.run(FOCUSED)
+            if over:
+                break
+            assert ring == ["solid", "3px"], name
+            stops.append(name)
+        sliders = ["SNR in the sampled band [dB]", "carrier offset [1/1000 of the sample rate]", "packets lost [%]"]
+        assert stops == ["Pause", "stop sending", "noise", *sliders]
+        assert viewer.button("Pause").get_attribute("aria-pressed") == "false"
+        viewer.button("Pause").send_keys(Keys.SPACE)
+        viewer.wait(lambda: viewer.button("Pause").get_attribute("aria-pressed") == "true", "a pressed toggle")
+        viewer.button("Pause").send_keys(Keys.SPACE)
+        for scheme in ("light", "dark"):
+            viewer.scheme(scheme)
+            viewer.wait(lambda: viewer.run(PALE) == [], f"texts that can be read on a {scheme} page")
+        # A screen reader says what is in an element that stays and has the role of a status.
+        viewer.slide(LOSS, Keys.END)
+        viewer.wait(
+            lambda: "heard" in viewer.run("return document.querySelector('[role=status]').textContent"), "alarm"
+        )
+
         result = stop(process, tmp_path / "out")
         viewer.wait(viewer.gone, "the page to notice that the program has ended")
     (topic,) = result.topics
@@ -340,37 +366,6 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
         viewer.wait(viewer.gone, "the page to notice that the program has ended")
         picture("ended")
     assert not viewer.text(".alarms li")
-
-
-@pytest.mark.slow
-def test_it_can_be_used_with_a_keyboard_and_a_screen_reader_and_read_in_both_modes(
-    viewer: Viewer, tmp_path: Path
-) -> None:
-    with program(tmp_path / "out", 0, "version=1", "reports={}") as (_, url):
-        viewer.driver.get(url)
-        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 20, "deliveries")
-        stops = []
-        while True:
-            webdriver.ActionChains(viewer.driver).send_keys(Keys.TAB).perform()
-            name, *ring, over = viewer.run(FOCUSED)
-            if over:
-                break
-            assert ring == ["solid", "3px"], name
-            stops.append(name)
-        sliders = ["SNR in the sampled band [dB]", "carrier offset [1/1000 of the sample rate]", "packets lost [%]"]
-        assert stops == ["Pause", "stop sending", "noise", *sliders]
-        assert viewer.button("Pause").get_attribute("aria-pressed") == "false"
-        viewer.button("Pause").send_keys(Keys.SPACE)
-        viewer.wait(lambda: viewer.button("Pause").get_attribute("aria-pressed") == "true", "a pressed toggle")
-        viewer.button("Pause").send_keys(Keys.SPACE)
-        for scheme in ("light", "dark"):
-            viewer.scheme(scheme)
-            viewer.wait(lambda: viewer.run(PALE) == [], f"texts that can be read on a {scheme} page")
-        # A screen reader says what is in an element that stays and has the role of a status.
-        viewer.slide(LOSS, Keys.END)
-        viewer.wait(
-            lambda: "heard" in viewer.run("return document.querySelector('[role=status]').textContent"), "alarm"
-        )
 
 
 @pytest.mark.slow
