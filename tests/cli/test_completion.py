@@ -29,13 +29,13 @@ def test_the_script_is_one_that_the_shell_reads(shell: str, tmp_path: Path, caps
 
 
 def completions(words: list[str], tmp_path: Path) -> list[str]:
-    """What bash offers for a command line whose last word is being typed."""
+    """What bash offers for a command line whose last word is being typed, with our script in a file."""
     program = tmp_path / "gr-ros2"
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m gr_ros2.cli "$@"\n')
     program.chmod(0o755)
     line = " ".join(words)
     script = (
-        f'source <(gr-ros2 completion bash) 2>/dev/null; COMP_WORDS=({line}); [ "{words[-1]}" ] || COMP_WORDS+=("");'
+        f'source {tmp_path}/script 2>/dev/null; COMP_WORDS=({line}); [ "{words[-1]}" ] || COMP_WORDS+=("");'
         f"COMP_CWORD={len(words) - 1}; _gr_ros2_completion gr-ros2; printf '%s\\n' \"${{COMPREPLY[@]}}\""
     )
     environ = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
@@ -45,7 +45,9 @@ def completions(words: list[str], tmp_path: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is missing")
-def test_bash_completes_commands_scenarios_and_options(tmp_path: Path) -> None:
+def test_bash_completes_commands_scenarios_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["completion", "bash"]) == 0
+    (tmp_path / "script").write_text(capsys.readouterr().out)
     assert completions(["gr-ros2", "re"], tmp_path) == [name for name in COMMANDS if name.startswith("re")]
     offered = completions(["gr-ros2", "run", "paper-"], tmp_path)
     assert {"paper-direct", "paper-ofdm"} <= set(offered)

@@ -16,15 +16,15 @@ PLAN = ("plan", "demo")
 GRAPH = ("registry", "from-graph", "--wait", "60")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
-    ("words", "loaded"),
+    ("words", "loaded", "number"),
     [
-        (PLAN, "click.exceptions"),  # before there is a command line
-        (PLAN, "pydantic_core"),  # with the command's own modules
-        (PLAN, "pmt"),
-        (PLAN, "gnuradio.digital.digital_python"),  # with a PHY
-        (GRAPH, "gr_ros2.middleware.cdr_dds"),  # with a middleware
+        (PLAN, "click.exceptions", signal.SIGINT),  # before there is a command line
+        (PLAN, "click.exceptions", signal.SIGTERM),
+        (PLAN, "pydantic_core", signal.SIGINT),  # with the command's own modules
+        (PLAN, "pmt", signal.SIGTERM),
+        (PLAN, "gnuradio.digital.digital_python", signal.SIGINT),  # with a PHY
+        (GRAPH, "gr_ros2.middleware.cdr_dds", signal.SIGTERM),  # with a middleware
     ],
 )
 def test_a_signal_while_modules_are_loaded(words: tuple[str, ...], loaded: str, number: signal.Signals) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.cli.main import run
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from tests.domains import free_domains
@@ -94,9 +95,11 @@ def test_it_ends_after_a_duration(config: Path) -> None:
         ("front_end={name: soapy, args: driver=none, frequency: 1e8}", "front_end soapy: args = 'driver=none'", 1),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(config: Path, change: str, said: str, status: int) -> None:
-    failed = link(config, "--transmit", "--open", *set_options([change]))
-    output, errors = failed.communicate(timeout=PATIENCE_S)
-    assert (failed.returncode, output) == (status, "")
+def test_what_is_wrong_is_said_in_a_line(
+    config: Path, change: str, said: str, status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["link", str(config), "--transmit", "--open", *set_options([change])]) == status
+    output, errors = capsys.readouterr()
+    assert output == ""
     assert errors.startswith("gr-ros2: ") and said in errors
     assert errors.count("\n") == 1

@@ -18,7 +18,7 @@ from gr_ros2.sim.motion import ACCELERATION, MAX_TURN, RADIUS, TURN_ACCELERATION
 from gr_ros2.sim.sensors import GRAVITY, TYPES
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-DURATION = 15
+DURATION = 10
 
 
 @pytest.fixture(scope="module")
