@@ -54,11 +54,12 @@ class Roadmap:
         ones, twos = ones[clear], twos[clear]
         distance[ones, twos] = distance[twos, ones] = lengths[ones, twos]
         step = np.where(np.isfinite(distance), np.arange(count)[None], -1)
+        through, better = np.empty_like(distance), np.empty(distance.shape, bool)  # new ones each time take twice as long
         for middle in range(count):
-            through = distance[:, middle, None] + distance[None, middle]
-            better = through < distance
-            distance = np.where(better, through, distance)
-            step = np.where(better, step[:, middle, None], step)
+            np.add(distance[:, middle, None], distance[None, middle], out=through)
+            np.less(through, distance, out=better)
+            np.copyto(distance, through, where=better)
+            np.copyto(step, step[:, middle, None].copy(), where=better)
         return distance, step
 
     def nearest(self, point: Floats) -> int:
