@@ -54,7 +54,7 @@ class Roadmap:
         ones, twos = ones[clear], twos[clear]
         distance[ones, twos] = distance[twos, ones] = lengths[ones, twos]
         step = np.where(np.isfinite(distance), np.arange(count)[None], -1)
-        through, better = np.empty_like(distance), np.empty(distance.shape, bool)  # new ones each time take twice as long
+        through, better = np.empty_like(distance), np.empty(distance.shape, bool)  # anew each time: twice as long
         for middle in range(count):
             np.add(distance[:, middle, None], distance[None, middle], out=through)
             np.less(through, distance, out=better)
