@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from itertools import repeat
-from math import exp, isfinite, log, sqrt
+from math import exp, inf, isfinite, log, sqrt
 from statistics import mean, stdev
 from typing import Any
 
@@ -28,7 +28,7 @@ from bench.rows import Row
 
 SEEDS = range(1, 7)
 SECONDS = 20.0
-"""Simulated s of a run. A seed of all promises takes about 10 s of processor time, one of the adaptive rate's 9 s."""
+"""Simulated s of a run. A seed of all promises takes about 10 s of processor time, one of the adaptive rate's 15 s."""
 SHOWN = 0.03
 """Relative change of a promise from which on a rule earns its place."""
 _T = {3: 4.303, 4: 3.182, 5: 2.776, 6: 2.571}
@@ -56,6 +56,9 @@ RULES: dict[str, list[Patch]] = {
     "no turns of topics": [("freshness", "TURN", 1 << 30)],
     "long messages by value alone": [("packing", "LONG", 1 << 30)],
     "no knowledge of what gaps held": [("gap_contents", "GapContents.learn", lambda _self, _number: None)],
+    "silence in fading as otherwise": [("rate", "_FADING_SILENT_S", 0.05), ("rate", "_FADING_UNANSWERED", 12)],
+    "silence otherwise as in fading": [("rate", "_LEAST_SILENT_S", 0.02), ("rate", "_UNANSWERED", 4)],
+    "no limit of a change of SNR": [("rate", "_MOST_DRIFT_DB_S", inf)],
 }
 CONSTANTS = (
     ("lifetime", "WORTH"), ("thrift", "_ENOUGH"),
@@ -67,7 +70,8 @@ CONSTANTS = (
 RATE = (
     "GAIN_UP", "GAIN_DOWN", "SETTLED", "_HASTY", "_MOST_PATIENCE", "MOST_SILENT_S", "_GAPS", "_UNANSWERED",
     "_FADING_SILENT_S", "_FADING_UNANSWERED", "_LOOK_BACK_S", "_REPORT_S", "_ERROR_DB", "_CHANGE_DB",
-    "_DRIFT_SMOOTHING", "_MOST_DRIFT_DB_S", "_CALM_DB_S", "_CORRECTION_DB_S", "_MOST_CORRECTION_DB", "_FADE_S",
+    "_DRIFT_SMOOTHING", "_MOST_DRIFT_DB_S", "_CALM_DB_S", "_CORRECTION_DB_S", "_FADE_S", "_LEAST_SILENT_S",
+    "_LONGEST_GAP_S", "_SMOOTHING",
 )  # fmt: skip
 """Constants of the adaptive rate, whose promises are its own."""
 
@@ -83,13 +87,15 @@ def _paced(name: str, seed: int, *, back: bool) -> float:
 
 
 def rate_promises(seed: int) -> dict[str, float]:
-    """The same of the adaptive rate where it fades: s per message delivered, at a load that it cannot carry."""
-    fading = {"doppler_hz": rate.DOPPLER_HZ, "seed": seed}
-    rates, load = tuple(rate.RATES), rate.FASTEST
-    return {
-        f"fading, {mean_db:g} dB": 1 / rate.carried(rates, {"snr_db": mean_db, **fading}, load, 4.0)[0]
+    """The same of the adaptive rate, in fading and at constant SNRs: s per message delivered, at a load that it cannot
+    carry. The constant SNRs differ by seed, so that edges of MCSs are among them."""
+    channels = {
+        f"fading, {mean_db:g} dB": {"snr_db": mean_db, "doppler_hz": rate.DOPPLER_HZ, "seed": seed}
         for mean_db in rate.MEANS_DB
     }
+    channels |= {f"about {snr_db} dB": {"snr_db": snr_db + (seed - 2) / 2, "seed": seed} for snr_db in (2, 6, 9, 12)}
+    rates = tuple(rate.RATES)
+    return {name: 1 / rate.carried(rates, channel, rate.FASTEST, 4.0)[0] for name, channel in channels.items()}
 
 
 def promises(seed: int) -> dict[str, float]:

@@ -54,9 +54,9 @@ _CALM_DB_S = 5.0
 """Mean rate of change up to which the channel counts as constant, dB/s."""
 _CORRECTION_DB_S = 3.0
 """dB of correction per s, for a loss of 1 where 0 was expected."""
-_MOST_CORRECTION_DB = 6.0
 _FADE_S = 1.2
-"""s in which the correction falls to 1/e: the SNR is trusted again in the end."""
+"""s in which the correction falls to 1/e: the SNR is trusted again in the end. With the speed above it limits the
+correction to 3.6 dB."""
 _STEEPEST = 50.0
 
 
@@ -161,8 +161,7 @@ class RateController:
         known = self._robots.setdefault(robot, _Peer())
         gap = known.heard_at(snr_db, now)
         surplus = loss - (1 - self.mcs_table[known.mcs].pdr(known.snr_db(now)))
-        correction = known.correction_db + gap * (_CORRECTION_DB_S * surplus - known.correction_db / _FADE_S)
-        known.correction_db = min(max(correction, -_MOST_CORRECTION_DB), _MOST_CORRECTION_DB)
+        known.correction_db += gap * (_CORRECTION_DB_S * surplus - known.correction_db / _FADE_S)
         self._choose(known, now)
 
     def meet(self, robot: int) -> None:
