@@ -179,7 +179,7 @@ def test_the_symbols_of_the_last_packet_can_be_seen(name: str) -> None:
         symbols = link.symbols()
         assert symbols is not None
         assert 100 < len(symbols) <= SYMBOLS_SHOWN
-        assert np.abs(symbols) == pytest.approx(np.ones(len(symbols)), abs=0.35)
+        assert np.abs(np.abs(symbols) - 1).max() <= 0.35
 
 
 @pytest.mark.parametrize("frequency_offset", [0.0, 0.0025, -0.005])

@@ -82,7 +82,18 @@ def test_a_serial_line_that_is_pulled_out_and_plugged_in(framing: str, tmp_path:
             assert cable.carried > 0
 
 
-def test_a_device_that_takes_no_more_costs_packets_and_nobody_waits(tmp_path: Path) -> None:
+def test_a_device_that_takes_no_more_costs_packets_and_nobody_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connect = socket.create_connection
+
+    def with_little_room(*where: Any) -> socket.socket:
+        """Linux would take megabytes before it takes no more."""
+        connected = connect(*where)
+        connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        return connected
+
+    monkeypatch.setattr(socket, "create_connection", with_little_room)
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         end = {"name": "kiss", "device": f"tcp://127.0.0.1:{server.getsockname()[1]}"}

@@ -7,6 +7,7 @@ has, and joins messages. It exists to find out whether the page says enough.
 from __future__ import annotations
 
 import hmac
+from functools import cache
 from hashlib import sha256
 
 
@@ -24,6 +25,7 @@ def crc32(data: bytes) -> int:
     return value ^ 0xFFFFFFFF
 
 
+@cache
 def times(a: int, b: int) -> int:
     """In GF(256) with 0x11D."""
     total = 0

@@ -125,6 +125,11 @@ def test_same_soft_bits_within_rounding(
     assert read >= 3
 
 
+def close(samples: Samples, wanted: Samples) -> bool:
+    """Whether samples are the same but for rounding."""
+    return len(samples) == len(wanted) and bool(np.abs(samples - wanted).max() <= 1e-5 * np.abs(wanted).max())
+
+
 @pytest.mark.parametrize(("name", "options"), SETTINGS, ids=IDS)
 def test_same_with_packets_of_all_lengths(
     name: str, options: dict[str, Any], every: list[Any], monkeypatch: pytest.MonkeyPatch
@@ -138,7 +143,7 @@ def test_same_with_packets_of_all_lengths(
         mcs, *fast_ones = rates[number % len(rates)]
         wanted = mcs.modulate(packet)
         for fast_mcs in fast_ones:
-            assert fast_mcs.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
+            assert close(fast_mcs.modulate(packet), wanted)
         parts += [wanted, np.zeros(phy.gap)]
     samples = delayed(np.concatenate((np.zeros(400), *parts, np.zeros(400))), 0.3)
     for snr_db in (half_point(phy.computed_pdr), 40):
@@ -156,7 +161,7 @@ def test_same_samples_are_sent(
     phy, fast = both(name, options, functions, monkeypatch)
     packet = random.Random(1).randbytes(64)
     wanted = phy.modem.modulate(packet)
-    assert fast.modulate(packet) == pytest.approx(wanted, abs=1e-5 * float(np.abs(wanted).max()))
+    assert close(fast.modulate(packet), wanted)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
@@ -211,7 +216,7 @@ def test_same_with_a_burst_whose_beginning_was_missed(
         assert fast.find(stream) == found
         if found.start is not None and name == "ofdm":
             wanted, got = phy.modem.read(stream, found.start), fast.read(stream, found.start)
-            assert got.soft == pytest.approx(wanted.soft, abs=EXACT * float(np.abs(wanted.soft).mean()))
+            assert np.abs(got.soft - wanted.soft).max() <= EXACT * np.abs(wanted.soft).mean()
         assert hear(fast, stream, [700]) == hear(phy.modem, stream, [700])
     if name == "ofdm":
         assert any((phy.modem.find(received(phy, samples[missed:])).start or 0) < 0 for missed in range(400, 480, 4))
