@@ -56,22 +56,22 @@ class Combining:
         self._place = (self._place + _GOLDEN) % 1
         span = packets.newest - packets.oldest + 1
         first = packets.oldest + min(max(int(self._place * span) - MAX_WINDOW // 2, 0), max(span - MAX_WINDOW, 0))
-        found = list(packets.live(first, min(first + MAX_WINDOW - 1, packets.newest), now))
-        if not found:  # no live packet there: continue at the next live one
-            for record in packets.live(first, packets.newest, now):
-                last = min(record.number + MAX_WINDOW - 1, packets.newest)
-                found = list(packets.live(record.number, last, now))
-                break
+        last = min(first + MAX_WINDOW - 1, packets.newest)
+        found = packets.live(first, last, now)
+        while not found and last < packets.newest:  # continue at the next live one
+            first, last = last + 1, min(last + MAX_WINDOW, packets.newest)
+            if later := packets.live(first, last, now):
+                found = packets.live(later[0].number, min(later[0].number + MAX_WINDOW - 1, packets.newest), now)
         return found[::-1]
 
     def around(self, number: int, now: float) -> list[Sent]:
         """The window around a number; only the oldest packet if all are newer."""
         packets = self._packets
         if number < packets.oldest:
-            return list(packets.live(packets.oldest, packets.oldest, now))
+            return packets.live(packets.oldest, packets.oldest, now)
         half = MAX_WINDOW // 2
         first, last = max(number - half, packets.oldest), min(number + half, packets.newest)
-        return list(packets.live(first, last, now))[::-1]
+        return packets.live(first, last, now)[::-1]
 
     def combine(self, window: list[Sent], proven: int, now: float) -> tuple[Repair, list[Sent]] | None:
         """The combination of a window, and the packets that it combines: all in its span if a mask does not fit beside
@@ -109,7 +109,7 @@ class Combining:
         for number in range(max(newest, proven) + 1, min(packets.newest, window[-1].number + MAX_WINDOW - 1) + 1):
             record = packets.records.get(number)
             if record is not None and not packets.full(number):
-                return [record, *reversed([*packets.live(newest + 1, number - 1, now)]), *window]
+                return [record, *packets.live(newest + 1, number - 1, now)[::-1], *window]
         while window and packets.full(window[0].number):
             window = window[1:]
         return window if window and window[0].number > proven else []

@@ -125,8 +125,10 @@ class Peers:
 
     def sent(self, number: int, lifetimes: tuple[Lifetime, ...], now: float) -> None:
         """A source packet leaves, after ``SentPackets.newest``."""
-        if any(lifetime.in_order for lifetime in lifetimes):
-            self._ordered = max(self._ordered, number)
+        for lifetime in lifetimes:
+            if lifetime.in_order:
+                self._ordered = max(self._ordered, number)
+                break
         before = self._times.get(self._packets.newest)
         if before is not None:
             self._period += (now - before - self._period) / 8

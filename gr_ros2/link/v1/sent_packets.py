@@ -8,7 +8,6 @@ Invariants: a repair id is used once per number; no live packet is more than ``s
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from gr_ros2.link.v1.lifetime import Lifetime
@@ -103,17 +102,19 @@ class SentPackets:
         self.retire(now)
         return bool(self.records)
 
-    def live(self, first: int, last: int, now: float) -> Iterator[Sent]:
+    def live(self, first: int, last: int, now: float) -> list[Sent]:
         """The packets from one number to another that are alive."""
-        everybody = self.everybody
+        found: list[Sent] = []
+        record_of, everybody = self.records.get, self.everybody
         for number in range(first, last + 1):
-            record = self.records.get(number)
+            record = record_of(number)
             if record is None or (everybody and record.confirmed & everybody == everybody):
                 continue
             for lifetime in record.lifetimes:  # ``alive``, whose call would take half of this loop's time
                 if now < lifetime.expires:
-                    yield record
+                    found.append(record)
                     break
+        return found
 
     def take_repair_id(self, number: int) -> int | None:
         """A repair id that no repair packet at this number has used; None if all are used."""

@@ -86,7 +86,7 @@ class SharedRepairs:
         ordered = self._ordered if lost < 0 else min(self._ordered, max(lost, packets.oldest) + MAX_WINDOW // 2)
         for newest in (ordered, packets.newest):  # where all in order is confirmed, it says at least that
             first = max(packets.oldest, newest - MAX_WINDOW + 1)
-            window = window or list(packets.live(first, newest, now))[::-1]
+            window = window or packets.live(first, newest, now)[::-1]
         if not window or window[-1].number == packets.oldest:
             self._told_at = now
         for record in window:
