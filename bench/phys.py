@@ -22,7 +22,7 @@ from bench.rows import Row
 from bench.runs import DRIVE
 from gr_ros2.core.errors import BackendMissingError
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.link import Sender
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink

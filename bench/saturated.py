@@ -21,7 +21,7 @@ from typing import Any
 
 from bench.repair import losses
 from bench.rows import Row
-from gr_ros2.gr.ends import message_codec
+from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import EndpointV1

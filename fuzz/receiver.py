@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from functools import partial
 
 from fuzz.loop import main, within
-from gr_ros2.link import Delivered, Lost, ReceivedPacket, Receiver, ReceiverEvent, Rejected, Sender
+from gr_ros2.link import Delivered, Lost, ReceivedPacket, ReceiverEvent, Rejected
+from gr_ros2.link.v0.receiver import Receiver
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import with_crc, without_crc

@@ -80,20 +80,14 @@ WITHOUT_BACKENDS = (
 
 KNOW_THEIR_VERSION = (
     "wire/",
-    "link/schedule.py",
-    "link/sender.py",
-    "link/receiver.py",
-    "link/reassemble.py",
-    "link/partials.py",
-    "link/sequence.py",
+    "link/v0/",
     "link/v1/",
     "mac/",
     "relay/",
     "link/reader.py",
 )
-"""The codec of a version and its engines. All others ask a Format; the race compares with version 0 by name."""
-COMPARES_WITH_VERSION_0 = ("race/race_settings.py",)
-FACTORY = "gr/ends.py"
+"""The codec of a version, its engines, and what reads packets without being an end. All others ask a Format."""
+FACTORY = "gr/factory.py"
 """The module outside ``link`` that makes the endpoint of a version."""
 SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "settings"}
 """Parts that handle packets and have no bytes of their own, as coders, modems and capture files have."""
@@ -110,7 +104,7 @@ def parsed(module: str) -> ast.Module:
 
 
 def part(module: str) -> str:
-    """``link`` of ``link/sender.py``."""
+    """``link`` of ``link/v0/sender.py``."""
     return module.split("/", maxsplit=1)[0].removesuffix(".py")
 
 
@@ -207,7 +201,7 @@ def test_nothing_but_its_engines_knows_a_version_of_the_wire_format() -> None:
     public = {f"gr_ros2.wire.{name}" for name in gr_ros2.wire.__all__}
 
     def inside(module: str) -> set[str]:
-        known = module.startswith(KNOW_THEIR_VERSION) or module in COMPARES_WITH_VERSION_0
+        known = module.startswith(KNOW_THEIR_VERSION)
         return set() if known else {name for name in imports(module) if name.startswith("gr_ros2.wire.")} - public
 
     assert breaking(inside) == {}
@@ -217,7 +211,7 @@ def test_one_factory_knows_the_engine_of_a_version() -> None:
     """All others work with the two sides of an Endpoint (``link/endpoint.py``)."""
 
     def engines(module: str) -> list[str]:
-        return [name for name in imports(module) if name.startswith("gr_ros2.link.v1")]
+        return [name for name in imports(module) if name.startswith(("gr_ros2.link.v0", "gr_ros2.link.v1"))]
 
     assert list(breaking(engines, [m for m in MODULES if part(m) not in {"wire", "link"}])) == [FACTORY]
 

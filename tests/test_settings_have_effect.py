@@ -19,7 +19,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ends import make_endpoint
+from gr_ros2.gr.factory import make_endpoint
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
 from gr_ros2.radio.ax25 import ui_header
@@ -208,9 +208,9 @@ effects(
     reassembly_timeout_s=run("ros_sink.reassembly_timeout_s=0.05", *PAPER, LOSSY),
     max_age_s=lambda: (withheld(), withheld(max_age_s=2.0)),
     hold_s=run("ros_sink.hold_s=0.1", LOSSY, OPTION + "scan={queue: fifo}", "phy.sample_rate=400000"),
-    max_sources=Elsewhere("tests/link/test_receiver.py"),
+    max_sources=Elsewhere("tests/link/v0/test_receiver.py"),
     max_source_bytes=Elsewhere("tests/link/v1/test_endpoint.py"),
-    max_bytes=Elsewhere("tests/link/test_receiver.py"),
+    max_bytes=Elsewhere("tests/link/v0/test_receiver.py"),
     use_sim_time=Elsewhere("tests/gr/test_sink.py"),
     frame_prefix=Elsewhere("tests/gr/test_sink.py"),
     merge_tf=Elsewhere("tests/gr/test_frame_ids.py"),

@@ -106,7 +106,7 @@ def _packets(config: LinkConfig) -> Iterator[Finding]:
 
 def _account(config: LinkConfig) -> Iterator[Finding]:
     """What this robot has sent of it already."""
-    from gr_ros2.gr.ends import account_of  # loads GNU Radio
+    from gr_ros2.gr.starts import account_of  # loads GNU Radio
 
     rule = config.airtime.rule
     if rule is None or rule.duty_cycle == 1:

@@ -20,7 +20,8 @@ from typing import Any
 
 from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, OutgoingFrame, Request, Service
 from gr_ros2.core.errors import ConfigError, GrRos2Error, MiddlewareError
-from gr_ros2.gr.ends import LOOP_GUARD, LiveEnd
+from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.loops import LOOP_GUARD
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
 from gr_ros2.link import Delivered, ReceiverEvent

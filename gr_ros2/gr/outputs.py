@@ -16,11 +16,12 @@ from typing import Any
 from gr_ros2.core.errors import ConfigError, DescriptionError, GrRos2Error
 from gr_ros2.core.names import topic_fault
 from gr_ros2.gr.early import EarlyMessages
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd
 from gr_ros2.gr.failures import Failures
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.heard_topics import HeardTopics, Key
 from gr_ros2.gr.latency import Latencies, LatencyWindow
+from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.loops import LOOP_GUARD, Graph
 from gr_ros2.link import Delivered, ReceiverEvent
 from gr_ros2.link.events import Announced
 from gr_ros2.link.fates import Fate

@@ -18,10 +18,13 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr.block_settings import own_settings, read_registry
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.ends import EndpointSetup, LiveEnd, make_endpoint, own_settings, read_registry, start_of
+from gr_ros2.gr.factory import EndpointSetup, make_endpoint
+from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.sink import RosSink
 from gr_ros2.gr.source import RosSource
+from gr_ros2.gr.starts import start_of
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.observe import LinkObserver

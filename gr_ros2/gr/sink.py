@@ -19,12 +19,16 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import GrRos2Error, SealError
 from gr_ros2.core.guard import Guard
+from gr_ros2.gr.block_settings import read_registry, settings
 from gr_ros2.gr.early import CHECK_S
-from gr_ros2.gr.ends import LOOP_GUARD, EndpointSetup, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.factory import EndpointSetup, make_endpoint
 from gr_ros2.gr.failures import Failures
 from gr_ros2.gr.latency import RECENT
+from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.loops import LOOP_GUARD, Graph
 from gr_ros2.gr.outputs import Outputs
 from gr_ros2.gr.readable import debug_logger, describe
+from gr_ros2.gr.starts import start_of
 from gr_ros2.link import Delivered, Received, ReceivedPacket, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
 from gr_ros2.link.fates import Fate

@@ -20,10 +20,14 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.core.guard import Guard
-from gr_ros2.gr.ends import EndpointSetup, Graph, LiveEnd, make_endpoint, read_registry, settings, start_of
+from gr_ros2.gr.block_settings import read_registry, settings
+from gr_ros2.gr.factory import EndpointSetup, make_endpoint
 from gr_ros2.gr.found_topics import FoundTopics
+from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.loops import Graph
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
+from gr_ros2.gr.starts import start_of
 from gr_ros2.gr.subscriptions import Subscriptions
 from gr_ros2.link import Refused, SenderEvent, SentPacket
 from gr_ros2.link.fates import Fate

@@ -13,8 +13,9 @@ from functools import partial
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ends import LOOP_GUARD, Graph, LiveEnd
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
+from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.loops import LOOP_GUARD, Graph
 from gr_ros2.link.endpoint import check_live_options
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.queues import PublisherQos

@@ -20,7 +20,9 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.ends import EndpointSetup, LiveEnd, make_endpoint, own_settings
+from gr_ros2.gr.block_settings import own_settings
+from gr_ros2.gr.factory import EndpointSetup, make_endpoint
+from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.link import ReceiverEvent, SenderEvent
 from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import Middleware, join_graph

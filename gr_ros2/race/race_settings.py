@@ -26,7 +26,7 @@ from gr_ros2.settings.config import PacketLen, PacketSettings, Populated, Sample
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
-from gr_ros2.wire.v0 import V0
+from gr_ros2.wire import FORMATS
 
 PHY_NAME = "ofdm"
 """The PHY with its defaults. For every contender, a frame is only as long on the air as its bytes need."""
@@ -102,7 +102,7 @@ class RaceRecording:
     @property
     def single_packet_len(self) -> int:
         """Bytes of a version 0 packet that holds any one of the messages without compression."""
-        return min(V0.packed_len([self.largest]), V0.max_packet_len)
+        return min(FORMATS[0].packed_len([self.largest]), FORMATS[0].max_packet_len)
 
 
 @plain_dataclass(frozen=True)

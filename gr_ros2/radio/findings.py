@@ -16,8 +16,8 @@ from dataclasses import asdict
 from typing import Any
 
 from gr_ros2 import __version__
-from gr_ros2.gr.ends import LiveEnd
 from gr_ros2.gr.health import LOCKED
+from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.phy import Phy, configured
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.settings.fields import AUTO

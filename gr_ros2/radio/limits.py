@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ends import account_of
+from gr_ros2.gr.starts import account_of
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.radio.permission import check_band

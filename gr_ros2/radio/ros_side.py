@@ -15,8 +15,9 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosLink, RosSink, RosSource
+from gr_ros2.gr.block_settings import own_settings
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.ends import EndpointSetup, own_settings
+from gr_ros2.gr.factory import EndpointSetup
 from gr_ros2.link.access import Access
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained

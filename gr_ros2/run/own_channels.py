@@ -16,7 +16,9 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.ends import EndpointSetup, LiveEnd, make_endpoint, own_settings
+from gr_ros2.gr.block_settings import own_settings
+from gr_ros2.gr.factory import EndpointSetup, make_endpoint
+from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.medium.base import Surroundings
 from gr_ros2.middleware import Middleware

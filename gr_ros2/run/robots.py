@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ends import EndpointSetup
+from gr_ros2.gr.factory import EndpointSetup
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.rate import Mcs
 from gr_ros2.mac import access_of

@@ -21,7 +21,7 @@ from math import inf
 from typing import Any, Protocol
 
 from gr_ros2.core.errors import BagError, ConfigError, RunError
-from gr_ros2.gr.ends import EndpointSetup, make_endpoint
+from gr_ros2.gr.factory import EndpointSetup, make_endpoint
 from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit, at_full_load

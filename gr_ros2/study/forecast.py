@@ -18,7 +18,7 @@ from typing import Any, get_args
 import numpy as np
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ends import message_codec
+from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.events import AirKind

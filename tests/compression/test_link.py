@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.compression import LinkCodec
-from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, Receiver, ReceiverEvent
+from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, ReceiverEvent
+from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0

@@ -6,8 +6,10 @@ import random
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from gr_ros2.link import ReceivedPacket, Receiver, Sender
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
+from gr_ros2.link.v0.receiver import Receiver
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.record.positions import humble_types
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry

@@ -13,7 +13,7 @@ import pytest
 from gnuradio import gr
 
 from gr_ros2.gr import RosSource
-from gr_ros2.link import Sender
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy.loopback import LoopbackLink

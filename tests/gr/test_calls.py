@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.gr import RosLink
-from gr_ros2.gr.ends import EndpointSetup
+from gr_ros2.gr.factory import EndpointSetup
 from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import ReceiverEvent
 from gr_ros2.mac import Slots

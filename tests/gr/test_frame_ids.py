@@ -23,8 +23,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.frame_ids import MAX_STATIC, TF_TYPE, FramePrefix, MergedTransforms, StaticTransforms, prefixed_frame
-from gr_ros2.link import Sender
 from gr_ros2.link.events import Accepted
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware

@@ -23,7 +23,8 @@ from gnuradio import gr
 from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.gr import RosSink
 from gr_ros2.gr.latency import LatencySummary, LatencyWindow
-from gr_ros2.link import Delivered, Lost, Received, Sender
+from gr_ros2.link import Delivered, Lost, Received
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.settings.config import SourceConfig

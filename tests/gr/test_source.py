@@ -18,7 +18,7 @@ from gnuradio import gr
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link import Accepted, Missed, Refused, SenderEvent, SentPacket
-from gr_ros2.link.slowness import Slowness
+from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy.pdus import credit_of

@@ -5,7 +5,9 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from gr_ros2.link import Delivered, Received, ReceivedPacket, Receiver, ReceiverEvent, Sender
+from gr_ros2.link import Delivered, Received, ReceivedPacket, ReceiverEvent
+from gr_ros2.link.v0.receiver import Receiver
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0, PacketV0

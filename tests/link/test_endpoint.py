@@ -8,7 +8,8 @@ from math import inf
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import Delivered, Endpoint, EndpointV0, Lost, ReceivedPacket, SenderEvent, SentPacket
+from gr_ros2.link import Delivered, Endpoint, Lost, ReceivedPacket, SenderEvent, SentPacket
+from gr_ros2.link.v0.endpoint import EndpointV0
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from tests.link.engines import registry
 from tests.packets import data_of

@@ -9,11 +9,12 @@ from typing import NamedTuple
 
 import pytest
 
-from gr_ros2.link import Delivered, ReceivedPacket, Receiver
+from gr_ros2.link import Delivered, ReceivedPacket
+from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.settings.config import SinkConfig, build
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 from tests.link.engines import delivered, receiver, registry
-from tests.link.test_receiver import packet
+from tests.link.v0.test_receiver import packet
 
 MESSAGES = 500
 PACKET_RATE = 100.0

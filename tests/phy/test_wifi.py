@@ -21,7 +21,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError
-from gr_ros2.link import Delivered, Receiver, Sender
+from gr_ros2.link import Delivered
+from gr_ros2.link.v0.receiver import Receiver
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.phy import PHY
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import SampleRecording, deliver, modulated, record

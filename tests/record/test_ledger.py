@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.core.errors import CrcError, PadError, RunError
-from gr_ros2.link import ReceivedPacket, Receiver, Sender
+from gr_ros2.link import ReceivedPacket
 from gr_ros2.link.events import (
     Accepted,
     Delivered,
@@ -27,6 +27,8 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
+from gr_ros2.link.v0.receiver import Receiver
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.record.ledger import REORDER_WINDOW, Ledger, TopicLedger
 from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions
 from gr_ros2.settings.registry import Registry, Topic

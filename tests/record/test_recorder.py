@@ -6,7 +6,9 @@ import random
 
 import pytest
 
-from gr_ros2.link import ReceivedPacket, Receiver, Sender
+from gr_ros2.link import ReceivedPacket
+from gr_ros2.link.v0.receiver import Receiver
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.record.positions import humble_types
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.settings.config import SinkConfig, SourceConfig

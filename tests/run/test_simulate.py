@@ -10,9 +10,10 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError, RunError
-from gr_ros2.gr.ends import message_codec
-from gr_ros2.link import Delivered, EndpointV0, ReceivedPacket, ReceiverEvent, SenderEvent
+from gr_ros2.gr.factory import message_codec
+from gr_ros2.link import Delivered, ReceivedPacket, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
+from gr_ros2.link.v0.endpoint import EndpointV0
 from gr_ros2.medium import FixedPaths
 from gr_ros2.medium import Path as Way
 from gr_ros2.medium.packets import PacketMedium

@@ -19,8 +19,8 @@ from pydantic import TypeAdapter
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard.monitor import RunMonitor
-from gr_ros2.link import EndpointV0
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.link.v0.endpoint import EndpointV0
 from gr_ros2.medium import loss_table
 from gr_ros2.middleware.bag_files import bag_topics, read_bag
 from gr_ros2.phy import measure

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ends import message_codec
+from gr_ros2.gr.factory import message_codec
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import simulate

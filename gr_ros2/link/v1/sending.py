@@ -11,7 +11,6 @@ from math import inf
 
 from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
-from gr_ros2.link.slowness import Slowness
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
@@ -22,6 +21,7 @@ from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.repair_slots import RepairSlots
 from gr_ros2.link.v1.report_slots import ReportSlots
+from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.link.v1.writer import PacketWriter
 from gr_ros2.relay.gain import TOLD
 from gr_ros2.wire.control import NEWEST_LEN, Heard, Hello

@@ -1,17 +1,16 @@
-"""The loop guard and the settings both blocks share."""
+"""The loop guard, and who is on one graph."""
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ends import Graph, LiveEnd, check_loop, read_registry, settings
+from gr_ros2.gr.loops import Graph, check_loop
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, replaced
+from gr_ros2.settings.config import SinkConfig, TopicOptions
 from gr_ros2.settings.registry import Registry
 
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "/tf": "tf2_msgs/TFMessage"})
@@ -95,49 +94,3 @@ def test_what_was_handed_over_is_not_closed() -> None:
 def test_a_bag_must_be_opened_by_hand() -> None:
     with pytest.raises(ConfigError, match="path"):
         Graph(None, "bag", -1, "node")
-
-
-def test_settings_name_what_is_wrong() -> None:
-    with pytest.raises(ConfigError, match="packet_len = 13"):
-        settings(SourceConfig, {"packet_len": 13}, "x.csv", None)
-    with pytest.raises(ConfigError, match="unknown key colour"):
-        settings(SinkConfig, {"colour": 1}, "x.csv", None)
-    with MemoryMiddleware(domain_id=54) as opened:
-        assert settings(SinkConfig, {}, "x.csv", opened).middleware == "memory"
-    assert replaced(SinkConfig(), debug=True).debug
-    with pytest.raises(ConfigError, match="registry is missing"):
-        read_registry("")
-
-
-def test_a_thread_that_has_slept_for_long_is_never_taken_for_stalled() -> None:
-    """Whoever asks takes no lock, so it is asked after each step of a thread that awakes after 12 s."""
-    clock = [0.0]
-    said: list[float] = []
-
-    class Asked(LiveEnd):
-        def __setattr__(self, name: str, value: object) -> None:
-            super().__setattr__(name, value)
-            if hasattr(self, "endpoint"):
-                said.append(self.stalled_s(clock[0]))
-
-    class Idle:
-        def next_departure(self, **_: bool) -> None:
-            pass
-
-    end = Asked(lambda _: Idle())  # type: ignore[arg-type, return-value]
-    end.looked = 0.0
-    said.clear()
-
-    def wake() -> None:
-        with end.work:  # free once the other thread sleeps
-            clock[0] = 12.0
-            end.work.notify()
-
-    with end.lock:
-        other = threading.Thread(target=wake)
-        other.start()
-        end.sleep(lambda: clock[0])
-    other.join()
-    assert len(said) >= 3
-    assert max(said) == 0
-    assert end.stalled_s(23.0) == 11.0

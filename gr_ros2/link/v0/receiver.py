@@ -14,10 +14,10 @@ from gr_ros2.core.errors import CodecError, WireError
 from gr_ros2.link.events import Delivered, Lost, PacketId, Received, ReceivedPacket, ReceiverEvent, Rejected
 from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.partials import Partial, Partials
-from gr_ros2.link.reassemble import Context, TopicReassembler
-from gr_ros2.link.sequence import Arrival, SequenceTracker
 from gr_ros2.link.stats import ReceiverStats
+from gr_ros2.link.v0.partials import Partial, Partials
+from gr_ros2.link.v0.reassemble import Context, TopicReassembler
+from gr_ros2.link.v0.sequence import Arrival, SequenceTracker
 from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry

@@ -20,8 +20,8 @@ from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
-from gr_ros2.link.schedule import PaperScheduler, Plan
 from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v0.schedule import PaperScheduler, Plan
 from gr_ros2.settings.config import QueuePolicy, SourceConfig, TopicOptions, replaced
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic

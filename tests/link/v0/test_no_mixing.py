@@ -12,8 +12,10 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from gr_ros2.link import Delivered, ReceivedPacket, Receiver, Sender, SenderEvent, SentPacket
+from gr_ros2.link import Delivered, ReceivedPacket, SenderEvent, SentPacket
 from gr_ros2.link.events import SentEntry
+from gr_ros2.link.v0.receiver import Receiver
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build
 from tests.link.engines import registry
 from tests.packets import data_of

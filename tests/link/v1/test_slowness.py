@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf
 
 from gr_ros2.link.pace import Pace
-from gr_ros2.link.slowness import Slowness
+from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.settings.fields import AUTO
 
 

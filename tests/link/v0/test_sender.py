@@ -12,8 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import Accepted, Missed, ReceivedPacket, Receiver, Refused, Sender, SenderEvent, SentPacket
-from gr_ros2.link.schedule import PaperScheduler
+from gr_ros2.link import Accepted, Missed, ReceivedPacket, Refused, SenderEvent, SentPacket
+from gr_ros2.link.v0.receiver import Receiver
+from gr_ros2.link.v0.schedule import PaperScheduler
+from gr_ros2.link.v0.sender import Sender
 from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.settings.registry import Registry
 from tests.link.engines import delivered, drain, read, registry, sender, trace

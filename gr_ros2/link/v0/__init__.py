@@ -1,0 +1,1 @@
+"""The engines of version 0, the paper's."""
