@@ -13,9 +13,9 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
+from typing import Generic, TypeVar
 
 from gr_ros2.link.fates import Fate
-from gr_ros2.link.fragment import Outgoing
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S
 from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO
@@ -29,11 +29,60 @@ s its oldest topic was 0.7 to 1.6 s old, with 0.25 s 0.8 s."""
 OVERLOADED = f"it waited for {STANDING_S:g} s and newer ones came"
 
 
+@dataclass(slots=True, eq=False)
+class Outgoing:
+    """A message being sent.
+
+    :param serial: number of the submitted message
+    :param payload: the bytes that are sent: the message, coded if the link compresses
+    :param qos: QoS class of its entries
+    :param submitted: time of submission, s
+    :param weight: weight of its age relative to other topics
+    :param lifespan_s: s after which the message is useless, where its queue's deadline is later
+    :param expires: time after which the message is useless, s
+    :param repeat: the message was sent before, and is sent again for robots that join late (transient-local topics)
+    :param index: next fragment to send
+    :param offset: bytes sent
+    """
+
+    serial: int
+    topic_id: int
+    payload: bytes
+    qos: int
+    submitted: float
+    weight: float = 1.0
+    lifespan_s: float = inf
+    expires: float = inf
+    repeat: bool = False
+    index: int = 0
+    offset: int = 0
+
+    @property
+    def started(self) -> bool:
+        """Whether at least one fragment has left."""
+        return self.index > 0
+
+    @property
+    def remaining(self) -> int:
+        """Bytes not yet sent."""
+        return len(self.payload) - self.offset
+
+    def take(self, length: int) -> bytes:
+        """The next fragment, of this many bytes."""
+        payload = self.payload[self.offset : self.offset + length]
+        self.index += 1
+        self.offset += length
+        return payload
+
+
+M = TypeVar("M", bound=Outgoing)
+
+
 @dataclass(frozen=True, slots=True)
-class Dropped:
+class Dropped(Generic[M]):
     """A message that will not be sent: its fate, and why in words."""
 
-    message: Outgoing
+    message: M
     fate: Fate
     detail: str
 
@@ -60,7 +109,7 @@ UNKNOWN_QOS = PublisherQos()
 """That of a topic of whose publishers nothing is known."""
 
 
-class TopicQueue(deque[Outgoing]):
+class TopicQueue(deque[M], Generic[M]):
     """The messages of one topic, in the order in which they are sent.
 
     :param policy: see ``TopicOptions.queue``
@@ -99,11 +148,11 @@ class TopicQueue(deque[Outgoing]):
             return not self or (len(self) == 1 and self[0].started)
         return not depth or len(self) < depth
 
-    def admit(self, message: Outgoing, depth: int) -> list[Dropped]:
+    def admit(self, message: M, depth: int) -> list[Dropped[M]]:
         """Add a message; returns the messages dropped to make room for it."""
         if not self:
             self.since = message.submitted
-        dropped: list[Dropped] = []
+        dropped: list[Dropped[M]] = []
         if self.policy == "latest":
             while self and not self[-1].started:
                 dropped.append(Dropped(self.pop(), Fate.SUPERSEDED, "a newer message came before it could start"))
@@ -116,7 +165,7 @@ class TopicQueue(deque[Outgoing]):
         self.append(message)
         return dropped
 
-    def shed(self, now: float) -> Iterator[Dropped]:
+    def shed(self, now: float) -> Iterator[Dropped[M]]:
         """A message has come while the computer is too slow: drop those before it that have waited for too long."""
         if self.policy != "fifo":
             return
@@ -124,7 +173,7 @@ class TopicQueue(deque[Outgoing]):
             self.remove(message)
             yield Dropped(message, Fate.OVERLOAD, OVERLOADED)
 
-    def expire(self, now: float, interval: float, lead: float, payload: int) -> Iterator[Dropped]:
+    def expire(self, now: float, interval: float, lead: float, payload: int) -> Iterator[Dropped[M]]:
         """Drop the messages that cannot be delivered in time, even if they had the link to themselves.
 
         :param interval: s from one packet to the next, 0 if unknown
@@ -150,7 +199,7 @@ class TopicQueue(deque[Outgoing]):
             # The delay of one start is not added to the next, unless it was a whole interval.
             self._opens = (self._opens if now - self._opens < self._interval else now) + self._interval
 
-    def open(self, now: float) -> Sequence[Outgoing]:
+    def open(self, now: float) -> Sequence[M]:
         """The messages that may continue or start."""
         if not self._interval and not self.closed:
             return self

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SentPacket
-from gr_ros2.link.fragment import Outgoing
-from gr_ros2.link.queues import STANDING_S, PublisherQos, TopicQueue, queue_for
+from gr_ros2.link.queues import STANDING_S, Outgoing, PublisherQos, TopicQueue, queue_for
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.settings.config import TopicOptions, build
 from gr_ros2.settings.registry import Registry, Topic
@@ -313,7 +312,7 @@ def test_every_message_ends_once(steps: list[tuple[int, int, float]], policy: st
 
 
 def test_a_message_may_be_useless_before_the_deadline_of_its_queue() -> None:
-    queue = TopicQueue("deadline", 60.0)
+    queue: TopicQueue[Outgoing] = TopicQueue("deadline", 60.0)
     lifespans = (60.0, 2.0, 100.0, 5.0)
     for serial, lifespan_s in enumerate(lifespans):
         queue.admit(Outgoing(serial, 0, b"message", 0, 10.0, lifespan_s=lifespan_s), 0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.v0.fragment import Fragmented
 from gr_ros2.settings.config import SourceConfig
 from gr_ros2.wire.v0 import V0
 
@@ -22,7 +22,7 @@ class Plan(NamedTuple):
     :param full: no further entry of ``min_fragment`` bytes would fit, so that waiting for more is useless
     """
 
-    picks: tuple[Outgoing, ...]
+    picks: tuple[Fragmented, ...]
     lengths: tuple[int, ...]
     full: bool
 
@@ -37,7 +37,7 @@ class PaperScheduler:
         self.config = config
         self._line: list[int] = []
 
-    def plan(self, queues: Mapping[int, Sequence[Outgoing]]) -> Plan | None:
+    def plan(self, queues: Mapping[int, Sequence[Fragmented]]) -> Plan | None:
         """The next packet's content from the messages waiting per topic id, or None if nothing is waiting."""
         pending = [topic_id for topic_id, queue in queues.items() if queue]
         if not pending:
@@ -46,7 +46,7 @@ class PaperScheduler:
             if topic_id not in self._line:
                 self._line.append(topic_id)
         config = self.config
-        picks: list[Outgoing] = []
+        picks: list[Fragmented] = []
         chosen: list[int] = []
         payload = 0
         for topic_id in self._line:
@@ -64,7 +64,7 @@ class PaperScheduler:
         room = V0.room(config.packet_len, len(picks), payload)
         return Plan(tuple(picks), tuple(chosen), room < config.min_fragment)
 
-    def _fitting(self, message: Outgoing, cut: int, entries: int, payload: int) -> list[int]:
+    def _fitting(self, message: Fragmented, cut: int, entries: int, payload: int) -> list[int]:
         """Lengths of the next fragments of a message that fit beside ``entries`` with ``payload`` bytes."""
         lengths: list[int] = []
         length = message.plan(cut)

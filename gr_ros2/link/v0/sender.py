@@ -16,11 +16,11 @@ from zlib import crc32
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Accepted, Missed, PacketId, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fates import Fate
-from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
 from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v0.fragment import Fragmented
 from gr_ros2.link.v0.schedule import PaperScheduler, Plan
 from gr_ros2.settings.config import QueuePolicy, SourceConfig, TopicOptions, replaced
 from gr_ros2.settings.fields import AUTO, Auto
@@ -64,7 +64,9 @@ class Sender:
         self._codec = codec
         self._largest = V0.largest_message(config.packet_len)
         self._scheduler = PaperScheduler(config)
-        self._queues = {topic.topic_id: TopicQueue("fifo") for topic in self.registry}
+        self._queues: dict[int, TopicQueue[Fragmented]] = {
+            topic.topic_id: TopicQueue("fifo") for topic in self.registry
+        }
         self._classes = [qos_class(topic.options) for topic in self.registry]
         self._depths = [topic.options.queue_depth for topic in self.registry]
         self._keeps = {topic.topic_id for topic in self.registry if topic.latched}
@@ -112,7 +114,7 @@ class Sender:
         if len(payload) > self._largest:
             self._refuse(serial, topic_id, Fate.TOO_LARGE, self._too_large(len(payload)))
             return
-        message = Outgoing(serial, topic_id, payload, self._classes[topic_id], now)
+        message = Fragmented(serial, topic_id, payload, self._classes[topic_id], now)
         for dropped in self._queues[topic_id].admit(message, self.depth(topic_id)):
             if not dropped.message.repeat:
                 self._refuse(dropped.message.serial, topic_id, dropped.fate, dropped.detail)
@@ -289,7 +291,7 @@ class Sender:
                 self._repeat_at[topic_id] = now + self.config.repeat_s
                 if not self._queues[topic_id]:
                     serial, payload = self._latched[topic_id]
-                    self._queues[topic_id].append(Outgoing(serial, topic_id, payload, QOS_BULK, now, repeat=True))
+                    self._queues[topic_id].append(Fragmented(serial, topic_id, payload, QOS_BULK, now, repeat=True))
                     self.stats.repeats += 1
                     self._stale = True
 

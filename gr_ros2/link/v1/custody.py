@@ -19,7 +19,7 @@ from typing import NamedTuple
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.queues import Dropped
 from gr_ros2.link.v1.key import Key
-from gr_ros2.link.v1.packing import Message
+from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopics
@@ -99,7 +99,7 @@ class Custody:
         room: int,
         most: int,
         dropped: Counter[str],
-        drop: Callable[[list[Dropped]], None],
+        drop: Callable[[list[Dropped[Message]]], None],
     ) -> None:
         self.routes = Routes()
         self._src_id, self._boot = own

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
-from gr_ros2.link.fragment import Outgoing
+from gr_ros2.link.queues import Outgoing
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 
 TURN = 4

@@ -14,7 +14,7 @@ from math import inf
 from zlib import crc32
 
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.link.v1.packing import Message
+from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
 from gr_ros2.wire import QOS_BULK
 from gr_ros2.wire.table import AnnouncedTopic, write_table

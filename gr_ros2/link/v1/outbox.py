@@ -25,7 +25,8 @@ from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.kept import KeptMessages
 from gr_ros2.link.v1.lifetime import WORTH
-from gr_ros2.link.v1.packing import ENTRY, Message, Packing
+from gr_ros2.link.v1.message import Message
+from gr_ros2.link.v1.packing import ENTRY, Packing
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopic, SentTopics
 from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO, Auto
@@ -283,12 +284,11 @@ class Outbox:
             if topic.dst_id == robot and topic.kept:
                 self.kept.ask(topic.topic.topic_id, now)
 
-    def drop(self, dropped: list[Dropped]) -> None:
+    def drop(self, dropped: list[Dropped[Message]]) -> None:
         """These messages are not sent, or not again."""
         for item in dropped:
             item.message.index = max(item.message.index, 1)
-            if isinstance(item.message, Message):
-                item.message.lifetime.end()
+            item.message.lifetime.end()
             if not item.message.repeat:
                 self._refuse(item.message.serial, item.message.topic_id, item.fate, item.detail)
 

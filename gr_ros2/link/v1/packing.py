@@ -14,19 +14,19 @@ Invariant: the messages of a topic begin one after the other, each after the one
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from math import inf
 
 from gr_ros2.link.events import SentEntry
-from gr_ros2.link.fragment import Outgoing
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import SentTopics
 from gr_ros2.wire import QOS_LATENCY
-from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, EntryV1, Part, fit
+from gr_ros2.wire.v1 import CARRIED_TOPIC, EntryV1, Part, fit
 
 SHARE = 2
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
@@ -38,22 +38,6 @@ LONG = 64
 beside 1 MB is then 1.05 times as old as without it; by value alone 1.4 times, because the last 60 kB go before it."""
 ENTRY = 3
 """Bytes that an entry takes beside its payload, at least."""
-
-
-@dataclass(slots=True, eq=False)
-class Message(Outgoing):
-    """A message to be sent. ``begin``: packet in which it began; ``place``: its place among the entries there.
-
-    :param dst_id: the robot for which it is, 255 for all
-    :param carried: its topic and key at the robot that made it, while it is carried over others
-    """
-
-    lifetime: Lifetime = field(default_factory=Lifetime)
-    begin: int = 0
-    place: int = 0
-    coded: bool = False
-    dst_id: int = BROADCAST
-    carried: tuple[int, Key] | None = None
 
 
 @dataclass(slots=True)
@@ -95,7 +79,7 @@ class Packing:
         self._boot = boot
         self._shares = shares
         self._room = room
-        self._open: dict[int, Sequence[Outgoing]] = {}
+        self._open: dict[int, Sequence[Message]] = {}
         """Messages that may continue or start now, by topic."""
         self._holder = -1
 
@@ -115,7 +99,6 @@ class Packing:
             _, _, topic_id, position = heappop(heap)
             queue = self._open[topic_id]
             message = queue[position]
-            assert isinstance(message, Message)
             remaining = message.remaining
             taken, size = fit(room - used, remaining, number - message.begin, message.offset)
             if taken < 0 or not (
@@ -146,10 +129,10 @@ class Packing:
         """Whether a message of class latency waits. The table of topics does not count: it follows a hello."""
         return any(topic.queue and topic.queue[0].qos == QOS_LATENCY for topic in self._topics.named())
 
-    def _rank(self, message: Outgoing) -> float:
+    def _rank(self, message: Message) -> float:
         return RANK[message.qos] + 0.5 * self._long(message)
 
-    def _long(self, message: Outgoing) -> bool:
+    def _long(self, message: Message) -> bool:
         return len(message.payload) > (1 if self._shares else LONG) * self._room
 
     def _heap(self, now: float) -> list[tuple[float, float, int, int]]:
@@ -158,10 +141,12 @@ class Packing:
         for topic_id, topic in self._topics.items():
             if topic.queue and (ready := topic.queue.open(now)):
                 self._open[topic_id] = ready
-        heap: list[tuple[float, float, int, int]] = []
         if not self._open:
-            return heap
+            return []
         holder = self._holder = self.turns.holder(self._open)
+        if len(self._open) == 1:  # nothing to choose
+            return [(0, 0, topic_id, 0) for topic_id in self._open]
+        heap: list[tuple[float, float, int, int]] = []
         for topic_id, ready in self._open.items():
             head, before = ready[0], self._topics[topic_id].newest
             worth = value(head, before if before > -inf else head.submitted - FIRST_AGE_S, ENTRY)

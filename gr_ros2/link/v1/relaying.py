@@ -22,9 +22,9 @@ from gr_ros2.link.endpoint import HeardRobot
 from gr_ros2.link.events import Gone, Met
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.inbox import Events, Inbox
+from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbours
 from gr_ros2.link.v1.order import Ready
-from gr_ros2.link.v1.packing import Message
 from gr_ros2.link.v1.sent_topics import SentTopic
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.routes import STALE_S

@@ -8,6 +8,7 @@ Invariants: a repair id is used once per number; no live packet is more than ``s
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gr_ros2.link.v1.lifetime import Lifetime
@@ -105,10 +106,12 @@ class SentPackets:
     def live(self, first: int, last: int, now: float) -> list[Sent]:
         """The packets from one number to another that are alive."""
         found: list[Sent] = []
-        record_of, everybody = self.records.get, self.everybody
-        for number in range(first, last + 1):
-            record = record_of(number)
-            if record is None or (everybody and record.confirmed & everybody == everybody):
+        records, everybody = self.records, self.everybody
+        kept: Iterable[Sent] = records.values()
+        if first > self.oldest or last < self.newest:
+            kept = [records[number] for number in range(first, last + 1) if number in records]
+        for record in kept:
+            if everybody and record.confirmed & everybody == everybody:
                 continue
             for lifetime in record.lifetimes:  # ``alive``, whose call would take half of this loop's time
                 if now < lifetime.expires:

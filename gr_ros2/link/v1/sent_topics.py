@@ -9,6 +9,7 @@ from math import inf
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
 from gr_ros2.link.v1.lifetime import Lifetimes
+from gr_ros2.link.v1.message import Message
 from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.fields import AUTO
@@ -35,7 +36,7 @@ class SentTopic:
     """
 
     topic: Topic
-    queue: TopicQueue
+    queue: TopicQueue[Message]
     qos: int
     weight: float
     latched: bool
@@ -127,14 +128,14 @@ class SentTopics(dict[int, SentTopic]):
     def __init__(self, codec: MessageCodec | None, commands: Sequence[str]) -> None:
         super().__init__()
         self._codec, self._commands = codec, commands
-        self.deadlines: list[TopicQueue] = []
+        self.deadlines: list[TopicQueue[Message]] = []
 
     def add(self, topics: Sequence[Topic]) -> None:
         """Send these topics too."""
         for topic in topics:
             options = topic.options
             command = is_command(topic.name, topic.type_name, self._commands)
-            queue = TopicQueue(*queue_for(options, command=command), options.max_rate)
+            queue: TopicQueue[Message] = TopicQueue(*queue_for(options, command=command), options.max_rate)
             qos, hidden = qos_class(options, command=command), not topic.is_topic
             self[topic.topic_id] = SentTopic(
                 topic, queue, qos, options.weight, topic.latched, hidden=hidden, command=command
