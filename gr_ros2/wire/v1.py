@@ -65,8 +65,11 @@ MAX_MESSAGE = 1 << 24
 MAX_BACK = (1 << 21) - 1
 """Most packets that a message may span."""
 
+ADDRESSED = 4
+"""Bit of the first byte of a packet that is for one robot."""
+
 _BLOCK = 0x80
-_SEALED, _ADDRESSED = 8, 4
+_SEALED = 8
 _MASKED = _CLEAR = _OLDEST = 0x80
 _CODED, _FILL = 0x20, 0x10
 _SHORT = 15
@@ -202,7 +205,7 @@ def write_header(header: Header) -> bytes:
     try:
         if not 0 <= qos <= QOS_REPAIR or not 0 <= src_id < BROADCAST:
             raise EncodeError(f"qos {qos} or src_id {src_id} of {header} is out of range")
-        first = bool(block) * _BLOCK | VERSION << 4 | sealed * _SEALED | addressed * _ADDRESSED | qos
+        first = bool(block) * _BLOCK | VERSION << 4 | sealed * _SEALED | addressed * ADDRESSED | qos
         data = _header.pack(first, src_id, number)
         return data + bytes((dst_id, hop)) + block if addressed else data + block
     except (struct_error, ValueError) as error:
@@ -222,12 +225,12 @@ def read_header(data: bytes, packet_len: int) -> Header:
     first, src_id, number = _header.unpack_from(data)
     if first >> 4 & 7 != VERSION:
         raise VersionError(f"version {first >> 4 & 7}; this decoder reads version {VERSION}")
-    if first & (_BLOCK | _SEALED | _ADDRESSED):
-        start = HEADER_LEN + ADDRESS_LEN if first & _ADDRESSED else HEADER_LEN
+    if first & (_BLOCK | _SEALED | ADDRESSED):
+        start = HEADER_LEN + ADDRESS_LEN if first & ADDRESSED else HEADER_LEN
         end = size - (TAG_LEN if first & _SEALED else CRC_LEN)
         if start > end:
             raise LengthError(f"{size} bytes; a packet of this kind has at least {size + start - end}")
-        to = (data[4], data[5]) if first & _ADDRESSED else (BROADCAST, 0)
+        to = (data[4], data[5]) if first & ADDRESSED else (BROADCAST, 0)
         block = data[start : start + block_len(data, start, end)] if first & _BLOCK else b""
         return Header(first & 3, first & _SEALED != 0, src_id, number, *to, block)
     return Header(first & 3, first & _SEALED != 0, src_id, number)

@@ -13,11 +13,11 @@ import pytest
 
 from gr_ros2.core.errors import WireError
 from gr_ros2.link.events import Delivered
-from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.gf256 import coefficient
 from gr_ros2.link.v1.inbox import Inbox
+from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.mac_block import read_block
@@ -110,6 +110,7 @@ def test_carried_messages_to_refuse(case: dict[str, Any]) -> None:
 def test_kept_messages() -> None:
     received, wanted = ([bytes.fromhex(text) for text in VECTORS["kept"][name]] for name in ("received", "delivered"))
     assert second.delivered(received) == wanted
+    outcomes = Outcomes()
     inbox = Inbox(
         1,
         1,
@@ -118,15 +119,14 @@ def test_kept_messages() -> None:
         Settings(2, packet_len=64),
         decoder_for=None,
         marks={},
-        stats=ReceiverStats(),
+        outcomes=outcomes,
         control=lambda _: None,
     )
     inbox.announced.take(write_table((AnnouncedTopic(0, "map", "std_msgs/msg/String", latched=True),)))
-    found = []
     for number, payload in enumerate(received, 1):
         part = v1.Part(0, payload)
-        found += inbox.source(number, v1.write_body([part], 40), [part], 0, 0.0)
-    assert [event.payload for event in found if isinstance(event, Delivered)] == wanted
+        inbox.source(number, v1.write_body([part], 40), [part], 0, 0.0)
+    assert [event.payload for event in outcomes.take() if isinstance(event, Delivered)] == wanted
 
 
 def test_a_hello_that_is_not_first_in_the_clear_and_a_message_in_a_control_packet_have_no_effect() -> None:

@@ -276,7 +276,6 @@ class EndpointV1:
     def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
         """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         self._now = now if now > self._now else self._now
-        self._sending.repairs.received()
         return self._receiving.receive(arrival, now)
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:

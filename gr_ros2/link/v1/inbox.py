@@ -15,16 +15,16 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 from gr_ros2.core.errors import CodecError, WireError
-from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met
+from gr_ros2.link.events import Announced, Delivered, Lost
 from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.announced import AnnouncedTopics
 from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
 from gr_ros2.link.v1.delivery import DeliveryRules, passed_over
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready
+from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.peers import MAP
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
@@ -32,8 +32,6 @@ from gr_ros2.link.v1.sent_packets import SPAN
 from gr_ros2.wire.control import Control
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import CARRIED_TOPIC, TABLE_TOPIC, EntryV1, Part, read_body
-
-Events = list[Delivered | Lost | Announced | Met | Gone]
 
 _PACKET_COST, _EQUATION_COST = 250, 350
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
@@ -74,7 +72,7 @@ class Passing(Protocol):
     def direct(self, src_id: int, boot: int, ready: Ready, now: float) -> None:
         """A message has come from the robot that made it."""
 
-    def receive(self, via: int, ready: Ready, now: float) -> Events:
+    def receive(self, via: int, ready: Ready, now: float) -> None:
         """A message of another robot has come over one that is heard."""
 
 
@@ -86,7 +84,7 @@ class Inbox:
     :param decoder_for: makes the decoder for its messages from its table of topics
     :param marks: CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as
         many as its depth
-    :param stats: receiver statistics, shared with other inboxes
+    :param outcomes: takes what comes of its packets, shared with other inboxes
     :param control: called with entries that are not messages
     :param relaying: is told of messages that came, where they are relayed
     :ivar reports: what the robot is told of its packets
@@ -105,7 +103,7 @@ class Inbox:
         *,
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
         marks: dict[int, tuple[int, ...]],
-        stats: ReceiverStats,
+        outcomes: Outcomes,
         control: Callable[[Control], None],
         relaying: Passing | None = None,
     ) -> None:
@@ -115,7 +113,7 @@ class Inbox:
         self.deliveries = DeliveryRules(settings, marks)
         self._room = room
         self._control, self._relaying = control, relaying
-        self._stats = stats
+        self._outcomes, self._stats = outcomes, outcomes.stats
         bounds = Bounds.of(settings.max_source_bytes, room)
         self.decoder = RepairDecoder(room, self._plausible, bounds.span, bounds.equations)
         self.decoder.begin(first)
@@ -130,7 +128,6 @@ class Inbox:
             else Reporter(of, self.decoder, self.order, half_duplex=settings.half_duplex, airtime_share=share)
         )
         self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
-        self._events: Events = []
         self._now = 0.0
 
     @property
@@ -143,20 +140,20 @@ class Inbox:
         """Bytes of incomplete messages, bookkeeping included."""
         return self._reassembly.held
 
-    def source(self, number: int, body: bytes, entries: Sequence[EntryV1], qos: int, now: float) -> Events:
+    def source(self, number: int, body: bytes, entries: Sequence[EntryV1], qos: int, now: float) -> None:
         """Take a source packet.
 
         :param body: as it stood in the packet, padding included
         :param entries: the entries of the packet
         """
         decoder = self.decoder
-        if number in decoder:
+        if number in decoder.bodies:
             self.counts["duplicate"] += 1
             self._stats.dropped["duplicate"] += 1
-            return []
+            return
         if number < decoder.floor:
             self.counts["late"] += 1
-            return []
+            return
         self.counts["packets"] += 1
         late = number < decoder.newest
         self._advance(number, now, here=True)
@@ -166,18 +163,14 @@ class Inbox:
                 self._take(number, entries, qos, repaired=late)
             else:
                 self._recovered(found)
-        return self._settled()
-
-    def lacks_packet(self, number: int) -> bool:
-        """Whether a source packet is neither here nor too old."""
-        return number not in self.decoder and number >= self.decoder.floor
+        self._settle()
 
     def repair(
         self, number: int, mask: int, repair_id: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
-    ) -> Events:
+    ) -> None:
         """Take a repair; only one that was not here before calls for a report."""
         self.reports.unreported += new
-        self.reports.repairable()
+        self.reports.confirms = True
         self._advance(number, now, here=False)
         window = mask.bit_length()
         if oldest:
@@ -189,9 +182,9 @@ class Inbox:
             self.reports.repaired_in_vain()
         if mask + 1 != 1 << window:
             self.order.left_out(number, mask)
-        return self._settled()
+        self._settle()
 
-    def heard(self, number: int, now: float, *, over: bool = False) -> Events:
+    def heard(self, number: int, now: float, *, over: bool = False) -> None:
         """Note the number at which a packet stands that is neither a source packet nor a repair.
 
         :param over: the sender repairs no packet up to that number
@@ -199,16 +192,14 @@ class Inbox:
         self._advance(number, now, here=False)
         if over:
             self.order.repaired_from(number + 1)
-        return self._settled()
+        self._settle()
 
-    def handle_timeout(self, now: float) -> Events:
+    def handle_timeout(self, now: float) -> None:
         """Go on without packets that have been waited for long enough."""
         self._now = now
-        events = self._settled()
+        self._settle()
         for partial in self._reassembly.expired(now, _INCOMPLETE_S):
             self._lose(partial, Fate.EXPIRED)
-        expired, self._events = self._events, []
-        return events + expired
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do."""
@@ -217,15 +208,13 @@ class Inbox:
             return ordered
         return waiting + _INCOMPLETE_S if ordered is None else min(ordered, waiting + _INCOMPLETE_S)
 
-    def close(self, reason: Fate) -> Events:
+    def close(self, reason: Fate) -> None:
         """Give up everything that is not delivered."""
         for partial in self._reassembly.clear():
             self._lose(partial, reason)
         self._give_up(self.order.without(()), reason)
         for ready in self.announced.waiting():
             self._give_up([ready], self.announced.unknown(ready))
-        events, self._events = self._events, []
-        return events
 
     def lacks(self, mark: tuple[int, int], number: int, now: float) -> bool:
         """Whether a latched message, named in a hello at a packet number, is neither here, nor a newer one of its
@@ -235,16 +224,13 @@ class Inbox:
             return False
         return self.deliveries.lacks(mark, number) and not self._reassembly.growing(mark[0], now - 1.0)
 
-    def _settled(self) -> Events:
-        """Deliver the messages that waited for what is here or given up now; everything that happened since the last
-        call."""
+    def _settle(self) -> None:
+        """Deliver the messages that waited for what is here or given up now."""
         for ready in self.order.settle(self._now):
             if ready.topic_id == CARRIED_TOPIC:
                 self._of_another(ready)
             else:
                 self._deliver(ready, self.announced.topics[ready.topic_id])
-        events, self._events = self._events, []
-        return events
 
     def _plausible(self, body: bytes) -> bool:
         try:
@@ -283,7 +269,7 @@ class Inbox:
                 continue
             topic = self.announced.topics.get(entry.topic_id)
             if topic is None or topic.reliable or topic.latched:
-                self.reports.repairable()
+                self.reports.confirms = True
             if entry.last and not entry.offset:
                 self._arrived(Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired))
             else:
@@ -343,10 +329,9 @@ class Inbox:
         if self._relaying is None:
             self._stats.dropped["relayed"] += 1
             return
-        events = self._relaying.receive(self.src_id, ready, self._now)
-        self._events.extend(events)
+        self._relaying.receive(self.src_id, ready, self._now)
 
-    def relayed(self, ready: Ready, now: float) -> Events:
+    def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""
         self._now = now
         if ready.topic_id == TABLE_TOPIC:
@@ -354,8 +339,6 @@ class Inbox:
         else:
             self.deliveries.came_over(ready)
             self._known(ready)
-        events, self._events = self._events, []
-        return events
 
     def adopt(self, far: Inbox) -> None:
         """Go on from what has come of this start over other robots."""
@@ -381,7 +364,7 @@ class Inbox:
             return
         qos = ready.qos if ready.qos >= 0 else topic.qos
         key, way = Key(self.boot, *ready.order), (ready.repaired, ready.hops, ready.over)
-        self._events.append(Delivered(self.src_id, ready.topic_id, payload, qos, key, *way))
+        self._outcomes.delivered(Delivered(self.src_id, ready.topic_id, payload, qos, key, *way))
 
     def _table(self, payload: bytes) -> None:
         try:
@@ -393,14 +376,14 @@ class Inbox:
             return
         for ready in self.order.without({*self.announced.topics, CARRIED_TOPIC}):
             self._await_table(ready)  # an older table, which came over others, lacks topics of the newest one
-        self._events.append(Announced(self.src_id, topics))
+        self._outcomes.events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
             self._known(ready)
 
     def _lose(self, partial: PartialMessage, reason: Fate) -> None:
         key = Key(self.boot, partial.begin, partial.place)
-        self._events.append(Lost(self.src_id, partial.topic_id, reason, key))
+        self._outcomes.lost(Lost(self.src_id, partial.topic_id, reason, key))
 
     def _give_up(self, messages: Iterable[Ready], reason: Fate) -> None:
         for ready in messages:
-            self._events.append(Lost(self.src_id, ready.topic_id, reason, Key(self.boot, *ready.order)))
+            self._outcomes.lost(Lost(self.src_id, ready.topic_id, reason, Key(self.boot, *ready.order)))

@@ -60,11 +60,10 @@ class KeptMessages:
         self._starting_until = inf
 
     def keep(self, topic: SentTopic, message: Message) -> None:
-        """Keep a new message, where its topic does."""
-        if topic.kept:
-            kept = self._kept.setdefault(message.topic_id, deque(maxlen=max(topic.kept_depth, 1)))
-            until = inf if topic.latched else message.submitted + topic.topic.options.keep_s
-            kept.append(_Kept(message.serial, message.payload, message.coded, crc32(message.payload), until=until))
+        """Keep a new message of a topic that keeps some."""
+        kept = self._kept.setdefault(message.topic_id, deque(maxlen=max(topic.kept_depth, 1)))
+        until = inf if topic.latched else message.submitted + topic.topic.options.keep_s
+        kept.append(_Kept(message.serial, message.payload, message.coded, crc32(message.payload), until=until))
 
     def tabulate(self, rows: Sequence[AnnouncedTopic]) -> bool:
         """Keep the table of topics; returns whether it has changed."""

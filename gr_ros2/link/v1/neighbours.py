@@ -41,7 +41,6 @@ from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Trailer
 from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, Heard, Hello
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
-    TAG_LEN,
     EntryV1,
     Header,
     RepairHeader,
@@ -77,6 +76,8 @@ class Neighbour:
     heard: float
     floor: Floor
     proofs: Proofs
+    proves: bool
+    """Whether it can prove when it sealed a packet: it hears this robot, and packets are sealed."""
     gone: bool = False
     """Whether it has been silent for long."""
     repair_ids: dict[int, int] = field(default_factory=dict)
@@ -89,11 +90,6 @@ class Neighbour:
     """When something of it is to be given up, s; infinite for never, None while nobody has looked since its newest
     packet. Only what it sends can bring this forward."""
 
-    @property
-    def encrypts(self) -> bool:
-        """Whether the bodies of its packets are encrypted."""
-        return self.trailer.size == TAG_LEN and self.hello.capabilities & ENCRYPTS != 0
-
     def number(self, low: int) -> int:
         """The full packet number for its low 16 bits: the one nearest to the newest."""
         newest = self.inbox.decoder.newest
@@ -104,9 +100,10 @@ class Neighbour:
 
     def new(self, number: int, repair_id: int) -> bool:
         """Whether a packet was not here before, as far as this is known; notes the repair id of a repair packet."""
+        decoder = self.inbox.decoder
         if repair_id == NOT_A_REPAIR:
-            return self.inbox.lacks_packet(number)
-        oldest = self.inbox.decoder.newest - _NUMBERS_KEPT
+            return number not in decoder.bodies and number >= decoder.floor
+        oldest = decoder.newest - _NUMBERS_KEPT
         used = self.repair_ids.get(number, 0)
         if used >> repair_id & 1 or number <= oldest:
             return False
@@ -224,7 +221,7 @@ class Neighbours:
             self._keep(header.src_id, data)
             raise
         control = repair is not None and not repair.mask
-        if not control and self.proves(neighbour.hello):
+        if not control and neighbour.proves:
             if neighbour.proofs.proven is None:
                 self._keep(header.src_id, data)
                 self.dropped["early"] += 1
@@ -238,14 +235,13 @@ class Neighbours:
         met = new and self._heard(neighbour, number, now)
         return Opened(neighbour, header, number, repair, body, met=met, new=new)
 
-    def proves(self, hello: Hello) -> bool:
-        """Whether a robot can prove when it sealed a packet: it hears this one, and packets are sealed."""
+    def _proves(self, hello: Hello) -> bool:
         return self._provable and hello.capabilities & CAN_HEAR != 0
 
     @property
     def unproven(self) -> bool:
         """Whether a robot is heard whose messages cannot be taken before it has proven that it hears this start."""
-        return any(n.proofs.proven is None and not n.gone and self.proves(n.hello) for n in self._known.values())
+        return any(n.proofs.proven is None and not n.gone and n.proves for n in self._known.values())
 
     def proved(self, neighbour: Neighbour, number: int, entries: Sequence[EntryV1]) -> bool:
         """Take the proofs among the entries of a control packet; returns whether they are the first of its sender."""
@@ -260,7 +256,7 @@ class Neighbours:
 
         :param newest: number of this robot's newest source packet
         """
-        echoes = [(n.src_id, *n.echo) for n in self._known.values() if n.echo and self.proves(n.hello) and not n.gone]
+        echoes = [(n.src_id, *n.echo) for n in self._known.values() if n.echo and n.proves and not n.gone]
         return [Heard(src_id, echo, since & 0xFFFF) for src_id, echo, since in echoes if newest - since < 1 << 16]
 
     def since(self, src_id: int) -> int:
@@ -317,6 +313,7 @@ class Neighbours:
                     raise ReplayedError(f"a hello of robot {src_id} at packet {number} was here before, or cannot be")
                 if number >= neighbour.hello_number:
                     neighbour.hello, neighbour.hello_number = hello, number
+                    neighbour.proves = self._proves(hello)
                 return Opened(neighbour, header, number, repair, b"", entries, self._heard(neighbour, number, now))
         boot, floor = self.floors.of(src_id)
         before = self._met_at.get(src_id, -inf)
@@ -343,8 +340,19 @@ class Neighbours:
         first = max(first, self._ended.pop((src_id, hello.boot), 0))
         room = header.room(self._settings.packet_len)
         inbox, proofs = self._make_inbox(src_id, hello.boot, first, room), Proofs(before)
-        met = Neighbour(src_id, hello.boot, trailer, inbox, hello, number, now, Floor(src_id, hello.boot), proofs)
-        if self.proves(hello):
+        met = Neighbour(
+            src_id,
+            hello.boot,
+            trailer,
+            inbox,
+            hello,
+            number,
+            now,
+            Floor(src_id, hello.boot),
+            proofs,
+            self._proves(hello),
+        )
+        if met.proves:
             inbox.deliveries.sealed_after = proofs.sealed_after
         self._met_at[src_id] = now
         met.new(number, repair.repair_id)
@@ -369,7 +377,7 @@ class Neighbours:
         """A new packet of a known robot arrived; returns whether the robot was taken for gone."""
         neighbour.heard = now
         back, neighbour.gone = neighbour.gone, False
-        if self._stores and not self.proves(neighbour.hello):
+        if self._stores and not neighbour.proves:
             self.floors.guard(neighbour.floor, number, now)
         return back
 
@@ -389,4 +397,4 @@ class Neighbours:
 
     def _counts_on_store(self, hello: Hello) -> bool:
         """Whether only the stored packet number keeps replays of a robot out."""
-        return self._stores and not self.proves(hello)
+        return self._stores and not self._proves(hello)

@@ -211,7 +211,8 @@ class Outbox:
         coded = codec is not None
         message = Message(serial, topic_id, payload, topic.qos, now - waited_s, topic.weight, lifespan_s, coded=coded)
         message.dst_id = topic.dst_id if dst_id == AUTO else dst_id
-        self.kept.keep(topic, message)
+        if topic.kept:
+            self.kept.keep(topic, message)
         self._admit(topic, message)
 
     def forget_kept(self, topic_id: int) -> None:

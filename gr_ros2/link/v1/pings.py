@@ -145,6 +145,8 @@ class Pings:
         self._to_answer: dict[int, _Question] = {}
         self._counts: dict[int, int] = {}
         self._not_before = -inf
+        self.due = inf
+        """When a question or an answer is to leave, s; infinite if none waits."""
 
     def introduce(self, packet_len: int, phy: int, key: int, text: str) -> None:
         """See :class:`gr_ros2.link.endpoint.Questions`."""
@@ -163,14 +165,8 @@ class Pings:
         if now >= trips.not_before:
             trips.not_before = now + ASK_S
             self._to_ask[robot] = wants_about
+            self.due = -inf
         return trips
-
-    @property
-    def due(self) -> float:
-        """When a question or an answer is to leave, s; infinite if none waits."""
-        if self._to_ask:
-            return -inf
-        return self._not_before if self._to_answer else inf
 
     def entries(self, room: int, snrs_db: dict[int, float | None], now: float) -> list[Ping | About]:
         """The entries of the next packet; empty if none is due.
@@ -180,12 +176,14 @@ class Pings:
         """
         if self._to_ask:
             robot, wants_about = self._to_ask.popitem()
+            self._plan()
             return [self.asked[robot].ask(robot, self._clock_us(now), now, wants_about=wants_about)]
         if not self._to_answer or now < self._not_before:
             return []
         self._not_before = now + ANSWER_S
         robot = next(iter(self._to_answer))
         question = self._to_answer.pop(robot)
+        self._plan()
         held = min(round((now - question.arrived) / HELD_STEP_S), _MOST_HELD)
         count, clock_us, snr_db = self._counts[robot] & 0xFFFF, self._clock_us(now), snrs_db.get(robot)
         if snr_db is None:
@@ -207,8 +205,13 @@ class Pings:
         elif not entry.reply:
             self._counts[src_id] = self._counts.get(src_id, 0) + 1
             self._to_answer[src_id] = _Question(entry.number, now, entry.wants_about)
+            self.due = min(self.due, self._not_before)
         elif src_id in self.asked:
             self.asked[src_id].answer(entry, self.wall_s, now)
+
+    def _plan(self) -> None:
+        """Something of what waited leaves."""
+        self.due = -inf if self._to_ask else self._not_before if self._to_answer else inf
 
     def _clock_us(self, now: float) -> int:
         return round((self.wall_s + now) * 1e6) if self.wall_s else 0

@@ -24,11 +24,11 @@ from gr_ros2.link.events import (
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import RateController
-from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
 from gr_ros2.link.v1.outbox import Outbox
+from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.replays import Save
@@ -50,7 +50,7 @@ from gr_ros2.wire.control import (
 )
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import BROADCAST, Header, PacketV1, read_body, read_header
+from gr_ros2.wire.v1 import BROADCAST, EntryV1, Header, PacketV1, RepairHeader, read_body, read_header
 
 GIVE_UP_S = 10.0
 """s of silence after which a robot is regarded as gone."""
@@ -79,7 +79,8 @@ class ReceivingSide:
         save: Save | None,
     ) -> None:
         self._access = access
-        self.stats = ReceiverStats()
+        self._outcomes = Outcomes()
+        self.stats = self._outcomes.stats
         self._settings = settings
         self._boot = boot
         self._sealed = keys.sealed
@@ -91,10 +92,9 @@ class ReceivingSide:
         self.neighbours = Neighbours(
             own, settings, keys, heard=heard, save=save, inbox=self._inbox, dropped=self.stats.dropped
         )
-        self.relaying = Relaying(settings.src_id, self.neighbours, self.stats.dropped) if settings.relay else None
+        self.relaying = Relaying(settings.src_id, self.neighbours, self._outcomes) if settings.relay else None
         if self.relaying is not None:
             self.relaying.tell(lambda src_id, boot: self._inbox(src_id, boot, 0, settings.packet_len))
-        self._events: list[ReceiverEvent] = []
         self._now = -inf
         self._sender: Neighbour | None = None
         """The sender of the packet that is processed."""
@@ -107,28 +107,26 @@ class ReceivingSide:
         """Take one packet; the events it causes, in order."""
         self._now = now
         self._receive(arrival, now)
-        events, self._events = self._events, []
-        return events
+        return self._outcomes.take()
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Give up missing packets, and forget robots that are silent."""
         self._now = now
         for neighbour in self.neighbours:
-            self._report_all(neighbour.inbox.handle_timeout(now))
+            neighbour.inbox.handle_timeout(now)
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now, self._give_up_s):
             self._forget(gone.src_id)
             gone.inbox.order.told = False
-            self._report_all(gone.inbox.handle_timeout(now))
+            gone.inbox.handle_timeout(now)
             if self.relaying is None or not self.relaying.reaches(gone.src_id, gone.boot, now):
-                self._events.append(Gone(gone.src_id, gone.boot))
+                self._outcomes.events.append(Gone(gone.src_id, gone.boot))
         if self.relaying is not None:
-            self._events += self.relaying.handle_timeout(now)
+            self.relaying.handle_timeout(now)
         for neighbour in self.neighbours:
             neighbour.timeout = None
         self._messages.reported = bool(self._window.peers)
-        events, self._events = self._events, []
-        return events
+        return self._outcomes.take()
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
@@ -170,7 +168,7 @@ class ReceivingSide:
             proved = self._use(arrival, opened, now)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
-            self._events.append(Rejected(arrival.data, error))
+            self._outcomes.events.append(Rejected(arrival.data, error))
             return
         if opened.met or proved:
             for early in self.neighbours.early(opened.neighbour.src_id):
@@ -191,7 +189,8 @@ class ReceivingSide:
             self.neighbours.check_own(data, header)
             self.stats.dropped["own"] += 1
             return None
-        if self._access is None and not self._for_us(header):  # where it is shared, all have to know whose slot it is
+        if header.dst_id != BROADCAST and self._access is None and not self._for_us(header):
+            # Where the channel is shared, all have to know whose slot it is.
             self.stats.dropped["not_for_us"] += 1
             return None
         if header.sealed and not self._sealed:
@@ -210,27 +209,33 @@ class ReceivingSide:
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
         sending = self._sending
         sending.heard_at = now
+        sending.repairs.waits_until = -inf
         sending.urged = sending.urged or (repair is not None and not repair.mask) or sending.reports.requests.lacking
         if opened.met:
             self._meet(opened, now)
         self._sender, inbox = neighbour, neighbour.inbox
+        mask, clear, repair_id = (0, False, NOT_A_REPAIR) if repair is None else (repair.mask, repair.clear, repair[0])
+        entries: Sequence[EntryV1] = ()
+        if not mask:
+            entries = opened.entries or read_body(opened.body, header.room(self._settings.packet_len))
+        encrypted = neighbour.trailer.encrypts and not clear
+        packet = PacketV1(header, tuple(entries), repair, opened.body if mask else b"", encrypted)
+        identity = PacketId(neighbour.src_id, neighbour.boot, number, repair_id)
+        self._outcomes.events.append(Received(arrival.data, packet, identity, arrival.received_at, arrival.snr_db))
         if repair is None:
-            entries = read_body(opened.body, header.room(self._settings.packet_len))
-            packet = PacketV1(header, tuple(entries), encrypted=neighbour.encrypts)
-            self._arrived(arrival, neighbour, number, NOT_A_REPAIR, packet)
-            self._report_all(inbox.source(number, opened.body, entries, header.qos, now))
-            return False
-        if repair.mask:
-            packet = PacketV1(header, (), repair, opened.body, neighbour.encrypts)
-            self._arrived(arrival, neighbour, number, repair.repair_id, packet)
-            oldest, new = repair.oldest, opened.new
-            self._report_all(
-                inbox.repair(number, repair.mask, repair.repair_id, opened.body, oldest=oldest, now=now, new=new)
-            )
-            return False
-        entries = opened.entries or read_body(opened.body, header.room(self._settings.packet_len))
-        packet = PacketV1(header, tuple(entries), repair, b"", neighbour.encrypts and not repair.clear)
-        self._arrived(arrival, neighbour, number, repair.repair_id, packet)
+            inbox.source(number, opened.body, entries, header.qos, now)
+        elif mask:
+            inbox.repair(number, mask, repair_id, opened.body, oldest=repair.oldest, now=now, new=opened.new)
+        else:
+            return self._control(arrival, opened, repair, entries, now)
+        return False
+
+    def _control(
+        self, arrival: ReceivedPacket, opened: Opened, repair: RepairHeader, entries: Sequence[EntryV1], now: float
+    ) -> bool:
+        """Take a packet of entries that are not messages; returns the same as ``_use``."""
+        neighbour, number, sending = opened.neighbour, opened.number, self._sending
+        inbox = neighbour.inbox
         if repair.clear:
             neighbour.echo = arrival.data[-ECHO_LEN:], self._window.packets.newest
             if neighbour.hello.capabilities & WANTS_PROOF:
@@ -243,21 +248,14 @@ class ReceivingSide:
                 self._entry(entry)
             elif isinstance(entry, (Ping, About)):
                 sending.pings.receive(neighbour.src_id, self._settings.src_id, entry, now)
-        self._report_all(inbox.heard(number, now, over=repair.oldest))
+        inbox.heard(number, now, over=repair.oldest)
         return proved
-
-    def _arrived(
-        self, arrival: ReceivedPacket, neighbour: Neighbour, number: int, repair_id: int, packet: PacketV1
-    ) -> None:
-        """Report a packet before the events that it causes."""
-        identity = PacketId(neighbour.src_id, neighbour.boot, number, repair_id)
-        self._events.append(Received(arrival.data, packet, identity, arrival.received_at, arrival.snr_db))
 
     def _meet(self, opened: Opened, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""
         neighbour = opened.neighbour
         if opened.replaced is not None:
-            self._report_all(opened.replaced.inbox.close(Fate.SENDER_RESTARTED))
+            opened.replaced.inbox.close(Fate.SENDER_RESTARTED)
         self._forget(neighbour.src_id)
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
@@ -266,7 +264,7 @@ class ReceivingSide:
                 self._rate.meet(neighbour.src_id)
             self._messages.reported = True
         self._sending.met(now)
-        self._events.append(Met(neighbour.src_id, neighbour.boot, hears))
+        self._outcomes.events.append(Met(neighbour.src_id, neighbour.boot, hears))
 
     def _entry(self, entry: Control) -> None:
         """Handle an entry that is not a message, from the sender of the packet that is processed."""
@@ -316,7 +314,7 @@ class ReceivingSide:
             self._settings,
             decoder_for=self._decoder_for,
             marks=self._marks.setdefault(src_id, {}),
-            stats=self.stats,
+            outcomes=self._outcomes,
             control=self._entry,
             relaying=self.relaying,
         )
@@ -325,17 +323,3 @@ class ReceivingSide:
             inbox.adopt(far)
         inbox.reports.tells_snr = self._rate is not None
         return inbox
-
-    def _report_all(self, events: Sequence[ReceiverEvent]) -> None:
-        stats = self.stats
-        for event in events:
-            self._events.append(event)
-            if isinstance(event, Delivered):
-                stats.delivered[event.src_id, event.topic_id] += 1
-                stats.repaired[event.src_id, event.topic_id] += event.repaired
-            elif isinstance(event, Lost):
-                if event.reason is Fate.NOT_FOR_US:  # nothing is missed here
-                    stats.dropped["not_for_us"] += 1
-                    continue
-                stats.lost[event.src_id, event.topic_id, str(event.reason)] += 1
-                stats.message_loss_est += 1

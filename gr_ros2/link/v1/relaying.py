@@ -21,10 +21,11 @@ from gr_ros2.core.errors import WireError
 from gr_ros2.link.endpoint import HeardRobot
 from gr_ros2.link.events import Gone, Met
 from gr_ros2.link.v1.custody import Custody
-from gr_ros2.link.v1.inbox import Events, Inbox
+from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbours
 from gr_ros2.link.v1.order import Ready
+from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sent_topics import SentTopic
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.routes import STALE_S
@@ -50,11 +51,11 @@ class Relaying:
 
     :param src_id: of this robot
     :param neighbours: the robots that are heard
-    :param dropped: counts what came and was of no use
+    :param outcomes: takes what comes of it
     :ivar hops: over how many robots the newest message of each robot came; 0 for directly
     """
 
-    def __init__(self, src_id: int, neighbours: Neighbours, dropped: Counter[str]) -> None:
+    def __init__(self, src_id: int, neighbours: Neighbours, outcomes: Outcomes) -> None:
         self.src_id = src_id
         self.hops: dict[int, int] = {}
         self.relayed: Counter[tuple[int, int]] = Counter()
@@ -64,7 +65,7 @@ class Relaying:
         self.custody: Custody
         self._here: dict[int, tuple[int, float]] = {}
         """Robots that are reached over others: boot number, and when something of them last came, s."""
-        self._neighbours, self._dropped = neighbours, dropped
+        self._neighbours, self._outcomes, self._dropped = neighbours, outcomes, outcomes.stats.dropped
         self._newest: dict[Stream, Relayed] = {}
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
@@ -112,7 +113,7 @@ class Relaying:
         message = Relayed(src_id, boot & 0xFFFF, number, place, ready.topic_id, 0, ready.payload, ready.coded)
         self._take(src_id, message, now)
 
-    def receive(self, via: int, ready: Ready, now: float) -> Events:
+    def receive(self, via: int, ready: Ready, now: float) -> None:
         """A message of another robot has come over one that is heard."""
         taker = BROADCAST
         try:
@@ -122,45 +123,44 @@ class Relaying:
                 message = read_relayed(ready.payload)
         except WireError as error:
             self._dropped[error.kind] += 1
-            return []
+            return
         if message.origin != self.src_id:
             self.custody.routes.note(message.origin, via, message.hops, now)
         if taker != BROADCAST:
             if message.dst_id != self.src_id:
                 if taker == self.src_id:
                     self.custody.take(message, via, now)
-                return []
+                return
         elif not self._take(via, message, now):
             self._dropped["relayed_before"] += 1
-            return []
+            return
         self.hops[message.origin] = message.hops
         if message.dst_id not in (BROADCAST, self.src_id):
-            return []
+            return
         if message.topic_id == TABLE_TOPIC:
-            return self._announced(message, via, now)
-        inbox = self._inbox(message.origin, message.start)
-        if inbox is not None:
-            return self._delivered(inbox, message, via, now)
-        if taker == BROADCAST:
+            self._announced(message, via, now)
+        elif (inbox := self._inbox(message.origin, message.start)) is not None:
+            self._delivered(inbox, message, via, now)
+        elif taker == BROADCAST:
             self._dropped["unknown_origin"] += 1
-            return []
-        # Whoever has handed it on has forgotten it by now. It waits until the table of its origin is here.
-        self._dropped["unknown_origin"] += len(self._early) == MOST_EARLY
-        self._early.append((message, via))
-        return []
+        else:  # Whoever has handed it on has forgotten it by now. It waits until the table of its origin is here.
+            self._dropped["unknown_origin"] += len(self._early) == MOST_EARLY
+            self._early.append((message, via))
 
-    def _delivered(self, inbox: Inbox, message: Relayed, via: int, now: float) -> Events:
+    def _delivered(self, inbox: Inbox, message: Relayed, via: int, now: float) -> None:
         order = message.number, message.place
         ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False, message.hops, via)
-        return self._reached(inbox, now) + inbox.relayed(ready, now)
+        self._reached(inbox, now)
+        inbox.relayed(ready, now)
 
-    def _reached(self, inbox: Inbox, now: float) -> Events:
+    def _reached(self, inbox: Inbox, now: float) -> None:
         """Something of a robot came over others."""
         neighbour = self._neighbours.get(inbox.src_id)
         known = neighbour is not None and not neighbour.gone
         met = not known and self._here.get(inbox.src_id, (-1, 0.0))[0] != inbox.boot
         self._here[inbox.src_id] = inbox.boot, now
-        return [Met(inbox.src_id, inbox.boot, hears=False)] if met else []
+        if met:
+            self._outcomes.events.append(Met(inbox.src_id, inbox.boot, hears=False))
 
     def reaches(self, src_id: int, boot: int, now: float) -> bool:
         """Whether a start of a robot is reached over others."""
@@ -181,16 +181,14 @@ class Relaying:
                 found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, 0, topics, hops, over))
         return found
 
-    def handle_timeout(self, now: float) -> Events:
+    def handle_timeout(self, now: float) -> None:
         """Give up robots of which nothing comes any more."""
-        events: Events = []
         for src_id, (boot, at) in list(self._here.items()):
             if now >= at + STALE_S:
                 del self._here[src_id]
                 neighbour = self._neighbours.get(src_id)
                 if neighbour is None or neighbour.gone:
-                    events.append(Gone(src_id, boot))
-        return events
+                    self._outcomes.events.append(Gone(src_id, boot))
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do."""
@@ -214,31 +212,30 @@ class Relaying:
         payload = boot.to_bytes(_BOOT_LEN, "big") + table
         self._take(src_id, Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload), now)
 
-    def _announced(self, message: Relayed, via: int, now: float) -> Events:
+    def _announced(self, message: Relayed, via: int, now: float) -> None:
         """The table of a far robot."""
         boot = int.from_bytes(message.payload[:_BOOT_LEN], "big")
         if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start:
             self._dropped["bad_table"] += 1
-            return []
+            return
         inbox = self._inbox(message.origin, message.start)
         if inbox is None:
             known = self.far.get(message.origin)
             if known is not None and known.boot > boot:
                 self._dropped["old_start"] += 1
-                return []
+                return
             if known is None and len(self.far) >= MOST_FAR:
                 self._dropped["max_sources"] += 1
-                return []
+                return
             inbox = self.far[message.origin] = self._make_inbox(message.origin, boot)
             self.found(message.origin, now)
-        events = self._delivered(inbox, message._replace(payload=message.payload[_BOOT_LEN:]), via, now)
+        self._delivered(inbox, message._replace(payload=message.payload[_BOOT_LEN:]), via, now)
         for early in [early for early in self._early if early[0].origin == message.origin]:
             self._early.remove(early)
             if early[0].start == message.start:
-                events = events + self._delivered(inbox, *early, now)
+                self._delivered(inbox, *early, now)
             else:
                 self._dropped["unknown_origin"] += 1
-        return events
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
         """Where messages of a start of a robot come together, directly or over others."""

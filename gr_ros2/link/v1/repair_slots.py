@@ -22,15 +22,17 @@ _POLL_S, _CALM_POLL_S = 0.02, 0.1
 
 
 class RepairSlots:
-    """The slots of one sender that carry repairs."""
+    """The slots of one sender that carry repairs.
+
+    :ivar waits_until: time in s up to which repairs wait, because a new message is about to come; -inf to look anew
+    """
 
     def __init__(
         self, settings: Settings, pace: Pace, window: RepairWindow, *, writer: PacketWriter, hold: Hold
     ) -> None:
         self._setting = settings.repair
         self._pace, self._window, self._writer, self._hold = pace, window, writer, hold
-        self._repair_at = -inf
-        """Time in s up to which repairs wait, because a new message is about to come."""
+        self.waits_until = -inf
         self._calm_since = inf
         """Time in s at which no repair was wanted, if no report has come since; otherwise infinite."""
         self._calm_number = 0
@@ -45,10 +47,6 @@ class RepairSlots:
         if mode != AUTO:
             return mode
         return "thrifty" if reported else "idle"
-
-    def received(self) -> None:
-        """Something has been received: what waits to be repaired is looked at again."""
-        self._repair_at = -inf
 
     def reported(self) -> None:
         """A report has come."""
@@ -74,7 +72,7 @@ class RepairSlots:
         """When ``spare`` may have something, s; inf for never."""
         if self.mode == "off" or not self._window.packets.unconfirmed(now):
             return inf
-        return max(self._repair_at, now if self.mode == "idle" else self._next_look(now))
+        return max(self.waits_until, now if self.mode == "idle" else self._next_look(now))
 
     def _tell(self, number: int, now: float) -> SentPacket | None:
         """Say that a packet is not repaired any more."""
@@ -84,9 +82,9 @@ class RepairSlots:
         return None if self._window.packets.unconfirmed(now) else self._writer.control([], "repair", now)
 
     def _repair(self, now: float) -> SentPacket | None:
-        self._repair_at = -inf
+        self.waits_until = -inf
         chosen = self._window.next(now, self._held)
-        held = self._repair_at > now
+        held = self.waits_until > now
         self._calm_since = now if chosen is None and not held else inf
         self._calm_number = self._window.packets.newest
         if chosen is not None:
@@ -107,5 +105,5 @@ class RepairSlots:
     def _held(self, now: float) -> bool:
         """Whether a repair that could leave now waits for a new message."""
         airtime = self._pace.interval
-        self._repair_at = self._hold.until(now, self._pace.free(now) + airtime, airtime)
-        return self._repair_at > now
+        self.waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime)
+        return self.waits_until > now

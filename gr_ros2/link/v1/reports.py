@@ -60,6 +60,7 @@ class Reporter:
     :param airtime_share: part of the time that this robot may send, above 0..1
     :ivar unreported: packets since the last report
     :ivar loss: recent share of lost packets
+    :ivar confirms: whether something has arrived that the sender repairs until it is confirmed
     :ivar snr: SNR of its packets
     :ivar tells_snr: whether reports give the SNR, as an adaptive rate needs
     """
@@ -75,6 +76,7 @@ class Reporter:
     ) -> None:
         self.unreported = 0
         self.loss = 0.0
+        self.confirms = False
         self.snr = SnrFilter()
         self.tells_snr = True
         self._sender = sender
@@ -130,9 +132,6 @@ class Reporter:
         if prompt or self.unreported >= most:
             return now
         return self.reported_at + self._pause
-
-    def repairable(self) -> None:
-        """Something has arrived that the sender repairs until it is confirmed. Here all packets are reported."""
 
     @property
     def lacks(self) -> bool:
@@ -194,11 +193,6 @@ class SharedReporter(Reporter):
     ) -> None:
         super().__init__(sender, decoder, order, half_duplex=True, airtime_share=airtime_share)
         self._reassembly = reassembly
-        self._confirms = False
-
-    def repairable(self) -> None:
-        """Something has arrived that the sender repairs until it is confirmed."""
-        self._confirms = True
 
     @property
     def lacks(self) -> bool:
@@ -209,9 +203,9 @@ class SharedReporter(Reporter):
     def due(self, now: float) -> float:
         if self._order.told and self.lacks:
             return now if self.unreported else self.reported_at + CONFIRM_S
-        wanted = (self._order.told and self._confirms) or (self.tells_snr and self.snr.changed)
+        wanted = (self._order.told and self.confirms) or (self.tells_snr and self.snr.changed)
         return self.reported_at + CONFIRM_S if wanted and self.unreported else inf
 
     def make(self, now: float) -> Report:
-        self._confirms = False
+        self.confirms = False
         return super().make(now)

@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gr_ros2.core.errors import ConfigError, CrcError, TagError
 from gr_ros2.state.keys import KEY_LEN
-from gr_ros2.wire.v1 import CRC_LEN, HEADER_LEN, TAG_LEN, crc, session_crc
+from gr_ros2.wire.v1 import ADDRESSED, CRC_LEN, HEADER_LEN, TAG_LEN, crc, session_crc
 
 SealMode = Literal["none", "authenticate", "encrypt"]
 
@@ -45,9 +45,13 @@ class Trailer(Protocol):
     ``clear`` is what stands before the body: the header, and in a repair packet also window, repair id and mask.
     ``number`` is the full packet number. ``repair_id`` is that of a repair packet; for other packets it is
     ``NOT_A_REPAIR``. ``plain``: the body is not encrypted, whatever the mode (as in a hello).
+
+    :ivar size: its bytes
+    :ivar encrypts: whether bodies are encrypted
     """
 
     size: int
+    encrypts: bool
 
     def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
         """The whole packet."""
@@ -66,7 +70,7 @@ class Checksum:
     :param boot: boot number of the sender
     """
 
-    size = CRC_LEN
+    size, encrypts = CRC_LEN, False
 
     def __init__(self, boot: int) -> None:
         self._boot = boot
@@ -103,23 +107,23 @@ class Seal:
     size = TAG_LEN
 
     def __init__(self, key: bytes, src_id: int, boot: int, *, encrypt: bool) -> None:
-        self.encrypt = encrypt
+        self.encrypts = encrypt
         self._cipher = AESCCM(subkey(key, src_id, boot), tag_length=TAG_LEN)
 
     def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
         """See :class:`Trailer`."""
         nonce = _nonce.pack(0, number, repair_id)
-        named = clear if len(clear) <= _HOP else without_hop(clear)
-        if self.encrypt and not plain:
+        named = without_hop(clear) if clear[0] & ADDRESSED else clear
+        if self.encrypts and not plain:
             return clear + self._cipher.encrypt(nonce, body, named)
         return clear + body + self._cipher.encrypt(nonce, b"", named + body)
 
     def open(self, clear: bytes, rest: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
         """See :class:`Trailer`."""
         nonce = _nonce.pack(0, number, repair_id)
-        named = clear if len(clear) <= _HOP else without_hop(clear)
+        named = without_hop(clear) if clear[0] & ADDRESSED else clear
         try:
-            if self.encrypt and not plain:
+            if self.encrypts and not plain:
                 return self._cipher.decrypt(nonce, rest, named)
             body = rest[:-TAG_LEN]
             self._cipher.decrypt(nonce, rest[-TAG_LEN:], named + body)
@@ -129,8 +133,8 @@ class Seal:
 
 
 def without_hop(clear: bytes) -> bytes:
-    """Header and other bytes before the body, without the hop count of an addressed packet."""
-    return clear[:_HOP] + clear[_HOP + 1 :] if clear[0] & 4 else clear
+    """The bytes of an addressed packet before its body, without the hop count."""
+    return clear[:_HOP] + clear[_HOP + 1 :]
 
 
 def subkey(key: bytes, src_id: int, boot: int) -> bytes:

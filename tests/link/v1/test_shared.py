@@ -34,7 +34,7 @@ def test_packets_that_nobody_repairs_are_not_reported() -> None:
     reports.arrived(late=False)
     reports.missed(3, counts=True)
     assert reports.due(5.0) == inf
-    reports.repairable()
+    reports.confirms = True
     assert reports.due(5.0) == CONFIRM_S, "it was never reported"
     reports.make(5.0)
     assert reports.due(5.0) == inf
