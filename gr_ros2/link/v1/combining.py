@@ -89,8 +89,11 @@ class Combining:
             longest = max(len(record.body) for record in window)
             if longest + (size + 7) // 8 > self._room:
                 window = [packets.records[number] for number in range(newest, first - 1, -1)]
-        full = len(window) == size
-        mask = (1 << size) - 1 if full else sum(1 << newest - record.number for record in window)
+        mask = (1 << size) - 1
+        if len(window) < size:
+            mask = 0
+            for record in window:
+                mask |= 1 << newest - record.number
         repair_id = packets.take_repair_id(newest)
         assert repair_id is not None
         combined = combine([(record.number, record.body) for record in window], repair_id)

@@ -145,7 +145,8 @@ class Packing:
             return []
         holder = self._holder = self.turns.holder(self._open)
         if len(self._open) == 1:  # nothing to choose
-            return [(0, 0, topic_id, 0) for topic_id in self._open]
+            (only,) = self._open
+            return [(0, 0, only, 0)]
         heap: list[tuple[float, float, int, int]] = []
         for topic_id, ready in self._open.items():
             head, before = ready[0], self._topics[topic_id].newest
