@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from math import inf
 
+from gr_ros2.link.events import AirPacket
 from gr_ros2.medium.base import Medium, Reception, Surroundings, Transmission
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import replaced
@@ -66,7 +67,7 @@ class FlowgraphMedium(Medium):
             self.lost.add("phy", batch[0].sender, receiver, len(batch) - whole)
             for place, packet in came:
                 sent = batch[place]
-                yield Reception(receiver, sent, sent.end, packet, snr_db, snr_db)
+                yield Reception(receiver, sent, sent.end, AirPacket(packet, sent.start), snr_db, snr_db)
         self._batches += 1
 
 

@@ -20,6 +20,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
+from gr_ros2.link.events import AirPacket
 from gr_ros2.medium.base import Medium, Reception, Surroundings, Transmission
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.phy import Phy
@@ -179,7 +180,8 @@ class SampleMedium(Medium):
                 burst = next((one for one in ear.bursts if one.packet.data == heard.data), None)
                 packet, snr_db = (sent, math.inf) if burst is None else (burst.packet, burst.snr_db)
                 arrived = arrived or packet is sent
-                yield Reception(receiver, packet, sent.end, heard.data, snr_db, snr_db, heard.snr_db)
+                arrival = AirPacket(heard.data, packet.start, snr_db=heard.snr_db)
+                yield Reception(receiver, packet, sent.end, arrival, snr_db, snr_db)
             if not arrived:
                 self.lost.add(self._reason(sent, receiver), sent.sender, receiver)
 

@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 from gr_ros2.core.errors import BagError, ConfigError, RunError
 from gr_ros2.gr.factory import EndpointSetup, make_endpoint
-from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, ReceiverEvent, SenderEvent, SenderStats, SentPacket
+from gr_ros2.link import Delivered, Lost, Received, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit, at_full_load
 from gr_ros2.link.endpoint import Endpoint
@@ -411,8 +411,7 @@ class Robot:
 
     def receive(self, reception: Reception) -> Iterator[TimedEvent]:
         """Take what has come out of the receiver."""
-        arrival = ReceivedPacket(reception.data, reception.sent.start, reception.measured_db)
-        for event in self.endpoint.receive(arrival, reception.at):
+        for event in self.endpoint.receive(reception.packet, reception.at):
             yield reception.at, self, event
 
     def expire(self, now: float) -> Iterator[TimedEvent]:

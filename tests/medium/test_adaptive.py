@@ -114,7 +114,7 @@ def test_packets_may_pass_through_the_modem_of_their_rate() -> None:
         medium.send(0, bytes(220), number, phy.airtime(220, mcs), mcs)
     received = list(medium.receptions(3.0))
     assert [reception.sent.mcs for reception in received] == [0, 2]
-    assert [reception.measured_db for reception in received] == pytest.approx([9.0, 9.0], abs=3.0)
+    assert [reception.packet.snr_db for reception in received] == pytest.approx([9.0, 9.0], abs=3.0)
 
 
 def test_fading_is_that_of_rayleigh_and_a_function_of_time() -> None:

@@ -11,13 +11,13 @@ from math import inf
 from gr_ros2.core.errors import EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.access import Access
 from gr_ros2.link.events import (
+    AirPacket,
     Delivered,
     Gone,
     Lost,
     Met,
     PacketId,
     Received,
-    ReceivedPacket,
     ReceiverEvent,
     Rejected,
 )
@@ -103,7 +103,7 @@ class ReceivingSide:
         """Use the parts of the sending half that what arrives can change."""
         self._sending, self._messages, self._window, self._rate = sending, messages, window, rate
 
-    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+    def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         """Take one packet; the events it causes, in order."""
         self._now = now
         self._receive(arrival, now)
@@ -153,7 +153,7 @@ class ReceivingSide:
         self.stats.lost[event.src_id, event.topic_id, Fate.PUBLISH_FAILED.value] += 1
         return Lost(event.src_id, event.topic_id, Fate.PUBLISH_FAILED, event.key)
 
-    def _receive(self, arrival: ReceivedPacket, now: float) -> None:
+    def _receive(self, arrival: AirPacket, now: float) -> None:
         try:
             header = read_header(arrival.data, self._settings.packet_len)
             opened = self._open(arrival.data, header, now)
@@ -174,14 +174,14 @@ class ReceivingSide:
             return
         if opened.met or proved:
             for early in self.neighbours.early(opened.neighbour.src_id):
-                self._receive(ReceivedPacket(early), now)
+                self._receive(AirPacket(early), now)
 
-    def _note_slot(self, access: Access, header: Header, arrival: ReceivedPacket, now: float, *, trusted: bool) -> None:
+    def _note_slot(self, access: Access, header: Header, arrival: AirPacket, now: float, *, trusted: bool) -> None:
         """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
-        if arrival.received_at is None or header.src_id == self._settings.src_id:
+        if arrival.at is None or header.src_id == self._settings.src_id:
             return
         block = read_block(header.block)[0] if header.block else None
-        access.hear(header.src_id, block, arrival.received_at, trusted=trusted)
+        access.hear(header.src_id, block, arrival.at, trusted=trusted)
         if self.relaying is not None and trusted:
             self.relaying.heard(header.src_id, block, now)
 
@@ -204,7 +204,7 @@ class ReceivingSide:
         own = self._settings.src_id
         return header.dst_id in (BROADCAST, own) or own == NOBODY
 
-    def _use(self, arrival: ReceivedPacket, opened: Opened, now: float) -> bool:
+    def _use(self, arrival: AirPacket, opened: Opened, now: float) -> bool:
         """Take an opened packet; returns whether packets that were kept until a proof can be taken now."""
         self.stats.packets += 1
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
@@ -246,12 +246,10 @@ class ReceivingSide:
         self._report_all(inbox.heard(number, now, over=repair.oldest))
         return proved
 
-    def _arrived(
-        self, arrival: ReceivedPacket, neighbour: Neighbour, number: int, repair_id: int, packet: PacketV1
-    ) -> None:
+    def _arrived(self, arrival: AirPacket, neighbour: Neighbour, number: int, repair_id: int, packet: PacketV1) -> None:
         """Report a packet before the events that it causes."""
         identity = PacketId(neighbour.src_id, neighbour.boot, number, repair_id)
-        self._events.append(Received(arrival.data, packet, identity, arrival.received_at, arrival.snr_db))
+        self._events.append(Received(arrival.data, packet, identity, arrival.at, arrival.snr_db))
 
     def _meet(self, opened: Opened, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""
