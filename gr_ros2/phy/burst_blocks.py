@@ -114,7 +114,6 @@ class BurstPhy(Phy):
 
     @cached_property
     def lag(self) -> int:
-        """Samples from the end of a burst, as sent, to where the receiver says that it ends, behind its filter."""
         packet = bytes(range(min(self.packet_len, 32)))
         burst = self.running_modem.modulate(packet if self.any_length else packet.ljust(self.packet_len, b"\0"))
         before = self.running_modem.margin + self.running_modem.preamble_samples
