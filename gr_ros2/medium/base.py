@@ -232,9 +232,6 @@ class Medium(ABC):
         setting of the channel that dropped it
     """
 
-    late = False
-    """Whether receptions may come after their time, see :attr:`known_until`."""
-
     def __init__(self, around: Surroundings, *, shared: bool) -> None:
         self.shared, self.around = shared, around
         self.lost = Losses(around.robots)
@@ -270,15 +267,6 @@ class Medium(ABC):
     @abstractmethod
     def outcome(self, sent: Transmission) -> Iterable[Reception]:
         """What the receivers make of a packet whose airtime is over, before whole packets are dropped."""
-
-    @property
-    def known_until(self) -> float:
-        """s, until when everything that was received is known; infinite where it is known at once."""
-        return inf
-
-    def rest(self) -> Iterator[Reception]:
-        """What has been received and was not known at once. Nothing further is sent."""
-        return iter(())
 
     def hearers(self, sent: Transmission) -> Hearers:
         """Those who hear a packet. All of a packet is heard as its start is."""
