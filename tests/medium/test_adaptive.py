@@ -17,7 +17,7 @@ from gr_ros2.medium import Path as Way
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.medium.packets import PacketMedium, limits_of
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.phy.ofdm_rate import RATES
+from gr_ros2.phy.ofdm import RATES
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.observers import RunObservers
 from gr_ros2.run.scenario import Scenario, scenario_from

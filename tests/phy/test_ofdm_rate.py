@@ -19,7 +19,7 @@ from gr_ros2.phy import PHY
 from gr_ros2.phy.burst import DemodulatedPacket, Samples
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.length_word import LENGTHS, RATES, WORD_BITS, LengthWord, header_bits, header_crc, mcs_mark
-from gr_ros2.phy.ofdm_rate import RATES as MCS_TABLE
+from gr_ros2.phy.ofdm import RATES as MCS_TABLE
 from gr_ros2.phy.pdus import packets_of, pdu_to_send
 from tests.gr.probe import Probe
 from tests.phy.test_burst import noise
