@@ -141,9 +141,15 @@ def _known(number: float) -> float | None:
 
 
 def _bundled(packet: AirPacket) -> bytes:
-    data, *times, mcs, snr_db = packet
-    at, leave_at, snr_db = (nan if number is None else number for number in (*times, snr_db))
-    return _HEAD_OF.pack(len(data), at, leave_at, -1 if mcs is None else mcs, snr_db) + data
+    data, at, leave_at, mcs, snr_db = packet
+    head = _HEAD_OF.pack(
+        len(data),
+        nan if at is None else at,
+        nan if leave_at is None else leave_at,
+        -1 if mcs is None else mcs,
+        nan if snr_db is None else snr_db,
+    )
+    return head + data
 
 
 class PduPort:
