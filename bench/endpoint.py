@@ -7,7 +7,7 @@ import time
 
 from bench.rows import Row
 from bench.yardstick import cost
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, SentPacket
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -60,7 +60,7 @@ def transfer() -> tuple[float, float]:
                 outgoing.append((sent, now))
         packets[0] += len(outgoing)
         spent[0] += clock() - begin
-        heard = [(ReceivedPacket(sent.data, at), at) for sent, at in outgoing if rng.random() >= LOSS]
+        heard = [(AirPacket(sent.data, at), at) for sent, at in outgoing if rng.random() >= LOSS]
         begin = clock()
         for arrival, at in heard:
             delivered += sum(isinstance(event, Delivered) for event in receiver.receive(arrival, at))
@@ -75,7 +75,7 @@ def transfer() -> tuple[float, float]:
         spent[1] += clock() - begin
         begin = clock()
         for answer in answers:
-            sender.receive(ReceivedPacket(answer.data), now)
+            sender.receive(AirPacket(answer.data), now)
         sender.handle_timeout(now)
         packets[0] += len(answers)
         spent[0] += clock() - begin

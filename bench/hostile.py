@@ -21,7 +21,7 @@ from bench.rows import Row
 from bench.yardstick import turn_s
 from fuzz.loop import inputs
 from gr_ros2.core.errors import ReplayedError
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, Rejected
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -105,7 +105,7 @@ def attack(kind: Kind, count: int, seed: int = 1) -> Outcome:
                 take(data, bad=False)
         answer = receiver.next_packet(now)
         if answer is not None and rng.random() >= _LOSS:
-            sender.receive(ReceivedPacket(answer.data), now)
+            sender.receive(AirPacket(answer.data), now)
         sender.handle_timeout(now)
         receiver.handle_timeout(now)
 
@@ -113,7 +113,7 @@ def attack(kind: Kind, count: int, seed: int = 1) -> Outcome:
         before = _refusals(receiver) if bad else 0
         gc.disable()  # the sets kept here would count
         begin = time.thread_time()
-        events = receiver.receive(ReceivedPacket(data), now)
+        events = receiver.receive(AirPacket(data), now)
         if bad and kind == "forged":
             outcome.slowest_s = max(outcome.slowest_s, time.thread_time() - begin)
         gc.enable()

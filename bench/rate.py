@@ -12,7 +12,7 @@ from pathlib import Path
 
 from bench.rows import Row
 from gr_ros2.link.events import Delivered
-from gr_ros2.phy.ofdm_rate import RATES
+from gr_ros2.phy.ofdm import RATES
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import scenario_from
 from gr_ros2.run.simulate import Offered, Simulation

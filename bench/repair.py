@@ -16,7 +16,7 @@ from math import inf
 from typing import Any, Literal
 
 from bench.rows import Row
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -150,7 +150,7 @@ def run(
         for number, end in enumerate(ends):
             lost = next(forward[number])
             if sent is not None and not lost:
-                for event in [*end.receive(ReceivedPacket(sent.data), now + slot), *end.handle_timeout(now + slot)]:
+                for event in [*end.receive(AirPacket(sent.data), now + slot), *end.handle_timeout(now + slot)]:
                     if isinstance(event, Delivered):
                         serial = serials[event.payload]
                         assert serial > latest[number], "out of order, or twice"
@@ -164,7 +164,7 @@ def run(
                 if answer is not None and not next(backward[number]):
                     under_way.append((index + delay, answer.data))
         while under_way and under_way[0][0] <= index:
-            sender.receive(ReceivedPacket(under_way.popleft()[1]), now + slot)
+            sender.receive(AirPacket(under_way.popleft()[1]), now + slot)
         sender.handle_timeout(now)
         if complete == count * receivers and outcome.done == inf:
             outcome.done, outcome.sent_until = now + slot, sum(sender.sent.air.values())

@@ -13,7 +13,7 @@ from math import inf
 
 from bench.repair import RATE, losses, quantile
 from bench.rows import Row
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -72,9 +72,9 @@ def run(sizes: tuple[int, ...], loss: float, *, odometry: bool = True, reports: 
         sent, answer = sender.next_packet(now), receiver.next_packet(now)
         events = receiver.handle_timeout(now + slot)
         if not next(forward) and sent is not None:
-            events += receiver.receive(ReceivedPacket(sent.data), now + slot)
+            events += receiver.receive(AirPacket(sent.data), now + slot)
         if not next(backward) and answer is not None:
-            sender.receive(ReceivedPacket(answer.data), now + slot)
+            sender.receive(AirPacket(answer.data), now + slot)
         sender.handle_timeout(now + slot)
         for event in events:
             if isinstance(event, Delivered) and event.topic_id:

@@ -22,7 +22,7 @@ from typing import Any
 from bench.repair import losses
 from bench.rows import Row
 from gr_ros2.gr.factory import message_codec
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -177,7 +177,7 @@ def run(
             air["sent"] += 1
         lost = next(forward)
         if sent is not None and not lost:
-            for event in [*receiver.receive(ReceivedPacket(sent.data), after), *receiver.handle_timeout(after)]:
+            for event in [*receiver.receive(AirPacket(sent.data), after), *receiver.handle_timeout(after)]:
                 if isinstance(event, Delivered):
                     known = serials[event.topic_id, event.payload]
                     arrived[event.topic_id].append((after, known.pop(0) if len(known) > 1 else known[0]))
@@ -186,7 +186,7 @@ def run(
                 receiver.pace.credit()
             answer = receiver.next_packet(now)
             if answer is not None and not next(backward):
-                sender.receive(ReceivedPacket(answer.data), after)
+                sender.receive(AirPacket(answer.data), after)
         sender.handle_timeout(now)
     air.update(sender.sent.air)
     topics = [

@@ -207,7 +207,7 @@ class SwarmRobot:
         """The time on this robot's clock, who made the message, and when."""
         sent = reception.sent
         sender = sent.sender
-        block, content = _read(reception.data)
+        block, content = _read(reception.packet.data)
         self.access.hear(sender, block, sent.start * self._ppm + self._offset)
         local = self._local(reception.at)
         origin, made = self.traffic.take(sender, block, content, local)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from fuzz.loop import main, work
 from gr_ros2.core.errors import WireError
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -38,7 +38,7 @@ def endpoint(data: bytes) -> None:
         packet = body + (b"\0" * 4 if boot is None else v1.crc(body, v1.session_crc(boot, _turns(end, body))))
 
         def take(packet: bytes = packet, now: float = now) -> tuple[list[ReceiverEvent], bytes | None]:
-            events = end.receive(ReceivedPacket(packet), now) + end.handle_timeout(now)
+            events = end.receive(AirPacket(packet), now) + end.handle_timeout(now)
             end.pace.credit()
             sent = end.next_packet(now)
             return events, None if sent is None else sent.data

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from functools import partial
 
 from fuzz.loop import main, within
-from gr_ros2.link import Delivered, Lost, ReceivedPacket, ReceiverEvent, Rejected
+from gr_ros2.link import AirPacket, Delivered, Lost, ReceiverEvent, Rejected
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.link.v0.sender import Sender
 from gr_ros2.settings.config import SinkConfig, SourceConfig
@@ -37,7 +37,7 @@ def _hear(data: bytes) -> None:
     for wait, intact, body in steps(data):
         now += wait
         packet = with_crc(body) if intact else body + b"\0\0"
-        events += engine.receive(ReceivedPacket(packet), now)
+        events += engine.receive(AirPacket(packet), now)
         given += 1
         assert engine.held_bytes <= _CONFIG.max_bytes
         timeout = engine.next_timeout()

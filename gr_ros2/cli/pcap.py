@@ -15,11 +15,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import click
 
+from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 
@@ -39,7 +39,7 @@ _NANOSECONDS = 9
 _CLOSE_S = 1.0
 
 
-class PacketCapture:
+class PacketCapture(Closing):
     """An open capture: a :class:`gr_ros2.run.observers.RunObserver`, and also the observer of a link without runs.
 
     :param path: file to write, replaced if it exists
@@ -98,14 +98,6 @@ class PacketCapture:
             with suppress(OSError):  # every record has been written by now
                 self._file.close()
             self._lock.release()
-
-    def __enter__(self) -> PacketCapture:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _write(self, interface: int, data: bytes, now: float) -> None:
         stamp = int((now + self._offset) * 1e9)

@@ -14,7 +14,6 @@ import threading
 import uuid
 from concurrent.futures import Future
 from contextlib import suppress
-from types import TracebackType
 from typing import Any
 
 from bokeh.application import Application
@@ -26,6 +25,7 @@ from bokeh.server.util import bind_sockets
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import RequestHandler
 
+from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard.admission import SETTINGS, Admission, BoundedServer, keep
 from gr_ros2.dashboard.live_page import LivePage
@@ -41,7 +41,7 @@ _UNUSED_MS = 5000
 _ANY = ("0.0.0.0", "::")
 
 
-class Dashboard(RunMonitor):
+class Dashboard(Closing, RunMonitor):
     """A monitor with a web page.
 
     :param address: address to serve on; 0.0.0.0 for every interface
@@ -102,11 +102,6 @@ class Dashboard(RunMonitor):
     def __enter__(self) -> Dashboard:
         self.start()
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _serve(self, started: Future[None]) -> None:
         asyncio.set_event_loop(asyncio.new_event_loop())

@@ -10,7 +10,8 @@ from typing import Any
 
 import pmt
 
-from gr_ros2.phy.pdus import AirPacket, pdu_to_send
+from gr_ros2.link.events import AirPacket
+from gr_ros2.phy.pdus import pdu_to_send
 from gr_ros2.wire import Packet
 
 _SRC, _DST, _SEQ, _QOS, _WALL = (pmt.intern(name) for name in ("src_id", "dst_id", "seq", "qos", "t_src_wall"))

@@ -29,14 +29,14 @@ from gr_ros2.gr.loops import LOOP_GUARD, Graph
 from gr_ros2.gr.outputs import Outputs
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.gr.starts import start_of
-from gr_ros2.link import Delivered, Received, ReceivedPacket, ReceiverEvent, Rejected
+from gr_ros2.link import AirPacket, Delivered, Received, ReceiverEvent, Rejected
 from gr_ros2.link.events import Announced
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.phy.pdus import PDUS, AirPacket, PduPort, packets_of
+from gr_ros2.phy.pdus import PDUS, PduPort, packets_of
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import SinkConfig, replaced, robot_of
 from gr_ros2.settings.registry import Registry, Topic, check_outputs
@@ -249,7 +249,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         events: list[ReceiverEvent] = []
         with self._lock:
             for packet in packets:
-                events += self._end.receive(ReceivedPacket(packet.data, packet.at, packet.snr_db), self._clock())
+                events += self._end.receive(packet, self._clock())
             if self._timer_idle and self._end.next_timeout() is not None:
                 self.outputs.due.notify_all()
             if self._end.answers:

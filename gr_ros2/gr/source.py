@@ -29,12 +29,12 @@ from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.gr.starts import start_of
 from gr_ros2.gr.subscriptions import Subscriptions
-from gr_ros2.link import Refused, SenderEvent, SentPacket
+from gr_ros2.link import AirPacket, Refused, SenderEvent, SentPacket
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware
-from gr_ros2.phy.pdus import CREDIT, AirPacket, PduPort, credited
+from gr_ros2.phy.pdus import CREDIT, PduPort, credited
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import SourceConfig, replaced
 from gr_ros2.settings.fields import Auto
@@ -305,7 +305,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.subscriptions.registry))
         adaptive = bool(self._end.mcs_table)
-        on_air = [AirPacket(sent.data, sent.mcs if adaptive else None, leave_at=sent.leave_at) for sent in packets]
+        on_air = [AirPacket(sent.data, None, sent.leave_at, sent.mcs if adaptive else None) for sent in packets]
         if self._port.bundles:
             self._port.send(on_air)
         else:

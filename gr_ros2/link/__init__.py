@@ -5,12 +5,12 @@ from __future__ import annotations
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import (
     Accepted,
+    AirPacket,
     Delivered,
     Lost,
     Missed,
     PacketId,
     Received,
-    ReceivedPacket,
     ReceiverEvent,
     Refused,
     Rejected,
@@ -22,13 +22,13 @@ from gr_ros2.link.stats import ReceiverStats, SenderStats
 
 __all__ = [
     "Accepted",
+    "AirPacket",
     "Delivered",
     "Endpoint",
     "Lost",
     "Missed",
     "PacketId",
     "Received",
-    "ReceivedPacket",
     "ReceiverEvent",
     "ReceiverStats",
     "Refused",

@@ -17,7 +17,7 @@ from math import inf
 from typing import Any, Protocol
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.events import Delivered, Lost, ReceivedPacket, ReceiverEvent, SentPacket
+from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SentPacket
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
@@ -169,7 +169,7 @@ class PacketSide(Protocol):
         :param credited: if there were a credit
         """
 
-    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+    def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         """Take one packet; the events it causes, in order."""
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:

@@ -31,22 +31,26 @@ class PacketId(NamedTuple):
     repair_id: int
 
 
-class ReceivedPacket(NamedTuple):
-    """A packet as it comes out of a PHY.
+class AirPacket(NamedTuple):
+    """A packet on its way to or from the air. Times are s on the clock of the link: live the machine's monotonic one.
 
-    :param received_at: s on the clock of the call, when its burst began; None where the PHY does not say
+    :param at: when its burst begins or began; None where the PHY does not say
+    :param leave_at: when its burst has to begin; None for as soon as possible
+    :param mcs: with an adaptive rate the MCS that it is sent with; None for a fixed rate
     :param snr_db: SNR of its burst, dB; None where it is not measured
     """
 
     data: bytes
-    received_at: float | None = None
+    at: float | None = None
+    leave_at: float | None = None
+    mcs: int | None = None
     snr_db: float | None = None
 
 
 class Received(NamedTuple):
     """A packet arrived: its bytes and their meaning. Events that it causes follow it.
 
-    :param received_at, snr_db: see :class:`ReceivedPacket`
+    :param received_at, snr_db: ``at`` and ``snr_db`` of its :class:`AirPacket`
     """
 
     data: bytes

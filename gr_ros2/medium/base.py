@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gr_ros2.link.events import AirPacket
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.settings.config import ChannelConfig
 
@@ -173,20 +174,18 @@ class Transmission(NamedTuple):
 class Reception(NamedTuple):
     """A packet that came out of a robot's receiver.
 
-    :param at: s
-    :param data: its bytes as received
+    :param at: s, when all of it has been received
+    :param packet: as received, with the SNR that the receiver itself has measured, where that is simulated
     :param snr_db: of the burst at this receiver, dB; infinite without noise
     :param sinr_db: the same with all other bursts as noise, where they were strongest
-    :param measured_db: SNR that the receiver itself has measured, dB; None where that is not simulated
     """
 
     receiver: int
     sent: Transmission
     at: float
-    data: bytes
+    packet: AirPacket
     snr_db: float = inf
     sinr_db: float = inf
-    measured_db: float | None = None
 
 
 class Losses:
@@ -233,9 +232,6 @@ class Medium(ABC):
         setting of the channel that dropped it
     """
 
-    late = False
-    """Whether receptions may come after their time, see :attr:`known_until`."""
-
     def __init__(self, around: Surroundings, *, shared: bool) -> None:
         self.shared, self.around = shared, around
         self.lost = Losses(around.robots)
@@ -272,15 +268,6 @@ class Medium(ABC):
     def outcome(self, sent: Transmission) -> Iterable[Reception]:
         """What the receivers make of a packet whose airtime is over, before whole packets are dropped."""
 
-    @property
-    def known_until(self) -> float:
-        """s, until when everything that was received is known; infinite where it is known at once."""
-        return inf
-
-    def rest(self) -> Iterator[Reception]:
-        """What has been received and was not known at once. Nothing further is sent."""
-        return iter(())
-
     def hearers(self, sent: Transmission) -> Hearers:
         """Those who hear a packet. All of a packet is heard as its start is."""
         return self.around.hearers(sent.sender, sent.start)
@@ -306,14 +293,14 @@ class Medium(ABC):
             return
         later: dict[float, list[Reception]] = {}
         for reception in received:
-            receiver, sent, at, data, snr_db, sinr_db, measured_db = reception
+            receiver, sent, at, packet, snr_db, sinr_db = reception
             pair = sent.sender, receiver
             losses, delay_s = self._ways.get(pair) or self._way(pair)
             if losses is not None and not losses.passes(at):
                 continue
             if delay_s:
                 at += delay_s
-                later.setdefault(at, []).append(Reception(receiver, sent, at, data, snr_db, sinr_db, measured_db))
+                later.setdefault(at, []).append(Reception(receiver, sent, at, packet, snr_db, sinr_db))
             else:
                 yield reception
         for at, receptions in later.items():

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.medium.base import Medium, Surroundings
+from gr_ros2.medium.base import Medium, Surroundings, Transmission
 from gr_ros2.medium.flowgraph import FlowgraphMedium
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.medium.samples import SampleMedium
@@ -19,12 +19,12 @@ def make_medium(
     samples: bool,
     shared: bool = False,
     seed: int = 0,
-    at_once: bool = True,
+    ahead: Iterable[Transmission] = (),
 ) -> Medium:
     """The medium for these robots.
 
     :param samples: bursts cross as samples, where the PHYs have any; otherwise packets are lost as measured
-    :param at_once: see :class:`FlowgraphMedium`
+    :param ahead: see :class:`FlowgraphMedium`
     :raises ConfigError: for PHYs of stock or foreign blocks that share one channel
     """
     if not samples or not any(phy.has_samples for phy in phys):
@@ -41,4 +41,4 @@ def make_medium(
             f"phy {phys[0].name} runs on {phys[0].runs_on()}, whose bursts cannot be added up on one channel; "
             "set time to packets, or take a receiver of this package"
         )
-    return FlowgraphMedium(around, phys, at_once=at_once)
+    return FlowgraphMedium(around, phys, ahead)

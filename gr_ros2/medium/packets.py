@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.events import AirPacket
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.rate import Mcs
 from gr_ros2.medium.base import Floats, Hearers, Ints, Medium, Reception, Surroundings, Transmission
@@ -155,7 +156,7 @@ class PacketMedium(Medium):
             self.lost.add("sending", sent.sender, heard.ids[busy])
         rows = (heard.ids, snrs, sinrs, np.where(heard.noise > 0, snrs + errors, _CLEAR_DB))
         return [
-            Reception(receiver, sent, sent.end, sent.data, snr_db, sinr_db, measured_db)
+            Reception(receiver, sent, sent.end, AirPacket(sent.data, sent.start, snr_db=measured_db), snr_db, sinr_db)
             for receiver, snr_db, sinr_db, measured_db in zip(*(row[arrived].tolist() for row in rows), strict=True)
         ]
 
@@ -172,7 +173,8 @@ class PacketMedium(Medium):
                 if lost:
                     self.lost.add(reason, sent.sender, lost)
             receivers = [one for one in receivers if one not in sending and one not in disturbed]
-        return [Reception(one, sent, sent.end, sent.data, measured_db=_CLEAR_DB) for one in receivers]
+        packet = AirPacket(sent.data, sent.start, snr_db=_CLEAR_DB)
+        return [Reception(one, sent, sent.end, packet) for one in receivers]
 
     def _reached(self, sent: Transmission, heard: Hearers) -> _Reach:
         known = self._reach.get(sent.sender)

@@ -20,6 +20,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
+from gr_ros2.link.events import AirPacket
 from gr_ros2.medium.base import Medium, Reception, Surroundings, Transmission
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.phy import Phy
@@ -54,13 +55,13 @@ class _Ear:
     """One robot's receiver and what is on the air around it."""
 
     def __init__(self, phy: Phy, modem: BurstModem, noise: np.random.Generator) -> None:
-        self._receiver = modem.receiver()
+        self._phy, self._modem, self._receiver = phy, modem, modem.receiver()
         self._noise = noise
         self._taps = None if phy.receiver_taps is None else np.asarray(phy.receiver_taps, np.float32)
         self._tail = np.zeros(0 if self._taps is None else len(self._taps) - 1, np.complex64)
         self._power = phy.burst_power()
         self._lead = modem.preamble_samples + modem.margin + len(self._tail) + _MARGIN
-        self._at = 0
+        self._at = self._fed = 0
         self._coming: list[tuple[int, int, _Burst]] = []
         self._order = count()
         self.bursts: list[_Burst] = []
@@ -71,10 +72,24 @@ class _Ear:
         """A burst will reach this receiver."""
         heapq.heappush(self._coming, (burst.start, next(self._order), burst))
 
-    def hear(self, until: int) -> list[DemodulatedPacket]:
-        """The packets that are complete at a sample."""
-        _, samples = self.received(until)
-        return self._receiver.feed(self._filtered(samples))
+    def hear(self, until: int) -> list[tuple[DemodulatedPacket, _Burst | None]]:
+        """The packets that are complete at a sample, and the burst of each."""
+        begin, samples = self.received(until)
+        skipped = begin - self._fed
+        self._fed += len(samples)
+        return [(packet, self._burst_of(packet, skipped)) for packet in self._receiver.feed(self._filtered(samples))]
+
+    def _burst_of(self, packet: DemodulatedPacket, skipped: int) -> _Burst | None:
+        """The burst that began where a packet did, whatever its bytes: others may send the same. Of those that began
+        together it is the strongest.
+
+        :param skipped: samples of silence that the receiver did not get
+        """
+        if len(self.bursts) < 2:
+            return self.bursts[0] if self.bursts else None
+        length = self._modem.rates[packet.mcs].samples_of(len(packet.data))
+        first = packet.end + skipped - self._phy.lag - length
+        return min(self.bursts, key=lambda burst: (abs(burst.start - first), -burst.snr_db))
 
     def silent(self, until: int) -> bool:
         """Whether no burst reaches this receiver between the last sample that it got and this one."""
@@ -175,11 +190,11 @@ class SampleMedium(Medium):
         for receiver in self.hearers(sent).ids.tolist():
             ear = self._ear(receiver, sent.sender)
             arrived = False
-            for heard in ear.hear(until):
-                burst = next((one for one in ear.bursts if one.packet.data == heard.data), None)
+            for heard, burst in ear.hear(until):
                 packet, snr_db = (sent, math.inf) if burst is None else (burst.packet, burst.snr_db)
                 arrived = arrived or packet is sent
-                yield Reception(receiver, packet, sent.end, heard.data, snr_db, snr_db, heard.snr_db)
+                arrival = AirPacket(heard.data, packet.start, snr_db=heard.snr_db)
+                yield Reception(receiver, packet, sent.end, arrival, snr_db, snr_db)
             if not arrived:
                 self.lost.add(self._reason(sent, receiver), sent.sender, receiver)
 

@@ -13,8 +13,9 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import ClassVar, Literal
+
+from gr_ros2.core.closing import Closing
 
 Reliability = Literal["reliable", "best_effort"]
 Durability = Literal["volatile", "transient_local"]
@@ -148,7 +149,7 @@ class Subscription(ABC):
             self._on_offers(self._offers)
 
 
-class Middleware(ABC):
+class Middleware(Closing, ABC):
     """One participant of a ROS graph (or of a substitute for one).
 
     ``counters`` names what went wrong, for statistics: ``samples_lost:/topic``, ``incompatible_qos:/topic:policy``,
@@ -178,7 +179,7 @@ class Middleware(ABC):
     def discover(self) -> list[TopicInfo]:
         """The topics of the graph without the endpoints of this participant, sorted by name."""
 
-    def start(self) -> None:  # noqa: B027 - most back-ends deliver from subscribe() on
+    def start(self) -> None:
         """Start to deliver. Only finite sources (bags) wait for this call; others deliver from subscribe() on."""
 
     @property
@@ -222,11 +223,3 @@ class Middleware(ABC):
             thread.join(JOIN_S)
             if thread.is_alive():
                 _log.warning("%s: a callback has not returned; closing without it", thread.name)
-
-    def __enter__(self) -> Middleware:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

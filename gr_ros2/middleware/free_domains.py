@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterable
-from types import TracebackType
 
+from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import MiddlewareError
 
 FIRST = 41
@@ -21,7 +21,7 @@ _PARTICIPANTS = 8
 """Number of a domain's participants that are looked for."""
 
 
-class ReservedDomain:
+class ReservedDomain(Closing):
     """A domain, reserved until it is closed.
 
     :param candidates: numbers, in the order in which they are tried
@@ -50,14 +50,6 @@ class ReservedDomain:
     def close(self) -> None:
         """Give the domain back. Idempotent."""
         self._reservation.close()
-
-    def __enter__(self) -> ReservedDomain:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _unused(number: int) -> bool:

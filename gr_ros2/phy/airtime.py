@@ -6,7 +6,6 @@ time (`throttle` would let bursts through); the queue is unbounded and counted; 
 
 from __future__ import annotations
 
-import threading
 import time
 from array import array
 from collections.abc import Callable
@@ -20,10 +19,10 @@ from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.pdus import CREDIT, PDUS, credit_of, leave_at_of, mcs_of, octets, with_begin
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import WaitingBlock
 
 
-class AirtimeGate(gr.basic_block):  # type: ignore[misc]
+class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
     """Message ports `pdus` in, `pdus` out, `credit` out (see :class:`gr_ros2.gr.source.RosSource`).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
@@ -55,7 +54,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         times: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__("gr_ros2_airtime_gate", None, None)
+        super().__init__("gr-ros2-airtime", "gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
         self._clock: AirtimeClock[Any] = AirtimeClock(
             airtime, lead, ahead, limit, measured=True, timed=timed, listens=listens, ready=ready
@@ -68,13 +67,10 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         self.lateness = Lateness()
         self.passed_at = array("d")
         self._times = times
-        self._changed = threading.Condition()
-        self._running = False
         self._looks_at = inf
         """When its thread began with what it does, or looks again at the latest, s."""
         self.arrived = 0
         """Packets that have come."""
-        self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.message_port_register_out(CREDIT)
@@ -130,17 +126,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self._looks_at = self._now()
-        with self._changed:
-            self._running = True
-        self._thread.start(self._run, "gr-ros2-airtime")
-        return True
-
-    def stop(self) -> bool:
-        with self._changed:
-            self._running = False
-            self._changed.notify_all()
-        self._thread.stop()
-        return True
+        return super().start()
 
     def _arrive(self, pdu: Any) -> None:
         airtime = None
@@ -155,7 +141,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
             self.arrived += 1
             self._changed.notify_all()
 
-    def _run(self) -> None:
+    def run(self) -> None:
         while True:
             with self._changed:
                 if not self._running:

@@ -197,6 +197,11 @@ class Phy(ABC):
         return None
 
     @property
+    def lag(self) -> int:
+        """Samples from the end of a burst, as sent, to where the modem says that it ends, behind its filter."""
+        return 0
+
+    @property
     def receiver_taps(self) -> Any:
         """The filter in front of the modem; None = no filter."""
         return None

@@ -19,12 +19,13 @@ from gnuradio import filter, gr
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.link.events import AirPacket
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, BurstReceiver, DemodulatedPacket, Frames, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import decoders, fastest, which
-from gr_ros2.phy.pdus import PDUS, AirPacket, PduPort, octets, packets_of
+from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of
 from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, StreamTimes, whole_and_rest
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
@@ -113,7 +114,6 @@ class BurstPhy(Phy):
 
     @cached_property
     def lag(self) -> int:
-        """Samples from the end of a burst, as sent, to where the receiver says that it ends, behind its filter."""
         packet = bytes(range(min(self.packet_len, 32)))
         burst = self.running_modem.modulate(packet if self.any_length else packet.ljust(self.packet_len, b"\0"))
         before = self.running_modem.margin + self.running_modem.preamble_samples
@@ -367,7 +367,7 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
         end = self._first + packet.end
         first = end - self._lag - modem.samples_of(len(packet.data))
         mcs = packet.mcs if len(self._modem.rates) > 1 else None
-        return AirPacket(packet.data, mcs, packet.snr_db, self.times.at(first, end, self._slack))
+        return AirPacket(packet.data, self.times.at(first, end, self._slack), mcs=mcs, snr_db=packet.snr_db)
 
     def _packets(self, samples: Samples) -> list[DemodulatedPacket]:
         assert self._engine is not None

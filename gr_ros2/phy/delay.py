@@ -5,7 +5,6 @@ Invariants: no packet passes before its delay is over; packets stay in order; no
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from typing import Any
@@ -13,42 +12,26 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.phy.pdus import PDUS
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import WaitingBlock
 
 
-class PacketDelay(gr.basic_block):  # type: ignore[misc]
+class PacketDelay(WaitingBlock, gr.basic_block):  # type: ignore[misc]
     """Message port `pdus` in and out: every packet leaves ``delay_s`` seconds after it came."""
 
     def __init__(self, delay_s: float) -> None:
-        super().__init__("gr_ros2_packet_delay", None, None)
+        super().__init__("gr-ros2-delay", "gr_ros2_packet_delay", None, None)
         self._delay_s = delay_s
         self._waiting: deque[tuple[float, Any]] = deque()
-        self._changed = threading.Condition()
-        self._running = False
-        self._thread = BlockThread()
         self.message_port_register_in(PDUS)
         self.message_port_register_out(PDUS)
         self.set_msg_handler(PDUS, self._take)
-
-    def start(self) -> bool:
-        with self._changed:
-            self._running = True
-        self._thread.start(self._run, "gr-ros2-delay")
-        return True
-
-    def stop(self) -> bool:
-        with self._changed:
-            self._running = False
-            self._changed.notify_all()
-        self._thread.stop()
-        return True
 
     def _take(self, pdu: Any) -> None:
         with self._changed:
             self._waiting.append((time.monotonic() + self._delay_s, pdu))
             self._changed.notify_all()
 
-    def _run(self) -> None:
+    def run(self) -> None:
         while True:
             with self._changed:
                 while self._running and (left := self._left()) != 0:

@@ -16,10 +16,12 @@ import threading
 from collections.abc import Sequence
 from math import isfinite, nan
 from struct import Struct
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 from weakref import WeakSet
 
 import pmt
+
+from gr_ros2.link.events import AirPacket
 
 PDUS, CREDIT = pmt.intern("pdus"), pmt.intern("credit")
 """The message ports of the blocks: packets, and the credits that request them."""
@@ -28,9 +30,9 @@ _BUNDLE = pmt.intern("bundle")
 _MCS, _SNR_DB, _RECEIVED_AT, _BEGINS_AT, _LEAVE_AT = (
     pmt.intern(key) for key in ("mcs", "snr_db", "received_at", "begins_at", "leave_at")
 )
-_HEAD_OF = Struct(">Ibfdd")
-"""In a bundle, before each packet: its length in bytes, ``mcs`` (-1 for none), and ``snr_db``, ``at`` and ``leave_at``
-of :class:`AirPacket` (NaN for none)."""
+_HEAD_OF = Struct(">Iddbf")
+"""In a bundle, before each packet: its length in bytes, and ``at``, ``leave_at``, ``mcs`` and ``snr_db`` of
+:class:`gr_ros2.link.events.AirPacket` (NaN for none, -1 for no ``mcs``)."""
 _NO_METADATA = pmt.make_dict()
 _HEAD = b"\n\x00"
 _OFFSET = 8
@@ -52,22 +54,6 @@ def octets(vector: Any) -> bytes:
 def pdu_of(data: bytes, metadata: Any = _NO_METADATA) -> Any:
     """A packet as a PDU."""
     return pmt.cons(metadata, u8vector(data))
-
-
-class AirPacket(NamedTuple):
-    """A packet on its way to or from the air. Times are s on the machine's monotonic clock.
-
-    :param mcs: with an adaptive rate the MCS that it is sent with; None for a fixed rate
-    :param snr_db: SNR of its burst, dB; None where it is not measured
-    :param at: when its burst begins or began; None where that is not known
-    :param leave_at: when its burst has to begin; None for as soon as possible
-    """
-
-    data: bytes
-    mcs: int | None = None
-    snr_db: float | None = None
-    at: float | None = None
-    leave_at: float | None = None
 
 
 def pdu_to_send(packet: AirPacket, metadata: Any = _NO_METADATA) -> Any:
@@ -134,7 +120,7 @@ def packets_of(message: Any) -> tuple[list[AirPacket], str]:
         return [AirPacket(data)], ""
     received_at = _number(message, _RECEIVED_AT)
     at = _number(message, _BEGINS_AT) if received_at is None else received_at
-    return [AirPacket(data, mcs_of(message), _number(message, _SNR_DB), at, leave_at_of(message))], ""
+    return [AirPacket(data, at, leave_at_of(message), mcs_of(message), _number(message, _SNR_DB))], ""
 
 
 def _unbundled(data: bytes) -> list[AirPacket]:
@@ -142,9 +128,10 @@ def _unbundled(data: bytes) -> list[AirPacket]:
     packets = []
     start = _HEAD_OF.size
     while start <= len(data):
-        length, mcs, *numbers = _HEAD_OF.unpack_from(data, start - _HEAD_OF.size)
+        length, at, leave_at, mcs, snr_db = _HEAD_OF.unpack_from(data, start - _HEAD_OF.size)
         end = start + length
-        packets.append(AirPacket(data[start:end], None if mcs < 0 else mcs, *map(_known, numbers)))
+        mcs = None if mcs < 0 else mcs
+        packets.append(AirPacket(data[start:end], _known(at), _known(leave_at), mcs, _known(snr_db)))
         start = end + _HEAD_OF.size
     return packets
 
@@ -154,9 +141,15 @@ def _known(number: float) -> float | None:
 
 
 def _bundled(packet: AirPacket) -> bytes:
-    data, mcs, *numbers = packet
-    head = (nan if number is None else number for number in numbers)
-    return _HEAD_OF.pack(len(data), -1 if mcs is None else mcs, *head) + data
+    data, at, leave_at, mcs, snr_db = packet
+    head = _HEAD_OF.pack(
+        len(data),
+        nan if at is None else at,
+        nan if leave_at is None else leave_at,
+        -1 if mcs is None else mcs,
+        nan if snr_db is None else snr_db,
+    )
+    return head + data
 
 
 class PduPort:

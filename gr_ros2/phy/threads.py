@@ -11,6 +11,7 @@ import logging
 import os
 import sys
 import threading
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import cached_property
@@ -170,6 +171,38 @@ class BlockThread:
             self._thread.join(patience_s)
             self._thread = None
         self._state.release()
+
+
+class WaitingBlock:
+    """Mix-in for a Python block with a thread that waits for what changes; list it before GNU Radio's class.
+
+    :param thread: name of the thread
+    :param args: arguments of GNU Radio's class
+    """
+
+    def __init__(self, thread: str, *args: Any) -> None:
+        super().__init__(*args)
+        self._called = thread
+        self._changed = threading.Condition()
+        self._running = False
+        self._thread = BlockThread()
+
+    @abstractmethod
+    def run(self) -> None:
+        """What the thread does. It is woken by ``_changed``, and returns when ``_running`` is False."""
+
+    def start(self) -> bool:
+        with self._changed:
+            self._running = True
+        self._thread.start(self.run, self._called)
+        return True
+
+    def stop(self) -> bool:
+        with self._changed:
+            self._running = False
+            self._changed.notify_all()
+        self._thread.stop()
+        return True
 
 
 class KeepsThreadState:

@@ -6,7 +6,6 @@ time, since each message between blocks costs about as much as a packet; progres
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 
 import pmt
@@ -14,7 +13,7 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.pdus import CREDIT
-from gr_ros2.phy.threads import BlockThread
+from gr_ros2.phy.threads import WaitingBlock
 
 WINDOW = 32
 """Packets in progress: enough to keep the flowgraph busy between two polls of its progress."""
@@ -24,7 +23,7 @@ _SHARE = 4
 _POLL_S = 0.001
 
 
-class CreditWindow(gr.basic_block):  # type: ignore[misc]
+class CreditWindow(WaitingBlock, gr.basic_block):  # type: ignore[misc]
     """Message port `credit` out: an integer, the number of further packets that may come, whenever the air is free.
 
     :param progress: returns how many packets have passed
@@ -33,30 +32,20 @@ class CreditWindow(gr.basic_block):  # type: ignore[misc]
     """
 
     def __init__(self, progress: Callable[[], int], window: int = WINDOW) -> None:
-        super().__init__("gr_ros2_credit_window", None, None)
+        super().__init__("gr-ros2-window", "gr_ros2_credit_window", None, None)
         if window < 1:
             raise ConfigError(f"window = {window}: must be 1 or more")
         self._progress = progress
         self._window = window
-        self._stopped = threading.Event()
-        self._thread = BlockThread()
         self.message_port_register_out(CREDIT)
 
-    def start(self) -> bool:
-        self._stopped.clear()
-        self._thread.start(self._run, "gr-ros2-window")
-        return True
-
-    def stop(self) -> bool:
-        self._stopped.set()
-        self._thread.stop()
-        return True
-
-    def _run(self) -> None:
+    def run(self) -> None:
         granted = self._progress()
-        while not self._stopped.is_set():
+        while self._running:
             credits = self._progress() + self._window - granted
             if credits * _SHARE >= self._window:
                 self.message_port_pub(CREDIT, pmt.from_long(credits))
                 granted += credits
-            self._stopped.wait(_POLL_S)
+            with self._changed:
+                if self._running:
+                    self._changed.wait(_POLL_S)

@@ -15,8 +15,8 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from ipaddress import IPv4Address
-from types import TracebackType
 
+from gr_ros2.core.closing import Closing
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy.threads import shorten_switch_interval
 from gr_ros2.race.contenders import MTU, address_of
@@ -29,7 +29,7 @@ _IP_PROTOCOL, _IP_TO = 9, slice(16, 20)
 _IGMP = 2
 
 
-class RaceChannel:
+class RaceChannel(Closing):
     """A TUN device in each namespace, and the channel between them.
 
     :param namespaces: paths of the robots' namespaces
@@ -116,11 +116,3 @@ class RaceChannel:
     def close(self) -> None:
         """Stop the channel and remove the interfaces."""
         self._stack.close()
-
-    def __enter__(self) -> RaceChannel:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+from gr_ros2.core.closing import Closing
 from gr_ros2.middleware import Publisher, Qos, Subscription, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.base import MessageCallback, Reliability
@@ -189,7 +189,7 @@ def join(contender: Contender, seat: Seat) -> Network:
     return DdsNetwork(_DOMAIN, False, Qos(reliability, "volatile", _ROS_DEPTH))
 
 
-class RaceProgram:
+class RaceProgram(Closing):
     """A program of a robot.
 
     :param plays: None: it only listens
@@ -266,12 +266,7 @@ class RaceProgram:
         with self._lock:
             heard.append((now, payload))
 
-    def __enter__(self) -> RaceProgram:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         if self._bag is not None:
             self._bag.close()
         if self._network is not None:

@@ -14,11 +14,11 @@ from array import array
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
-from types import TracebackType
 from typing import Any
 
 from gnuradio import gr
 
+from gr_ros2.core.closing import Closing
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.block_settings import own_settings
 from gr_ros2.gr.factory import EndpointSetup, make_endpoint
@@ -101,7 +101,7 @@ class LinkReport:
     drops: dict[str, int]
 
 
-class RaceRosLink:
+class RaceRosLink(Closing):
     """gr-ros2 between two namespaces: a ROS graph and a robot's end of the link at each end, the radio between them.
 
     Version 1 uses both directions: messages there, reports back. Version 0 sends nothing back.
@@ -184,14 +184,6 @@ class RaceRosLink:
         """Stop the radio and leave both graphs."""
         self._stack.close()
 
-    def __enter__(self) -> RaceRosLink:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 class _FrameLog:
     """Logs the packets that one end sends."""
@@ -207,7 +199,7 @@ class _FrameLog:
         """Do nothing: a source does not receive."""
 
 
-class RaceIpLink:
+class RaceIpLink(Closing):
     """IP between two namespaces, in both directions: a TUN device at each end, one frame of the same length per packet.
 
     :param namespaces: paths of the namespaces of the sending and the receiving end
@@ -255,14 +247,6 @@ class RaceIpLink:
     def close(self) -> None:
         """Stop the radio and remove the interfaces."""
         self._stack.close()
-
-    def __enter__(self) -> RaceIpLink:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class TunSource(gr.basic_block):  # type: ignore[misc]

@@ -13,9 +13,9 @@ import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import TypeVar
 
+from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import RunError
 
 T = TypeVar("T")
@@ -27,7 +27,7 @@ _TOOLS = ("ip", "tc")
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-class Namespace:
+class Namespace(Closing):
     """A new network namespace. It contains only a loopback interface, which is down.
 
     :raises RunError: when this process has no permission to create one
@@ -46,14 +46,6 @@ class Namespace:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
-
-    def __enter__(self) -> Namespace:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def enter(path: str) -> None:

@@ -154,7 +154,7 @@ def record_sim(folder: Path, settings: RaceSettings) -> Path:
         publishers = {topic: bag.advertise(topic, "nav_msgs/msg/Odometry", Qos()) for topic in topics}
         for message in fleet.messages(settings.duration_s, _SIM_START_NS * 1e-9, topics):
             publisher = publishers[message.topic]
-            publisher.publish_at(message.payload, _SIM_START_NS + round(message.t * 1e9))  # type: ignore[attr-defined]
+            publisher.publish_at(message.payload, _SIM_START_NS + round(message.t * 1e9))
     return path
 
 

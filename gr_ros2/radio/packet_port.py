@@ -21,8 +21,9 @@ import pmt
 from gnuradio import gr
 
 from gr_ros2.core.errors import RadioError
+from gr_ros2.link.events import AirPacket
 from gr_ros2.phy import Phy
-from gr_ros2.phy.pdus import PDUS, AirPacket, octets, pdu_heard
+from gr_ros2.phy.pdus import PDUS, octets, pdu_heard
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.radio.framing import Framing
 from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters

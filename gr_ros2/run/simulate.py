@@ -21,14 +21,14 @@ from math import inf
 from typing import Any, Protocol
 
 from gr_ros2.core.errors import BagError, ConfigError, RunError
-from gr_ros2.gr.factory import EndpointSetup, make_endpoint
-from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, ReceiverEvent, SenderEvent, SenderStats, SentPacket
+from gr_ros2.gr.factory import make_endpoint
+from gr_ros2.link import Delivered, Lost, Received, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit, at_full_load
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.medium import Medium, Reception, make_medium
+from gr_ros2.medium import FixedPaths, Medium, Reception, Transmission, make_medium
 from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
@@ -36,7 +36,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phys, recorded_names, source_names
 from gr_ros2.run.recorders import make_recorder
-from gr_ros2.run.robots import Halves, halves_of_robots, start_of_run, surroundings
+from gr_ros2.run.robots import halves_of_robots, start_of_run, surroundings
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.task_run import TaskRun
 from gr_ros2.settings.config import robot_of
@@ -259,47 +259,22 @@ class Simulation:
         ways = scenario.directions()
         if messages is None:
             messages = offered_by(ways, registry) if task is None else task.offered()
-        coming: list[Iterator[Upcoming]] = list(messages)
-        shared = scenario.duplex == "half"
-        any_length = all(phy.any_length for phy in phys)
-        start = start_of_run(
-            ways,
-            any_length=any_length,
-            mcs_table=phys[0].mcs_table,
-            half_duplex=shared,
-            airtime_s=phys[0].airtime(),
-        )
-        self.robots: list[Robot] = []
-        starts = random.Random(f"starts {scenario.seed}")
-        for number, halves in enumerate(halves_of_robots(ways)):
-            sends = number < len(ways)
-            phy = phys[number if sends else 0]
-            endpoint, events = _endpoint(registry, halves, codec, start, ways[0].seed)
-            robot = Robot(
-                scenario,
-                number,
-                endpoint,
-                events=events,
-                src_id=robot_of(*halves),
-                airtime=phy.airtime,
-                messages=coming[number] if sends else iter(()),
-                start_s=starts.uniform(0.0, STARTED_S) if scenario.robots else 0.0,
-                busy=ideal,
-            )
-            self.robots.append(robot)
+        self.robots = _robots(scenario, registry, phys, messages, codec=codec, busy=ideal)
         all_phys = [phys[number if number < len(ways) else 0] for number in range(len(self.robots))]
         self.around = around = surroundings(scenario, phys[0].sample_rate, task)
+        shared = scenario.duplex == "half"
         if ideal:
             self.medium: Medium = PacketMedium(around, all_phys, shared=shared, ideal=True)
         else:
             heard = {receiver for number in range(len(self.robots)) for receiver in around.reached(number)}
+            answered = any(self.robots[number].endpoint.answers for number in heard)
             self.medium = make_medium(
                 around,
                 all_phys,
                 samples=scenario.time == "samples",
                 shared=shared,
                 seed=scenario.seed,
-                at_once=any(self.robots[number].endpoint.answers for number in heard),
+                ahead=() if answered else _rehearsed(scenario, registry, phys),
             )
 
     def events(self) -> Iterator[TimedEvent]:
@@ -322,13 +297,69 @@ class Simulation:
         return all(robot.empty for robot in self.robots)
 
 
-def _endpoint(
-    registry: Registry, halves: Halves, codec: MessageCodec | None, start: EndpointSetup, seed: int
-) -> tuple[Endpoint, list[SenderEvent]]:
-    """An endpoint, and the list to which it adds the events of its sending half."""
-    events: list[SenderEvent] = []
-    rng = None if halves[0] is None else random.Random(seed)
-    return make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=events.append), events
+def _robots(
+    scenario: Scenario,
+    registry: Registry,
+    phys: Sequence[Phy],
+    messages: Sequence[Iterator[Upcoming]],
+    *,
+    codec: MessageCodec | None = None,
+    busy: bool = False,
+) -> list[Robot]:
+    """The robots of a run, those that send first; see :class:`Simulation` and :class:`Robot`."""
+    ways = scenario.directions()
+    start = start_of_run(
+        ways,
+        any_length=all(phy.any_length for phy in phys),
+        mcs_table=phys[0].mcs_table,
+        half_duplex=scenario.duplex == "half",
+        airtime_s=phys[0].airtime(),
+    )
+    robots: list[Robot] = []
+    starts = random.Random(f"starts {scenario.seed}")
+    for number, halves in enumerate(halves_of_robots(ways)):
+        sends = number < len(ways)
+        events: list[SenderEvent] = []
+        rng = None if halves[0] is None else random.Random(ways[0].seed)
+        endpoint = make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=events.append)
+        robot = Robot(
+            scenario,
+            number,
+            endpoint,
+            events=events,
+            src_id=robot_of(*halves),
+            airtime=phys[number if sends else 0].airtime,
+            messages=messages[number] if sends else iter(()),
+            start_s=starts.uniform(0.0, STARTED_S) if scenario.robots else 0.0,
+            busy=busy,
+        )
+        robots.append(robot)
+    return robots
+
+
+class _Unheard(Medium):
+    """A medium on which nobody hears anything.
+
+    :ivar over: packets whose airtime is over
+    """
+
+    def __init__(self, robots: int) -> None:
+        super().__init__(FixedPaths([[]] * robots), shared=False)
+        self.over: list[Transmission] = []
+
+    def outcome(self, sent: Transmission) -> tuple[()]:
+        self.over.append(sent)
+        return ()
+
+
+def _rehearsed(scenario: Scenario, registry: Registry, phys: Sequence[Phy]) -> Iterator[Transmission]:
+    """What the robots send as long as they hear nothing. Where nobody answers, that is what they send in any case."""
+    robots = _robots(scenario, registry, phys, offered_by(scenario.directions(), registry))
+    medium = _Unheard(len(robots))
+    for _ in EventLoop(robots, medium).run():
+        yield from medium.over
+        medium.over.clear()
+    yield from medium.over
 
 
 class Robot:
@@ -411,8 +442,7 @@ class Robot:
 
     def receive(self, reception: Reception) -> Iterator[TimedEvent]:
         """Take what has come out of the receiver."""
-        arrival = ReceivedPacket(reception.data, reception.sent.start, reception.measured_db)
-        for event in self.endpoint.receive(arrival, reception.at):
+        for event in self.endpoint.receive(reception.packet, reception.at):
             yield reception.at, self, event
 
     def expire(self, now: float) -> Iterator[TimedEvent]:
@@ -463,15 +493,6 @@ class EventLoop:
     def run(self) -> Iterator[TimedEvent]:
         """Everything that happens, in the order of time, until nothing is left or the time to drain is over. To be
         called only once."""
-        held: list[tuple[float, int, TimedEvent]] = []  # events after a packet of which nobody knows yet who gets it
-        for order, timed_event in enumerate(self._all()):
-            heapq.heappush(held, (timed_event[0], order, timed_event))
-            while held and held[0][0] <= self._medium.known_until:
-                yield heapq.heappop(held)[2]
-        while held:
-            yield heapq.heappop(held)[2]
-
-    def _all(self) -> Iterator[TimedEvent]:
         for robot in self._robots:
             self._plan(robot)
         in_vain = 0
@@ -488,7 +509,6 @@ class EventLoop:
             in_vain = 0 if happened or now > before else in_vain + 1
             if in_vain == _IN_VAIN:
                 raise self._stalled()
-        yield from self._received(self._medium.rest(), set())
         for robot in self._robots:
             yield from robot.expire(self.now)
 
@@ -514,28 +534,20 @@ class EventLoop:
             number = heapq.heappop(self._agenda)[1]
             self._at[number] = inf
             concerned.add(number)
-            if not self._medium.late:
-                for timed_event in self._robots[number].expire(now):
-                    yield timed_event
-                    self._robots[number].wake(now)
-        yield from self._received(self._medium.receptions(now), concerned)
+            for timed_event in self._robots[number].expire(now):
+                yield timed_event
+                self._robots[number].wake(now)
+        for reception in self._medium.receptions(now):
+            concerned.add(reception.receiver)
+            robot = self._robots[reception.receiver]
+            for timed_event in robot.receive(reception):
+                yield timed_event
+                robot.wake(now)
         for number in sorted(concerned):
             robot = self._robots[number]
             if robot.due <= now:
                 yield from robot.step(now, self._medium)
             self._plan(robot)
-
-    def _received(self, receptions: Iterable[Reception], concerned: set[int]) -> Iterator[TimedEvent]:
-        """Hand over what was received, and note by whom."""
-        late = self._medium.late
-        for reception in receptions:
-            concerned.add(reception.receiver)
-            robot = self._robots[reception.receiver]
-            if late:
-                yield from robot.expire(reception.at)
-            for timed_event in robot.receive(reception):
-                yield timed_event
-                robot.wake(self.now)
 
     def _soonest(self) -> float:
         """When a robot has something to do next."""
@@ -545,7 +557,7 @@ class EventLoop:
 
     def _plan(self, robot: Robot) -> None:
         """Note when a robot has something to do next."""
-        timeout = None if self._medium.late else robot.endpoint.next_timeout()
+        timeout = robot.endpoint.next_timeout()
         # A timeout that stays in the past has been handled.
         at, number = robot.due, robot.number
         if timeout is not None and self.now < timeout < at:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.compression import LinkCodec
-from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, ReceiverEvent
+from gr_ros2.link import AirPacket, Delivered, Lost, Received, ReceiverEvent
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.registry import Registry
@@ -22,7 +22,7 @@ def received(coded: bytes, *, codec: LinkCodec | None, compressed: bool = True) 
     events: list[ReceiverEvent] = []
     for n, piece in enumerate(pieces):
         packet = PacketV0(1, 255, n, 1, (EntryV0(0, 7, n, len(pieces), piece),), compressed=compressed)
-        events += receiver.receive(ReceivedPacket(V0.encode(packet, PACKET_LEN)), 0.0)
+        events += receiver.receive(AirPacket(V0.encode(packet, PACKET_LEN)), 0.0)
     lost = [key for key, count in receiver.stats.lost.items() if count == 1]
     assert lost == [(event.src_id, event.topic_id, event.reason) for event in events if isinstance(event, Lost)]
     return [event for event in events if not isinstance(event, Received)]

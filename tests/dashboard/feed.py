@@ -6,7 +6,7 @@ import random
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.link.v0.sender import Sender
@@ -69,7 +69,7 @@ class Feed:
 
     def hear(self, data: bytes, now: float) -> None:
         """Bytes come to the receiver."""
-        self._tell(self.receiver.receive(ReceivedPacket(data), now), now)
+        self._tell(self.receiver.receive(AirPacket(data), now), now)
 
     def pass_time(self, now: float) -> None:
         """Time passes at the receiver."""

@@ -14,7 +14,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.gr import RosLink
 from gr_ros2.gr.factory import EndpointSetup
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import ReceiverEvent
 from gr_ros2.mac import Slots
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -82,7 +82,7 @@ class LinkedRobot:
     def receive(self, data: bytes, now: float, began: float) -> None:
         """Take a packet."""
         with self.link.end.lock:
-            events = self._endpoint.receive(ReceivedPacket(data, began), now)
+            events = self._endpoint.receive(AirPacket(data, began), now)
         self._settle(events)
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.gr.pmts import PduMaker
-from gr_ros2.phy.pdus import AirPacket, packets_of
+from gr_ros2.link.events import AirPacket
+from gr_ros2.phy.pdus import packets_of
 from gr_ros2.wire.v0 import PacketV0
 
 PACKET = PacketV0(1, 255, 0, 1, ())

@@ -138,7 +138,7 @@ def test_garbage_is_counted_and_nothing_else_is_lost(rig: Rig) -> None:
         rig.probe.post_message(message)
     for data in (b"", bytes(13), bytes(PACKET_LEN), bytes(5000), broken, *good):
         rig.probe.post(data)
-    wait_for(lambda: rig.heard == [stamped(5)])
+    wait_for(lambda: rig.heard == [stamped(5)] and sink.handled == 9 + len(good))
     stats = sink.stats()
     assert (stats["not_a_pair"], stats["not_u8"], stats["handler_failed"]) == (2, 2, 0)
     assert stats["rejected"]["length"] == 3

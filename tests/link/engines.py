@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from gr_ros2.link import Delivered, Received, ReceivedPacket, ReceiverEvent
+from gr_ros2.link import AirPacket, Delivered, Received, ReceiverEvent
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.link.v0.sender import Sender
 from gr_ros2.settings.config import SinkConfig, SourceConfig, build
@@ -47,7 +47,7 @@ def read(data: bytes) -> PacketV0:
 
 def take(engine: Receiver, data: bytes, now: float) -> list[ReceiverEvent]:
     """What comes of a packet, beside that it came."""
-    return [event for event in engine.receive(ReceivedPacket(data), now) if not isinstance(event, Received)]
+    return [event for event in engine.receive(AirPacket(data), now) if not isinstance(event, Received)]
 
 
 def delivered(events: list[ReceiverEvent]) -> list[bytes]:

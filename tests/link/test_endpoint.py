@@ -8,7 +8,7 @@ from math import inf
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import Delivered, Endpoint, Lost, ReceivedPacket, SenderEvent, SentPacket
+from gr_ros2.link import AirPacket, Delivered, Endpoint, Lost, SenderEvent, SentPacket
 from gr_ros2.link.v0.endpoint import EndpointV0
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from tests.link.engines import registry
@@ -30,9 +30,7 @@ def run(ends: list[Endpoint], until: float) -> list[list[bytes]]:
         for place, (one, other) in enumerate((ends, ends[::-1])):
             events = one.handle_timeout(now)
             while (data := data_of(one.next_packet(now))) is not None:
-                got[1 - place] += [
-                    e.payload for e in other.receive(ReceivedPacket(data), now) if isinstance(e, Delivered)
-                ]
+                got[1 - place] += [e.payload for e in other.receive(AirPacket(data), now) if isinstance(e, Delivered)]
             assert not any(isinstance(event, Delivered) for event in events)
         later = [at for e in ends for at in (e.next_timeout(), e.next_departure()) if at is not None]
         assert all(at > now for at in later), "what is due has been done"
@@ -59,8 +57,8 @@ def test_an_end_that_only_sends_and_one_that_only_hears() -> None:
     source.messages.submit(0, bytes(100), 0.0)
     packets = [data_of(source.next_packet(number / 100)) for number in range(4)]
     assert packets[2:] == [None] * 2, "two fragments"
-    assert source.receive(ReceivedPacket(packets[0] or b""), 0.0) == source.handle_timeout(9.0) == []
-    events = [event for data in packets[:2] for event in sink.receive(ReceivedPacket(data or b""), 0.0)]
+    assert source.receive(AirPacket(packets[0] or b""), 0.0) == source.handle_timeout(9.0) == []
+    events = [event for data in packets[:2] for event in sink.receive(AirPacket(data or b""), 0.0)]
     assert [event.payload for event in events if isinstance(event, Delivered)] == [bytes(100)]
     assert sink.next_packet(0.0) is None
     assert sink.idle
@@ -74,7 +72,7 @@ def test_each_half_says_when_it_has_something_to_do() -> None:
     other.messages.submit(0, bytes(160), 0.0)
     first, _ = data_of(other.next_packet(0.0)), data_of(other.next_packet(0.0))
     assert other.next_departure() == pytest.approx(0.01), "the next packet"
-    one.receive(ReceivedPacket(first or b""), 0.0)
+    one.receive(AirPacket(first or b""), 0.0)
     assert one.next_timeout() == pytest.approx(0.5), "the incomplete message"
     one.messages.submit(0, b"x", 0.1)
     assert one.next_departure() == pytest.approx(-inf)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import pytest
 
-from gr_ros2.link import Delivered, ReceivedPacket
+from gr_ros2.link import AirPacket, Delivered
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.settings.config import SinkConfig, build
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
@@ -87,7 +87,7 @@ def carry(send: Sending, loss: float, seed: int) -> tuple[int, set[int]]:
         data = V0.encode(PacketV0(1, 255, number & 255, 1, (entry,)), 64)
         if rng.random() < loss:
             continue
-        for event in sink.receive(ReceivedPacket(data), number / PACKET_RATE):
+        for event in sink.receive(AirPacket(data), number / PACKET_RATE):
             if isinstance(event, Delivered):
                 message = int.from_bytes(event.payload[:4], "big")
                 whole = event.payload == event.payload[:4] * (10 * piece.total)
@@ -130,10 +130,10 @@ def test_two_messages_under_one_id_at_the_same_time_are_both_lost() -> None:
     sink = receiver(packet_len=64)
     events = []
     for seq, (index, payload) in enumerate([(0, b"A0"), (0, b"B0"), (1, b"A1"), (1, b"B1")]):
-        events += sink.receive(ReceivedPacket(packet(seq, EntryV0(0, 7, index, 2, payload))), 0.0)
+        events += sink.receive(AirPacket(packet(seq, EntryV0(0, 7, index, 2, payload))), 0.0)
     assert delivered(events) == []
-    events += sink.receive(ReceivedPacket(packet(4, EntryV0(0, 8, 0, 2, b"C0"))), 0.0)
-    events += sink.receive(ReceivedPacket(packet(5, EntryV0(0, 8, 1, 2, b"C1"))), 0.0)
+    events += sink.receive(AirPacket(packet(4, EntryV0(0, 8, 0, 2, b"C0"))), 0.0)
+    events += sink.receive(AirPacket(packet(5, EntryV0(0, 8, 1, 2, b"C1"))), 0.0)
     assert delivered(events) == [b"C0C1"]
 
 
@@ -141,7 +141,7 @@ def test_fragments_in_reverse_are_refused_from_the_second_message_on() -> None:
     sink = receiver(packet_len=64)
     events = []
     for seq, (entry_id, index) in enumerate([(1, 1), (1, 0), (2, 1), (2, 0), (3, 1), (3, 0)]):
-        events += sink.receive(ReceivedPacket(packet(seq, EntryV0(0, entry_id, index, 2, bytes([entry_id])))), 0.0)
+        events += sink.receive(AirPacket(packet(seq, EntryV0(0, entry_id, index, 2, bytes([entry_id])))), 0.0)
     assert delivered(events) == [b"\x01\x01"]
     assert sink.stats.lost[1, 0, "lost_fragments"] == 2
 
@@ -150,11 +150,9 @@ def test_a_sender_that_keeps_to_the_rules_after_a_restart_is_trusted_again() -> 
     sink = receiver(packet_len=64)
     for number in range(100):
         for index in (1, 0):
-            sink.receive(
-                ReceivedPacket(packet(2 * number + index & 255, EntryV0(0, number, index, 2, b"x"))), number * 0.1
-            )
+            sink.receive(AirPacket(packet(2 * number + index & 255, EntryV0(0, number, index, 2, b"x"))), number * 0.1)
     later = [EntryV0(0, 200, index, 3, bytes([index])) for index in range(3)]
-    events = sink.receive(ReceivedPacket(packet(50, later[0])), 60.0)
-    events += sink.receive(ReceivedPacket(packet(52, later[2])), 60.2)  # the two change places on the way
-    events += sink.receive(ReceivedPacket(packet(51, later[1])), 60.3)
+    events = sink.receive(AirPacket(packet(50, later[0])), 60.0)
+    events += sink.receive(AirPacket(packet(52, later[2])), 60.2)  # the two change places on the way
+    events += sink.receive(AirPacket(packet(51, later[1])), 60.3)
     assert delivered(events) == [b"\x00\x01\x02"]

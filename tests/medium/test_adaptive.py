@@ -17,7 +17,7 @@ from gr_ros2.medium import Path as Way
 from gr_ros2.medium.fading import RayleighFading
 from gr_ros2.medium.packets import PacketMedium, limits_of
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.phy.ofdm_rate import RATES
+from gr_ros2.phy.ofdm import RATES
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.observers import RunObservers
 from gr_ros2.run.scenario import Scenario, scenario_from
@@ -114,7 +114,7 @@ def test_packets_may_pass_through_the_modem_of_their_rate() -> None:
         medium.send(0, bytes(220), number, phy.airtime(220, mcs), mcs)
     received = list(medium.receptions(3.0))
     assert [reception.sent.mcs for reception in received] == [0, 2]
-    assert [reception.measured_db for reception in received] == pytest.approx([9.0, 9.0], abs=3.0)
+    assert [reception.packet.snr_db for reception in received] == pytest.approx([9.0, 9.0], abs=3.0)
 
 
 def test_fading_is_that_of_rayleigh_and_a_function_of_time() -> None:

@@ -103,6 +103,23 @@ def test_the_stronger_of_two_bursts_may_survive(time: str) -> None:
         assert heard[0].sinr_db == pytest.approx(21.4, abs=0.1)
 
 
+@pytest.mark.parametrize("stronger", [0, 1])
+@pytest.mark.parametrize("offset", [0.0, 0.005, 0.3, 0.9])
+def test_of_robots_that_send_equal_bytes_the_one_that_is_heard_is_named(stronger: int, offset: float) -> None:
+    of = phy()
+    snrs_db = [8.0, 8.0]
+    snrs_db[stronger] = 32.0
+    paths = [[Path(2, ChannelConfig(snr_db=snr_db))] for snr_db in snrs_db]
+    medium = media([*paths, []], of, shared=True)["samples"]
+    airtime = of.airtime()
+    for sender in (0, 1):
+        medium.send(sender, bytes(PACKET_LEN), (1 + offset * sender) * airtime, airtime)
+    heard = list(medium.receptions(4 * airtime))
+    assert [(one.sent.sender, one.snr_db) for one in heard] == [(stronger, 32.0)]
+    assert heard[0].packet.at == heard[0].sent.start
+    assert medium.lost[1 - stronger, 2] == {"collision": 1}
+
+
 def test_a_path_with_a_delay_receives_later() -> None:
     of = phy()
     paths = [[Path(1, ChannelConfig(), delay_s=0.25)], []]

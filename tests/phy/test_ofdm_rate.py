@@ -14,12 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.events import AirPacket
 from gr_ros2.phy import PHY
 from gr_ros2.phy.burst import DemodulatedPacket, Samples
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.length_word import LENGTHS, RATES, WORD_BITS, LengthWord, header_bits, header_crc, mcs_mark
-from gr_ros2.phy.ofdm_rate import RATES as MCS_TABLE
-from gr_ros2.phy.pdus import AirPacket, packets_of, pdu_to_send
+from gr_ros2.phy.ofdm import RATES as MCS_TABLE
+from gr_ros2.phy.pdus import packets_of, pdu_to_send
 from tests.gr.probe import Probe
 from tests.phy.test_burst import noise
 from tests.waiting import wait_for
@@ -151,7 +152,7 @@ def test_the_rate_of_a_pdu_is_sent_and_comes_out_with_the_snr() -> None:
     rates = [0, 6, 3, 1, 5, 99]
     with top:
         for mcs in rates:
-            probe.post_message(pdu_to_send(AirPacket(bytes([mcs]) * 20, mcs)))
+            probe.post_message(pdu_to_send(AirPacket(bytes([mcs]) * 20, mcs=mcs)))
         wait_for(lambda: len(probe.messages) == len(rates), "every packet")
     packets = [packet for message in probe.messages for packet in packets_of(message)[0]]
     assert [packet.mcs for packet in packets] == [0, 6, 3, 1, 5, 0]

@@ -14,7 +14,8 @@ from gnuradio import gr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.phy.pdus import AirPacket, PduPort, _bundled, packets_of, pdu_heard, pdu_of, pdu_to_send, u8vector
+from gr_ros2.link.events import AirPacket
+from gr_ros2.phy.pdus import PduPort, _bundled, packets_of, pdu_heard, pdu_of, pdu_to_send, u8vector
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 
@@ -85,13 +86,14 @@ def test_a_pdu_is_one_packet(data: bytes) -> None:
 
 
 _TIMES = st.none() | st.floats(0, 1e9)
+_SNRS = st.none() | st.floats(-100, 100, width=32)
 
 
-@given(st.lists(st.builds(AirPacket, st.binary(max_size=40), st.none() | st.integers(0, 7), st.none(), _TIMES, _TIMES)))
+@given(st.lists(st.builds(AirPacket, st.binary(max_size=40), _TIMES, _TIMES, st.none() | st.integers(0, 7), _SNRS)))
 def test_a_bundle_carries_what_a_pdu_says(packets: list[AirPacket]) -> None:
     assert packets_of(pmt.cons(pmt.intern("bundle"), u8vector(b"".join(map(_bundled, packets))))) == (packets, "")
     for packet in packets:
-        to_send, heard = packet._replace(at=None), packet._replace(leave_at=None)
+        to_send, heard = packet._replace(at=None, snr_db=None), packet._replace(leave_at=None)
         assert packets_of(pdu_to_send(to_send)) == ([to_send], "")
         assert packets_of(pdu_heard(heard)) == ([heard], "")
 

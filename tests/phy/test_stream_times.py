@@ -13,10 +13,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import pmt
 from gnuradio import blocks, gr
 
+from gr_ros2.link.events import AirPacket
 from gr_ros2.phy import PHY
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.flowgraph import Flowgraph
-from gr_ros2.phy.pdus import AirPacket, packets_of, pdu_to_send
+from gr_ros2.phy.pdus import packets_of, pdu_to_send
 from gr_ros2.phy.stream_times import RX_TIME, StreamTimes, seconds_of, whole_and_rest
 from tests.gr.probe import Probe
 from tests.waiting import wait_for

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from tests.packets import data_of
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
@@ -340,6 +340,6 @@ def test_messages_of_odometry_arrive_at_20_db() -> None:
     phy = make(760)
     arrived = deliver(phy, modulated(phy, packets), ChannelConfig(snr_db=20, seed=1))
     receiver = Receiver(registry, SinkConfig(packet_len=760))
-    events = [event for packet in arrived for event in receiver.receive(ReceivedPacket(packet), 0.0)]
+    events = [event for packet in arrived for event in receiver.receive(AirPacket(packet), 0.0)]
     delivered = [event.payload for event in events if isinstance(event, Delivered)]
     assert delivered == messages

@@ -156,7 +156,8 @@ TIMED = """
 import json, sys, time
 from gr_ros2.phy import PHY
 from gr_ros2.phy.flowgraph import Flowgraph
-from gr_ros2.phy.pdus import AirPacket, packets_of, pdu_to_send
+from gr_ros2.link.events import AirPacket
+from gr_ros2.phy.pdus import packets_of, pdu_to_send
 from gr_ros2.radio.radio import make_radio
 from tests.gr.probe import Probe
 from tests.waiting import wait_for

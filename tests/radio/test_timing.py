@@ -11,8 +11,9 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
+from gr_ros2.link.events import AirPacket
 from gr_ros2.phy.flowgraph import Flowgraph
-from gr_ros2.phy.pdus import AirPacket, packets_of, pdu_to_send
+from gr_ros2.phy.pdus import packets_of, pdu_to_send
 from gr_ros2.radio.radio import Radio, make_radio
 from tests.gr.probe import Probe
 from tests.waiting import wait_for

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.core.errors import CrcError, PadError, RunError
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import (
     Accepted,
     Delivered,
@@ -345,7 +345,7 @@ def test_what_a_codec_changes_on_purpose_is_delivered_and_nothing_else_is(decode
     for now, payload in enumerate(written):
         sender.submit(0, payload, now)
         while (data := data_of(sender.next_packet(now))) is not None:
-            for event in receiver.receive(ReceivedPacket(data), now):
+            for event in receiver.receive(AirPacket(data), now):
                 if isinstance(event, Received):
                     assert ledger.packet_received(event.identity) is not None
                 ledger.receiver_event(event, now)
@@ -392,7 +392,7 @@ def test_the_engines_over_a_bad_link(
         events = receiver.handle_timeout(now)
         while len(air) > delay:
             data = air.pop(0)
-            events += receiver.receive(ReceivedPacket(data), now)
+            events += receiver.receive(AirPacket(data), now)
         for event in events:
             if isinstance(event, Received):
                 assert ledger.packet_received(event.identity) is not None

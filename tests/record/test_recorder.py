@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.link.v0.sender import Sender
 from gr_ros2.record.positions import humble_types
@@ -41,7 +41,7 @@ def test_a_run_over_the_engines() -> None:
         while (data := data_of(sender.next_packet(now))) is not None:
             if 20 <= step < 30:  # an outage
                 continue
-            for event in receiver.receive(ReceivedPacket(data), now + 0.05):
+            for event in receiver.receive(AirPacket(data), now + 0.05):
                 recorder.receiver_event(event, now + 0.05)
     assert recorder.progress() == (100, 90)
     at, imu = recorder.finish(duration_s=10, t_end=110)

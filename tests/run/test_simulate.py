@@ -11,7 +11,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.gr.factory import message_codec
-from gr_ros2.link import Delivered, ReceivedPacket, ReceiverEvent, SenderEvent
+from gr_ros2.link import AirPacket, Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.v0.endpoint import EndpointV0
 from gr_ros2.medium import FixedPaths
@@ -193,7 +193,7 @@ class Answering(EndpointV0):
 
     answers = True
 
-    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+    def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         events = super().receive(arrival, now)
         for event in events:
             if isinstance(event, Delivered):

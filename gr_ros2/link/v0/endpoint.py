@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.endpoint import HeardRobot, Questions, check_live
-from gr_ros2.link.events import Delivered, Lost, ReceivedPacket, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import Mcs
@@ -84,7 +84,7 @@ class EndpointV0:
         """See :class:`PacketSide`."""
         return None if self._sender is None else self._sender.next_timeout()
 
-    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+    def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         """See :class:`PacketSide`."""
         return [] if self._receiver is None else self._receiver.receive(arrival, now)
 

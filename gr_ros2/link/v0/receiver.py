@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
-from gr_ros2.link.events import Delivered, Lost, PacketId, Received, ReceivedPacket, ReceiverEvent, Rejected
+from gr_ros2.link.events import AirPacket, Delivered, Lost, PacketId, Received, ReceiverEvent, Rejected
 from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
@@ -60,7 +60,7 @@ class Receiver:
         self._sources: dict[int, _Source] = {}
         self._partials = Partials()
 
-    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+    def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         """Take one packet; the events it causes, in order."""
         data = arrival.data
         events = self.handle_timeout(now) if self._partials.size else []
@@ -71,7 +71,9 @@ class Receiver:
             events.append(Rejected(data, error))
             return events
         self.stats.packets += 1
-        events.append(Received(data, packet, PacketId(packet.src_id, 0, packet.seq, crc32(data)), *arrival[1:]))
+        events.append(
+            Received(data, packet, PacketId(packet.src_id, 0, packet.seq, crc32(data)), arrival.at, arrival.snr_db)
+        )
         source = self._admit(packet, now)
         if source is not None:
             self._take(source, packet, data, now, events)

@@ -19,7 +19,7 @@ from typing import Any
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.access import Access
 from gr_ros2.link.endpoint import HeardRobot, check_live
-from gr_ros2.link.events import Delivered, Lost, ReceivedPacket, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.custody import Custody
@@ -273,7 +273,7 @@ class EndpointV1:
             return max(self._access.departure(self._now) - self._lead, self.pace.slot)
         return self._sending.next_departure(self._now)
 
-    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+    def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         self._now = now if now > self._now else self._now
         return self._receiving.receive(arrival, now)

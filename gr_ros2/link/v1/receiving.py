@@ -11,13 +11,13 @@ from math import inf
 from gr_ros2.core.errors import EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.access import Access
 from gr_ros2.link.events import (
+    AirPacket,
     Delivered,
     Gone,
     Lost,
     Met,
     PacketId,
     Received,
-    ReceivedPacket,
     ReceiverEvent,
     Rejected,
 )
@@ -103,7 +103,7 @@ class ReceivingSide:
         """Use the parts of the sending half that what arrives can change."""
         self._sending, self._messages, self._window, self._rate = sending, messages, window, rate
 
-    def receive(self, arrival: ReceivedPacket, now: float) -> list[ReceiverEvent]:
+    def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         """Take one packet; the events it causes, in order."""
         self._now = now
         self._receive(arrival, now)
@@ -151,7 +151,7 @@ class ReceivingSide:
         self.stats.lost[event.src_id, event.topic_id, Fate.PUBLISH_FAILED.value] += 1
         return Lost(event.src_id, event.topic_id, Fate.PUBLISH_FAILED, event.key)
 
-    def _receive(self, arrival: ReceivedPacket, now: float) -> None:
+    def _receive(self, arrival: AirPacket, now: float) -> None:
         try:
             header = read_header(arrival.data, self._settings.packet_len)
             opened = self._open(arrival.data, header, now)
@@ -172,14 +172,14 @@ class ReceivingSide:
             return
         if opened.met or proved:
             for early in self.neighbours.early(opened.neighbour.src_id):
-                self._receive(ReceivedPacket(early), now)
+                self._receive(AirPacket(early), now)
 
-    def _note_slot(self, access: Access, header: Header, arrival: ReceivedPacket, now: float, *, trusted: bool) -> None:
+    def _note_slot(self, access: Access, header: Header, arrival: AirPacket, now: float, *, trusted: bool) -> None:
         """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
-        if arrival.received_at is None or header.src_id == self._settings.src_id:
+        if arrival.at is None or header.src_id == self._settings.src_id:
             return
         block = read_block(header.block)[0] if header.block else None
-        access.hear(header.src_id, block, arrival.received_at, trusted=trusted)
+        access.hear(header.src_id, block, arrival.at, trusted=trusted)
         if self.relaying is not None and trusted:
             self.relaying.heard(header.src_id, block, now)
 
@@ -203,7 +203,7 @@ class ReceivingSide:
         own = self._settings.src_id
         return header.dst_id in (BROADCAST, own) or own == NOBODY
 
-    def _use(self, arrival: ReceivedPacket, opened: Opened, now: float) -> bool:
+    def _use(self, arrival: AirPacket, opened: Opened, now: float) -> bool:
         """Take an opened packet; returns whether packets that were kept until a proof can be taken now."""
         self.stats.packets += 1
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
@@ -221,7 +221,7 @@ class ReceivingSide:
         encrypted = neighbour.trailer.encrypts and not clear
         packet = PacketV1(header, tuple(entries), repair, opened.body if mask else b"", encrypted)
         identity = PacketId(neighbour.src_id, neighbour.boot, number, repair_id)
-        self._outcomes.events.append(Received(arrival.data, packet, identity, arrival.received_at, arrival.snr_db))
+        self._outcomes.events.append(Received(arrival.data, packet, identity, arrival.at, arrival.snr_db))
         if repair is None:
             inbox.source(number, opened.body, entries, header.qos, now)
         elif mask:
@@ -231,7 +231,7 @@ class ReceivingSide:
         return False
 
     def _control(
-        self, arrival: ReceivedPacket, opened: Opened, repair: RepairHeader, entries: Sequence[EntryV1], now: float
+        self, arrival: AirPacket, opened: Opened, repair: RepairHeader, entries: Sequence[EntryV1], now: float
     ) -> bool:
         """Take a packet of entries that are not messages; returns the same as ``_use``."""
         neighbour, number, sending = opened.neighbour, opened.number, self._sending

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from gr_ros2.link import Delivered, ReceivedPacket, SenderEvent, SentPacket
+from gr_ros2.link import AirPacket, Delivered, SenderEvent, SentPacket
 from gr_ros2.link.events import SentEntry
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.link.v0.sender import Sender
@@ -109,7 +109,7 @@ class Link:
             self.arrived[payload] = self.arrived.get(payload, 0) + 1
             if self.arrived[payload] == entry.total:
                 self.complete.add(payload)
-        for event in self.receiver.receive(ReceivedPacket(data), now):
+        for event in self.receiver.receive(AirPacket(data), now):
             if isinstance(event, Delivered):
                 whole = event.payload == event.payload[:4] * (len(event.payload) // 4)
                 self.corrupt += not whole or event.payload in self.got
@@ -162,7 +162,7 @@ def test_ids_that_come_round_during_an_outage_of_exactly_256_messages() -> None:
             packets.append(data)
         assert len(packets) == fragments
         for data in packets[:lost]:
-            link.receiver.receive(ReceivedPacket(data), now)
+            link.receiver.receive(AirPacket(data), now)
         for _ in range(255):
             link.sender.submit(0, link.payloads[0], now)
         while link.sender.next_packet(now) is not None:
@@ -173,7 +173,7 @@ def test_ids_that_come_round_during_an_outage_of_exactly_256_messages() -> None:
             data = data_of(link.sender.next_packet(now + 256 / 35))
             assert data is not None
             if number >= lost:
-                events += link.receiver.receive(ReceivedPacket(data), now + 256 / 35)
+                events += link.receiver.receive(AirPacket(data), now + 256 / 35)
         assert not any(isinstance(event, Delivered) for event in events)
 
 

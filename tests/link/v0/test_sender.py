@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import Accepted, Missed, ReceivedPacket, Refused, SenderEvent, SentPacket
+from gr_ros2.link import Accepted, AirPacket, Missed, Refused, SenderEvent, SentPacket
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.link.v0.schedule import PaperScheduler
 from gr_ros2.link.v0.sender import Sender
@@ -337,7 +337,7 @@ def test_a_codec_shrinks_what_is_sent_and_events_keep_what_was_submitted() -> No
     assert isinstance(events[0], Accepted)
     assert events[0].payload == message
     sink = Receiver(registry(2), SinkConfig(packet_len=64), codec=Halving())
-    assert delivered(sink.receive(ReceivedPacket(data), 0.0)) == [message]
+    assert delivered(sink.receive(AirPacket(data), 0.0)) == [message]
 
 
 def test_what_the_graph_lost_before_submission_is_observed_once() -> None:

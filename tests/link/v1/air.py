@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.access import Access
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.v1.endpoint import EndpointV1
@@ -83,7 +83,7 @@ class Robot:
 
     def receive(self, data: bytes, now: float, began: float | None = None) -> list[ReceiverEvent]:
         """What a packet causes."""
-        events = self.end.receive(ReceivedPacket(data, began), now)
+        events = self.end.receive(AirPacket(data, began), now)
         self.events += events
         return events
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, Gone, Rejected
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.rate import Mcs
@@ -346,7 +346,7 @@ def test_a_recorded_packet_is_no_sign_of_life(mode: SealMode) -> None:
     for _ in range(200):
         air.run(0.1)
         for data in recorded[-30:]:
-            two.events += two.end.receive(ReceivedPacket(data, snr_db=40.0), air.now)
+            two.events += two.end.receive(AirPacket(data, snr_db=40.0), air.now)
         known = two.end.neighbours.get(1)
         assert known is not None
         assert not known.inbox.reports.unreported or air.now < 3.0

@@ -8,7 +8,7 @@ import pytest
 
 from fuzz.loop import work
 from gr_ros2.core.errors import ReplayedError
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Rejected
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint import EndpointV1
@@ -33,7 +33,7 @@ def test_a_forged_hello_does_not_hang_a_robot_without_a_key() -> None:
     one, two = Robot(1, registry()), Robot(2, registry())
     air = Air(one, two)
     air.run(1.0)
-    lines, events = work(lambda: two.end.receive(ReceivedPacket(hello(one.boot, 0xFFFF_FFFF << 16)), air.now))
+    lines, events = work(lambda: two.end.receive(AirPacket(hello(one.boot, 0xFFFF_FFFF << 16)), air.now))
     assert lines < MOST_LINES
     assert isinstance(events[-1], Rejected)
     assert isinstance(events[-1].error, ReplayedError)
@@ -44,7 +44,7 @@ def test_a_forged_hello_does_not_hang_a_robot_without_a_key() -> None:
     air.robots = [two]
     air.run(12.0)
     for number in (5_000_000, (1 << 48) - 1):
-        lines, _ = work(lambda number=number: two.end.receive(ReceivedPacket(hello(one.boot, number)), air.now))
+        lines, _ = work(lambda number=number: two.end.receive(AirPacket(hello(one.boot, number)), air.now))
         assert lines < MOST_LINES
         air.run(12.0)
 
@@ -74,13 +74,13 @@ def test_a_sealed_robot_that_comes_back_after_millions_of_packets() -> None:
 
 def test_jumps_of_short_packets_cost_no_more_than_others() -> None:
     end = EndpointV1(None, Settings(2, 64, fixed=False), boot=1)
-    end.receive(ReceivedPacket(hello(7, 0)), 0.0)
+    end.receive(AirPacket(hello(7, 0)), 0.0)
     trailer = keys("none").own(1, 7)
     for step in range(1, 200):
         number = step * 32_000
         data = trailer.close(v1.write_header(Header(0, False, 1, number & 0xFFFF)), b"", number, NOT_A_REPAIR)
         lines, _ = work(
-            lambda data=data, step=step: (end.receive(ReceivedPacket(data), step * 0.1), end.handle_timeout(step * 0.1))
+            lambda data=data, step=step: (end.receive(AirPacket(data), step * 0.1), end.handle_timeout(step * 0.1))
         )
         assert len(data) == 8
         assert lines < MOST_LINES
@@ -102,7 +102,7 @@ def test_memory_is_counted_as_it_is_used(packet_len: int) -> None:
     """First fragments of one byte, one to a packet: what they cost is bookkeeping."""
     most = 1_000_000
     end = EndpointV1(None, Settings(2, packet_len, max_source_bytes=most), boot=1)
-    end.receive(ReceivedPacket(hello(7, 0)), 0.0)
+    end.receive(AirPacket(hello(7, 0)), 0.0)
     trailer = keys("none").own(1, 7)
     room = v1.body_room(packet_len)
 
@@ -113,7 +113,7 @@ def test_memory_is_counted_as_it_is_used(packet_len: int) -> None:
     tracemalloc.start()
     before, _ = tracemalloc.get_traced_memory()
     for number in range(1, 4_001):
-        end.receive(ReceivedPacket(packet(number)), number * 1e-3)
+        end.receive(AirPacket(packet(number)), number * 1e-3)
     used = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     assert used < 1.1 * most

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -73,7 +73,7 @@ def test_the_sending_thread_need_not_look_after_every_packet_and_credit() -> Non
     one.end.messages.submit(ODOM, text(2), now)
     message = one.slot(now)
     assert message is not None
-    two.end.receive(ReceivedPacket(message), now)
+    two.end.receive(AirPacket(message), now)
     due = two.end.next_departure(credited=True)
     assert not two.end.urged, "a message alone lets nothing leave"
     assert due is not None
@@ -85,7 +85,7 @@ def test_the_sending_thread_need_not_look_after_every_packet_and_credit() -> Non
     one.end.messages.add([("late", "std_msgs/msg/String", TopicOptions())])
     hello = one.slot(now)
     assert hello is not None
-    two.end.receive(ReceivedPacket(hello), now)
+    two.end.receive(AirPacket(hello), now)
     assert two.end.urged, "it asks for the table of topics"
     two.slot(now)
     assert not two.end.urged

@@ -10,7 +10,7 @@ from itertools import cycle
 import pytest
 
 from bench.hostile import GROWTH, Kind, attack
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
@@ -81,7 +81,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -
     lives = cycle((HALF, ROUND))
 
     def hear(data: bytes) -> None:
-        for event in two.end.receive(ReceivedPacket(data), now):
+        for event in two.end.receive(AirPacket(data), now):
             if isinstance(event, Delivered):
                 number = sent[event.topic_id].get(event.payload)
                 assert number is not None, f"never sent: {event.payload!r}"
@@ -126,7 +126,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -
             hear(late.popleft())
         answer = two.slot(now)
         if answer is not None and not weather.lost():
-            one.end.receive(ReceivedPacket(answer), now)
+            one.end.receive(AirPacket(answer), now)
         if int(now / SLOT_S) % 8 == 0:
             one.end.handle_timeout(now)
             two.end.handle_timeout(now)
@@ -152,7 +152,7 @@ def test_nothing_is_reserved_for_a_message_that_is_announced(per_topic: int) -> 
     """The last fragments of messages of 16 MB, and of none of them anything else."""
     one, two = Robot(1, registry()), Robot(2, max_source_bytes=200_000)
     for n in range(5):
-        two.end.receive(ReceivedPacket(one.slot(n * SLOT_S) or b""), n * SLOT_S)
+        two.end.receive(AirPacket(one.slot(n * SLOT_S) or b""), n * SLOT_S)
     inbox = two.end.neighbours.get(1).inbox  # type: ignore[union-attr]
     body_len, number = 30, inbox.newest
     tracemalloc.start()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.v1.pings import ANSWER_S, KEPT, Pings
 from gr_ros2.wire.control import About, Ping
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
@@ -54,9 +54,9 @@ def test_answers_tell_the_snr_at_the_other_robot() -> None:
     trips = one.end.pings.ask(2, air.now)
     for _ in range(20):
         if (data := one.slot(air.now)) is not None:
-            two.end.receive(ReceivedPacket(data, snr_db=17.5), air.now)
+            two.end.receive(AirPacket(data, snr_db=17.5), air.now)
         if (data := two.slot(air.now)) is not None:
-            one.end.receive(ReceivedPacket(data, snr_db=9.0), air.now)
+            one.end.receive(AirPacket(data, snr_db=9.0), air.now)
         air.now += 1 / 75
     assert trips.snr_there_db == 17.5
 

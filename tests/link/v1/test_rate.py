@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gr_ros2.link import ReceivedPacket
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import SenderEvent, SentPacket
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.endpoint import EndpointV1
@@ -54,9 +54,9 @@ class Fleet:
                     if snr_db is None:
                         continue
                     if data is not None:
-                        receiver.receive(ReceivedPacket(data, snr_db=snr_db), self.now)
+                        receiver.receive(AirPacket(data, snr_db=snr_db), self.now)
                     if (answer := data_of(receiver.next_packet(self.now))) is not None:
-                        self.sender.receive(ReceivedPacket(answer, snr_db=10.0), self.now)
+                        self.sender.receive(AirPacket(answer, snr_db=10.0), self.now)
         return [event.mcs for event in self.sent[before:] if event.kind == "new"]
 
 
@@ -101,7 +101,7 @@ def test_without_an_mcs_table_nothing_is_chosen_and_without_an_snr_none_is_repor
     receiver = EndpointV1(None, Settings(2, packet_len=64), boot=5)
     sender.messages.submit(0, bytes(30), 0.0)
     while (sent := sender.next_packet(0.0)) is not None:
-        receiver.receive(ReceivedPacket(sent.data), 0.0)
+        receiver.receive(AirPacket(sent.data), 0.0)
         assert sent.mcs == 0
     (neighbour,) = receiver.neighbours
     assert neighbour.inbox.reports.make(0.0).snr_db is None
@@ -118,9 +118,9 @@ def test_reports_leave_at_the_most_robust_rate() -> None:
         fleet.sender.messages.submit(0, bytes(30), now)
         data = data_of(fleet.sender.next_packet(now))
         if data is not None:
-            other.receive(ReceivedPacket(data, snr_db=30.0), now)
+            other.receive(AirPacket(data, snr_db=30.0), now)
         if (answer := data_of(other.next_packet(now))) is not None:
-            fleet.sender.receive(ReceivedPacket(answer, snr_db=30.0), now)
+            fleet.sender.receive(AirPacket(answer, snr_db=30.0), now)
     reports = [event for event in told if isinstance(event, SentPacket) and event.kind == "report"]
     assert reports
     assert {event.mcs for event in reports} == {0}
