@@ -72,10 +72,10 @@ def talk(
         }
         scenario = load_scenario("twenty-robots", [], **common)
         rows = scenario.load_registry()
-        (phy, *_) = make_phys(scenario.directions(), rows)
+        (phy, *_) = make_phys(scenario, rows)
         rate = scenario.phy.sample_rate * phy.airtime() * PACKETS_S
         scenario = load_scenario("twenty-robots", [f"phy.sample_rate={rate}"], **common)
-        phys = make_phys(scenario.directions(), rows)
+        phys = make_phys(scenario, rows)
         messages = [_offered(number, robots, seed, reliable=reliable) for number in range(robots)]
         run = Simulation(scenario, rows, phys, messages=messages, ideal=True)
         return _watched(run, packet_len)

@@ -85,7 +85,7 @@ class _Run:
         last = max(messages[-1].t for messages in offered)
         scenario = self._scenario(self._settings.match_s if until_all_heard else last)
         registry = Registry.from_rows([(_TOPIC, self._senders[0].recording.type_name)])
-        phys = make_phys(scenario.directions(), registry)
+        phys = make_phys(scenario, registry)
         run = Simulation(scenario, registry, phys, messages=[iter(messages) for messages in offered], ideal=True)
         places = {robot.src_id: robot.number for robot in run.robots}
         silent, newest, met = set(self.heard), 0.0, inf

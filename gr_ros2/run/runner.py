@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shutil import copyfile
@@ -30,12 +31,11 @@ from gr_ros2.run.observers import RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2.run.pulse import Pulse
 from gr_ros2.run.recorders import RunRecords
-from gr_ros2.run.repeat import repetitions
-from gr_ros2.run.robots import ears_of, surroundings
-from gr_ros2.run.scenario import Scenario
+from gr_ros2.run.robots import surroundings
+from gr_ros2.run.scenario import Scenario, changed
 from gr_ros2.run.simulated_runner import run_simulated
 from gr_ros2.run.task_run import TaskRun
-from gr_ros2.settings.config import replaced
+from gr_ros2.settings.config import Seeded, replaced
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 
@@ -167,15 +167,24 @@ def run_repetitions(
     return results
 
 
+def repetitions(scenario: Scenario) -> Iterator[Scenario]:
+    """The scenario once per repetition, each with its own seeds: in repetition k (from 0) every seed is k higher."""
+    for k in range(scenario.repetitions):
+        yield replace(changed(scenario, Seeded, partial(_reseeded, by=k)), repetitions=1)
+
+
+def _reseeded(part: Seeded, by: int) -> Seeded:
+    return replace(part, seed=part.seed + by)
+
+
 class _Run:
     def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, run_observers: RunObservers) -> None:
         self.registry = registry = scenario.load_registry()
-        phys = make_phys(scenario.directions(), registry)
+        phys = make_phys(scenario, registry)
         self.task = TaskRun(scenario, registry) if scenario.task else None
         around = surroundings(scenario, phys[0].sample_rate, self.task)
-        ears = ears_of(scenario, around)
-        self.records = RunRecords(scenario, registry, phys, ears, run_observers=run_observers, task=self.task)
-        self.scenario = scenario = on_own_domains(scenario, stack)
+        self.records = RunRecords(scenario, registry, phys[0], around, run_observers=run_observers, task=self.task)
+        self.scenario, robots = scenario, on_own_domains(scenario, stack)
         self.run_observers = run_observers
         self.progress_guard = Guard("progress")
         self.pulse = Pulse()
@@ -186,7 +195,7 @@ class _Run:
         try:
             from gr_ros2.run.live import LiveRobots  # only a run in real time needs GNU Radio
 
-            self.live = LiveRobots(scenario, registry, phys, around, records=self.records, stack=stack)
+            self.live = LiveRobots(scenario, robots, registry, phys, around, records=self.records, stack=stack)
             self.medium, self.clock = self.live.medium, self.live.medium.clock
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)

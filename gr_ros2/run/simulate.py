@@ -36,10 +36,10 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phys, recorded_names, source_names
 from gr_ros2.run.recorders import make_recorder
-from gr_ros2.run.robots import Halves, halves_of_robots, start_of_run, surroundings
+from gr_ros2.run.robot_settings import RobotSettings, sources_of
+from gr_ros2.run.robots import hearer_of, start_of_run, surroundings
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.task_run import TaskRun
-from gr_ros2.settings.config import robot_of
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.sim_settings import SimSettings
@@ -49,8 +49,6 @@ _LONGEST_GAP_S = 30 * 86400.0
 simulated for all of the gap: decades where the first stamp is 0."""
 _IN_VAIN = 1000
 """Steps in a row without an event at one time after which a simulation is said to stand still."""
-STARTED_S = 1.0
-"""s within which the robots of a run begin to send. Hellos of robots that begin together would collide for ever."""
 _REMEMBERED_S = 60.0
 """Simulated messages of runs up to this long are cached: 5 MB for two robots with all their topics."""
 
@@ -102,13 +100,13 @@ class Simulated:
 
 
 def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
-    """What the scenario's source gives to the link, in time order.
+    """What the source of a scenario with one gives to the link, in time order.
 
     :raises ConfigError: for a recording played as fast as the link takes it, because its messages have no times
     :raises BagError: for a recording whose times jump by more than 30 days
     """
     if scenario.bag_path is None:
-        names = source_names(scenario, registry)
+        names = source_names(scenario.ros_source, registry)
         for sent in _simulated(scenario.sim, scenario.duration_s, frozenset(names)):
             yield Offered(sent.t, names[sent.topic], sent.payload)
         return
@@ -131,12 +129,12 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
         yield Offered(t, names[message.topic], message.payload)
 
 
-def offered_by(ways: Sequence[Scenario], registry: Registry) -> list[Iterator[Offered]]:
-    """What each direction's source gives to the link. The robots of a simulator drive only once."""
-    if len(ways) == 1 or ways[0].bag_path is not None:
-        return [offered(way, registry) for way in ways]
-    names = [source_names(way, registry) for way in ways]
-    sent = list(_simulated(ways[0].sim, ways[0].duration_s, frozenset().union(*names)))
+def offered_by(scenario: Scenario, registry: Registry) -> list[Iterator[Offered]]:
+    """What each robot that sends gives to the link. The robots of a simulator drive only once."""
+    names = [source_names(source, registry) for source in sources_of(scenario.all_robots)]
+    if len(names) == 1:
+        return [offered(scenario, registry)]
+    sent = list(_simulated(scenario.sim, scenario.duration_s, frozenset().union(*names)))
     return [_own(sent, own) for own in names]
 
 
@@ -175,22 +173,22 @@ def simulate(
 
     :param registry: None takes the scenario's
     :param phy: None makes the scenario's
-    :param messages: those that each direction is offered, in time order; None takes the scenario's source
+    :param messages: those that each robot that sends is offered, in time order; None takes the scenario's source
     :param codec: of all messages; None makes one
     :param on_packet: called with every packet that leaves a robot
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
     :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
     """
     scenario = coupled(scenario)
-    ways = scenario.directions()
     registry = registry or scenario.load_registry()
-    phys = make_phys(ways, registry) if phy is None else [phy] * len(ways)
+    phys = make_phys(scenario, registry) if phy is None else [phy] * len(scenario.all_robots)
     if phys[0].mcs_table:
         raise ConfigError("rate = 'adaptive': a forecast has one rate; set phy.options.rate to fixed")
     run = Simulation(scenario, registry, phys, messages=messages, codec=codec, ideal=True)
-    ids = [way.ros_source.src_id() for way in ways]
-    listeners = {src_id: next(iter(run.around.reached(number)), number) for number, src_id in enumerate(ids)}
-    recorder = make_recorder(registry, ways)
+    sources = sources_of(scenario.all_robots)
+    ids = [source.src_id() for source in sources]
+    listeners = {src_id: hearer_of(run.around, number) for number, src_id in enumerate(ids)}
+    recorder = make_recorder(registry, sources)
     for timed_event in run.events():
         _, robot, event = timed_event
         if not isinstance(event, _OfSender) or listeners.get(_sender(event), robot.number) == robot.number:
@@ -209,7 +207,7 @@ def simulate(
 
 def coupled(scenario: Scenario) -> Scenario:
     """What is forecast together: all robots that send, with one receiver where only one does."""
-    return scenario if len(scenario.directions()) > 1 else replace(scenario, receivers=())
+    return replace(scenario, receivers=())
 
 
 _OfSender = Received | Delivered | Lost
@@ -232,8 +230,8 @@ def pass_on(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float =
 class Simulation:
     """The robots of a scenario and the medium between them: all that a run in simulated time consists of.
 
-    :param phys: one per direction, see :func:`gr_ros2.run.load.make_phys`
-    :param messages: those that each direction is offered, in time order; None takes the scenario's source
+    :param phys: of every robot, see :func:`gr_ros2.run.load.make_phys`
+    :param messages: those that each robot that sends is offered, in time order; None takes the scenario's source
     :param task: offers them instead, and moves the robots
     :param codec: of all messages; None makes one
     :param ideal: the PHY loses nothing
@@ -256,46 +254,34 @@ class Simulation:
                 "time = 'unthrottled': packets pass whenever the computer gets round to it, which cannot "
                 "be simulated; set time to real, samples or packets"
             )
-        ways = scenario.directions()
         if messages is None:
-            messages = offered_by(ways, registry) if task is None else task.offered()
-        coming: list[Iterator[Upcoming]] = list(messages)
+            messages = offered_by(scenario, registry) if task is None else task.offered()
+        coming = iter(messages)
         shared = scenario.duplex == "half"
-        any_length = all(phy.any_length for phy in phys)
-        start = start_of_run(
-            ways,
-            any_length=any_length,
-            mcs_table=phys[0].mcs_table,
-            half_duplex=shared,
-            airtime_s=phys[0].airtime(),
-        )
+        start = start_of_run(scenario, phys[0])
         self.robots: list[Robot] = []
-        starts = random.Random(f"starts {scenario.seed}")
-        for number, halves in enumerate(halves_of_robots(ways)):
-            sends = number < len(ways)
-            phy = phys[number if sends else 0]
-            endpoint, events = _endpoint(registry, halves, codec, start, ways[0].seed)
+        for number, (settings, phy) in enumerate(zip(scenario.all_robots, phys, strict=True)):
+            endpoint, events = _endpoint(registry, settings, codec, start, scenario.seed)
             robot = Robot(
                 scenario,
                 number,
                 endpoint,
                 events=events,
-                src_id=robot_of(*halves),
+                src_id=settings.robot_id,
                 airtime=phy.airtime,
-                messages=coming[number] if sends else iter(()),
-                start_s=starts.uniform(0.0, STARTED_S) if scenario.robots else 0.0,
+                messages=iter(()) if settings.source is None else next(coming),
+                start_s=settings.start_s,
                 busy=ideal,
             )
             self.robots.append(robot)
-        all_phys = [phys[number if number < len(ways) else 0] for number in range(len(self.robots))]
         self.around = around = surroundings(scenario, phys[0].sample_rate, task)
         if ideal:
-            self.medium: Medium = PacketMedium(around, all_phys, shared=shared, ideal=True)
+            self.medium: Medium = PacketMedium(around, phys, shared=shared, ideal=True)
         else:
             heard = {receiver for number in range(len(self.robots)) for receiver in around.reached(number)}
             self.medium = make_medium(
                 around,
-                all_phys,
+                phys,
                 samples=scenario.time == "samples",
                 shared=shared,
                 seed=scenario.seed,
@@ -323,12 +309,13 @@ class Simulation:
 
 
 def _endpoint(
-    registry: Registry, halves: Halves, codec: MessageCodec | None, start: EndpointSetup, seed: int
+    registry: Registry, robot: RobotSettings, codec: MessageCodec | None, start: EndpointSetup, seed: int
 ) -> tuple[Endpoint, list[SenderEvent]]:
     """An endpoint, and the list to which it adds the events of its sending half."""
     events: list[SenderEvent] = []
-    rng = None if halves[0] is None else random.Random(seed)
-    return make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=events.append), events
+    rng = None if robot.source is None else random.Random(seed)
+    end = make_endpoint(registry, robot.source, robot.sink, start=start, codec=codec, rng=rng, observer=events.append)
+    return end, events
 
 
 class Robot:

@@ -22,7 +22,7 @@ def delivered(name: str, *overrides: str, duration_s: float) -> tuple[dict[int, 
     """Messages that others have received of each robot."""
     scenario = load_scenario(name, overrides, duration_s=duration_s)
     registry = scenario.load_registry()
-    run = Simulation(scenario, registry, make_phys(scenario.directions(), registry))
+    run = Simulation(scenario, registry, make_phys(scenario, registry))
     counts = {robot.src_id: 0 for robot in run.robots}
     for _, _, event in run.events():
         if isinstance(event, Delivered):

@@ -13,7 +13,8 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.medium import Surroundings
 from gr_ros2.record.result import Result, read_result, write_result
 from gr_ros2.report.table import summary_grid
-from gr_ros2.run.robots import ears_of, surroundings
+from gr_ros2.run.recorders import receivers_of
+from gr_ros2.run.robots import surroundings
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import dump, load_scenario, scenario_from
 from gr_ros2.settings.config import replaced
@@ -73,7 +74,7 @@ def test_levels_follow_from_power_gain_and_noise() -> None:
         [(0, 30 - 110 - noise_dbm), (2, 30 - 90 - noise_dbm + 3)],
         [],  # 20 - 200 dBm is below what anybody hears
     ]
-    assert ears_of(scenario, around) == [[1], [0], [1]]
+    assert [receiver.senders for receiver in receivers_of(scenario, around)] == [[1], [0], [1]]
     assert len({around.path(*pair).channel.seed for pair in ((0, 1), (1, 0), (1, 2))}) == 3
     assert scenario_from(dump(scenario)) == scenario
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.run.scenario import builtin_scenarios, dump, load_scenario, scenario_from
-from gr_ros2.settings.config import ChannelConfig
+from gr_ros2.medium.base import Path as Way
+from gr_ros2.run.scenario import builtin_scenarios, changed, dump, load_scenario, scenario_from
+from gr_ros2.settings.config import ChannelConfig, PacketSettings, replaced
 from gr_ros2.settings.files import parse_override
 
 BUILTIN = {scenario.name: scenario for scenario in builtin_scenarios()}
@@ -36,7 +38,7 @@ def test_each_is_ready_to_run(name: str) -> None:
     assert scenario.duration_s + scenario.drain_s <= (65 if scenario.time != "real" else 40), (
         "in real time it is waited for"
     )
-    assert scenario.directions()[0].ros_source.src_id() == 1
+    assert scenario.all_robots[0].robot_id == 1
     assert scenario.ros_source.packet_len == scenario.ros_sink.packet_len == scenario.packet_len
     assert scenario.ros_source.registry == scenario.ros_sink.registry == scenario.registry
     assert {scenario.ros_source.domain_id, scenario.ros_sink.domain_id} == {"auto"}, "free ones, or that of the shell"
@@ -78,9 +80,14 @@ def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
         "back.ros_sink.publisher_depth=7",
         "phy.sample_rate=2e5",
     ]
-    there, back = load_scenario("demo", changes, seed=5).directions()
-    assert there == load_scenario("demo", [change for change in changes if not change.startswith("back")], seed=5)
-    assert back.back is None
+    there = load_scenario("demo", changes, seed=5)
+    back = there.back
+    assert back is not None
+    assert replace(there, back=None) == load_scenario("demo", [c for c in changes if not c.startswith("back")], seed=5)
+    here, other = there.all_robots
+    assert (here.source, other.source) == (there.ros_source, back.ros_source)
+    assert (here.sink, other.sink) == (back.ros_sink, there.ros_sink)  # each hears the other's source
+    assert (here.paths, other.paths) == ((Way(1, there.channel),), (Way(0, back.channel),))
     assert (back.ros_source.domain_id, back.ros_sink.domain_id) == (
         there.ros_sink.domain_id,
         there.ros_source.domain_id,
@@ -89,12 +96,44 @@ def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
     assert back.ros_source.compression
     assert (there.ros_sink.publisher_depth, back.ros_sink.publisher_depth) == (1000, 7)
     assert back.ros_source.registry == there.registry
-    assert (back.channel.snr_db, back.phy) == (20, there.phy)
+    assert back.channel.snr_db == 20
     assert back.channel.seed != there.channel.seed == 5
 
 
-def test_a_one_way_scenario_has_one_direction() -> None:
-    assert BUILTIN["demo"].directions() == (BUILTIN["demo"],)
+def test_a_one_way_scenario_is_a_robot_that_sends_and_those_that_receive() -> None:
+    first, *others = load_scenario("demo", ["reports=null", "receivers=[{packet_loss: 0.5}]"]).all_robots
+    assert first.source == BUILTIN["demo"].ros_source
+    assert first.sink is None
+    assert [(path.receiver, path.channel.packet_loss) for path in first.paths] == [(1, 0.1), (2, 0.5)]
+    assert [(other.source, other.sink, other.paths) for other in others] == [(None, BUILTIN["demo"].ros_sink, ())] * 2
+
+
+def test_receivers_that_report_have_ids_and_ways_back_of_their_own() -> None:
+    scenario = load_scenario("demo", ["reports={delay_s: 0.5, channel: {packet_loss: 0.1}}", "receivers=[{}]"])
+    _, *others = scenario.all_robots
+    assert [other.robot_id for other in others] == [254, 253]
+    paths = [path for other in others for path in other.paths]
+    assert [(path.receiver, path.delay_s, path.channel.packet_loss) for path in paths] == [(0, 0.5, 0.1)] * 2
+    assert paths[0].channel.seed != paths[1].channel.seed
+
+
+def test_robots_that_all_send_and_receive_are_on_one_graph_each() -> None:
+    scenario = load_scenario("two-robots-half-duplex", ["robots=[{}, {}, {ros_source: {domain_id: 7}}]"])
+    assert [robot.robot_id for robot in scenario.all_robots] == [1, 2, 3]
+    assert [[path.receiver for path in robot.paths] for robot in scenario.all_robots] == [[1, 2], [0, 2], [0, 1]]
+    assert [robot.sink.domain_id for robot in scenario.all_robots if robot.sink is not None] == ["auto", "auto", 7]
+    assert all(0 < robot.start_s < 1 for robot in scenario.all_robots)
+    assert len({path.channel.seed for robot in scenario.all_robots for path in robot.paths}) == 6
+
+
+def test_a_part_is_changed_at_all_robots() -> None:
+    for name in ("two-way", "team", "demo"):
+        scenario = changed(BUILTIN[name], PacketSettings, lambda part: replaced(part, packet_len=99))
+        halves = [half for robot in scenario.all_robots for half in (robot.source, robot.sink) if half is not None]
+        assert {scenario.packet_len, *(half.packet_len for half in halves)} == {99}
+        assert changed(scenario, PacketSettings, lambda part: replaced(part, packet_len=64)) == changed(
+            BUILTIN[name], PacketSettings, lambda part: replaced(part, packet_len=64)
+        )
 
 
 def test_override_values_are_yaml() -> None:
