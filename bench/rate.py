@@ -13,7 +13,7 @@ from pathlib import Path
 from bench.rows import Row
 from gr_ros2.link.events import Delivered
 from gr_ros2.phy.ofdm_rate import RATES
-from gr_ros2.run.load import make_phys
+from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import scenario_from
 from gr_ros2.run.simulate import Offered, Simulation
 from gr_ros2.settings.files import find_registry
@@ -62,7 +62,7 @@ def carried(rates: tuple[str, ...], channel: dict[str, float], load: float, seco
         }
     )
     registry = scenario.load_registry()
-    run = Simulation(scenario, registry, make_phys(scenario, registry), messages=[messages(load, seconds)])
+    run = Simulation(scenario, registry, make_phy(scenario, registry), messages=[messages(load, seconds)])
     whole = [(now, event.payload) for now, _, event in run.events() if isinstance(event, Delivered)]
     settled = sum(WARM_UP_S <= now < seconds for now, _ in whole)
     in_time = sum(now - int.from_bytes(payload[:4], "big") / load <= LATE_S for now, payload in whole)

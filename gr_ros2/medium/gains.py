@@ -16,18 +16,6 @@ Gains = float | Sequence[Sequence[float | None]] | None
 _SEEDS_APART = 7919
 
 
-def paths_between(
-    channel: ChannelConfig, gains_db: Gains, levels: Sequence[tuple[float, float]], bandwidth: float
-) -> list[list[Path]]:
-    """The paths between robots that all send and receive, at their levels.
-
-    :param channel: what all paths have in common; without gains also their level
-    :param levels, bandwidth: see :func:`at_gains`
-    """
-    paths = all_paths(channel, len(levels), leveled=gains_db is not None)
-    return at_gains(paths, gains_db, levels, bandwidth)
-
-
 def all_paths(channel: ChannelConfig, robots: int, *, leveled: bool) -> list[list[Path]]:
     """The paths between robots that all send and receive. Where they draw random numbers, each has its own seed.
 

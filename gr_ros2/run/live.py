@@ -59,7 +59,8 @@ class LiveMedium(Protocol):
     def check(self) -> None:
         """:raises GrRos2Error: when it cannot go on"""
 
-    def stop(self) -> None: ...
+    def stop(self) -> None:
+        """Nothing is carried any more. Idempotent."""
 
     def empty(self, unresolved: bool) -> bool:
         """Whether nothing is on its way.
@@ -86,7 +87,6 @@ class LiveRobot:
     """
 
     settings: RobotSettings
-    src_id: int
     topics: Mapping[str, int]
     heard: Mapping[str, str]
     source: RosSource | None
@@ -104,7 +104,7 @@ class LiveRobots:
     """The robots of a scenario and the medium between them, ready to start.
 
     :param robots: those of the scenario, on domains of their own where it says so
-    :param phys: of every robot
+    :param phy: of all robots
     :param around: who hears whom
     :param records: observe the robots
     :param stack: closes what is opened here
@@ -116,7 +116,7 @@ class LiveRobots:
         scenario: Scenario,
         robots: Sequence[RobotSettings],
         registry: Registry,
-        phys: Sequence[Phy],
+        phy: Phy,
         around: Surroundings,
         *,
         records: RunRecords,
@@ -124,7 +124,7 @@ class LiveRobots:
     ) -> None:
         kind: Callable[..., LiveMedium] = SharedChannel if scenario.duplex == "half" else OwnChannels
         self._scenario = scenario
-        self.medium = kind(scenario, robots, registry, phys, around, records=records, stack=stack)
+        self.medium = kind(scenario, robots, registry, phy, around, records=records, stack=stack)
         sources = sources_of(robots)
         self.robots = [
             _robot(registry, settings, sources, blocks)
@@ -139,7 +139,7 @@ class LiveRobots:
     @property
     def sources(self) -> dict[int, RosSource]:
         """The blocks that send messages, by source id."""
-        return {robot.src_id: robot.source for robot in self.offering if robot.source is not None}
+        return {robot.settings.robot_id: robot.source for robot in self.offering if robot.source is not None}
 
     @property
     def graphs(self) -> tuple[tuple[str, int | None], ...]:
@@ -155,7 +155,7 @@ class LiveRobots:
         """The graph of a simulated robot: a participant of its own on that of its source, or else the graph at the
         other end of the link."""
         for robot in self.offering:
-            if robot.src_id == src_id and (source := robot.settings.source) is not None:
+            if robot.settings.robot_id == src_id and (source := robot.settings.source) is not None:
                 return stack.enter_context(open_graph(self._scenario, source, f"robot_{src_id}"))
         return self.robots[1].graph
 
@@ -190,4 +190,4 @@ def _robot(
             topics = [sink.registry[topic_id] for topic_id in ids]
             heard |= {topic.republished(sink.config.namespace_format, src_id): topic.type_name for topic in topics}
     offered = {} if settings.source is None else source_names(settings.source, registry)
-    return LiveRobot(settings, -1 if source is None else source.src_id, offered, heard, source, sink)
+    return LiveRobot(settings, offered, heard, source, sink)

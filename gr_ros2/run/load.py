@@ -24,7 +24,7 @@ _SAMPLE_S = 2.0
 
 
 def make_phy(scenario: Scenario, registry: Registry) -> Phy:
-    """The scenario's PHY at its sample rate, or at ``headroom`` times what the robot needs that offers most.
+    """The PHY of all robots, at its sample rate, or at ``headroom`` times what the robot needs that offers most.
 
     :raises ConfigError: for wrong PHY options, a channel that the PHY does not support, or when a robot offers nothing
     """
@@ -46,16 +46,6 @@ def check_channels(scenario: Scenario, phy: Phy) -> None:
     """
     for channel in dict.fromkeys(path.channel for robot in scenario.all_robots for path in robot.paths):
         phy.check_channel(channel)
-
-
-def make_phys(scenario: Scenario, registry: Registry) -> list[Phy]:
-    """The PHY of every robot of a scenario: objects of their own, with equal settings.
-
-    :raises ConfigError: see :func:`make_phy`
-    """
-    phy = make_phy(scenario, registry)
-    others = scenario.all_robots[1:]
-    return [phy, *(configured(scenario.phy, scenario.packet_len, phy.sample_rate) for _ in others)]
 
 
 def offered_packets(scenario: Scenario, source: SourceConfig, registry: Registry) -> float:

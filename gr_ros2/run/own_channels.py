@@ -47,7 +47,7 @@ class OwnChannels:
         scenario: Scenario,
         robots: Sequence[RobotSettings],
         registry: Registry,
-        phys: Sequence[Phy],
+        phy: Phy,
         around: Surroundings,
         *,
         records: RunRecords,
@@ -55,13 +55,13 @@ class OwnChannels:
     ) -> None:
         self._scenario, self._registry, self._records, self._stack = scenario, registry, records, stack
         self._hearing = Counter(receiver for number in range(around.robots) for receiver in around.reached(number))
-        start = start_of_run(scenario, phys[0])
+        start = start_of_run(scenario, phy)
         self.blocks = [
             self._blocks(number, robot, start, sends=bool(around.reached(number)))
             for number, robot in enumerate(robots)
         ]
         self._flowgraph = Flowgraph("gr_ros2_channels", scenario.name)
-        self.links = [self._link(number, phy, around) for number, phy in enumerate(phys) if around.reached(number)]
+        self.links = [self._link(number, phy, around) for number in range(around.robots) if around.reached(number)]
         self._offering = [source.src_id() for source in sources_of(robots)]
         stack.callback(self.stop)
         self.clock: Callable[[], float] = time.monotonic
@@ -129,6 +129,10 @@ class OwnChannels:
             raise ConfigError(
                 f"gains_db: nobody hears {source.namespace}, whose channel in real time would have no receiver; set "
                 "duplex: half, or time to packets or samples"
+            )
+        if source is None and not hears:
+            raise ConfigError(
+                f"gains_db: receiver {number} hears nobody; set a higher gain, or time to packets or samples"
             )
         if source is not None and scenario.bag_path is not None and not scenario.bag_speed:
             # A bag that is read as fast as the link takes it: the reader waits, so that nothing is dropped.

@@ -66,37 +66,20 @@ def make_team(registry: Registry, scenario: Scenario, phy: Phy) -> TeamRecord | 
     return TeamRecord([source.src_id() for source in sources], phy.airtime, readers)
 
 
-@dataclass(frozen=True)
-class RecordedReceiver:
-    """What one recorder counts.
-
-    :param name: namespace of the robot that receives, where it also sends; '' where all share one recorder
-    :param robots: places of those of which it records what comes out
-    :param senders: places of those whose packets it counts
-    """
-
-    name: str
-    robots: Sequence[int]
-    senders: Sequence[int]
-
-
-def receivers_of(scenario: Scenario, around: Surroundings) -> list[RecordedReceiver]:
-    """For each recorder of a run what it counts: first that of the result, then those of further receivers.
-
-    Two robots share one recorder. Each of several that receive has its own, for the robots that it can hear, or for all
-    where messages are relayed.
-    """
-    robots = range(around.robots)
-    senders = [number for number, robot in enumerate(scenario.all_robots) if robot.source is not None]
-    if around.robots == 2:
-        return [RecordedReceiver("", robots, senders)]
-    found = []
-    for number, robot in enumerate(scenario.all_robots):
-        if robot.sink is not None:
-            others = [one for one in senders if one != number]
-            heard = others if scenario.relay != "off" else [one for one in others if number in around.reached(one)]
-            found.append(RecordedReceiver(robot.namespace, [number], heard))
-    return found
+def receivers_of(scenario: Scenario, around: Surroundings) -> dict[int, list[int]]:
+    """The places of the robots that have a recorder, with those of the robots whose messages it counts. The first is
+    that of the result. Two robots share one. Each of several that receive counts what it can hear, or messages of all
+    where they are relayed."""
+    robots = scenario.all_robots
+    senders = [number for number, robot in enumerate(robots) if robot.source is not None]
+    if len(robots) == 2:
+        return {1: senders}
+    relays, reached = scenario.relay != "off", {one: set(around.reached(one)) for one in senders}
+    return {
+        number: [one for one in senders if one != number and (relays or number in reached[one])]
+        for number, robot in enumerate(robots)
+        if robot.sink is not None
+    }
 
 
 class RunRecords:
@@ -122,8 +105,9 @@ class RunRecords:
         self._config = dump(scenario)
         self._sources = sources = sources_of(scenario.all_robots)
         self.run_observers = run_observers
-        self._receivers = receivers_of(scenario, around)
-        heard = [[sources[number] for number in receiver.senders] for receiver in self._receivers]
+        receivers = receivers_of(scenario, around)
+        self._places = {number: place for place, number in enumerate(receivers)}
+        heard = [[sources[number] for number in senders] for senders in receivers.values()]
         self.recorder = make_recorder(registry, heard[0], on_delivery)
         self._recorders = [self.recorder, *(make_recorder(registry, others) for others in heard[1:])]
         self._guards = [Guard("Recorder", needed=True) for _ in self._recorders]
@@ -144,11 +128,8 @@ class RunRecords:
         return RobotObserver(self, number, src_id, self.place(number))
 
     def place(self, number: int) -> int:
-        """Of the recorder of what a robot receives, 0 for that of the result; of one that receives reports alone too.
-
-        :param number: its place among the robots of the run
-        """
-        return next((place for place, one in enumerate(self._receivers) if number in one.robots), 0)
+        """That of the recorder of what a robot receives; 0 = that of the result, which has reports to a sender too."""
+        return self._places.get(number, 0)
 
     def sent(self, src_id: int, event: SenderEvent) -> None:
         """An event of a robot's sending half."""
@@ -243,13 +224,12 @@ class RunRecords:
                 ReceiverResult(
                     number,
                     recorder.finish(played, end, drained),
-                    receiver.name,
+                    self._scenario.all_robots[robot].namespace,
                     packets=recorder.ledger.packets(),
                     phy=numbers(recorder),
                 )
-                for number, (recorder, receiver) in enumerate(
-                    zip(self._recorders[1:], self._receivers[1:], strict=True), 2
-                )
+                for number, (recorder, robot) in enumerate(zip(self._recorders, self._places, strict=True), 1)
+                if number > 1
             ),
             packets=self.recorder.ledger.packets(),
             phy=numbers(self.recorder),

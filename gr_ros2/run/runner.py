@@ -26,7 +26,7 @@ from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
 from gr_ros2.run.domains import on_own_domains, open_graph
-from gr_ros2.run.load import make_phys, recording
+from gr_ros2.run.load import make_phy, recording
 from gr_ros2.run.observers import RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2.run.pulse import Pulse
@@ -180,10 +180,10 @@ def _reseeded(part: Seeded, by: int) -> Seeded:
 class _Run:
     def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, run_observers: RunObservers) -> None:
         self.registry = registry = scenario.load_registry()
-        phys = make_phys(scenario, registry)
+        phy = make_phy(scenario, registry)
         self.task = TaskRun(scenario, registry) if scenario.task else None
-        around = surroundings(scenario, phys[0].sample_rate, self.task)
-        self.records = RunRecords(scenario, registry, phys[0], around, run_observers=run_observers, task=self.task)
+        around = surroundings(scenario, phy.sample_rate, self.task)
+        self.records = RunRecords(scenario, registry, phy, around, run_observers=run_observers, task=self.task)
         self.scenario, robots = scenario, on_own_domains(scenario, stack)
         self.run_observers = run_observers
         self.progress_guard = Guard("progress")
@@ -195,7 +195,7 @@ class _Run:
         try:
             from gr_ros2.run.live import LiveRobots  # only a run in real time needs GNU Radio
 
-            self.live = LiveRobots(scenario, robots, registry, phys, around, records=self.records, stack=stack)
+            self.live = LiveRobots(scenario, robots, registry, phy, around, records=self.records, stack=stack)
             self.medium, self.clock = self.live.medium, self.live.medium.clock
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)

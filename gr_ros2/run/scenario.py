@@ -79,9 +79,9 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
         as many that differ in their names alone
     :param duplex: full = each robot sends on a channel of its own, and hears while it sends; half = all use one
         channel: who sends hears nothing meanwhile, and packets that overlap at a receiver disturb each other
-    :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
-        each other, null where nothing arrives. Level and noise then follow from transmit power, noise figure and
-        ``phy.sample_rate``; null = ``channel.snr_db`` between all
+    :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot (without ``robots``
+        first that of ``ros_source``) with a number for each other, null where nothing arrives. Level and noise then
+        follow from transmit power, noise figure and ``phy.sample_rate``; null = ``channel.snr_db`` between all
     :param task: what the robots do on what they hear of each other: `formation`, `rendezvous`, or `module:Class`, a
         subclass of :class:`gr_ros2.sim.tasks.Task`; '' = each drives its own ways
     :param controller: who drives the robots of a task. `task`: the task itself; `ros`: a node on the graph of each
@@ -159,23 +159,20 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError(
                 f"controller = {self.controller!r}: stands in for that of a task in real time; set task and time: real"
             )
+        matrix, count = self.gains_db, len(self.robots) or 2 + len(self.receivers)
+        if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
+            raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
         if not self.robots:
-            if self.gains_db is not None:
-                raise ValueError("gains_db: lie between robots; set robots, or channel.snr_db instead")
             return
         if not self.simulated:
             self._check_live_robots()
         if self.source != "sim" or self.back is not None or self.reports is not None or self.receivers:
             raise ValueError("robots: they all send and receive; set source to sim, leave back, reports, receivers out")
-        count = len(self.robots)
         ids = {robot.ros_source.src_id() for robot in self.robots}
         if count < 2 or len(ids) < count:
             raise ValueError(
                 f"robots: {count} robots with {len(ids)} source ids; two or more robots, each with its own"
             )
-        matrix = self.gains_db
-        if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
-            raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
 
     def _check_live_robots(self) -> None:
         """Whether the robots fit the medium that carries them in real time."""

@@ -47,14 +47,14 @@ class SharedChannel:
         scenario: Scenario,
         robots: Sequence[RobotSettings],
         registry: Registry,  # noqa: ARG002 - each link reads its own
-        phys: Sequence[Phy],
+        phy: Phy,
         around: Surroundings,
         *,
         records: RunRecords,
         stack: ExitStack,
     ) -> None:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="gr-ros2-")))
-        phy = replaced(scenario.phy, sample_rate=phys[0].sample_rate)
+        settings = replaced(scenario.phy, sample_rate=phy.sample_rate)
         ends = [
             tuple(f"ipc://{folder}/{number}-{what}" for what in ("sends", "hears")) for number in range(len(robots))
         ]
@@ -62,7 +62,7 @@ class SharedChannel:
         self._medium = MediumProcess(
             MediumConfig(
                 name=scenario.name,
-                phy=phy,
+                phy=settings,
                 packet_len=scenario.packet_len,
                 robots=tuple(MediumRobot(connect=sends, bind=hears) for sends, hears in ends),
                 seed=scenario.seed,
@@ -73,7 +73,7 @@ class SharedChannel:
         self._robots: list[RobotLink] = []
         for number, (robot, (sends, hears)) in enumerate(zip(robots, ends, strict=True)):
             front_end = {"name": "zmq", "bind": sends, "connect": [hears], "medium_process": "lockstep"}
-            config = _link_of(scenario, robot, phy, front_end, folder / f"robot-{number}")
+            config = _link_of(scenario, robot, settings, front_end, folder / f"robot-{number}")
             self._robots.append(RobotLink(config, observer=records.of(number, robot.robot_id)))
             stack.callback(self._robots[-1].stop)
         self.blocks = [(link.source, link.sink) for link in self._robots]

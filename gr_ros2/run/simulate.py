@@ -34,7 +34,7 @@ from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
-from gr_ros2.run.load import make_phys, recorded_names, source_names
+from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.recorders import make_recorder
 from gr_ros2.run.robot_settings import RobotSettings, sources_of
 from gr_ros2.run.robots import hearer_of, start_of_run, surroundings
@@ -54,7 +54,11 @@ _REMEMBERED_S = 60.0
 
 
 class Upcoming(Protocol):
-    """A message for the source. ``payload`` is asked for at ``t``, so it may depend on what came before."""
+    """A message for the source.
+
+    :ivar t: when it is submitted, s after the start
+    :ivar payload: is asked for at ``t``, so it may depend on what came before
+    """
 
     @property
     def t(self) -> float: ...
@@ -181,10 +185,10 @@ def simulate(
     """
     scenario = coupled(scenario)
     registry = registry or scenario.load_registry()
-    phys = make_phys(scenario, registry) if phy is None else [phy] * len(scenario.all_robots)
-    if phys[0].mcs_table:
+    phy = phy or make_phy(scenario, registry)
+    if phy.mcs_table:
         raise ConfigError("rate = 'adaptive': a forecast has one rate; set phy.options.rate to fixed")
-    run = Simulation(scenario, registry, phys, messages=messages, codec=codec, ideal=True)
+    run = Simulation(scenario, registry, phy, messages=messages, codec=codec, ideal=True)
     sources = sources_of(scenario.all_robots)
     ids = [source.src_id() for source in sources]
     listeners = {src_id: hearer_of(run.around, number) for number, src_id in enumerate(ids)}
@@ -197,7 +201,7 @@ def simulate(
             on_packet(event)
     return Simulated(
         duration_s=run.duration_s,
-        airtime_s=phys[0].airtime(),
+        airtime_s=phy.airtime(),
         topics=recorder.finish(run.duration_s, run.duration_s, run.empty),
         packets=recorder.ledger.packets(),
         stats={src_id: robot.endpoint.sent for src_id, robot in zip(ids, run.robots, strict=False)},
@@ -230,7 +234,7 @@ def pass_on(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float =
 class Simulation:
     """The robots of a scenario and the medium between them: all that a run in simulated time consists of.
 
-    :param phys: of every robot, see :func:`gr_ros2.run.load.make_phys`
+    :param phy: of all robots, see :func:`gr_ros2.run.load.make_phy`
     :param messages: those that each robot that sends is offered, in time order; None takes the scenario's source
     :param task: offers them instead, and moves the robots
     :param codec: of all messages; None makes one
@@ -242,7 +246,7 @@ class Simulation:
         self,
         scenario: Scenario,
         registry: Registry,
-        phys: Sequence[Phy],
+        phy: Phy,
         *,
         messages: Sequence[Iterator[Upcoming]] | None = None,
         task: TaskRun | None = None,
@@ -258,9 +262,9 @@ class Simulation:
             messages = offered_by(scenario, registry) if task is None else task.offered()
         coming = iter(messages)
         shared = scenario.duplex == "half"
-        start = start_of_run(scenario, phys[0])
+        start = start_of_run(scenario, phy)
         self.robots: list[Robot] = []
-        for number, (settings, phy) in enumerate(zip(scenario.all_robots, phys, strict=True)):
+        for number, settings in enumerate(scenario.all_robots):
             endpoint, events = _endpoint(registry, settings, codec, start, scenario.seed)
             robot = Robot(
                 scenario,
@@ -274,7 +278,8 @@ class Simulation:
                 busy=ideal,
             )
             self.robots.append(robot)
-        self.around = around = surroundings(scenario, phys[0].sample_rate, task)
+        self.around = around = surroundings(scenario, phy.sample_rate, task)
+        phys = [phy] * len(self.robots)
         if ideal:
             self.medium: Medium = PacketMedium(around, phys, shared=shared, ideal=True)
         else:
@@ -443,7 +448,7 @@ class EventLoop:
     def __init__(self, robots: Sequence[Robot], medium: Medium) -> None:
         self._robots, self._medium = robots, medium
         self._at = [inf] * len(robots)
-        self._agenda: list[tuple[float, int]] = []
+        self._queue: list[tuple[float, int]] = []
         self._busy = set(range(len(robots)))
         self.now = 0.0
 
@@ -498,7 +503,7 @@ class EventLoop:
     def _happen(self, now: float) -> Iterator[TimedEvent]:
         concerned: set[int] = set()
         while self._soonest() <= now:
-            number = heapq.heappop(self._agenda)[1]
+            number = heapq.heappop(self._queue)[1]
             self._at[number] = inf
             concerned.add(number)
             if not self._medium.late:
@@ -526,9 +531,9 @@ class EventLoop:
 
     def _soonest(self) -> float:
         """When a robot has something to do next."""
-        while self._agenda and self._at[self._agenda[0][1]] != self._agenda[0][0]:
-            heapq.heappop(self._agenda)  # it has been planned anew since
-        return self._agenda[0][0] if self._agenda else inf
+        while self._queue and self._at[self._queue[0][1]] != self._queue[0][0]:
+            heapq.heappop(self._queue)  # it has been planned anew since
+        return self._queue[0][0] if self._queue else inf
 
     def _plan(self, robot: Robot) -> None:
         """Note when a robot has something to do next."""
@@ -539,5 +544,5 @@ class EventLoop:
             at = timeout
         if at != self._at[number]:
             self._at[number] = at
-            heapq.heappush(self._agenda, (at, number))
+            heapq.heappush(self._queue, (at, number))
         (self._busy.discard if robot.over else self._busy.add)(number)

@@ -17,7 +17,7 @@ from typing import Any
 
 from gr_ros2.core.guard import Guard
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
-from gr_ros2.run.load import make_phys, published_names, recording, source_names
+from gr_ros2.run.load import make_phy, published_names, recording, source_names
 from gr_ros2.run.observers import RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, by_sender
 from gr_ros2.run.recorders import RunRecords
@@ -57,7 +57,7 @@ def run_simulated(
     began = time.monotonic()
     registry = registry or scenario.load_registry()
     sources = sources_of(scenario.all_robots)
-    phys = make_phys(scenario, registry)
+    phy = make_phy(scenario, registry)
     with ExitStack() as stack:
         if bag is None and out is not None:
             origin_ns = bag_origin_ns(scenario, source_names(sources[0], registry))
@@ -70,12 +70,12 @@ def run_simulated(
                 ids = source_names(source, registry)
                 bag.add_source(source.src_id(), registry, {ids[name]: other for name, other in names.items()})
         task = TaskRun(scenario, registry) if scenario.task else None
-        run = Simulation(scenario, registry, phys, task=task)
+        run = Simulation(scenario, registry, phy, task=task)
         run_observers = run_observers or RunObservers(threaded=False)
         records = RunRecords(
             scenario,
             registry,
-            phys[0],
+            phy,
             run.around,
             run_observers=run_observers,
             task=task,
