@@ -137,7 +137,7 @@ class OwnChannels:
         if source is not None and scenario.bag_path is not None and not scenario.bag_speed:
             # A bag that is read as fast as the link takes it: the reader waits, so that nothing is dropped.
             source = replace(source, backpressure=True)
-        observer = self._records.of(number, robot.robot_id)
+        observer = self._records.of(number)
         blocks = RobotBlocks(self._registry, source, sink, start=start, observer=observer, seed=scenario.seed)
         here, there = self._graphs(source, sink)
         sending, receiving = blocks.source(here) if sends else None, blocks.sink(there) if hears else None

@@ -119,13 +119,12 @@ class RunRecords:
         self.team = make_team(registry, scenario, phy)
         self._task, self._acting = task, Guard(f"task {scenario.task}", needed=True)
 
-    def of(self, number: int, src_id: int) -> RobotObserver:
+    def of(self, number: int) -> RobotObserver:
         """What observes a robot.
 
         :param number: its place among the robots of the run
-        :param src_id: -1 for none
         """
-        return RobotObserver(self, number, src_id, self.place(number))
+        return RobotObserver(self, number, self._scenario.all_robots[number].robot_id, self.place(number))
 
     def place(self, number: int) -> int:
         """That of the recorder of what a robot receives; 0 = that of the result, which has reports to a sender too."""

@@ -74,7 +74,7 @@ class SharedChannel:
         for number, (robot, (sends, hears)) in enumerate(zip(robots, ends, strict=True)):
             front_end = {"name": "zmq", "bind": sends, "connect": [hears], "medium_process": "lockstep"}
             config = _link_of(scenario, robot, settings, front_end, folder / f"robot-{number}")
-            self._robots.append(RobotLink(config, observer=records.of(number, robot.robot_id)))
+            self._robots.append(RobotLink(config, observer=records.of(number)))
             stack.callback(self._robots[-1].stop)
         self.blocks = [(link.source, link.sink) for link in self._robots]
         self.clock = self._robots[0].front_end.clock

@@ -21,7 +21,7 @@ from math import inf
 from typing import Any, Protocol
 
 from gr_ros2.core.errors import BagError, ConfigError, RunError
-from gr_ros2.gr.factory import EndpointSetup, make_endpoint
+from gr_ros2.gr.factory import make_endpoint
 from gr_ros2.link import Delivered, Lost, Received, ReceivedPacket, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit, at_full_load
@@ -36,7 +36,7 @@ from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
 from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.recorders import make_recorder
-from gr_ros2.run.robot_settings import RobotSettings, sources_of
+from gr_ros2.run.robot_settings import sources_of
 from gr_ros2.run.robots import hearer_of, start_of_run, surroundings
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.task_run import TaskRun
@@ -265,11 +265,14 @@ class Simulation:
         start = start_of_run(scenario, phy)
         self.robots: list[Robot] = []
         for number, settings in enumerate(scenario.all_robots):
-            endpoint, events = _endpoint(registry, settings, codec, start, scenario.seed)
+            events: list[SenderEvent] = []
+            rng = random.Random(scenario.seed)
             robot = Robot(
                 scenario,
                 number,
-                endpoint,
+                make_endpoint(
+                    registry, settings.source, settings.sink, start=start, codec=codec, rng=rng, observer=events.append
+                ),
                 events=events,
                 src_id=settings.robot_id,
                 airtime=phy.airtime,
@@ -311,16 +314,6 @@ class Simulation:
     def empty(self) -> bool:
         """Whether nothing waits at a robot or for the air."""
         return all(robot.empty for robot in self.robots)
-
-
-def _endpoint(
-    registry: Registry, robot: RobotSettings, codec: MessageCodec | None, start: EndpointSetup, seed: int
-) -> tuple[Endpoint, list[SenderEvent]]:
-    """An endpoint, and the list to which it adds the events of its sending half."""
-    events: list[SenderEvent] = []
-    rng = None if robot.source is None else random.Random(seed)
-    end = make_endpoint(registry, robot.source, robot.sink, start=start, codec=codec, rng=rng, observer=events.append)
-    return end, events
 
 
 class Robot:

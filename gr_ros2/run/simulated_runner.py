@@ -81,7 +81,7 @@ def run_simulated(
             task=task,
             on_delivery=None if bag is None else bag.take,
         )
-        seen = [records.of(robot.number, robot.src_id) for robot in run.robots]
+        seen = [records.of(number) for number in range(len(run.robots))]
         clock = _EventClock()
         run_observers.run_started(records.live_run(clock))
         reported, progress = 0.0, Guard("progress")
