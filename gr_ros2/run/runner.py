@@ -35,7 +35,7 @@ from gr_ros2.run.robots import surroundings
 from gr_ros2.run.scenario import Scenario, changed
 from gr_ros2.run.simulated_runner import run_simulated
 from gr_ros2.run.task_run import TaskRun
-from gr_ros2.settings.config import Seeded, replaced
+from gr_ros2.settings.config import Seeded
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 
@@ -212,10 +212,11 @@ class _Run:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
 
     def _listen(self, out: Path, stack: ExitStack) -> DeliveryRecorder:
-        graphs = {}
-        for robot in self.live.recorded:
-            end = replaced(self.scenario.ros_sink, middleware=robot.graph.name, domain_id=robot.graph.domain_id)
-            graphs[stack.enter_context(open_graph(self.scenario, end, "listener"))] = robot.heard
+        graphs = {
+            stack.enter_context(open_graph(self.scenario, robot.settings.sink, "listener")): robot.heard
+            for robot in self.live.recorded
+            if robot.settings.sink is not None
+        }
         listener = DeliveryRecorder(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)
         return listener
