@@ -260,29 +260,9 @@ class Simulation:
             )
         if messages is None:
             messages = offered_by(scenario, registry) if task is None else task.offered()
-        coming = iter(messages)
-        shared = scenario.duplex == "half"
-        start = start_of_run(scenario, phy)
-        self.robots: list[Robot] = []
-        for number, settings in enumerate(scenario.all_robots):
-            events: list[SenderEvent] = []
-            rng = random.Random(scenario.seed)
-            robot = Robot(
-                scenario,
-                number,
-                make_endpoint(
-                    registry, settings.source, settings.sink, start=start, codec=codec, rng=rng, observer=events.append
-                ),
-                events=events,
-                src_id=settings.robot_id,
-                airtime=phy.airtime,
-                messages=iter(()) if settings.source is None else next(coming),
-                start_s=settings.start_s,
-                busy=ideal,
-            )
-            self.robots.append(robot)
+        self.robots = _robots(scenario, registry, phy, messages, codec=codec, busy=ideal)
         self.around = around = surroundings(scenario, phy.sample_rate, task)
-        phys = [phy] * len(self.robots)
+        shared, phys = scenario.duplex == "half", [phy] * len(self.robots)
         if ideal:
             self.medium: Medium = PacketMedium(around, phys, shared=shared, ideal=True)
         else:
@@ -314,6 +294,37 @@ class Simulation:
     def empty(self) -> bool:
         """Whether nothing waits at a robot or for the air."""
         return all(robot.empty for robot in self.robots)
+
+
+def _robots(
+    scenario: Scenario,
+    registry: Registry,
+    phy: Phy,
+    messages: Sequence[Iterator[Upcoming]],
+    *,
+    codec: MessageCodec | None = None,
+    busy: bool = False,
+) -> list[Robot]:
+    """The robots of a run, those that send first; see :class:`Simulation` and :class:`Robot`."""
+    start, coming = start_of_run(scenario, phy), iter(messages)
+    robots: list[Robot] = []
+    for number, settings in enumerate(scenario.all_robots):
+        events: list[SenderEvent] = []
+        halves, rng = (settings.source, settings.sink), random.Random(scenario.seed)
+        endpoint = make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=events.append)
+        robot = Robot(
+            scenario,
+            number,
+            endpoint,
+            events=events,
+            src_id=settings.robot_id,
+            airtime=phy.airtime,
+            messages=iter(()) if settings.source is None else next(coming),
+            start_s=settings.start_s,
+            busy=busy,
+        )
+        robots.append(robot)
+    return robots
 
 
 class Robot:
