@@ -20,7 +20,7 @@ from bench.mac_rivals import Csma, Sotdma
 from bench.rows import Row
 from bench.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 from gr_ros2.mac import Aloha, Slots
-from gr_ros2.run.load import make_phys
+from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import Simulation, offered_by
 from gr_ros2.run.task_run import TaskRun
@@ -275,9 +275,9 @@ def energy() -> list[Row]:
     for robots, most in ((5, 0), (20, 0.15), (60, 0)):
         sizes = [f"robots={robots}", f"sim.robots={robots}", f"ros_sink.max_sources={robots}"]
         scenario = load_scenario("twenty-robots", [*sizes, "sim.size_m=100"])
-        registry, ways = scenario.load_registry(), scenario.directions()
-        messages = [iter(list(way)) for way in offered_by(ways, registry)]  # the simulator is no part of it
-        run = Simulation(scenario, registry, make_phys(ways, registry), messages=messages)
+        registry = scenario.load_registry()
+        messages = [iter(list(one)) for one in offered_by(scenario, registry)]  # the simulator is no part of it
+        run = Simulation(scenario, registry, make_phy(scenario, registry), messages=messages)
         began = time.process_time()
         for _ in run.events():
             pass
@@ -295,8 +295,8 @@ def whole() -> list[Row]:
     sizes = ["robots=255", "ros_sink.max_sources=255", "duration_s=20", "sim.odom_rate=2"]
     scenario = load_scenario("formation", sizes)
     scenario, registry = replace(scenario, gains_db=gains), scenario.load_registry()
-    phys = make_phys(scenario.directions(), registry)
-    run = Simulation(scenario, registry, phys, task=TaskRun(scenario, registry))
+    phy = make_phy(scenario, registry)
+    run = Simulation(scenario, registry, phy, task=TaskRun(scenario, registry))
     began = time.process_time()
     for _ in run.events():
         pass

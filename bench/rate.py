@@ -62,7 +62,7 @@ def carried(rates: tuple[str, ...], channel: dict[str, float], load: float, seco
         }
     )
     registry = scenario.load_registry()
-    run = Simulation(scenario, registry, [make_phy(scenario, registry)], messages=[messages(load, seconds)])
+    run = Simulation(scenario, registry, make_phy(scenario, registry), messages=[messages(load, seconds)])
     whole = [(now, event.payload) for now, _, event in run.events() if isinstance(event, Delivered)]
     settled = sum(WARM_UP_S <= now < seconds for now, _ in whole)
     in_time = sum(now - int.from_bytes(payload[:4], "big") / load <= LATE_S for now, payload in whole)

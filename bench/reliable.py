@@ -18,7 +18,7 @@ from statistics import mean
 
 from bench.rows import Row
 from gr_ros2.link import Accepted, Delivered, SentPacket
-from gr_ros2.run.load import make_phys
+from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import Offered, Simulation
 from gr_ros2.sim.fleet import Fleet
@@ -72,12 +72,12 @@ def talk(
         }
         scenario = load_scenario("twenty-robots", [], **common)
         rows = scenario.load_registry()
-        (phy, *_) = make_phys(scenario.directions(), rows)
+        phy = make_phy(scenario, rows)
         rate = scenario.phy.sample_rate * phy.airtime() * PACKETS_S
         scenario = load_scenario("twenty-robots", [f"phy.sample_rate={rate}"], **common)
-        phys = make_phys(scenario.directions(), rows)
+        phy = make_phy(scenario, rows)
         messages = [_offered(number, robots, seed, reliable=reliable) for number in range(robots)]
-        run = Simulation(scenario, rows, phys, messages=messages, ideal=True)
+        run = Simulation(scenario, rows, phy, messages=messages, ideal=True)
         return _watched(run, packet_len)
 
 

@@ -8,7 +8,6 @@ sent.
 
 from __future__ import annotations
 
-import random
 import secrets
 import time
 from collections.abc import Callable, Mapping
@@ -18,12 +17,10 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.block_settings import own_settings, read_registry
+from gr_ros2.gr.block_settings import read_registry
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.factory import EndpointSetup, make_endpoint
-from gr_ros2.gr.live_end import LiveEnd
-from gr_ros2.gr.sink import RosSink
-from gr_ros2.gr.source import RosSource
+from gr_ros2.gr.factory import EndpointSetup
+from gr_ros2.gr.robot_blocks import RobotBlocks
 from gr_ros2.gr.starts import start_of
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
@@ -67,15 +64,11 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
         topics = read_registry(registry, needed=not source.version)
         start = self._start = start_of(source, source.src_id(), setup)
-        rng = random.Random(seed)
         calls = source.version != 0 and (len(topics) < MAX_TOPICS or bool(topics.services))
-        self.end = LiveEnd(
-            lambda hears: make_endpoint(topics, source, sink, start=start, rng=rng, observer=hears, calls=calls)
-        )
-        graphs: tuple[Any, Any] = middleware or (source.middleware, sink.middleware)
-        common: dict[str, Any] = {"observer": observer, "clock": clock, "end": self.end}
-        self.source = RosSource(topics, middleware=graphs[0], **common, **own_settings(source))
-        self.sink = RosSink(topics, middleware=graphs[1], **common, **own_settings(sink))
+        graphs = middleware or (source.middleware, sink.middleware)
+        common: dict[str, Any] = {"observer": observer, "clock": clock, "seed": seed, "calls": calls}
+        blocks = RobotBlocks(topics, source, sink, start=start, **common)
+        self.end, self.source, self.sink = blocks.end, blocks.source(graphs[0]), blocks.sink(graphs[1])
         self.calls: LiveCalls | None = None
         """The services that cross the link; None with version 0, and where topics leave no room for calls."""
         if calls:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from gr_ros2.medium.base import Path
 from gr_ros2.medium.positions import LEAST_DB, MOST_DB
 from gr_ros2.medium.propagation import snr_over_db
-from gr_ros2.settings.config import ChannelConfig, replaced
+from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.wire import BROADCAST
 
 Gains = float | Sequence[Sequence[float | None]] | None
@@ -15,29 +16,41 @@ Gains = float | Sequence[Sequence[float | None]] | None
 _SEEDS_APART = 7919
 
 
-def paths_between(
-    channel: ChannelConfig, gains_db: Gains, levels: Sequence[tuple[float, float]], bandwidth: float
-) -> list[list[Path]]:
-    """The paths between robots that all send and receive.
+def all_paths(channel: ChannelConfig, robots: int, *, leveled: bool) -> list[list[Path]]:
+    """The paths between robots that all send and receive. Where they draw random numbers, each has its own seed.
 
-    :param channel: what all paths have in common; without gains also their level
+    :param channel: what all paths have in common
+    :param leveled: whether each gets a level of its own
+    """
+    apart = leveled or channel.loses_packets or bool(channel.doppler_hz)
+
+    def between(number: int, other: int) -> ChannelConfig:
+        return replace(channel, seed=channel.seed + _SEEDS_APART * (1 + number * BROADCAST + other))
+
+    return [
+        [Path(other, between(number, other) if apart else channel) for other in range(robots) if other != number]
+        for number in range(robots)
+    ]
+
+
+def at_gains(
+    paths: Sequence[Sequence[Path]], gains_db: Gains, levels: Sequence[tuple[float, float]], bandwidth: float
+) -> list[list[Path]]:
+    """The paths of robots at the levels that follow from gains, without those on which nothing is heard.
+
     :param levels: power that each robot transmits, dBm, and noise figure of its receiver, dB
     :param bandwidth: of the noise, Hz
     """
-    draws = channel.loses_packets or channel.doppler_hz
-    paths: list[list[Path]] = []
-    for number, (power, _) in enumerate(levels):
-        paths.append([])
-        for other, (_, figure) in enumerate(levels):
-            snr_db = channel.snr_db
-            if gains_db is not None:
-                gain_db = gains_db if isinstance(gains_db, float | int) else gains_db[number][other]
-                snr_db = None if gain_db is None else float(snr_over_db(gain_db, power, figure, bandwidth))
-                if snr_db is None or snr_db < LEAST_DB:
-                    continue
-                snr_db = min(snr_db, MOST_DB)
-            if other != number:
-                seed = channel.seed + _SEEDS_APART * (1 + number * BROADCAST + other)
-                same = snr_db == channel.snr_db and not draws
-                paths[-1].append(Path(other, channel if same else replaced(channel, snr_db=snr_db, seed=seed)))
-    return paths
+    if gains_db is None:
+        return [list(heard) for heard in paths]
+    found: list[list[Path]] = []
+    for number, (heard, (power, _)) in enumerate(zip(paths, levels, strict=True)):
+        found.append([])
+        for path in heard:
+            gain_db = gains_db if isinstance(gains_db, float | int) else gains_db[number][path.receiver]
+            if gain_db is None:
+                continue
+            snr_db = float(snr_over_db(gain_db, power, levels[path.receiver][1], bandwidth))
+            if snr_db >= LEAST_DB:
+                found[-1].append(replace(path, channel=replace(path.channel, snr_db=min(snr_db, MOST_DB))))
+    return found

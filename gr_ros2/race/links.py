@@ -7,7 +7,6 @@ own air.
 
 from __future__ import annotations
 
-import random
 import threading
 import time
 from array import array
@@ -20,9 +19,8 @@ from gnuradio import gr
 
 from gr_ros2.core.closing import Closing
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.block_settings import own_settings
-from gr_ros2.gr.factory import EndpointSetup, make_endpoint
-from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.factory import EndpointSetup
+from gr_ros2.gr.robot_blocks import RobotBlocks
 from gr_ros2.link import ReceiverEvent, SenderEvent
 from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import Middleware, join_graph
@@ -155,14 +153,9 @@ class RaceRosLink(Closing):
         sink = SinkConfig(publisher_depth=DEPTH, **common)
         phy = self._radio.with_frames_of(self._packet_len)
         start = EndpointSetup(1, reports=True, any_length=phy.any_length)
-        rng = random.Random(self._radio.seed)
         log = _FrameLog(phy, self._logs[direction])
-        end = LiveEnd(lambda hears: make_endpoint(self._registry, source, sink, start=start, rng=rng, observer=hears))
-        blocks: dict[str, Any] = {"middleware": graph, "end": end}
-        return (
-            RosSource(self._registry, observer=log, **blocks, **own_settings(source)),
-            RosSink(self._registry, **blocks, **own_settings(sink)),
-        )
+        blocks = RobotBlocks(self._registry, source, sink, start=start, observer=log, seed=self._radio.seed)
+        return blocks.source(graph), blocks.sink(graph)
 
     @property
     def output_topic(self) -> str:
@@ -196,7 +189,7 @@ class _FrameLog:
             self._log.note(event.now, len(event.data), self._phy.airtime(len(event.data)))
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """Do nothing: a source does not receive."""
+        """Do nothing: what arrives was logged when it was sent."""
 
 
 class RaceIpLink(Closing):

@@ -20,7 +20,7 @@ from gr_ros2.race.contenders import Contender
 from gr_ros2.race.links import LinkLog, LinkReport
 from gr_ros2.race.measure import Observed, RaceSender, RaceStream
 from gr_ros2.race.race_settings import PHY_NAME, Condition, RaceSettings
-from gr_ros2.run.load import make_phys
+from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, scenario_from
 from gr_ros2.run.simulate import Offered, Simulation
 from gr_ros2.settings.registry import Registry
@@ -85,8 +85,8 @@ class _Run:
         last = max(messages[-1].t for messages in offered)
         scenario = self._scenario(self._settings.match_s if until_all_heard else last)
         registry = Registry.from_rows([(_TOPIC, self._senders[0].recording.type_name)])
-        phys = make_phys(scenario.directions(), registry)
-        run = Simulation(scenario, registry, phys, messages=[iter(messages) for messages in offered], ideal=True)
+        phy = make_phy(scenario, registry)
+        run = Simulation(scenario, registry, phy, messages=[iter(messages) for messages in offered], ideal=True)
         places = {robot.src_id: robot.number for robot in run.robots}
         silent, newest, met = set(self.heard), 0.0, inf
         sent: list[tuple[float, int]] = []
@@ -106,7 +106,7 @@ class _Run:
                 break
         for now, size in sent:
             if now <= max(last, newest):
-                self.log.note(now, size, phys[0].airtime(size))
+                self.log.note(now, size, phy.airtime(size))
         reasons = {"on_air": "packet_loss", "collision": "collision", "sending": "sending"}
         self.drops = {name: run.medium.lost.total(reason) for name, reason in reasons.items()}
         return met

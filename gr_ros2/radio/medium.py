@@ -36,7 +36,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.medium.base import FixedPaths, Surroundings, Transmission
-from gr_ros2.medium.gains import paths_between
+from gr_ros2.medium.gains import all_paths, at_gains
 from gr_ros2.medium.positions import Positions
 from gr_ros2.medium.samples import SampleMedium
 from gr_ros2.phy import PHY, configured
@@ -120,7 +120,8 @@ class MediumConfig:
         """Who hears whom, and how well."""
         assert self.phy.sample_rate != AUTO
         levels, bandwidth = [self.channel.levels(robot) for robot in self.robots], float(self.phy.sample_rate)
-        paths = paths_between(self.channel, self.gains_db, levels, bandwidth)
+        paths = all_paths(self.channel, len(self.robots), leveled=self.gains_db is not None)
+        paths = at_gains(paths, self.gains_db, levels, bandwidth)
         if not self.channel.from_positions:
             return FixedPaths(paths)
         places = np.array([robot.position for robot in self.robots], float)

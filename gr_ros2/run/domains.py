@@ -5,12 +5,16 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import TypeVar
 
 from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.free_domains import FREE, ReservedDomain
+from gr_ros2.run.robot_settings import RobotSettings
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced
 from gr_ros2.settings.fields import AUTO
+
+_Half = TypeVar("_Half", SourceConfig | None, SinkConfig | None)
 
 
 def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) -> Middleware:
@@ -22,43 +26,29 @@ def open_graph(scenario: Scenario, end: SourceConfig | SinkConfig, node: str) ->
     return join_graph(end.middleware, domain_id=end.domain_id, node_name=f"gr_ros2_{node}", localhost_only=local)
 
 
-def on_own_domains(scenario: Scenario, stack: ExitStack) -> Scenario:
-    """The scenario on domains that nobody else uses, where ``own_domains`` is set and it names none.
+def on_own_domains(scenario: Scenario, stack: ExitStack) -> tuple[RobotSettings, ...]:
+    """The robots of a scenario on domains that nobody else uses, where ``own_domains`` is set and they name none. Each
+    has a graph of its own; those that only receive are on one together.
 
     :param stack: gives the domains back
     :raises MiddlewareError: when none is free
     """
+    robots = scenario.all_robots
     if not scenario.own_domains:
-        return scenario
-    given = [
-        end.domain_id for end in (scenario.ros_source, scenario.ros_sink, *(one.ros_source for one in scenario.robots))
-    ]
+        return robots
+    given = {half.domain_id for robot in robots for half in (robot.source, robot.sink) if half is not None}
     free = (number for number in FREE if number not in given)
-    if scenario.robots:
-        domains = [
-            stack.enter_context(ReservedDomain(free)).number if domain == AUTO else domain for domain in given[2:]
-        ]
-        robots = [
-            replace(robot, ros_source=replaced(robot.ros_source, domain_id=domain))
-            for robot, domain in zip(scenario.robots, domains, strict=True)
-        ]
-        return replace(scenario, robots=tuple(robots))
-    here, there = (stack.enter_context(ReservedDomain(free)).number if domain == AUTO else domain for domain in given)
-    back = scenario.back
-    if back is not None:  # the reverse direction has the same two graphs
-        ends = {"ros_source": there, "ros_sink": here}
-        back = replace(
-            back,
-            **{
-                name: replaced(end, domain_id=domain)
-                for name, domain in ends.items()
-                for end in (getattr(back, name),)
-                if end.domain_id == AUTO
-            },
-        )
-    return replace(
-        scenario,
-        ros_source=replaced(scenario.ros_source, domain_id=here),
-        ros_sink=replaced(scenario.ros_sink, domain_id=there),
-        back=back,
+    reserved: dict[int, int] = {}
+
+    def own(half: _Half, graph: int) -> _Half:
+        if half is None or half.domain_id != AUTO:
+            return half
+        if graph not in reserved:
+            reserved[graph] = stack.enter_context(ReservedDomain(free)).number
+        return replaced(half, domain_id=reserved[graph])
+
+    graphs = [-1 if robot.source is None else number for number, robot in enumerate(robots)]
+    return tuple(
+        replace(robot, source=own(robot.source, graph), sink=own(robot.sink, graph))
+        for robot, graph in zip(robots, graphs, strict=True)
     )

@@ -21,11 +21,14 @@ from gr_ros2.phy import Phy
 from gr_ros2.run.domains import open_graph
 from gr_ros2.run.load import source_names
 from gr_ros2.run.observers import LiveLink
+from gr_ros2.run.outcome import by_sender
 from gr_ros2.run.own_channels import OwnChannels
 from gr_ros2.run.recorders import RunRecords
-from gr_ros2.run.robots import recorder_of
+from gr_ros2.run.robot_settings import RobotSettings, sources_of
+from gr_ros2.run.robots import hearer_of
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.shared_channel import SharedChannel
+from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.registry import Registry
 
 
@@ -56,7 +59,8 @@ class LiveMedium(Protocol):
     def check(self) -> None:
         """:raises GrRos2Error: when it cannot go on"""
 
-    def stop(self) -> None: ...
+    def stop(self) -> None:
+        """Nothing is carried any more. Idempotent."""
 
     def empty(self, unresolved: bool) -> bool:
         """Whether nothing is on its way.
@@ -78,17 +82,13 @@ class LiveMedium(Protocol):
 class LiveRobot:
     """A robot that is ready to start.
 
-    :param way: the scenario in which it sends; None: it offers nothing
     :param topics: topic id of every topic that it offers, by absolute name
     :param heard: name and type of every topic of the others, as it comes out here
-    :param recorded: whether what comes out here counts in the tables of the first receiver
     """
 
-    src_id: int
-    way: Scenario | None
+    settings: RobotSettings
     topics: Mapping[str, int]
     heard: Mapping[str, str]
-    recorded: bool
     source: RosSource | None
     sink: RosSink | None
 
@@ -103,8 +103,8 @@ class LiveRobot:
 class LiveRobots:
     """The robots of a scenario and the medium between them, ready to start.
 
-    :param scenario: in which robots have domains of their own where it says so
-    :param phys: one per direction
+    :param robots: those of the scenario, on domains of their own where it says so
+    :param phy: of all robots
     :param around: who hears whom
     :param records: observe the robots
     :param stack: closes what is opened here
@@ -114,34 +114,39 @@ class LiveRobots:
     def __init__(
         self,
         scenario: Scenario,
+        robots: Sequence[RobotSettings],
         registry: Registry,
-        phys: Sequence[Phy],
+        phy: Phy,
         around: Surroundings,
         *,
         records: RunRecords,
         stack: ExitStack,
     ) -> None:
         kind: Callable[..., LiveMedium] = SharedChannel if scenario.duplex == "half" else OwnChannels
-        self.medium = kind(scenario, registry, phys, around, records=records, stack=stack)
-        ways = scenario.directions()
-        self.robots = [_robot(scenario, registry, number, blocks) for number, blocks in enumerate(self.medium.blocks)]
-        self.offering = self.robots[: len(ways)]
+        self._scenario = scenario
+        self.medium = kind(scenario, robots, registry, phy, around, records=records, stack=stack)
+        sources = sources_of(robots)
+        self.robots = [
+            _robot(registry, settings, sources, blocks)
+            for settings, blocks in zip(robots, self.medium.blocks, strict=True)
+        ]
+        self.offering = self.robots[: len(sources)]
         """Those that offer messages."""
-        self.recorded = [robot for robot in self.robots if robot.recorded and robot.heard]
-        """Those of which the bag has what comes out."""
-        self._hearers = [next(iter(around.reached(number)), number) for number in range(len(ways))]
+        self.recorded = [one for number, one in enumerate(self.robots) if one.heard and not records.place(number)]
+        """Those of which the bag has what comes out: what counts in the tables of the first receiver."""
+        self._hearers = [hearer_of(around, number) for number in range(len(sources))]
 
     @property
     def sources(self) -> dict[int, RosSource]:
         """The blocks that send messages, by source id."""
-        return {robot.src_id: robot.source for robot in self.offering if robot.source is not None}
+        return {robot.settings.robot_id: robot.source for robot in self.offering if robot.source is not None}
 
     @property
     def graphs(self) -> tuple[tuple[str, int | None], ...]:
         """Where other programs can join in: what is there, and the ROS domain."""
         return tuple(
-            (f"the graph of {robot.way.ros_source.namespace}", robot.source.middleware.domain_id)
-            if robot.way is not None and robot.source is not None
+            (f"the graph of {robot.settings.namespace}", robot.source.middleware.domain_id)
+            if robot.settings.source is not None and robot.source is not None
             else ("the graph on which messages come out", robot.graph.domain_id)
             for robot in self.robots
         )
@@ -150,8 +155,8 @@ class LiveRobots:
         """The graph of a simulated robot: a participant of its own on that of its source, or else the graph at the
         other end of the link."""
         for robot in self.offering:
-            if robot.src_id == src_id and robot.way is not None:
-                return stack.enter_context(open_graph(robot.way, robot.way.ros_source, f"robot_{src_id}"))
+            if robot.settings.robot_id == src_id and (source := robot.settings.source) is not None:
+                return stack.enter_context(open_graph(self._scenario, source, f"robot_{src_id}"))
         return self.robots[1].graph
 
     def empty(self, unresolved: bool) -> bool:
@@ -166,25 +171,23 @@ class LiveRobots:
             sink = (robot if len(self.offering) > 2 else self.robots[hearer]).sink
             stats = {name: block.stats() for name, block in (("source", robot.source), ("sink", sink)) if block}
             counted.append({**stats, **self.medium.counted(number)})
-        first, *others = counted
-        rest = {"back": others[0]} if len(others) == 1 else {"robots": others} if others else {}
-        return {**first, **rest, **self.medium.counters()}
+        return {**by_sender(counted), **self.medium.counters()}
 
 
 def _robot(
-    scenario: Scenario, registry: Registry, number: int, blocks: tuple[RosSource | None, RosSink | None]
+    registry: Registry,
+    settings: RobotSettings,
+    sources: Sequence[SourceConfig],
+    blocks: tuple[RosSource | None, RosSink | None],
 ) -> LiveRobot:
     """A robot, whose sink knows the topics of the others from the start."""
     source, sink = blocks
-    ways = scenario.directions()
-    way = ways[number] if number < len(ways) else None
     heard: dict[str, str] = {}
-    for other in ways:
-        if sink is not None and sink.registry and other is not way:
-            src_id, ids = other.ros_source.src_id(), source_names(other, registry).values()
+    for other in sources:
+        if sink is not None and sink.registry and other is not settings.source:
+            src_id, ids = other.src_id(), source_names(other, registry).values()
             sink.outputs.announce(src_id, ids)
             topics = [sink.registry[topic_id] for topic_id in ids]
             heard |= {topic.republished(sink.config.namespace_format, src_id): topic.type_name for topic in topics}
-    offered = {} if way is None else source_names(way, registry)
-    src_id = -1 if source is None else source.src_id
-    return LiveRobot(src_id, way, offered, heard, recorder_of(scenario, number) == 0, source, sink)
+    offered = {} if settings.source is None else source_names(settings.source, registry)
+    return LiveRobot(settings, offered, heard, source, sink)

@@ -6,15 +6,14 @@ of the link.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.bag_files import BagContents, bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy, configured
+from gr_ros2.run.robot_settings import sources_of
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.settings.config import replaced
+from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet
@@ -25,59 +24,59 @@ _SAMPLE_S = 2.0
 
 
 def make_phy(scenario: Scenario, registry: Registry) -> Phy:
-    """The scenario's PHY at its sample rate, or at ``headroom`` times what the offered load needs.
+    """The PHY of all robots, at its sample rate, or at ``headroom`` times what the robot needs that offers most.
 
-    :raises ConfigError: for wrong PHY options, a channel that the PHY does not support, or when nothing is offered
+    :raises ConfigError: for wrong PHY options, a channel that the PHY does not support, or when a robot offers nothing
     """
     chosen = scenario.phy.sample_rate
     rate = 0.0 if chosen == AUTO else chosen
     if not rate and PHY.load(scenario.phy.name).has_samples:
         at_1_hz = configured(scenario.phy, scenario.packet_len, 1.0)
-        rate = scenario.phy.headroom * offered_packets(scenario, registry) * at_1_hz.airtime_samples()
+        most = max(offered_packets(scenario, source, registry) for source in sources_of(scenario.all_robots))
+        rate = scenario.phy.headroom * most * at_1_hz.airtime_samples()
     phy = configured(scenario.phy, scenario.packet_len, rate)
-    phy.check_channel(scenario.channel)
+    check_channels(scenario, phy)
     return phy
 
 
-def make_phys(directions: Sequence[Scenario], registry: Registry) -> list[Phy]:
-    """The PHY of every direction of a scenario. All have one sample rate: the highest that any of them needs.
+def check_channels(scenario: Scenario, phy: Phy) -> None:
+    """Refuse channels that a PHY does not support.
 
-    :raises ConfigError: see :func:`make_phy`
+    :raises ConfigError: see :meth:`gr_ros2.phy.Phy.check_channel`
     """
-    phys = [make_phy(way, registry) for way in directions]
-    rate = max(phy.sample_rate for phy in phys)
-    return [
-        phy if phy.sample_rate == rate else make_phy(replace(way, phy=replaced(way.phy, sample_rate=rate)), registry)
-        for phy, way in zip(phys, directions, strict=True)
-    ]
+    for channel in dict.fromkeys(path.channel for robot in scenario.all_robots for path in robot.paths):
+        phy.check_channel(channel)
 
 
-def offered_packets(scenario: Scenario, registry: Registry) -> float:
-    """Packets/s that the source needs if no packet carries more than one message.
+def offered_packets(scenario: Scenario, source: SourceConfig, registry: Registry) -> float:
+    """Packets/s that a robot's source needs if no packet carries more than one message.
 
     A recording counts with one message per second at least: at the average load of one with a message per hour, a
     packet would take the better part of an hour, and the last ones would never arrive.
 
     :raises ConfigError: when the source offers nothing on the registered topics
     """
-    packets, seconds = _bag_load(scenario, registry) if scenario.bag_path is not None else _sim_load(scenario, registry)
+    load = _sim_load if scenario.bag_path is None else _bag_load
+    packets, seconds = load(scenario, source, registry)
     if packets == 0:
         raise ConfigError(f"{scenario.source}: nothing on the registered topics; set phy.sample_rate, or other topics")
     return packets / seconds
 
 
-def source_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
-    """Topic ids of the topics the source subscribes, by their absolute names."""
-    chosen = registry.chosen(scenario.ros_source.topics)
-    return {topic.on_graph(scenario.ros_source.namespace): topic.topic_id for topic in chosen}
+def source_names(source: SourceConfig, registry: Registry) -> dict[str, int]:
+    """Topic ids of the topics that a source subscribes, by their absolute names."""
+    return {topic.on_graph(source.namespace): topic.topic_id for topic in registry.chosen(source.topics)}
 
 
-def published_names(scenario: Scenario, registry: Registry) -> dict[str, str]:
-    """Name of every topic at the sink, by its name at the source."""
-    format_, src_id = scenario.ros_sink.namespace_format, scenario.ros_source.src_id()
-    topics = registry.with_options(scenario.ros_sink.topic_options)
-    names = source_names(scenario, registry)
-    return {name: topics[topic_id].republished(format_, src_id) for name, topic_id in names.items()}
+def published_names(scenario: Scenario, source: SourceConfig, registry: Registry) -> dict[str, str]:
+    """Name of every topic of a source where it comes out, by its name there. Of several sinks the first one says it."""
+    others = (robot.sink for robot in scenario.all_robots if robot.source is not source)
+    sink = next(sink for sink in others if sink is not None)
+    topics = registry.with_options(sink.topic_options)
+    names = source_names(source, registry)
+    return {
+        name: topics[topic_id].republished(sink.namespace_format, source.src_id()) for name, topic_id in names.items()
+    }
 
 
 def recorded_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
@@ -86,7 +85,7 @@ def recorded_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
     :raises ConfigError: when the recording has none of them, or has one with another type or one that cannot be carried
     :raises BagError: when the recording cannot be read
     """
-    names = source_names(scenario, registry)
+    names = source_names(scenario.ros_source, registry)
     contents = recording(scenario)
     for name, topic_id in names.items():
         contents.check(name, registry[topic_id].type_name)
@@ -105,8 +104,8 @@ def recording(scenario: Scenario) -> BagContents:
     return BagContents(Path(), {}, {}, ()) if scenario.bag_path is None else bag_contents(scenario.bag_path)
 
 
-def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
-    names = source_names(scenario, registry)
+def _sim_load(scenario: Scenario, source: SourceConfig, registry: Registry) -> tuple[float, float]:
+    names = source_names(source, registry)
     duration = min(_SAMPLE_S, scenario.duration_s)
     sizes = {
         message.topic: len(message.payload)
@@ -117,16 +116,16 @@ def _sim_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     packets = 0.0
     for topic, size in sizes.items():
         rate = rates.get(topic.rsplit("/", 1)[-1], 0.0)
-        alone = _packets_alone(size, scenario.packet_len, scenario.ros_source.wire_format)
+        alone = _packets_alone(size, scenario.packet_len, source.wire_format)
         packets += alone * (rate or 1 / scenario.duration_s)
     return packets, 1.0
 
 
-def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
+def _bag_load(scenario: Scenario, source: SourceConfig, registry: Registry) -> tuple[float, float]:
     assert scenario.bag_path is not None
     packets, messages, first, last = 0, 0, 0, 0
     for message in read_bag(scenario.bag_path, recorded_names(scenario, registry)):
-        packets += _packets_alone(len(message.payload), scenario.packet_len, scenario.ros_source.wire_format)
+        packets += _packets_alone(len(message.payload), scenario.packet_len, source.wire_format)
         messages += 1
         first = first or message.stamp_ns
         last = message.stamp_ns

@@ -42,6 +42,12 @@ class LiveLink(Protocol):
     """What an observer can read and change in a flowgraph: ``phy.loopback.LoopbackLink``, ``radio.radio.Radio``.
 
     The setters raise a GrRos2Error where the setting cannot be changed.
+
+    :ivar phy: of transmitter and receiver
+    :ivar channel: as its settings say
+    :ivar snr_db: of the newest packets, as the receiver measured it, dB; None where it has not
+    :ivar changeable: whether the channel can be changed
+    :ivar transmits: whether packets go on the air
     """
 
     @property
@@ -52,16 +58,32 @@ class LiveLink(Protocol):
     def snr_db(self) -> float | None: ...
     @property
     def changeable(self) -> bool: ...
-    def gate_lateness(self) -> Lateness | None: ...
-    def counts(self) -> LinkCounts: ...
-    def samples(self) -> Samples | None: ...
-    def symbols(self) -> Samples | None: ...
     @property
     def transmits(self) -> bool: ...
-    def transmit(self, *, on: bool) -> None: ...
-    def set_snr_db(self, snr_db: float | None) -> None: ...
-    def set_frequency_offset(self, frequency_offset: float) -> None: ...
-    def set_packet_loss(self, probability: float) -> None: ...
+
+    def gate_lateness(self) -> Lateness | None:
+        """How late packets left the airtime gate; None where there is none."""
+
+    def counts(self) -> LinkCounts:
+        """Packets so far."""
+
+    def samples(self) -> Samples | None:
+        """The newest samples behind the channel; None where nothing taps them."""
+
+    def symbols(self) -> Samples | None:
+        """The newest constellation points of the receiver; None where it shows none."""
+
+    def transmit(self, *, on: bool) -> None:
+        """Whether packets go on the air from now on."""
+
+    def set_snr_db(self, snr_db: float | None) -> None:
+        """Signal-to-noise ratio of the channel from now on, dB; None = no noise."""
+
+    def set_frequency_offset(self, frequency_offset: float) -> None:
+        """Offset of the carrier from now on, fraction of the sample rate."""
+
+    def set_packet_loss(self, probability: float) -> None:
+        """Probability from now on that a packet is dropped, 0..1."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +118,7 @@ class LiveRun:
 class RunObserver(LinkObserver, Protocol):
     """An observer. Messages about it use its ``name``, where it has one.
 
-    :param instruments: whether the link must be built so that its channel can be changed and its signal observed
+    :ivar instruments: whether the link must be built so that its channel can be changed and its signal observed
     """
 
     @property
@@ -166,7 +188,6 @@ class RunObservers(Observers[RunObserver]):
             guard(observer.run_started, run)
 
     def settle(self) -> None:
-        """Wait until the observer has had all events; one that does not keep up is given up."""
         """Wait until all observers have received everything so far. The link has stopped. If an observer takes too
         long, its remaining events count as missed."""
         for observer in self._threaded:
@@ -199,6 +220,7 @@ class ThreadedObserver(Observers[RunObserver]):
         self._backlog.offer(0, self._guard, self._observer.run_started, run)
 
     def settle(self) -> None:
+        """Wait until the observer has had all events; one that does not keep up is given up."""
         if not self._backlog.settle(_PATIENCE_S):
             self._give_up()
 

@@ -5,6 +5,7 @@ Invariant: nothing here depends on how a run is made.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,10 +44,20 @@ class Outcome:
     team: TeamRecord | None = None
 
 
+def by_sender(counted: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Counters as in a result: those of the first robot, of a second as ``back``, of several others as ``robots``.
+
+    :param counted: of each robot that sends
+    """
+    first, *others = counted
+    rest = {"back": others[0]} if len(others) == 1 else {"robots": others} if others else {}
+    return {**first, **rest}
+
+
 def phy_numbers(phy: Phy, channels: int, recorder: Recorder) -> dict[str, Any]:
     """The field ``phy`` of a result. Call it after the recorder has finished.
 
-    :param channels: one per direction
+    :param channels: how many the robots used
     """
     return {
         "name": phy.name,

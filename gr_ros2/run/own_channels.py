@@ -6,7 +6,6 @@ receiver for each channel that it hears. A robot that sends nothing but reports 
 
 from __future__ import annotations
 
-import random
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -16,9 +15,8 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.block_settings import own_settings
-from gr_ros2.gr.factory import EndpointSetup, make_endpoint
-from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.factory import EndpointSetup
+from gr_ros2.gr.robot_blocks import RobotBlocks
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.medium.base import Surroundings
 from gr_ros2.middleware import Middleware
@@ -30,9 +28,10 @@ from gr_ros2.record.lateness import modem_lateness
 from gr_ros2.run.domains import open_graph
 from gr_ros2.run.load import recorded_names
 from gr_ros2.run.recorders import RunRecords
-from gr_ros2.run.robots import Halves, halves_of_robots, start_of_run
+from gr_ros2.run.robot_settings import RobotSettings, sources_of
+from gr_ros2.run.robots import start_of_run
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced, robot_of
+from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 
@@ -46,32 +45,27 @@ class OwnChannels:
     def __init__(
         self,
         scenario: Scenario,
+        robots: Sequence[RobotSettings],
         registry: Registry,
-        phys: Sequence[Phy],
+        phy: Phy,
         around: Surroundings,
         *,
         records: RunRecords,
         stack: ExitStack,
     ) -> None:
         self._scenario, self._registry, self._records, self._stack = scenario, registry, records, stack
-        ways = scenario.directions()
         self._hearing = Counter(receiver for number in range(around.robots) for receiver in around.reached(number))
-        any_length = all(phy.any_length for phy in phys)
-        start = start_of_run(ways, any_length=any_length, mcs_table=phys[0].mcs_table)
+        start = start_of_run(scenario, phy)
         self.blocks = [
-            self._blocks(number, halves, start, sends=bool(around.reached(number)))
-            for number, halves in enumerate(halves_of_robots(ways))
+            self._blocks(number, robot, start, sends=bool(around.reached(number)))
+            for number, robot in enumerate(robots)
         ]
         self._flowgraph = Flowgraph("gr_ros2_channels", scenario.name)
-        self.links = [
-            self._link(number, phys[number if number < len(ways) else 0], around)
-            for number in range(around.robots)
-            if around.reached(number)
-        ]
-        self._offering = [way.ros_source.src_id() for way in ways]
+        self.links = [self._link(number, phy, around) for number in range(around.robots) if around.reached(number)]
+        self._offering = [source.src_id() for source in sources_of(robots)]
         stack.callback(self.stop)
         self.clock: Callable[[], float] = time.monotonic
-        self.channels = len(ways)
+        self.channels = len(self._offering)
 
     def start(self) -> None:
         """Start the flowgraph."""
@@ -124,45 +118,33 @@ class OwnChannels:
         return self._scenario.time != "unthrottled"
 
     def _blocks(
-        self, number: int, halves: Halves, start: EndpointSetup, *, sends: bool
+        self, number: int, robot: RobotSettings, start: EndpointSetup, *, sends: bool
     ) -> tuple[RosSource | None, RosSink | None]:
         """The blocks of a robot, which share one endpoint."""
-        scenario, registry = self._scenario, self._registry
-        source, sink = halves
-        if scenario.robots:
-            assert source is not None and sink is not None
-            sink = replaced(sink, middleware=source.middleware, domain_id=source.domain_id)
-        elif sink is not None and number > 1:
-            sink = _apart(sink, registry, number)
+        scenario, source, sink = self._scenario, robot.source, robot.sink
+        if source is None and sink is not None and number > 1:
+            sink = _apart(sink, self._registry, number)
         hears = bool(self._hearing[number])
         if source is not None and not sends:
             raise ConfigError(
                 f"gains_db: nobody hears {source.namespace}, whose channel in real time would have no receiver; set "
                 "duplex: half, or time to packets or samples"
             )
-        rng = random.Random(scenario.seed)
-        end = LiveEnd(lambda events: make_endpoint(registry, *halves, start=start, rng=rng, observer=events))
-        src_id = robot_of(source, sink)
-        bare: dict[str, Any] = {"version": scenario.version, "packet_len": scenario.packet_len, "robot_id": src_id}
-        common: dict[str, Any] = {"end": end, "observer": self._records.of(number, src_id)}
+        if source is None and not hears:
+            raise ConfigError(
+                f"gains_db: receiver {number} hears nobody; set a higher gain, or time to packets or samples"
+            )
+        if source is not None and scenario.bag_path is not None and not scenario.bag_speed:
+            # A bag that is read as fast as the link takes it: the reader waits, so that nothing is dropped.
+            source = replace(source, backpressure=True)
+        observer = self._records.of(number)
+        blocks = RobotBlocks(self._registry, source, sink, start=start, observer=observer, seed=scenario.seed)
         here, there = self._graphs(source, sink)
-        sending = receiving = None
-        if sends:
-            mine = registry if source is not None else Registry.empty()
-            half = own_settings(self._pulled(source) if source is not None else SourceConfig(**bare))
-            sending = RosSource(mine, middleware=here, **common, **half)
-            self._stack.callback(sending.close)
-        if hears:
-            mine = registry if sink is not None else Registry.empty()
-            receiving = RosSink(mine, middleware=there, **common, **own_settings(sink or SinkConfig(**bare)))
-            self._stack.callback(receiving.close)
+        sending, receiving = blocks.source(here) if sends else None, blocks.sink(there) if hears else None
+        for block in (sending, receiving):
+            if block is not None:
+                self._stack.callback(block.close)
         return sending, receiving
-
-    def _pulled(self, source: SourceConfig) -> SourceConfig:
-        """A bag that is read as fast as the link takes it needs a source that makes the reader wait instead of
-        dropping."""
-        pulled = self._scenario.bag_path is not None and self._scenario.bag_speed == 0
-        return replace(source, backpressure=True) if pulled else source
 
     def _graphs(self, source: SourceConfig | None, sink: SinkConfig | None) -> tuple[Middleware, Middleware]:
         """The participants of a robot's two halves: one for both where they are on the same graph."""

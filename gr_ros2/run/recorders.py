@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gr_ros2.core.guard import Guard
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.medium.base import Surroundings
 from gr_ros2.phy import Phy
 from gr_ros2.record.positions import position_reader
 from gr_ros2.record.recorder import Recorder
@@ -23,9 +24,10 @@ from gr_ros2.record.trace import Trace
 from gr_ros2.run.load import published_names, source_names
 from gr_ros2.run.observers import LiveLink, LiveRun, RunObservers
 from gr_ros2.run.outcome import Outcome, phy_numbers
-from gr_ros2.run.robots import recorder_of
+from gr_ros2.run.robot_settings import sources_of
 from gr_ros2.run.scenario import Scenario, dump
 from gr_ros2.run.task_run import TaskRun
+from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.registry import Registry
 
 if TYPE_CHECKING:
@@ -34,43 +36,56 @@ if TYPE_CHECKING:
 
 def make_recorder(
     registry: Registry,
-    ways: Sequence[Scenario],
+    sources: Sequence[SourceConfig],
     on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
 ) -> Recorder:
     """The recorder of a run.
 
-    :param ways: one scenario per direction
+    :param sources: of the robots whose messages it counts
     :param on_delivery: see :class:`gr_ros2.record.recorder.Recorder`
     """
     return Recorder(
         registry,
-        {way.ros_source.src_id(): way.ros_source.namespace for way in ways},
-        {way.ros_source.src_id(): source_names(way, registry).values() for way in ways},
+        {source.src_id(): source.namespace for source in sources},
+        {source.src_id(): source_names(source, registry).values() for source in sources},
         on_delivery=on_delivery,
     )
 
 
-def make_team(registry: Registry, ways: Sequence[Scenario], phy: Phy) -> TeamRecord | None:
-    """What follows the robots of a scenario that share a channel; None where they do not.
-
-    :param ways: one scenario per direction
-    """
-    if ways[0].duplex != "half":
+def make_team(registry: Registry, scenario: Scenario, phy: Phy) -> TeamRecord | None:
+    """What follows the robots of a scenario that share a channel; None where they do not."""
+    if scenario.duplex != "half":
         return None
+    sources = sources_of(scenario.all_robots)
     readers = {
-        (way.ros_source.src_id(), topic_id): reader
-        for way in ways
-        for topic_id in source_names(way, registry).values()
+        (source.src_id(), topic_id): reader
+        for source in sources
+        for topic_id in source_names(source, registry).values()
         if (reader := position_reader(registry[topic_id].type_name)) is not None
     }
-    return TeamRecord([way.ros_source.src_id() for way in ways], phy.airtime, readers)
+    return TeamRecord([source.src_id() for source in sources], phy.airtime, readers)
+
+
+def receivers_of(scenario: Scenario, around: Surroundings) -> dict[int, list[int]]:
+    """The places of the robots that have a recorder, with those of the robots whose messages it counts. The first is
+    that of the result. Two robots share one. Each of several that receive counts what it can hear, or messages of all
+    where they are relayed."""
+    robots = scenario.all_robots
+    senders = [number for number, robot in enumerate(robots) if robot.source is not None]
+    if len(robots) == 2:
+        return {1: senders}
+    relays, reached = scenario.relay != "off", {one: set(around.reached(one)) for one in senders}
+    return {
+        number: [one for one in senders if one != number and (relays or number in reached[one])]
+        for number, robot in enumerate(robots)
+        if robot.sink is not None
+    }
 
 
 class RunRecords:
     """Who observes what of a run, and its result.
 
-    :param phys: one per direction
-    :param ears: see :func:`gr_ros2.run.robots.ears_of`
+    :param around: who hears whom
     :param task: of robots that act on what they hear; is told what comes out of their links
     :param on_delivery: see :func:`make_recorder`; of what the first receiver gets
     """
@@ -79,36 +94,41 @@ class RunRecords:
         self,
         scenario: Scenario,
         registry: Registry,
-        phys: Sequence[Phy],
-        ears: Sequence[Sequence[int]],
+        phy: Phy,
+        around: Surroundings,
         *,
         run_observers: RunObservers,
         task: TaskRun | None = None,
         on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
     ) -> None:
-        self._scenario, self._registry, self._phy = scenario, registry, phys[0]
+        self._scenario, self._registry, self._phy = scenario, registry, phy
         self._config = dump(scenario)
-        self.ways = ways = scenario.directions()
+        self._sources = sources = sources_of(scenario.all_robots)
         self.run_observers = run_observers
-        heard = [[ways[number] for number in ear] for ear in ears]
+        receivers = receivers_of(scenario, around)
+        self._places = {number: place for place, number in enumerate(receivers)}
+        heard = [[sources[number] for number in senders] for senders in receivers.values()]
         self.recorder = make_recorder(registry, heard[0], on_delivery)
         self._recorders = [self.recorder, *(make_recorder(registry, others) for others in heard[1:])]
         self._guards = [Guard("Recorder", needed=True) for _ in self._recorders]
-        self._hearing: dict[int, list[int]] = {way.ros_source.src_id(): [] for way in ways}
+        self._hearing: dict[int, list[int]] = {source.src_id(): [] for source in sources}
         """Which recorders get what a robot sends; all that of one that offers nothing."""
         for place, others in enumerate(heard):
-            for way in others:
-                self._hearing[way.ros_source.src_id()].append(place)
-        self.team = make_team(registry, ways, phys[0])
+            for source in others:
+                self._hearing[source.src_id()].append(place)
+        self.team = make_team(registry, scenario, phy)
         self._task, self._acting = task, Guard(f"task {scenario.task}", needed=True)
 
-    def of(self, number: int, src_id: int) -> RobotObserver:
+    def of(self, number: int) -> RobotObserver:
         """What observes a robot.
 
         :param number: its place among the robots of the run
-        :param src_id: -1 for none
         """
-        return RobotObserver(self, number, src_id, recorder_of(self._scenario, number))
+        return RobotObserver(self, number, self._scenario.all_robots[number].robot_id, self.place(number))
+
+    def place(self, number: int) -> int:
+        """That of the recorder of what a robot receives; 0 = that of the result, which has reports to a sender too."""
+        return self._places.get(number, 0)
 
     def sent(self, src_id: int, event: SenderEvent) -> None:
         """An event of a robot's sending half."""
@@ -144,9 +164,9 @@ class RunRecords:
             packet_len=self._scenario.packet_len,
             registry=self._registry,
             topics={
-                (way.ros_source.src_id(), topic_id): name
-                for way in self.ways
-                for name, topic_id in source_names(way, self._registry).items()
+                (source.src_id(), topic_id): name
+                for source in self._sources
+                for name, topic_id in source_names(source, self._registry).items()
             },
             sources=sources or {},
             links=links,
@@ -186,7 +206,11 @@ class RunRecords:
         :param rest: further fields of the result
         """
         topics = self.recorder.finish(played, end, drained)
-        names = {name: other for way in self.ways for name, other in published_names(way, self._registry).items()}
+        names = {
+            name: other
+            for source in self._sources
+            for name, other in published_names(self._scenario, source, self._registry).items()
+        }
         trace = self.recorder.trace(begin, end, names)
         numbers = partial(phy_numbers, self._phy, channels)
         result = Result(
@@ -199,11 +223,12 @@ class RunRecords:
                 ReceiverResult(
                     number,
                     recorder.finish(played, end, drained),
-                    self._scenario.robots[number - 1].ros_source.namespace if self._scenario.robots else "",
+                    self._scenario.all_robots[robot].namespace,
                     packets=recorder.ledger.packets(),
                     phy=numbers(recorder),
                 )
-                for number, recorder in enumerate(self._recorders[1:], 2)
+                for number, (recorder, robot) in enumerate(zip(self._recorders, self._places, strict=True), 1)
+                if number > 1
             ),
             packets=self.recorder.ledger.packets(),
             phy=numbers(self.recorder),

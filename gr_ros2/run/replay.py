@@ -71,7 +71,7 @@ def replay(
     scenario, registry = carrying(
         replace(scenario, time=scenario.time if scenario.simulated else "samples"), contents, topics
     )
-    names = source_names(scenario, registry)
+    names = source_names(scenario.ros_source, registry)
     src_id = scenario.ros_source.src_id()
     with _bag_at(target, bag_origin_ns(scenario, names)) as bag:
         bag.copy_source(src_id, {topic_id: recorded[name] for name, topic_id in names.items()})
@@ -87,10 +87,14 @@ def carrying(scenario: Scenario, contents: BagContents, topics: Sequence[str]) -
     """
     scenario = replace(scenario, source=f"bag:{contents.path}", bag_speed=1.0)
     registry = scenario.load_registry()
-    names = {name: topic_id for name, topic_id in source_names(scenario, registry).items() if name in contents.topics}
+    names = {
+        name: topic_id
+        for name, topic_id in source_names(scenario.ros_source, registry).items()
+        if name in contents.topics
+    }
     if topics or not names:
         scenario, registry = _made_for(scenario, registry, contents, topics)
-        names = source_names(scenario, registry)
+        names = source_names(scenario.ros_source, registry)
     else:
         carried = tuple(registry[topic_id].name for topic_id in names.values())
         scenario = replace(scenario, ros_source=replaced(scenario.ros_source, topics=carried))
@@ -119,7 +123,7 @@ def _made_for(
             f"{source}: has {len(rows)} topics, and a link carries {most}; choose with --topics from "
             f"{', '.join(first(recorded))}"
         )
-    names = {name: registry[topic_id].name for name, topic_id in source_names(scenario, registry).items()}
+    names = {name: registry[topic_id].name for name, topic_id in source_names(scenario.ros_source, registry).items()}
 
     def options(given: Mapping[str, TopicOptions]) -> dict[str, TopicOptions]:
         by_name = {name.lstrip("/"): value for name, value in given.items()}

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shutil import copyfile
@@ -25,17 +26,16 @@ from gr_ros2.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2.record.trace import Trace, write_trace
 from gr_ros2.run.domains import on_own_domains, open_graph
-from gr_ros2.run.load import make_phys, recording
+from gr_ros2.run.load import make_phy, recording
 from gr_ros2.run.observers import RunObserver, RunObservers
 from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2.run.pulse import Pulse
 from gr_ros2.run.recorders import RunRecords
-from gr_ros2.run.repeat import repetitions
-from gr_ros2.run.robots import ears_of, surroundings
-from gr_ros2.run.scenario import Scenario
+from gr_ros2.run.robots import surroundings
+from gr_ros2.run.scenario import Scenario, changed
 from gr_ros2.run.simulated_runner import run_simulated
 from gr_ros2.run.task_run import TaskRun
-from gr_ros2.settings.config import replaced
+from gr_ros2.settings.config import Seeded
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 
@@ -167,15 +167,24 @@ def run_repetitions(
     return results
 
 
+def repetitions(scenario: Scenario) -> Iterator[Scenario]:
+    """The scenario once per repetition, each with its own seeds: in repetition k (from 0) every seed is k higher."""
+    for k in range(scenario.repetitions):
+        yield replace(changed(scenario, Seeded, partial(_reseeded, by=k)), repetitions=1)
+
+
+def _reseeded(part: Seeded, by: int) -> Seeded:
+    return replace(part, seed=part.seed + by)
+
+
 class _Run:
     def __init__(self, scenario: Scenario, out: Path | None, stack: ExitStack, run_observers: RunObservers) -> None:
         self.registry = registry = scenario.load_registry()
-        phys = make_phys(scenario.directions(), registry)
+        phy = make_phy(scenario, registry)
         self.task = TaskRun(scenario, registry) if scenario.task else None
-        around = surroundings(scenario, phys[0].sample_rate, self.task)
-        ears = ears_of(scenario, around)
-        self.records = RunRecords(scenario, registry, phys, ears, run_observers=run_observers, task=self.task)
-        self.scenario = scenario = on_own_domains(scenario, stack)
+        around = surroundings(scenario, phy.sample_rate, self.task)
+        self.records = RunRecords(scenario, registry, phy, around, run_observers=run_observers, task=self.task)
+        self.scenario, robots = scenario, on_own_domains(scenario, stack)
         self.run_observers = run_observers
         self.progress_guard = Guard("progress")
         self.pulse = Pulse()
@@ -186,7 +195,7 @@ class _Run:
         try:
             from gr_ros2.run.live import LiveRobots  # only a run in real time needs GNU Radio
 
-            self.live = LiveRobots(scenario, registry, phys, around, records=self.records, stack=stack)
+            self.live = LiveRobots(scenario, robots, registry, phy, around, records=self.records, stack=stack)
             self.medium, self.clock = self.live.medium, self.live.medium.clock
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)
@@ -203,10 +212,11 @@ class _Run:
             raise error if isinstance(error, BagError) else RunError(f"{scenario.name}: {error}") from error
 
     def _listen(self, out: Path, stack: ExitStack) -> DeliveryRecorder:
-        graphs = {}
-        for robot in self.live.recorded:
-            end = replaced(self.scenario.ros_sink, middleware=robot.graph.name, domain_id=robot.graph.domain_id)
-            graphs[stack.enter_context(open_graph(self.scenario, end, "listener"))] = robot.heard
+        graphs = {
+            stack.enter_context(open_graph(self.scenario, robot.settings.sink, "listener")): robot.heard
+            for robot in self.live.recorded
+            if robot.settings.sink is not None
+        }
         listener = DeliveryRecorder(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)
         return listener

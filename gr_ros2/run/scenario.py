@@ -2,16 +2,17 @@
 
 Invariants: settings that must be equal at both ends of the link (`registry`, `packet_len`) are given once, at the top
 level, and apply to all ends; `source` names where messages come from, `ros_source` and `ros_sink` configure the two
-blocks; a scenario of several senders is as many one-way scenarios; `dump` gives a mapping from which
-`scenario_from` makes the same scenario again.
+blocks; what runs a scenario reads its `all_robots`, never the short forms `back`, `reports` and `receivers`; `dump`
+gives a mapping from which `scenario_from` makes the same scenario again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
@@ -19,20 +20,15 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
+from gr_ros2.run.robot_settings import Back, Reports, RobotConfig, RobotSettings, all_to_all, both_ways, one_way
 from gr_ros2.settings.config import (
     STRICT,
     AnyLink,
     Decibels,
-    OneWay,
-    OverChannel,
     Populated,
     ScenarioChannel,
-    Seconds,
-    Sending,
     Traffic,
-    Transceiver,
     build,
-    replaced,
 )
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
@@ -48,6 +44,7 @@ _BACK_SEED = 100_003
 """Difference between the channel seeds of the two directions. It is larger than between any two repetitions."""
 
 
+_T = TypeVar("_T")
 Time = Literal["real", "unthrottled", "samples", "packets"]
 
 
@@ -69,38 +66,6 @@ class Experiment:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Back(OneWay):
-    """The reverse direction of a two-way scenario, at the same time on a second channel (full duplex).
-
-    What is not set is as in the forward direction, with the two graphs swapped; of ``channel`` the seed differs.
-
-    :param ros_source: the second robot's sending block; needs a ``namespace`` or ``robot_id`` of its own
-    :param ros_sink: the first robot's receiving block
-    :param channel: what lies between them
-    """
-
-    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Reports(OverChannel):
-    """The reverse direction for reports of what was heard, on a channel of its own (version 1).
-
-    :param channel: what lies between them and the sender; what is not set is as forward, but for the seed
-    :param delay_s: s that a report takes beside its airtime
-    """
-
-    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
-    delay_s: Seconds = 0.0
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class RobotConfig(Transceiver, Sending):
-    """One of the robots that share a medium. What is not set in its block is as in the scenario's, but for the
-    namespace: ``/robot_1``, ``/robot_2``, …"""
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Scenario(Populated, Experiment, Traffic, AnyLink):
     """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
 
@@ -114,9 +79,9 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
         as many that differ in their names alone
     :param duplex: full = each robot sends on a channel of its own, and hears while it sends; half = all use one
         channel: who sends hears nothing meanwhile, and packets that overlap at a receiver disturb each other
-    :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
-        each other, null where nothing arrives. Level and noise then follow from transmit power, noise figure and
-        ``phy.sample_rate``; null = ``channel.snr_db`` between all
+    :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot (without ``robots``
+        first that of ``ros_source``) with a number for each other, null where nothing arrives. Level and noise then
+        follow from transmit power, noise figure and ``phy.sample_rate``; null = ``channel.snr_db`` between all
     :param task: what the robots do on what they hear of each other: `formation`, `rendezvous`, or `module:Class`, a
         subclass of :class:`gr_ros2.sim.tasks.Task`; '' = each drives its own ways
     :param controller: who drives the robots of a task. `task`: the task itself; `ros`: a node on the graph of each
@@ -194,23 +159,20 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError(
                 f"controller = {self.controller!r}: stands in for that of a task in real time; set task and time: real"
             )
+        matrix, count = self.gains_db, len(self.robots) or 2 + len(self.receivers)
+        if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
+            raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
         if not self.robots:
-            if self.gains_db is not None:
-                raise ValueError("gains_db: lie between robots; set robots, or channel.snr_db instead")
             return
         if not self.simulated:
             self._check_live_robots()
         if self.source != "sim" or self.back is not None or self.reports is not None or self.receivers:
             raise ValueError("robots: they all send and receive; set source to sim, leave back, reports, receivers out")
-        count = len(self.robots)
         ids = {robot.ros_source.src_id() for robot in self.robots}
         if count < 2 or len(ids) < count:
             raise ValueError(
                 f"robots: {count} robots with {len(ids)} source ids; two or more robots, each with its own"
             )
-        matrix = self.gains_db
-        if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
-            raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
 
     def _check_live_robots(self) -> None:
         """Whether the robots fit the medium that carries them in real time."""
@@ -247,23 +209,15 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
                 f"back.ros_source: source id {src_id} is that of ros_source; set another namespace or robot_id"
             )
 
-    def directions(self) -> tuple[Scenario, ...]:
-        """The one-way scenarios that this scenario consists of, one for each robot that offers messages."""
+    @cached_property
+    def all_robots(self) -> tuple[RobotSettings, ...]:
+        """The robots of its runs, those included that short forms stand for. Those that offer messages come first."""
         if self.robots:
-            alone = replace(self, robots=(), gains_db=None, task="", controller="task")
-            return tuple(replace(alone, ros_source=robot.ros_source) for robot in self.robots)
-        if self.back is None:
-            return (self,)
-        forward = replace(self, back=None, reports=None, receivers=())
-        back = {item.name: getattr(self.back, item.name) for item in fields(self.back)}
-        return forward, replace(forward, **back)
-
-    def report_channels(self) -> list[ScenarioChannel]:
-        """The channel on which each receiver reports: that of ``reports``, with a seed of its own; [] without it."""
-        if self.reports is None:
-            return []
-        channel = self.reports.channel
-        return [replaced(channel, seed=channel.seed + number) for number in range(1 + len(self.receivers))]
+            leveled = self.gains_db is not None
+            return all_to_all(self.robots, self.ros_sink, self.channel, leveled=leveled, seed=self.seed)
+        if self.back is not None:
+            return both_ways(self.ros_source, self.ros_sink, self.channel, self.back)
+        return one_way(self.ros_source, self.ros_sink, (self.channel, *self.receivers), self.reports)
 
     @property
     def simulated(self) -> bool:
@@ -278,8 +232,9 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             :func:`gr_ros2.settings.registry.check_outputs`
         """
         registry = Registry.from_csv(self.registry)
-        for way in self.directions():
-            check_outputs(registry, way.ros_sink)
+        for way in (self, self.back):
+            if way is not None:
+                check_outputs(registry, way.ros_sink)
         return registry
 
 
@@ -287,6 +242,24 @@ def dump(scenario: Scenario) -> dict[str, Any]:
     """Every setting as JSON values, from which :func:`scenario_from` makes an equal scenario."""
     values: dict[str, Any] = TypeAdapter(Scenario).dump_python(scenario, mode="json", by_alias=True)
     return values
+
+
+def changed(scenario: Scenario, kind: type[_T], change: Callable[[_T], _T]) -> Scenario:
+    """The scenario with every part of a kind changed, of all its robots: all sources, for instance, or all channels.
+
+    :param kind: a class of settings; those with parts of this kind may be of it too
+    """
+
+    def inside(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(inside(one) for one in value)
+        if not is_dataclass(value) or isinstance(value, type):
+            return value
+        value = replace(value, **{item.name: inside(getattr(value, item.name)) for item in fields(value)})
+        return change(value) if isinstance(value, kind) else value
+
+    made: Scenario = inside(scenario)
+    return made
 
 
 def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:

@@ -25,8 +25,9 @@ from gr_ros2.radio.medium import MediumConfig, MediumProcess, MediumRobot
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.run.recorders import RunRecords
+from gr_ros2.run.robot_settings import RobotSettings
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.settings.config import AnyLink, ChannelConfig, DiagnosticsConfig, build, replaced
+from gr_ros2.settings.config import AnyLink, ChannelConfig, DiagnosticsConfig, PhyConfig, build, replaced
 from gr_ros2.settings.registry import Registry
 
 _FOUND_S = 20.0
@@ -44,22 +45,24 @@ class SharedChannel:
     def __init__(
         self,
         scenario: Scenario,
+        robots: Sequence[RobotSettings],
         registry: Registry,  # noqa: ARG002 - each link reads its own
-        phys: Sequence[Phy],
+        phy: Phy,
         around: Surroundings,
         *,
         records: RunRecords,
         stack: ExitStack,
     ) -> None:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="gr-ros2-")))
-        ways = scenario.directions()
-        phy = replaced(scenario.phy, sample_rate=phys[0].sample_rate)
-        ends = [tuple(f"ipc://{folder}/{number}-{what}" for what in ("sends", "hears")) for number in range(len(ways))]
+        settings = replaced(scenario.phy, sample_rate=phy.sample_rate)
+        ends = [
+            tuple(f"ipc://{folder}/{number}-{what}" for what in ("sends", "hears")) for number in range(len(robots))
+        ]
         self._around = around
         self._medium = MediumProcess(
             MediumConfig(
                 name=scenario.name,
-                phy=phy,
+                phy=settings,
                 packet_len=scenario.packet_len,
                 robots=tuple(MediumRobot(connect=sends, bind=hears) for sends, hears in ends),
                 seed=scenario.seed,
@@ -68,10 +71,10 @@ class SharedChannel:
         )
         stack.callback(self._medium.close)
         self._robots: list[RobotLink] = []
-        for number, (way, (sends, hears)) in enumerate(zip(ways, ends, strict=True)):
+        for number, (robot, (sends, hears)) in enumerate(zip(robots, ends, strict=True)):
             front_end = {"name": "zmq", "bind": sends, "connect": [hears], "medium_process": "lockstep"}
-            config = _link_of(replaced(way, phy=phy), front_end, folder / f"robot-{number}")
-            self._robots.append(RobotLink(config, observer=records.of(number, way.ros_source.src_id())))
+            config = _link_of(scenario, robot, settings, front_end, folder / f"robot-{number}")
+            self._robots.append(RobotLink(config, observer=records.of(number)))
             stack.callback(self._robots[-1].stop)
         self.blocks = [(link.source, link.sink) for link in self._robots]
         self.clock = self._robots[0].front_end.clock
@@ -155,15 +158,16 @@ class SharedChannel:
             self._thread.join()
 
 
-def _link_of(way: Scenario, front_end: dict[str, Any], state: Path) -> LinkConfig:
+def _link_of(
+    scenario: Scenario, robot: RobotSettings, phy: PhyConfig, front_end: dict[str, Any], state: Path
+) -> LinkConfig:
     """The link of a robot, by the settings of its scenario."""
-    source = replaced(way.ros_source, state=str(state))
-    graph = {"middleware": source.middleware, "domain_id": source.domain_id}
     own = {
-        "ros_source": source,
-        "ros_sink": replaced(way.ros_sink, **graph),
+        "phy": phy,
+        "ros_source": replaced(robot.source, state=str(state)),
+        "ros_sink": robot.sink,
         "channel": ChannelConfig(),
         "front_end": front_end,
         "diagnostics": DiagnosticsConfig(period_s=0),
     }
-    return build(LinkConfig, {field.name: getattr(way, field.name) for field in fields(AnyLink)} | own)
+    return build(LinkConfig, {field.name: getattr(scenario, field.name) for field in fields(AnyLink)} | own)

@@ -34,12 +34,12 @@ from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.phy import Phy
 from gr_ros2.record.recorder import Recorder
 from gr_ros2.record.result import TopicResult
-from gr_ros2.run.load import make_phys, recorded_names, source_names
+from gr_ros2.run.load import make_phy, recorded_names, source_names
 from gr_ros2.run.recorders import make_recorder
-from gr_ros2.run.robots import halves_of_robots, start_of_run, surroundings
+from gr_ros2.run.robot_settings import sources_of
+from gr_ros2.run.robots import hearer_of, start_of_run, surroundings
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.task_run import TaskRun
-from gr_ros2.settings.config import robot_of
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.sim_settings import SimSettings
@@ -49,14 +49,16 @@ _LONGEST_GAP_S = 30 * 86400.0
 simulated for all of the gap: decades where the first stamp is 0."""
 _IN_VAIN = 1000
 """Steps in a row without an event at one time after which a simulation is said to stand still."""
-STARTED_S = 1.0
-"""s within which the robots of a run begin to send. Hellos of robots that begin together would collide for ever."""
 _REMEMBERED_S = 60.0
 """Simulated messages of runs up to this long are cached: 5 MB for two robots with all their topics."""
 
 
 class Upcoming(Protocol):
-    """A message for the source. ``payload`` is asked for at ``t``, so it may depend on what came before."""
+    """A message for the source.
+
+    :ivar t: when it is submitted, s after the start
+    :ivar payload: is asked for at ``t``, so it may depend on what came before
+    """
 
     @property
     def t(self) -> float: ...
@@ -102,13 +104,13 @@ class Simulated:
 
 
 def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
-    """What the scenario's source gives to the link, in time order.
+    """What the source of a scenario with one gives to the link, in time order.
 
     :raises ConfigError: for a recording played as fast as the link takes it, because its messages have no times
     :raises BagError: for a recording whose times jump by more than 30 days
     """
     if scenario.bag_path is None:
-        names = source_names(scenario, registry)
+        names = source_names(scenario.ros_source, registry)
         for sent in _simulated(scenario.sim, scenario.duration_s, frozenset(names)):
             yield Offered(sent.t, names[sent.topic], sent.payload)
         return
@@ -131,12 +133,12 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
         yield Offered(t, names[message.topic], message.payload)
 
 
-def offered_by(ways: Sequence[Scenario], registry: Registry) -> list[Iterator[Offered]]:
-    """What each direction's source gives to the link. The robots of a simulator drive only once."""
-    if len(ways) == 1 or ways[0].bag_path is not None:
-        return [offered(way, registry) for way in ways]
-    names = [source_names(way, registry) for way in ways]
-    sent = list(_simulated(ways[0].sim, ways[0].duration_s, frozenset().union(*names)))
+def offered_by(scenario: Scenario, registry: Registry) -> list[Iterator[Offered]]:
+    """What each robot that sends gives to the link. The robots of a simulator drive only once."""
+    names = [source_names(source, registry) for source in sources_of(scenario.all_robots)]
+    if len(names) == 1:
+        return [offered(scenario, registry)]
+    sent = list(_simulated(scenario.sim, scenario.duration_s, frozenset().union(*names)))
     return [_own(sent, own) for own in names]
 
 
@@ -175,22 +177,22 @@ def simulate(
 
     :param registry: None takes the scenario's
     :param phy: None makes the scenario's
-    :param messages: those that each direction is offered, in time order; None takes the scenario's source
+    :param messages: those that each robot that sends is offered, in time order; None takes the scenario's source
     :param codec: of all messages; None makes one
     :param on_packet: called with every packet that leaves a robot
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
     :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
     """
     scenario = coupled(scenario)
-    ways = scenario.directions()
     registry = registry or scenario.load_registry()
-    phys = make_phys(ways, registry) if phy is None else [phy] * len(ways)
-    if phys[0].mcs_table:
+    phy = phy or make_phy(scenario, registry)
+    if phy.mcs_table:
         raise ConfigError("rate = 'adaptive': a forecast has one rate; set phy.options.rate to fixed")
-    run = Simulation(scenario, registry, phys, messages=messages, codec=codec, ideal=True)
-    ids = [way.ros_source.src_id() for way in ways]
-    listeners = {src_id: next(iter(run.around.reached(number)), number) for number, src_id in enumerate(ids)}
-    recorder = make_recorder(registry, ways)
+    run = Simulation(scenario, registry, phy, messages=messages, codec=codec, ideal=True)
+    sources = sources_of(scenario.all_robots)
+    ids = [source.src_id() for source in sources]
+    listeners = {src_id: hearer_of(run.around, number) for number, src_id in enumerate(ids)}
+    recorder = make_recorder(registry, sources)
     for timed_event in run.events():
         _, robot, event = timed_event
         if not isinstance(event, _OfSender) or listeners.get(_sender(event), robot.number) == robot.number:
@@ -199,7 +201,7 @@ def simulate(
             on_packet(event)
     return Simulated(
         duration_s=run.duration_s,
-        airtime_s=phys[0].airtime(),
+        airtime_s=phy.airtime(),
         topics=recorder.finish(run.duration_s, run.duration_s, run.empty),
         packets=recorder.ledger.packets(),
         stats={src_id: robot.endpoint.sent for src_id, robot in zip(ids, run.robots, strict=False)},
@@ -209,7 +211,7 @@ def simulate(
 
 def coupled(scenario: Scenario) -> Scenario:
     """What is forecast together: all robots that send, with one receiver where only one does."""
-    return scenario if len(scenario.directions()) > 1 else replace(scenario, receivers=())
+    return replace(scenario, receivers=())
 
 
 _OfSender = Received | Delivered | Lost
@@ -232,8 +234,8 @@ def pass_on(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float =
 class Simulation:
     """The robots of a scenario and the medium between them: all that a run in simulated time consists of.
 
-    :param phys: one per direction, see :func:`gr_ros2.run.load.make_phys`
-    :param messages: those that each direction is offered, in time order; None takes the scenario's source
+    :param phy: of all robots, see :func:`gr_ros2.run.load.make_phy`
+    :param messages: those that each robot that sends is offered, in time order; None takes the scenario's source
     :param task: offers them instead, and moves the robots
     :param codec: of all messages; None makes one
     :param ideal: the PHY loses nothing
@@ -244,7 +246,7 @@ class Simulation:
         self,
         scenario: Scenario,
         registry: Registry,
-        phys: Sequence[Phy],
+        phy: Phy,
         *,
         messages: Sequence[Iterator[Upcoming]] | None = None,
         task: TaskRun | None = None,
@@ -256,25 +258,23 @@ class Simulation:
                 "time = 'unthrottled': packets pass whenever the computer gets round to it, which cannot "
                 "be simulated; set time to real, samples or packets"
             )
-        ways = scenario.directions()
         if messages is None:
-            messages = offered_by(ways, registry) if task is None else task.offered()
-        self.robots = _robots(scenario, registry, phys, messages, codec=codec, busy=ideal)
-        all_phys = [phys[number if number < len(ways) else 0] for number in range(len(self.robots))]
-        self.around = around = surroundings(scenario, phys[0].sample_rate, task)
-        shared = scenario.duplex == "half"
+            messages = offered_by(scenario, registry) if task is None else task.offered()
+        self.robots = _robots(scenario, registry, phy, messages, codec=codec, busy=ideal)
+        self.around = around = surroundings(scenario, phy.sample_rate, task)
+        shared, phys = scenario.duplex == "half", [phy] * len(self.robots)
         if ideal:
-            self.medium: Medium = PacketMedium(around, all_phys, shared=shared, ideal=True)
+            self.medium: Medium = PacketMedium(around, phys, shared=shared, ideal=True)
         else:
             heard = {receiver for number in range(len(self.robots)) for receiver in around.reached(number)}
             answered = any(self.robots[number].endpoint.answers for number in heard)
             self.medium = make_medium(
                 around,
-                all_phys,
+                phys,
                 samples=scenario.time == "samples",
                 shared=shared,
                 seed=scenario.seed,
-                ahead=() if answered else _rehearsed(scenario, registry, phys),
+                ahead=() if answered else _rehearsed(scenario, registry, phy),
             )
 
     def events(self) -> Iterator[TimedEvent]:
@@ -300,37 +300,28 @@ class Simulation:
 def _robots(
     scenario: Scenario,
     registry: Registry,
-    phys: Sequence[Phy],
+    phy: Phy,
     messages: Sequence[Iterator[Upcoming]],
     *,
     codec: MessageCodec | None = None,
     busy: bool = False,
 ) -> list[Robot]:
     """The robots of a run, those that send first; see :class:`Simulation` and :class:`Robot`."""
-    ways = scenario.directions()
-    start = start_of_run(
-        ways,
-        any_length=all(phy.any_length for phy in phys),
-        mcs_table=phys[0].mcs_table,
-        half_duplex=scenario.duplex == "half",
-        airtime_s=phys[0].airtime(),
-    )
+    start, coming = start_of_run(scenario, phy), iter(messages)
     robots: list[Robot] = []
-    starts = random.Random(f"starts {scenario.seed}")
-    for number, halves in enumerate(halves_of_robots(ways)):
-        sends = number < len(ways)
+    for number, settings in enumerate(scenario.all_robots):
         events: list[SenderEvent] = []
-        rng = None if halves[0] is None else random.Random(ways[0].seed)
+        halves, rng = (settings.source, settings.sink), random.Random(scenario.seed)
         endpoint = make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=events.append)
         robot = Robot(
             scenario,
             number,
             endpoint,
             events=events,
-            src_id=robot_of(*halves),
-            airtime=phys[number if sends else 0].airtime,
-            messages=messages[number] if sends else iter(()),
-            start_s=starts.uniform(0.0, STARTED_S) if scenario.robots else 0.0,
+            src_id=settings.robot_id,
+            airtime=phy.airtime,
+            messages=iter(()) if settings.source is None else next(coming),
+            start_s=settings.start_s,
             busy=busy,
         )
         robots.append(robot)
@@ -352,9 +343,9 @@ class _Unheard(Medium):
         return ()
 
 
-def _rehearsed(scenario: Scenario, registry: Registry, phys: Sequence[Phy]) -> Iterator[Transmission]:
+def _rehearsed(scenario: Scenario, registry: Registry, phy: Phy) -> Iterator[Transmission]:
     """What the robots send as long as they hear nothing. Where nobody answers, that is what they send in any case."""
-    robots = _robots(scenario, registry, phys, offered_by(scenario.directions(), registry))
+    robots = _robots(scenario, registry, phy, offered_by(scenario, registry))
     medium = _Unheard(len(robots))
     for _ in EventLoop(robots, medium).run():
         yield from medium.over
@@ -486,7 +477,7 @@ class EventLoop:
     def __init__(self, robots: Sequence[Robot], medium: Medium) -> None:
         self._robots, self._medium = robots, medium
         self._at = [inf] * len(robots)
-        self._agenda: list[tuple[float, int]] = []
+        self._queue: list[tuple[float, int]] = []
         self._busy = set(range(len(robots)))
         self.now = 0.0
 
@@ -531,7 +522,7 @@ class EventLoop:
     def _happen(self, now: float) -> Iterator[TimedEvent]:
         concerned: set[int] = set()
         while self._soonest() <= now:
-            number = heapq.heappop(self._agenda)[1]
+            number = heapq.heappop(self._queue)[1]
             self._at[number] = inf
             concerned.add(number)
             for timed_event in self._robots[number].expire(now):
@@ -551,9 +542,9 @@ class EventLoop:
 
     def _soonest(self) -> float:
         """When a robot has something to do next."""
-        while self._agenda and self._at[self._agenda[0][1]] != self._agenda[0][0]:
-            heapq.heappop(self._agenda)  # it has been planned anew since
-        return self._agenda[0][0] if self._agenda else inf
+        while self._queue and self._at[self._queue[0][1]] != self._queue[0][0]:
+            heapq.heappop(self._queue)  # it has been planned anew since
+        return self._queue[0][0] if self._queue else inf
 
     def _plan(self, robot: Robot) -> None:
         """Note when a robot has something to do next."""
@@ -564,5 +555,5 @@ class EventLoop:
             at = timeout
         if at != self._at[number]:
             self._at[number] = at
-            heapq.heappush(self._agenda, (at, number))
+            heapq.heappush(self._queue, (at, number))
         (self._busy.discard if robot.over else self._busy.add)(number)

@@ -17,11 +17,12 @@ from typing import Any
 
 from gr_ros2.core.guard import Guard
 from gr_ros2.run.delivered import DeliveredBag, bag_origin_ns
-from gr_ros2.run.load import make_phys, published_names, recording, source_names
+from gr_ros2.run.load import make_phy, published_names, recording, source_names
 from gr_ros2.run.observers import RunObservers
-from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress
+from gr_ros2.run.outcome import DELIVERED_BAG, Outcome, Progress, by_sender
 from gr_ros2.run.recorders import RunRecords
-from gr_ros2.run.robots import ears_of
+from gr_ros2.run.robot_settings import sources_of
+from gr_ros2.run.robots import hearer_of
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.run.simulate import Simulation, pass_on
 from gr_ros2.run.task_run import TaskRun
@@ -55,31 +56,32 @@ def run_simulated(
     """
     began = time.monotonic()
     registry = registry or scenario.load_registry()
-    ways = scenario.directions()
-    phys = make_phys(ways, registry)
+    sources = sources_of(scenario.all_robots)
+    phy = make_phy(scenario, registry)
     with ExitStack() as stack:
         if bag is None and out is not None:
-            origin_ns = bag_origin_ns(scenario, source_names(scenario, registry))
-            source = recording(scenario)
-            for line in source.differences:
+            origin_ns = bag_origin_ns(scenario, source_names(sources[0], registry))
+            contents = recording(scenario)
+            for line in contents.differences:
                 _log.warning(line)
-            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns, definitions=source.texts))
-            for way in ways:
-                ids, names = source_names(way, registry).values(), published_names(way, registry).values()
-                bag.add_source(way.ros_source.src_id(), registry, dict(zip(ids, names, strict=True)))
+            bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns, definitions=contents.texts))
+            for source in sources:
+                names = published_names(scenario, source, registry)
+                ids = source_names(source, registry)
+                bag.add_source(source.src_id(), registry, {ids[name]: other for name, other in names.items()})
         task = TaskRun(scenario, registry) if scenario.task else None
-        run = Simulation(scenario, registry, phys, task=task)
+        run = Simulation(scenario, registry, phy, task=task)
         run_observers = run_observers or RunObservers(threaded=False)
         records = RunRecords(
             scenario,
             registry,
-            phys,
-            ears_of(scenario, run.around),
+            phy,
+            run.around,
             run_observers=run_observers,
             task=task,
             on_delivery=None if bag is None else bag.take,
         )
-        seen = [records.of(robot.number, robot.src_id) for robot in run.robots]
+        seen = [records.of(number) for number in range(len(run.robots))]
         clock = _EventClock()
         run_observers.run_started(records.live_run(clock))
         reported, progress = 0.0, Guard("progress")
@@ -94,17 +96,16 @@ def run_simulated(
                 reported = time.monotonic()
                 progress(on_progress, Progress(clock.now, scenario.duration_s, *records.recorder.progress()))
         records.check()
-    there, *others = (_counters(run, number, source_names(way, registry)) for number, way in enumerate(ways))
-    back = {"back": others[0]} if len(others) == 1 else {"robots": others} if others else {}
+    counted = [_counters(run, number, source_names(source, registry)) for number, source in enumerate(sources)]
     return records.outcome(
         begin=0.0,
         end=run.duration_s,
         played=run.duration_s,
         drained=run.empty,
-        channels=1 if run.medium.shared else len(ways),
+        channels=1 if run.medium.shared else len(sources),
         began=began,
         incomplete=tuple(run_observers.incomplete()),
-        counters={**there, **back, "listener": {} if bag is None else dict(bag.written)},
+        counters={**by_sender(counted), "listener": {} if bag is None else dict(bag.written)},
     )
 
 
@@ -118,13 +119,13 @@ class _EventClock:
 
 
 def _counters(run: Simulation, number: int, names: Mapping[str, int]) -> dict[str, Any]:
-    """What each part of one direction counted. ``channel``: packets lost in the PHY, and packets dropped by each
-    setting.
+    """What a robot that sends and the first that hears it counted. ``channel``: packets lost in the PHY, and packets
+    dropped by each setting.
 
     :param number: of the robot that sends
     :param names: topic ids by name
     """
-    receiver = next(iter(run.around.reached(number)), number)
+    receiver = hearer_of(run.around, number)
     sent, got = run.robots[number].endpoint.sent, run.robots[receiver].endpoint.received
     lost = run.medium.lost[number, receiver]
     return {

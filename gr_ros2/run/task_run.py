@@ -21,6 +21,7 @@ from gr_ros2.link import Delivered
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.base import Subscription
 from gr_ros2.run.load import source_names
+from gr_ros2.run.robot_settings import sources_of
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.settings.registry import Registry
 from gr_ros2.sim.sensors import TYPES, read_command
@@ -52,22 +53,22 @@ class TaskRun:
     """
 
     def __init__(self, scenario: Scenario, registry: Registry) -> None:
-        ways = scenario.directions()
+        sources = sources_of(scenario.all_robots)
         self.settings, self._duration_s = scenario.sim, scenario.duration_s
-        self.robot_ids = tuple(way.ros_source.src_id() for way in ways)
+        self.robot_ids = tuple(source.src_id() for source in sources)
         self.commands: Counter[str] = Counter()
-        self._namespaces = [way.ros_source.namespace for way in ways]
+        self._namespaces = [source.namespace for source in sources]
         self._topics: list[tuple[str, int]] = []
-        for way in ways:
-            names = source_names(way, registry)
-            if list(names) != [f"{way.ros_source.namespace}/odom"]:
+        for source in sources:
+            names = source_names(source, registry)
+            if list(names) != [f"{source.namespace}/odom"]:
                 raise ConfigError(
                     f"task = {scenario.task!r}: its robots send their odometry alone, and {scenario.registry} has "
                     f"{', '.join(names) or 'nothing'}; set registry to odom.csv"
                 )
             self._topics += names.items()
-        task = make_task(scenario.task, len(ways), scenario.seed)
-        self._commanded = [] if scenario.controller == "task" else [*{*range(len(ways))} - {*task.scripted}]
+        task = make_task(scenario.task, len(sources), scenario.seed)
+        self._commanded = [] if scenario.controller == "task" else [*{*range(len(sources))} - {*task.scripted}]
         self._robots = TaskRobots(task, scenario.sim, self._commanded)
         self._subscriptions: dict[str, Subscription] = {}
         self._clock: Callable[[], float] = lambda: 0.0

@@ -28,11 +28,12 @@ from gr_ros2.medium.positions import Positions
 from gr_ros2.phy import PHY, configured
 from gr_ros2.record.result import TopicResult
 from gr_ros2.report.explain import air_line
-from gr_ros2.run.load import make_phys, source_names
+from gr_ros2.run.load import make_phy, source_names
+from gr_ros2.run.robot_settings import sources_of
 from gr_ros2.run.robots import surroundings
-from gr_ros2.run.scenario import Scenario
+from gr_ros2.run.scenario import Scenario, changed
 from gr_ros2.run.simulate import Simulated, coupled, offered_by, simulate
-from gr_ros2.settings.config import ChannelConfig, SourceConfig, TopicOptions, replaced
+from gr_ros2.settings.config import ChannelConfig, PacketSettings, SourceConfig, TopicOptions, replaced
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry, Topic
 
@@ -241,21 +242,16 @@ class Planner:
         self._whole = scenario
         self.scenario = coupled(scenario)
         self.registry = registry or scenario.load_registry()
-        ways = self.scenario.directions()
-        self.phy = make_phys(ways, self.registry)[0]
-        self._messages = [list(messages) for messages in offered_by(ways, self.registry)]
+        self.phy = make_phy(self.scenario, self.registry)
+        self._messages = [list(messages) for messages in offered_by(self.scenario, self.registry)]
         if not any(self._messages):
             raise ConfigError(f"source = {scenario.source!r}: has nothing on the registered topics; set other topics")
-        self._rows = {
-            name: self.registry[topic_id].name
-            for way in ways
-            for name, topic_id in source_names(way, self.registry).items()
-        }
+        self._rows: dict[str, str] = {}
         self._weights: dict[str, float] = {}
-        for way in ways:
-            options = self.registry.with_options(way.ros_source.topic_options)
-            names = source_names(way, self.registry)
-            self._weights |= {name: options[topic_id].options.weight for name, topic_id in names.items()}
+        for source in sources_of(self.scenario.all_robots):
+            options = self.registry.with_options(source.topic_options)
+            for name, topic_id in source_names(source, self.registry).items():
+                self._rows[name], self._weights[name] = self.registry[topic_id].name, options[topic_id].options.weight
         self._remembering: _Remembering | None = None
 
     @property
@@ -315,7 +311,7 @@ class Planner:
             yield "ros_source.packet_rate=auto", _sending(base, lambda own: replace(own, packet_rate=AUTO))
         for packet_len in self._packet_lens():
             yield f"packet_len={packet_len}", _with_packet_len(base, packet_len)
-        if base.duplex == "half" and len(base.directions()) > 1 and base.medium == "exclusive":
+        if base.duplex == "half" and len(sources_of(base.all_robots)) > 1 and base.medium == "exclusive":
             yield "medium=slots", replace(base, medium="slots")
 
     def _packet_lens(self) -> list[int]:
@@ -405,7 +401,7 @@ class Planner:
                 scenario = _sending(scenario, partial(_limited, row=row, rate_hz=rate_hz))
             else:
                 scenario = _sending(scenario, partial(self._without, row=row))
-                left = [way.ros_source.topics for way in scenario.directions()]
+                left = [source.topics for source in sources_of(scenario.all_robots)]
                 if not all(left):
                     return
                 without = (f"ros_source.topics=[{', '.join(left[0])}]",)
@@ -435,21 +431,21 @@ class Planner:
         return len(payload) if codec is None else len(codec.encode(topic_id, payload))
 
     def _forecast(self, scenario: Scenario) -> Forecast:
-        ways = scenario.directions()
+        sources = sources_of(scenario.all_robots)
         phy = configured(scenario.phy, scenario.packet_len, self.phy.sample_rate)
         airtime = phy.airtime()
         codec = self._codec(scenario.ros_source.compresses)
         rule = scenario.airtime.rule
         shared = scenario.duplex == "half"
-        allowed = 1.0 if rule is None else min(1.0, (len(ways) if shared else 1) * sustained(rule))
+        allowed = 1.0 if rule is None else min(1.0, (len(sources) if shared else 1) * sustained(rule))
         duration = scenario.duration_s or self._messages[0][-1].t
         topic_ids: dict[tuple[int, str], int] = {}
         rates_hz: dict[tuple[int, int], float] = {}
         payloads: dict[tuple[int, int], list[bytes]] = {}
         messages = []
-        for way, own in zip(ways, self._messages, strict=True):
-            src_id, options = way.ros_source.src_id(), self.registry.with_options(way.ros_source.topic_options)
-            for name, topic_id in source_names(way, self.registry).items():
+        for source, own in zip(sources, self._messages, strict=True):
+            src_id, options = source.src_id(), self.registry.with_options(source.topic_options)
+            for name, topic_id in source_names(source, self.registry).items():
                 topic_ids[src_id, name] = topic_id
                 rates_hz[src_id, topic_id] = options[topic_id].options.max_rate or np.inf
                 payloads[src_id, topic_id] = []
@@ -510,7 +506,7 @@ class Planner:
         delivered = sum(topic.result.delivered for topic in topics)
         spent = [float(kinds.total()) for kinds in senders.values()]
         span = max(ended - begun, airtime)
-        sending = {str(way.ros_source.src_id()) for way in ways}
+        sending = {str(source.src_id()) for source in sources}
         return Forecast(
             packet_len=scenario.packet_len,
             airtime_s=airtime,
@@ -564,9 +560,7 @@ class _Remembering:
 
 def _sending(scenario: Scenario, change: Callable[[SourceConfig], SourceConfig]) -> Scenario:
     """The scenario with the sending block of every robot changed."""
-    robots = tuple(replace(robot, ros_source=change(robot.ros_source)) for robot in scenario.robots)
-    back = scenario.back and replace(scenario.back, ros_source=change(scenario.back.ros_source))
-    return replace(scenario, ros_source=change(scenario.ros_source), robots=robots, back=back)
+    return changed(scenario, SourceConfig, change)
 
 
 def _limited(source: SourceConfig, *, row: str, rate_hz: float) -> SourceConfig:
@@ -575,10 +569,7 @@ def _limited(source: SourceConfig, *, row: str, rate_hz: float) -> SourceConfig:
 
 
 def _with_packet_len(scenario: Scenario, packet_len: int) -> Scenario:
-    scenario = _sending(scenario, lambda own: replace(own, packet_len=packet_len))
-    sink = replace(scenario.ros_sink, packet_len=packet_len)
-    back = scenario.back and replace(scenario.back, ros_sink=replace(scenario.back.ros_sink, packet_len=packet_len))
-    return replace(scenario, packet_len=packet_len, ros_sink=sink, back=back)
+    return changed(scenario, PacketSettings, lambda part: replace(part, packet_len=packet_len))
 
 
 def _fair_level(loads: Sequence[tuple[float, float]]) -> float:

@@ -194,7 +194,7 @@ def test_a_recording_without_what_it_takes_is_refused(overrides: list[str], mess
 def test_a_drive_behind_obstacles_loses_what_the_tables_say(time: str) -> None:
     """Packets by their SNR, which follows from places and walls: those that arrive, against the PDR of the table."""
     scenario = load_scenario("two-robots-half-duplex", [*AMONG_WALLS, "duration_s=60"])
-    of = make_phy(scenario.directions()[0], scenario.load_registry())
+    of = make_phy(scenario, scenario.load_registry())
     around = surroundings(scenario, of.sample_rate)
     medium = make_medium(around, [of] * 2, samples=time == "samples", shared=True)
     snrs_db, arrived = [], []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -15,10 +16,16 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.middleware.free_domains import ReservedDomain
 from gr_ros2.record.result import read_result
 from gr_ros2.run.domains import on_own_domains
+from gr_ros2.run.robot_settings import RobotSettings
 from gr_ros2.run.scenario import load_scenario
 from tests.domains import free_domains
 
 DEMO = [sys.executable, "-m", "gr_ros2.cli", "demo", "--no-report", "--duration", "3"]
+
+
+def domains(robots: Iterable[RobotSettings]) -> list[list[int | str]]:
+    """Those of the halves of each robot."""
+    return [[half.domain_id for half in (robot.source, robot.sink) if half is not None] for robot in robots]
 
 
 def two_demos(tmp_path: Path, *words: str) -> list[tuple[subprocess.Popen[str], str, str]]:
@@ -68,19 +75,18 @@ def test_a_run_that_receives_what_it_did_not_send_fails(tmp_path: Path) -> None:
 def test_a_domain_that_is_named_stays() -> None:
     words = ["ros_source.domain_id=7"]
     with ExitStack() as stack:
-        scenario = on_own_domains(load_scenario("two-way", words), stack)
-        back = scenario.back
-        assert back is not None
-        assert scenario.ros_source.domain_id == back.ros_sink.domain_id == 7
-        assert scenario.ros_sink.domain_id == back.ros_source.domain_id not in (7, "auto")
+        assert (here := domains(on_own_domains(load_scenario("two-way", words), stack)))[0] == [7, 7]
+        assert len({*here[1]}) == 1
+        assert here[1][0] not in (7, "auto")
 
 
 def test_two_ends_have_two_graphs_that_are_free_again_afterwards() -> None:
     with ExitStack() as stack:
-        scenario = on_own_domains(load_scenario("demo"), stack)
-        here, there = scenario.ros_source.domain_id, scenario.ros_sink.domain_id
+        robots = on_own_domains(load_scenario("demo", ["receivers=[{}]"]), stack)
+        (here,), (there,), (elsewhere,) = domains(robots)
         assert isinstance(here, int)
         assert here != there
+        assert elsewhere == there, "who only receives is on one graph"
     with ReservedDomain([here]) as again:
         assert again.number == here
 
@@ -88,4 +94,4 @@ def test_two_ends_have_two_graphs_that_are_free_again_afterwards() -> None:
 def test_one_graph_is_that_of_the_shell() -> None:
     with ExitStack() as stack:
         scenario = load_scenario("one-graph")  # it has own_domains: false
-        assert on_own_domains(scenario, stack) is scenario
+        assert on_own_domains(scenario, stack) is scenario.all_robots

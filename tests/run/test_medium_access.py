@@ -10,7 +10,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import Delivered
-from gr_ros2.run.load import make_phys
+from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import Simulation
 from gr_ros2.state.keys import new_key_file
@@ -22,7 +22,7 @@ def delivered(name: str, *overrides: str, duration_s: float) -> tuple[dict[int, 
     """Messages that others have received of each robot."""
     scenario = load_scenario(name, overrides, duration_s=duration_s)
     registry = scenario.load_registry()
-    run = Simulation(scenario, registry, make_phys(scenario.directions(), registry))
+    run = Simulation(scenario, registry, make_phy(scenario, registry))
     counts = {robot.src_id: 0 for robot in run.robots}
     for _, _, event in run.events():
         if isinstance(event, Delivered):

@@ -10,13 +10,13 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.record.repetitions import REPETITIONS_FILE, run_folders, summarize
 from gr_ros2.record.result import Result
 from gr_ros2.report.page import read_runs
 from gr_ros2.report.repetitions import repetition_grid
-from gr_ros2.run.repeat import repetitions
-from gr_ros2.run.runner import run_repetitions
+from gr_ros2.run.runner import repetitions, run_repetitions
 from gr_ros2.run.scenario import Scenario, load_scenario
 
 LOSSY = ["channel.packet_loss=0.02", "time=packets"]

@@ -13,7 +13,8 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.medium import Surroundings
 from gr_ros2.record.result import Result, read_result, write_result
 from gr_ros2.report.table import summary_grid
-from gr_ros2.run.robots import ears_of, surroundings
+from gr_ros2.run.recorders import receivers_of
+from gr_ros2.run.robots import surroundings
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import dump, load_scenario, scenario_from
 from gr_ros2.settings.config import replaced
@@ -73,9 +74,48 @@ def test_levels_follow_from_power_gain_and_noise() -> None:
         [(0, 30 - 110 - noise_dbm), (2, 30 - 90 - noise_dbm + 3)],
         [],  # 20 - 200 dBm is below what anybody hears
     ]
-    assert ears_of(scenario, around) == [[1], [0], [1]]
+    assert receivers_of(scenario, around) == {0: [1], 1: [0], 2: [1]}
     assert len({around.path(*pair).channel.seed for pair in ((0, 1), (1, 0), (1, 2))}) == 3
     assert scenario_from(dump(scenario)) == scenario
+
+
+ONE_WAY = ["phy.sample_rate=1e6", "reports={}", "receivers=[{packet_loss: 0.5}]", "time=packets"]
+
+
+def test_robots_of_short_forms_have_levels_too() -> None:
+    """20 dBm over a gain, and noise of -174 dBm/Hz at a noise figure of 6 dB."""
+    rows = "[[null, -100, -110], [-120, null, -90], [null, null, null]]"
+    scenario = load_scenario("demo", [*ONE_WAY, f"gains_db={rows}"])
+    noise_dbm = -174 + 60 + 6
+    around = surroundings(scenario, 1e6)
+    assert levels(around) == [[(1, 20 - 100 - noise_dbm), (2, 20 - 110 - noise_dbm)], [(0, 20 - 120 - noise_dbm)], []]
+    assert around.path(0, 2).channel.packet_loss == 0.5
+    assert receivers_of(scenario, around) == {1: [0], 2: [0]}
+    both = surroundings(load_scenario("two-way", ["gains_db=-105", "time=packets"]), 1e6)
+    assert levels(both) == [[(1, 20 - 105 - noise_dbm)], [(0, 20 - 105 - noise_dbm)]]
+    with pytest.raises(ConfigError, match="3 robots need 3 rows of 3 numbers"):
+        load_scenario("demo", [*ONE_WAY, "gains_db=[[0, 1], [1, 0]]"])
+
+
+@pytest.mark.parametrize("time", ["packets", "samples"])
+@pytest.mark.parametrize(("name", "change"), [("demo", "reports=null"), ("two-way", "back.channel={}")])
+def test_what_arrives_one_way_and_two_ways_follows_from_the_gain(name: str, change: str, time: str) -> None:
+    own = ["phy.sample_rate=200000", f"time={time}", "channel.packet_loss=0", 'ros_source.repair="off"']
+    own += [change, "ros_source.topics=[odom]", "ros_source.topic_options={}"]
+    near, far = (run(name, *own, f"gains_db={gain}", duration_s=3.0) for gain in (-60, -133))
+    assert [topic.pdr for topic in near.topics] == [1.0] * len(near.topics)
+    assert all(topic.delivered == 0 for topic in far.topics)
+    assert far.counters["channel"]["phy"] > 0
+
+
+@pytest.mark.real_time
+def test_in_real_time_too_and_who_hears_nobody_is_named() -> None:
+    result = run("demo", "gains_db=-90", "channel.packet_loss=0", "phy.sample_rate=200000", duration_s=2.0)
+    assert all(topic.delivered for topic in result.topics if topic.sent)
+    with pytest.raises(ConfigError, match="receiver 2 hears nobody"):
+        run("demo", "receivers=[{}]", "gains_db=[[0, -90, null], [-90, 0, 0], [0, 0, 0]]", duration_s=2.0)
+    with pytest.raises(ConfigError, match="nobody hears /robot_1"):
+        run("demo", "gains_db=-300", duration_s=2.0)
 
 
 def test_without_gains_the_snr_is_that_of_the_channel() -> None:
@@ -91,7 +131,7 @@ def test_without_gains_the_snr_is_that_of_the_channel() -> None:
         ("gains_db=[[1, 2]]", "2 robots need 2 rows of 2 numbers"),
         ("robots=null", "must be a list"),
         ("reports={}", "leave back, reports, receivers out"),
-        ("robots=[]", "gains_db: lie between robots"),
+        ("receivers=[{}]", "leave back, reports, receivers out"),
     ],
 )
 def test_what_does_not_go_together_is_refused(override: str, message: str) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.run.scenario import builtin_scenarios, dump, load_scenario, scenario_from
-from gr_ros2.settings.config import ChannelConfig
+from gr_ros2.medium.base import Path as Way
+from gr_ros2.run.scenario import builtin_scenarios, changed, dump, load_scenario, scenario_from
+from gr_ros2.settings.config import ChannelConfig, PacketSettings, replaced
 from gr_ros2.settings.files import parse_override
 
 BUILTIN = {scenario.name: scenario for scenario in builtin_scenarios()}
@@ -36,7 +38,7 @@ def test_each_is_ready_to_run(name: str) -> None:
     assert scenario.duration_s + scenario.drain_s <= (65 if scenario.time != "real" else 40), (
         "in real time it is waited for"
     )
-    assert scenario.directions()[0].ros_source.src_id() == 1
+    assert scenario.all_robots[0].robot_id == 1
     assert scenario.ros_source.packet_len == scenario.ros_sink.packet_len == scenario.packet_len
     assert scenario.ros_source.registry == scenario.ros_sink.registry == scenario.registry
     assert {scenario.ros_source.domain_id, scenario.ros_sink.domain_id} == {"auto"}, "free ones, or that of the shell"
@@ -78,9 +80,14 @@ def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
         "back.ros_sink.publisher_depth=7",
         "phy.sample_rate=2e5",
     ]
-    there, back = load_scenario("demo", changes, seed=5).directions()
-    assert there == load_scenario("demo", [change for change in changes if not change.startswith("back")], seed=5)
-    assert back.back is None
+    there = load_scenario("demo", changes, seed=5)
+    back = there.back
+    assert back is not None
+    assert replace(there, back=None) == load_scenario("demo", [c for c in changes if not c.startswith("back")], seed=5)
+    here, other = there.all_robots
+    assert (here.source, other.source) == (there.ros_source, back.ros_source)
+    assert (here.sink, other.sink) == (back.ros_sink, there.ros_sink)  # each hears the other's source
+    assert (here.paths, other.paths) == ((Way(1, there.channel),), (Way(0, back.channel),))
     assert (back.ros_source.domain_id, back.ros_sink.domain_id) == (
         there.ros_sink.domain_id,
         there.ros_source.domain_id,
@@ -89,12 +96,18 @@ def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
     assert back.ros_source.compression
     assert (there.ros_sink.publisher_depth, back.ros_sink.publisher_depth) == (1000, 7)
     assert back.ros_source.registry == there.registry
-    assert (back.channel.snr_db, back.phy) == (20, there.phy)
+    assert back.channel.snr_db == 20
     assert back.channel.seed != there.channel.seed == 5
 
 
-def test_a_one_way_scenario_has_one_direction() -> None:
-    assert BUILTIN["demo"].directions() == (BUILTIN["demo"],)
+def test_a_part_is_changed_at_all_robots() -> None:
+    for name in ("two-way", "team", "demo"):
+        scenario = changed(BUILTIN[name], PacketSettings, lambda part: replaced(part, packet_len=99))
+        halves = [half for robot in scenario.all_robots for half in (robot.source, robot.sink) if half is not None]
+        assert {scenario.packet_len, *(half.packet_len for half in halves)} == {99}
+        assert changed(scenario, PacketSettings, lambda part: replaced(part, packet_len=64)) == changed(
+            BUILTIN[name], PacketSettings, lambda part: replaced(part, packet_len=64)
+        )
 
 
 def test_override_values_are_yaml() -> None:

@@ -203,23 +203,24 @@ class Answering(EndpointV0):
 
 def test_a_robot_may_answer_what_it_hears() -> None:
     settings = scenario("two-way", "time=packets", "version=0", "ros_source.topic_options={}", duration=2.0)
-    there, back = settings.directions()
-    registry = there.load_registry()
+    registry = settings.load_registry()
     coming = [Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))]
     robots = []
-    for number, (source, sink) in enumerate(((there.ros_source, back.ros_sink), (back.ros_source, there.ros_sink))):
+    for number, one in enumerate(settings.all_robots):
         told: list[SenderEvent] = []
         codecs = message_codec((), registry), message_codec((), registry)
-        endpoint = (Answering if number else EndpointV0)(registry, source, sink, codecs=codecs, observer=told.append)
+        kind = Answering if number else EndpointV0
+        endpoint = kind(registry, one.source, one.sink, codecs=codecs, observer=told.append)
         messages = iter(() if number else coming)
-        common: dict[str, Any] = {"src_id": source.src_id(), "airtime": lambda *_: 0.01}
-        robots.append(Robot(there, number, endpoint, events=told, messages=messages, **common))
+        common: dict[str, Any] = {"src_id": one.robot_id, "airtime": lambda *_: 0.01}
+        robots.append(Robot(settings, number, endpoint, events=told, messages=messages, **common))
     paths = [[Way(1, ChannelConfig())], [Way(0, ChannelConfig())]]
     medium = PacketMedium(FixedPaths(paths), [DirectPhy(220)] * 2)
     heard = [(now, event) for now, _, event in EventLoop(robots, medium).run() if isinstance(event, Delivered)]
     times = [now for now, _ in heard]
-    assert [event.payload for _, event in heard if event.src_id == there.ros_source.src_id()] == [bytes(51), bytes(300)]
-    answers = [event.payload for _, event in heard if event.src_id == back.ros_source.src_id()]
+    there, back = (one.robot_id for one in settings.all_robots)
+    assert [event.payload for _, event in heard if event.src_id == there] == [bytes(51), bytes(300)]
+    answers = [event.payload for _, event in heard if event.src_id == back]
     assert [int.from_bytes(answer, "big") for answer in answers] == [51, 300]
     assert times == sorted(times)
     assert times[1] - times[0] == pytest.approx(0.01), "the answer is on the air as soon as the message has landed"

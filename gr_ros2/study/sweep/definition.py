@@ -20,9 +20,10 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.record.team_numbers import TEAM_VALUES
-from gr_ros2.run.load import make_phy, source_names
-from gr_ros2.run.scenario import Experiment, Scenario, Time, dump, load_scenario
-from gr_ros2.settings.config import ScenarioChannel, Text, build, read_yaml, replaced
+from gr_ros2.run.load import check_channels, make_phy, source_names
+from gr_ros2.run.robot_settings import sources_of
+from gr_ros2.run.scenario import Experiment, Scenario, Time, changed, dump, load_scenario
+from gr_ros2.settings.config import ScenarioChannel, Text, build, read_yaml
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.files import BUILTIN_DIR as SCENARIO_DIR
 from gr_ros2.settings.files import find_registry
@@ -234,13 +235,11 @@ def _check(sweep: Sweep, scenario: Scenario, phys: dict[str, Phy]) -> None:
     :param phys: PHYs made for earlier cells; they are reused because computing the load for a sample rate takes time
     """
     registry = scenario.load_registry()
-    names: list[str] = []
-    for way in scenario.directions():
-        beside_channel = repr(replaced(way, channel=ScenarioChannel(), reports=None, receivers=()))
-        if beside_channel not in phys:
-            phys[beside_channel] = make_phy(way, registry)
-        phys[beside_channel].check_channel(way.channel)
-        names += source_names(way, registry)
+    beside_channel = repr(changed(scenario, ScenarioChannel, lambda _: ScenarioChannel()))
+    if beside_channel not in phys:
+        phys[beside_channel] = make_phy(scenario, registry)
+    check_channels(scenario, phys[beside_channel])
+    names = [name for source in sources_of(scenario.all_robots) for name in source_names(source, registry)]
     if sweep.topic and sweep.topic not in names:
         raise ConfigError(f"topic = {sweep.topic!r}: not sent; sent are {', '.join(names)}")
     if not sweep.topic and len(names) > 1 and sweep.value not in OF_THE_LINK:

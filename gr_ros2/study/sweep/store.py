@@ -72,8 +72,8 @@ def without_registry(settings: Any) -> Any:
 
 
 def _files(scenario: Scenario) -> Iterator[Any]:
-    ends = [end for way in scenario.directions() for end in (way.ros_source, way.ros_sink)]
-    for name in (scenario.registry, *(name for end in ends for name in end.dictionaries)):
+    halves = [half for robot in scenario.all_robots for half in (robot.source, robot.sink) if half is not None]
+    for name in (scenario.registry, *(name for half in halves for name in half.dictionaries)):
         path = Path(name).expanduser()
         yield hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else name
     if (bag := scenario.bag_path) is not None:
