@@ -7,17 +7,22 @@ it does. A row without an entry fails, and so does an entry whose two outcomes a
 from __future__ import annotations
 
 import functools
+import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.cli.medium import medium
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.factory import make_endpoint
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
@@ -33,6 +38,7 @@ from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
 from tests.gr.test_health import make, parts
 from tests.link.v1.air import Air, Robot, registry
+from tests.radio.carried import addresses, carried
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGE = REPOSITORY / "docs" / "reference" / "parameters.md"
@@ -93,7 +99,7 @@ def sealed() -> Outcomes:
 
 def withheld(**sink: Any) -> list[bytes]:
     """Messages that are taken of sealed packets which somebody held back for 5 s."""
-    take = end_settings(None, SinkConfig(robot_id=2, **sink), hears=True)
+    take = end_settings(None, SinkConfig(robot_id=2, key="fleet.key", **sink), hears=True)
     one = Robot(1, registry(cmd_vel=TopicOptions(queue="deadline", deadline_s=1.0)), mode="encrypt")
     two = Robot(2, registry(), mode="encrypt", max_age_s=take.max_age_s, max_ages=take.max_ages)
     air = Air(one, two)
@@ -369,6 +375,43 @@ effects(
 )
 
 
+def crosses(*robots: dict[str, Any], beside: Mapping[str, Any] = MappingProxyType({}), **changed: Any) -> Outcomes:
+    """What a medium process makes of a burst, without and with a change."""
+    return lambda: (carried(**beside), carried(*robots, **{**beside, **changed}))
+
+
+def called(name: str) -> str:
+    """What `gr-ros2 medium` says first."""
+    with TemporaryDirectory() as folder:
+        robots = [{"connect": f"ipc://{folder}/robot{n}", "bind": f"ipc://{folder}/medium{n}"} for n in (1, 2)]
+        config = {"name": name, "phy": {"name": "psk", "sample_rate": 2e6}, "robots": robots}
+        (Path(folder) / "air.yaml").write_text(json.dumps(config))
+        return CliRunner().invoke(medium, [f"{folder}/air.yaml", "--duration", "0.001"]).output
+
+
+HERE, THERE, AWAY = ({"position": [x, 0.0]} for x in (0.0, 9.0, 90.0))
+GAINS, PLACED = {"gains_db": -90.0}, {"channel": {"from": "positions"}}
+effects(
+    "Medium",
+    name=lambda: (called("air"), called("hall")),
+    phy=crosses(phy={"name": "psk", "sample_rate": 1e6}),
+    packet_len=crosses(packet_len=200),
+    robots=crosses({}, {}, {}),
+    gains_db=crosses(gains_db=-90.0),
+    channel=crosses(channel={"snr_db": 3.0}),
+    time=crosses(time="real"),
+    seed=crosses(seed=3, beside={"channel": {"snr_db": 3.0}}),
+)
+effects(
+    "Robot of a medium",
+    tx_power_dbm=crosses({"tx_power_dbm": 3.0}, {}, beside=GAINS),
+    noise_figure_db=crosses({}, {"noise_figure_db": 3.0}, beside=GAINS),
+    connect=lambda: (addresses(), addresses(connect="ipc://{}/elsewhere")),
+    bind=lambda: (addresses(), addresses(bind="ipc://{}/elsewhere")),
+    position=lambda: (carried(HERE, THERE, **PLACED), carried(HERE, AWAY, **PLACED)),
+)
+
+
 def judged(limit: str) -> Outcomes:
     """What is said of a poor link without any limit, and with this one."""
 
@@ -540,6 +583,35 @@ def test_a_running_link_refuses_what_cannot_change(version: int) -> None:
         end.reconfigure(greedy=True)
     end.reconfigure(queue_depth=3)
     assert end.messages.depth(0) == 3
+
+
+OF_A_GRAPH = {
+    "ros_source.middleware": "memory",
+    "ros_source.domain_id": 3,
+    "ros_source.subscriber_depth": 3,
+    "ros_source.backpressure": True,
+    "ros_source.debug": True,
+    "ros_sink.middleware": "memory",
+    "ros_sink.domain_id": 3,
+    "ros_sink.publisher_depth": 3,
+    "ros_sink.debug": True,
+    "ros_sink.use_sim_time": True,
+    "localhost_only": False,
+    "own_domains": False,
+    "sim.transforms": True,
+}
+"""Settings of ROS graphs, which a run in simulated time has not. They are taken all the same: a scenario is run in real
+and in simulated time, and planned, as it is. The page says so (`time`)."""
+
+
+@pytest.mark.parametrize("setting", OF_A_GRAPH)
+def test_simulated_time_takes_the_settings_of_a_graph_that_it_has_not(setting: str) -> None:
+    assert outcome("six-topics-paced") == outcome("six-topics-paced", f"{setting}={json.dumps(OF_A_GRAPH[setting])}")
+
+
+def test_a_recording_takes_the_settings_of_the_simulator() -> None:
+    """A scenario keeps its ``sim`` where ``--set source=bag:PATH`` puts a recording in its place."""
+    assert outcome("six-topics-paced", *DRIVE) == outcome("six-topics-paced", *DRIVE, "sim={robots: 5, seed: 7}")
 
 
 def test_a_seal_needs_a_key_and_a_shared_setting_is_refused_once() -> None:

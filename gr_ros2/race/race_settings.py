@@ -22,8 +22,8 @@ from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
-from gr_ros2.settings.config import PacketLen, PacketSettings, Populated, Sampled, Seconds, Text, Traffic
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.config import PacketLen, SampleRate, Seconds, Text, Traffic
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire import FORMATS
@@ -43,7 +43,7 @@ Load = Annotated[float, Field(gt=0, le=100)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
-class RaceSettings(Populated, Sampled, PacketSettings, Traffic):
+class RaceSettings(Traffic):
     """One race: every contender at every load and every loss.
 
     :param robots: all of them send to all others on one channel, each a recording of its own; of a bag all the same,
@@ -65,6 +65,7 @@ class RaceSettings(Populated, Sampled, PacketSettings, Traffic):
     bag_topic: Text = AUTO
     peers: tuple[str, ...] = ()
     loss: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.0, 0.05, 0.2, 0.4)
+    sample_rate: SampleRate | Auto = AUTO
     load: Annotated[tuple[Load, ...], Field(min_length=1)] = (0.5, 2.0)
     duration_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     packet_len: PacketLen = 64

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.factory import EndpointSetup
+from gr_ros2.gr.factory import EndpointSetup, keys_of_run
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.rate import Mcs
 from gr_ros2.mac import access_of
@@ -51,6 +51,7 @@ def start_of_run(
     answered = _answered(ways)
     return EndpointSetup(
         ways[0].seed + 1,
+        keys=keys_of_run(ways[0].ros_source),
         reports=answered,
         half_duplex=half_duplex,
         any_length=any_length,

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
@@ -20,20 +20,20 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.settings.config import (
+    LEVELS,
     STRICT,
     AnyLink,
     Decibels,
     OneWay,
-    OverChannel,
-    Populated,
     ScenarioChannel,
     Seconds,
-    Sending,
+    SourceConfig,
     Traffic,
     Transceiver,
     build,
     replaced,
 )
+from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
 from gr_ros2.settings.registry import Registry, check_outputs
@@ -60,7 +60,9 @@ class Experiment:
     :param time: what the clock of a run follows. `real`: the wall clock, packets pass at the pace of the air;
         `unthrottled`: the wall clock, packets pass as fast as the flowgraph runs, which measures its speed; `samples`:
         simulated time, as the samples of the flowgraph tell it, as fast as it can be computed; `packets`: simulated
-        time of the packets alone, which are lost as measured on the flowgraph (docs/explanation/simulated-time.md)
+        time of the packets alone, which are lost as measured on the flowgraph (docs/explanation/simulated-time.md).
+        Simulated time has no ROS graphs, so what says how one is joined (`middleware`, domains, depths of subscriptions
+        and publishers, `backpressure`, `use_sim_time`, `debug`) has no effect there
     """
 
     description: str = ""
@@ -83,7 +85,7 @@ class Back(OneWay):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Reports(OverChannel):
+class Reports:
     """The reverse direction for reports of what was heard, on a channel of its own (version 1).
 
     :param channel: what lies between them and the sender; what is not set is as forward, but for the seed
@@ -95,17 +97,22 @@ class Reports(OverChannel):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class RobotConfig(Transceiver, Sending):
+class RobotConfig(Transceiver):
     """One of the robots that share a medium. What is not set in its block is as in the scenario's, but for the
-    namespace: ``/robot_1``, ``/robot_2``, …"""
+    namespace: ``/robot_1``, ``/robot_2``, …
+
+    :param ros_source: its sending block
+    """
+
+    ros_source: SourceConfig = Field(default_factory=SourceConfig)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Scenario(Populated, Experiment, Traffic, AnyLink):
+class Scenario(Experiment, Traffic, AnyLink):
     """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
 
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
-    :param sim: settings of the simulator; its seed is the scenario's unless given
+    :param sim: settings of the simulator, which a recording does not need; its seed is the scenario's unless given
     :param back: the reverse direction, where both robots talk; null = one way only
     :param reports: the reverse direction for reports alone (version 1); null = there is none
     :param receivers: channels of further receivers of the same sender; what is not set in one is as in ``channel``, but
@@ -139,9 +146,28 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     controller: Literal["task", "ros"] = "task"
     localhost_only: bool | Auto = True
     own_domains: bool = True
+    conditions: ClassVar = (
+        ActsWhere(
+            ("bag_speed",),
+            lambda scenario: scenario.source != "sim",
+            "the simulator plays no recording; leave it out, or set source: bag:PATH",
+        ),
+        ActsWhere(
+            ("state",),
+            lambda _: False,
+            "a run counts no starts of its robots; leave it out",
+        ),
+        ActsWhere(
+            ("controller",),
+            lambda scenario: scenario.task and scenario.time == "real",
+            "stands in for that of a task in real time; set task and time: real",
+        ),
+        *LEVELS,
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
+        refuse_without_effect(self)
         if self.source == "sim" and self.duration_s == 0:
             raise ValueError("duration_s = 0: the simulator has no end; set duration_s above 0")
         for key, name, table in (
@@ -189,10 +215,6 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError(
                 f"task = {self.task!r}: robots act on what they hear in real time or at packets; set robots, and time: "
                 "real or packets"
-            )
-        if self.controller != "task" and (not self.task or self.time != "real"):
-            raise ValueError(
-                f"controller = {self.controller!r}: stands in for that of a task in real time; set task and time: real"
             )
         if not self.robots:
             if self.gains_db is not None:

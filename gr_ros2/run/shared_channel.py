@@ -26,7 +26,7 @@ from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.run.recorders import RunRecords
 from gr_ros2.run.scenario import Scenario
-from gr_ros2.settings.config import AnyLink, ChannelConfig, DiagnosticsConfig, build, replaced
+from gr_ros2.settings.config import AnyLink, ChannelConfig, DiagnosticsConfig, PhyConfig, build, replaced
 from gr_ros2.settings.registry import Registry
 
 _FOUND_S = 20.0
@@ -53,7 +53,7 @@ class SharedChannel:
     ) -> None:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="gr-ros2-")))
         ways = scenario.directions()
-        phy = replaced(scenario.phy, sample_rate=phys[0].sample_rate)
+        phy = replaced(scenario.phy, sample_rate=phys[0].sample_rate, headroom=PhyConfig.headroom)
         ends = [tuple(f"ipc://{folder}/{number}-{what}" for what in ("sends", "hears")) for number in range(len(ways))]
         self._around = around
         self._medium = MediumProcess(
