@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import functools
 import json
+import random
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -25,6 +26,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.cli.medium import medium
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.factory import make_endpoint
+from gr_ros2.link.endpoint import LIVE_OPTIONS
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
 from gr_ros2.radio.ax25 import ui_header
@@ -542,11 +544,15 @@ def other(setting: Setting) -> Any:
         return 7
     if isinstance(setting.default, bool):
         return not setting.default
-    if isinstance(setting.default, tuple):
-        return ("other",)
+    if isinstance(setting.default, tuple | dict):
+        return type(setting.default)()
+    if setting.kinds == (str,):
+        return "other"
     choices = [choice for choice in setting.choices if choice not in (setting.default, AUTO)]
     if choices:
         return choices[0]
+    if setting.default == AUTO and setting.kinds == (int,):
+        return 3
     return 0.5 if setting.default == AUTO or setting.below is not None else setting.default + 1
 
 
@@ -579,10 +585,94 @@ def test_a_version_refuses_what_only_the_other_one_has(cls: type[Any], setting: 
 def test_a_running_link_refuses_what_cannot_change(version: int) -> None:
     rows = Registry.from_rows({"odom": "nav_msgs/Odometry"})
     end = make_endpoint(rows, SourceConfig(version=version, robot_id=1), None)
-    with pytest.raises(ConfigError, match="greedy cannot change while running; these can: packet_rate, dst_id"):
-        end.reconfigure(greedy=True)
-    end.reconfigure(queue_depth=3)
-    assert end.messages.depth(0) == 3
+    for setting in settings_of(SourceConfig):
+        if setting.name == "dst_id" and version:
+            with pytest.raises(ConfigError, match="dst_id = 7: another destination needs a restart of the link"):
+                end.reconfigure(dst_id=7)
+        elif setting.name not in end.live_settings:
+            said = f"{setting.name} cannot change while running; these can: {', '.join(end.live_settings)}"
+            with pytest.raises(ConfigError, match=re.escape(said)):
+                end.reconfigure(**{setting.name: other(setting)})
+    for option in settings_of(TopicOptions):
+        if option.name not in end.live_options:
+            changed = replace(rows[0].options, **{option.name: other(option)})
+            with pytest.raises(
+                ConfigError, match=f"topic odom: ({option.name} cannot|with version 0, its options) change"
+            ):
+                end.messages.change(0, changed)
+
+
+def says(version: int, **changes: Any) -> list[Any]:
+    """What an end sends for 3 s, of which a setting changes in the first: packets with their times, and queues."""
+    options = TopicOptions(durability="transient_local", queue="fifo" if version else AUTO)
+    rows = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options)])
+    end = make_endpoint(
+        rows, SourceConfig(version=version, robot_id=1, packet_rate=20.0, repeat_s=1.0), None, rng=random.Random(1)
+    )
+    sent: list[Any] = []
+    for step in range(300):
+        now = step * 0.01
+        if step == 20:
+            end.reconfigure(**changes)
+        if step < 50 and step % 2 == 0:
+            end.messages.submit(0, b"message %d" % step * 20, now)
+        while (packet := end.next_packet(now)) is not None:
+            sent.append((now, packet.data))
+    return [*sent, dict(end.sent.refused)]
+
+
+LIVE = {"packet_rate": 50.0, "dst_id": 7, "repeat_s": 0.3, "queue_depth": 3}
+
+
+@pytest.mark.parametrize("version", [0, 1])
+def test_what_can_change_while_a_link_runs_has_its_effect_then(version: int) -> None:
+    end = make_endpoint(
+        Registry.from_rows({"odom": "nav_msgs/Odometry"}), SourceConfig(version=version, robot_id=1), None
+    )
+    same = says(version)
+    assert says(version) == same
+    for name in end.live_settings:
+        assert says(version, **{name: LIVE[name]}) != same, name
+    assert len(says(version, repeat_s=0.0)) < len(same), "0 is off"
+
+
+CHANGED: dict[str, tuple[dict[str, Any], Any]] = {
+    "to": ({}, 3),
+    "qos": ({}, "bulk"),
+    "queue": ({}, "latest"),
+    "queue_depth": ({}, 2),
+    "deadline_s": ({"queue": "deadline", "deadline_s": 2.0}, 0.1),
+    "weight": ({"queue": "latest"}, 50.0),
+    "max_rate": ({"queue": "latest"}, 2.0),
+    "keep_s": ({}, 5.0),
+}
+"""Options of a topic that runs, and the value that one takes."""
+
+
+def optioned(base: Mapping[str, Any], **changed: Any) -> list[bytes]:
+    """What an end sends of two topics that want more than there is, of which the options of one change."""
+    options = TopicOptions(**{"queue": "fifo", **base})
+    rows = Registry([Topic(n, name, "a_msgs/msg/B", options) for n, name in enumerate(("goal", "scan"))])
+    config = SourceConfig(robot_id=1, packet_rate=20.0, repeat_s=0.5, compression=False)
+    end = make_endpoint(rows, config, None)
+    sent, topic_id = [], 0
+    for step in range(300):
+        now = step * 0.01
+        if step == 20:
+            topic_id = end.messages.change(0, replace(options, **changed))[1].topic_id
+        if step < 200 and step % 10 == 0:
+            for topic in (topic_id, 1):
+                end.messages.submit(topic, b"message %3d of %d" % (step, topic) * 12, now)
+        while (packet := end.next_packet(now)) is not None:
+            sent.append(packet.data)
+    return sent
+
+
+@pytest.mark.parametrize("option", LIVE_OPTIONS)
+def test_an_option_that_can_change_has_its_effect_then(option: str) -> None:
+    base, value = CHANGED[option]
+    assert optioned(base) == optioned(base)
+    assert optioned(base, **{option: value}) != optioned(base)
 
 
 OF_A_GRAPH = {

@@ -240,7 +240,7 @@ class SourceConfig(EndConfig):
     :param services: whether these names choose services and actions of the ROS graph too, which other robots may then
         call; this needs both directions of a link
     :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
-    :param dst_id: destination id, 255 broadcast
+    :param dst_id: destination id, 255 broadcast; while a link runs it can change with version 0 only
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
     :param greedy: several entries of one topic in a packet, back to back
     :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
