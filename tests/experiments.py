@@ -8,19 +8,22 @@ from __future__ import annotations
 import functools
 import json
 import random
+import re
 import socket
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 from unittest import mock
 
 import numpy as np
+from click.testing import CliRunner
 from gnuradio import blocks, gr
 
+from gr_ros2.cli.run import run
 from gr_ros2.compression.train import learn
 from gr_ros2.gr import RosSink
 from gr_ros2.gr.factory import EndpointSetup, make_endpoint
@@ -210,7 +213,7 @@ def prepared(**changes: Any) -> list[Any]:
 @functools.cache
 def raced(**changes: Any) -> list[Any]:
     """What robots in slots hear of each other in a race at its first load and loss."""
-    values = {"robots": 2, "duration_s": 0.2, "loss": (0.05,), "load": (4.0,), "drain_s": 0.5, **changes}
+    values = {"robots": 2, "duration_s": 0.2, "loss": (0.05,), "load": (4.0,), **changes}
     settings = build(RaceSettings, values)
     with TemporaryDirectory() as folder:
         recordings = read_recordings(settings, Path(folder))
@@ -226,14 +229,17 @@ def guarded(front_end: str, options: Mapping[str, Any]) -> float:
     return kind.airtime_with(phy, kind.Options(**options), 64)
 
 
-def shares(front_end: str, **options: Any) -> bool:
-    """Whether a link takes it that it hears nothing while it sends."""
+def linked(front_end: str = "udp", *, options: Mapping[str, Any] = MappingProxyType({}), **changes: Any) -> Any:
+    """What a link is called, whether it sends, relays, has slots, and hears nothing while it sends.
+
+    :param options: of the front end
+    """
     with ExitStack() as stack:
         server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
-        own = {"device": f"tcp://127.0.0.1:{server.getsockname()[1]}"}
+        folder = stack.enter_context(TemporaryDirectory())
+        own: Any = {"device": f"tcp://127.0.0.1:{server.getsockname()[1]}"}
         if front_end == "udp":
             own = {"listen": str(_free_port()), "send_to": ["127.0.0.1:9"]}
-        folder = stack.enter_context(TemporaryDirectory())
         values = {
             "phy": {"name": "modem"},
             "front_end": {"name": front_end, **own, **options},
@@ -242,10 +248,21 @@ def shares(front_end: str, **options: Any) -> bool:
             "state": f"{folder}/state",
             "ros_source": {"robot_id": 1, "middleware": "memory"},
             "ros_sink": {"middleware": "memory"},
+            **changes,
         }
         link = RobotLink(link_from(values))
         stack.callback(link.stop)
-        return link.source._end.settings.half_duplex
+        told, settings = link.stats(), link.end.endpoint.settings  # type: ignore[attr-defined]
+        return told["name"], told["airtime"]["transmits"], settings.relay, settings.shares, settings.half_duplex
+
+
+@functools.cache
+def printed(*settings: str) -> str:
+    """What `gr-ros2 run` says of a run in simulated time, but for numbers and places."""
+    with TemporaryDirectory() as folder:
+        words = [f"--set={setting}" for setting in ("time=packets", "duration_s=0.2", *settings)]
+        output = CliRunner().invoke(run, ["paper-direct", "--out", folder, *words]).output
+        return re.sub(r"[\d.]+", "", output.replace(folder, ""))
 
 
 def _free_port() -> int:

@@ -50,14 +50,15 @@ from tests.experiments import (
     kept,
     lasting,
     levels,
+    linked,
     prepared,
+    printed,
     published,
     raced,
     rates,
     reached,
     replayed,
     sent,
-    shares,
     wifi,
 )
 from tests.gr.test_health import make, parts
@@ -395,14 +396,14 @@ effects(
 ENDS = {name: EFFECTS["ROS Source", name] for name in ("packet_len", "registry", "version", "key", "seal", "state")}
 effects(
     "Scenario",
-    name=Elsewhere("run/test_scenario.py::test_a_file_with_a_registry_beside_it"),
+    name=lambda: (printed(), printed("name=another")),
     key=ENDS["key"],
     seal=ENDS["seal"],
     state=Refused(("state=robot.json",)),
     localhost_only=Elsewhere("middleware/test_dds.py::test_a_domain_is_on_loopback_or_not_for_the_whole_process"),
     own_domains=Elsewhere("run/test_domains.py::test_one_graph_is_that_of_the_shell"),
-    description=Elsewhere("run/test_scenario.py::test_each_is_ready_to_run"),
-    repetitions=Elsewhere("run/test_repeat.py::test_every_seed_moves_on_with_the_repetition"),
+    description=lambda: (printed(), printed("description=another")),
+    repetitions=lambda: (printed(), printed("repetitions=2")),
     time=Elsewhere("run/test_simulated_runner.py::test_in_noise_packets_lose_what_samples_lose"),
     bag_speed=run("bag_speed=2", *DRIVE),
     back=run("back={ros_source: {namespace: /robot_2}}"),
@@ -428,17 +429,17 @@ effects(
 effects(
     "Link",
     **ENDS,
-    name=Elsewhere("radio/test_version1.py::test_with_a_key_only_those_who_have_it_are_heard"),
+    name=differs(linked, name="another"),
     channel=Elsewhere("radio/test_radio.py::test_a_channel_that_is_given_can_be_changed_while_it_runs"),
     ros_source=EFFECTS["Scenario", "ros_source"],
     ros_sink=EFFECTS["Scenario", "ros_sink"],
     phy=EFFECTS["Scenario", "phy"],
     airtime=EFFECTS["Scenario", "airtime"],
-    medium=Elsewhere("radio/test_slots.py::test_the_guard_is_what_the_front_end_may_be_late_by"),
-    relay=Elsewhere("radio/test_slots.py::test_a_message_reaches_a_robot_that_does_not_hear_its_sender"),
+    medium=differs(linked, medium="slots"),
+    relay=lambda: (linked(medium="slots"), linked(medium="slots", relay="gain")),
     localhost_only=EFFECTS["Scenario", "localhost_only"],
     front_end=Elsewhere("radio/test_devices.py::test_every_packet_goes_out_as_one_ended_burst_and_comes_back"),
-    transmit=Elsewhere("radio/test_permission.py::test_a_radio_asks_first"),
+    transmit=differs(linked, transmit=False),
     open=Elsewhere("radio/test_permission.py::test_a_radio_asks_first"),
     record=Elsewhere("radio/test_radio.py::test_it_records_what_it_receives_and_finishes_it_without_being_closed"),
     diagnostics=Elsewhere("radio/test_diagnostics.py::test_a_running_link_is_diagnosed"),
@@ -543,8 +544,6 @@ effects(
     peers=lambda: (list(chosen((), "two")), list(chosen(("gr-ros2",), "two"))),
     loss=differs(prepared, loss=(0.5,)),
     load=differs(prepared, load=(0.8,)),
-    match_s=differs(raced, match_s=0.1),
-    drain_s=differs(raced, drain_s=0.0),
     seed=differs(prepared, seed=3),
 )
 
@@ -633,7 +632,7 @@ for name in ("kiss", "serial"):
         device=opens(name, device="/dev/b"),
         baud=opens(name, baud=9600),
         backoff_s=opens(name, backoff_s=1.0),
-        half_duplex=differs(shares, name, half_duplex=False),
+        half_duplex=differs(linked, name, options={"half_duplex": False}),
     )
 effects(
     "Front end `kiss`",
@@ -650,7 +649,7 @@ effects(
     "Front end `udp`",
     listen=opens("udp", listen="5556"),
     send_to=opens("udp", send_to=("10.0.0.2:5555",)),
-    half_duplex=differs(shares, "udp", half_duplex=True),
+    half_duplex=differs(linked, "udp", options={"half_duplex": True}),
 )
 effects(
     "Front end `zmq`",

@@ -22,7 +22,7 @@ from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
-from gr_ros2.settings.config import PacketLen, SampleRate, Seconds, Text, Traffic
+from gr_ros2.settings.config import PacketLen, SampleRate, Text, Traffic
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
@@ -38,6 +38,10 @@ _SIM_HZ = 35.0
 _LARGEST_IN_IP = MTU - 200
 """Bytes of the largest message that fits into an IP packet with the headers of any contender."""
 
+MATCH_S = 30.0
+"""s that all ends have to find each other."""
+DRAIN_S = 10.0
+"""s that what is on its way has after the last message was published."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Load = Annotated[float, Field(gt=0, le=100)]
 
@@ -56,8 +60,6 @@ class RaceSettings(Traffic):
     :param sample_rate: samples/s instead of ``load``; auto = chosen by it
     :param duration_s: s of the recording
     :param packet_len: bytes of gr-ros2's longest packets; of `gr-ros2-plain` they are as long as a message needs
-    :param match_s: s that both ends have to find each other
-    :param drain_s: s that what is on its way has after the last message was published
     :param seed: of the simulator, the losses and gr-ros2's sender
     """
 
@@ -69,8 +71,6 @@ class RaceSettings(Traffic):
     load: Annotated[tuple[Load, ...], Field(min_length=1)] = (0.5, 2.0)
     duration_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     packet_len: PacketLen = 64
-    match_s: Seconds = 30.0
-    drain_s: Seconds = 10.0
 
 
 @plain_dataclass(frozen=True)

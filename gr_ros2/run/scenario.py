@@ -111,6 +111,7 @@ class RobotConfig(Transceiver):
 class Scenario(Experiment, Traffic, AnyLink):
     """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
 
+    :param drain_s: s the link may go on delivering after ``duration_s``
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
     :param sim: settings of the simulator, which a recording does not need; its seed is the scenario's unless given
     :param back: the reverse direction, where both robots talk; null = one way only
@@ -133,6 +134,7 @@ class Scenario(Experiment, Traffic, AnyLink):
     :param seed: of the simulator, the channel and the sender
     """
 
+    drain_s: Seconds = 2.0
     bag_speed: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
     sim: SimSettings = Field(default_factory=SimSettings)
     back: Back | None = None

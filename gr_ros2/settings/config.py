@@ -83,13 +83,11 @@ class Traffic:
 
     :param source: where messages come from: `sim`, the simulated robots, or `bag:PATH`, a recording
     :param duration_s: s during which messages are submitted; 0 = no limit: as long as the recording
-    :param drain_s: s the link may go on delivering after that
     :param seed: of everything random in it; the same seed draws the same numbers
     """
 
     source: str = "sim"
     duration_s: Seconds = 15.0
-    drain_s: Seconds = 2.0
     seed: Count = 0
 
     @model_validator(mode="after")
