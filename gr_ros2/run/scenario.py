@@ -154,11 +154,7 @@ class Scenario(Experiment, Traffic, AnyLink):
             lambda scenario: scenario.source != "sim",
             "the simulator plays no recording; leave it out, or set source: bag:PATH",
         ),
-        ActsWhere(
-            ("state",),
-            lambda _: False,
-            "a run counts no starts of its robots; leave it out",
-        ),
+        ActsWhere(("state",), lambda _: False, "a run counts no starts of its robots; leave it out"),
         ActsWhere(
             ("controller",),
             lambda scenario: scenario.task and scenario.time == "real",

@@ -379,9 +379,7 @@ class SinkConfig(EndConfig):
     end: ClassVar = "sink"
     conditions: ClassVar = (
         ActsWhere(
-            ("max_age_s",),
-            lambda sink: bool(sink.key),
-            "only sealed messages have an age; set key, or leave it out",
+            ("max_age_s",), lambda sink: bool(sink.key), "only sealed messages have an age; set key, or leave it out"
         ),
     )
 
