@@ -1,29 +1,38 @@
 """Every row of docs/reference/parameters.md has an effect, or is refused where it has none.
 
-``EFFECTS`` has an entry for every row: an experiment whose outcome the setting changes, or the test elsewhere in which
-it does. A row without an entry fails, and so does an entry whose two outcomes are equal.
+``EFFECTS`` has an entry for every row: an experiment whose outcome the setting changes; the test elsewhere that shows
+its effect, where that takes processes, real time or a module that few machines have; or settings of a scenario that
+refuses it. A row without an entry fails, and so does an entry whose two outcomes are equal, and one whose test is not
+there or does not name the setting.
 """
 
 from __future__ import annotations
 
+import ast
 import functools
+import json
+import random
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.cli.medium import medium
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.factory import make_endpoint
+from gr_ros2.link.endpoint import LIVE_OPTIONS
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
-from gr_ros2.radio.ax25 import ui_header
-from gr_ros2.radio.framing import Kiss
+from gr_ros2.phy.wifi_frames import DataFrames
+from gr_ros2.race.contenders import chosen
 from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import simulate
 from gr_ros2.settings.config import DiagnosticsConfig, SinkConfig, SourceConfig, TopicOptions, build
@@ -31,8 +40,31 @@ from gr_ros2.settings.fields import AUTO, Setting, settings_of
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
+from tests.experiments import (
+    GRAPH,
+    dictionary,
+    drawn,
+    guarded,
+    heard,
+    impaired,
+    kept,
+    lasting,
+    levels,
+    linked,
+    prepared,
+    printed,
+    published,
+    raced,
+    rates,
+    reached,
+    replayed,
+    sent,
+    wifi,
+)
 from tests.gr.test_health import make, parts
 from tests.link.v1.air import Air, Robot, registry
+from tests.radio.carried import addresses, carried
+from tests.radio.opened import opened
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGE = REPOSITORY / "docs" / "reference" / "parameters.md"
@@ -93,7 +125,7 @@ def sealed() -> Outcomes:
 
 def withheld(**sink: Any) -> list[bytes]:
     """Messages that are taken of sealed packets which somebody held back for 5 s."""
-    take = end_settings(None, SinkConfig(robot_id=2, **sink), hears=True)
+    take = end_settings(None, SinkConfig(robot_id=2, key="fleet.key", **sink), hears=True)
     one = Robot(1, registry(cmd_vel=TopicOptions(queue="deadline", deadline_s=1.0)), mode="encrypt")
     two = Robot(2, registry(), mode="encrypt", max_age_s=take.max_age_s, max_ages=take.max_ages)
     air = Air(one, two)
@@ -112,11 +144,44 @@ def withheld(**sink: Any) -> list[bytes]:
 
 
 class Elsewhere(str):
-    """File with the test that shows the effect of the setting; it names it."""
+    """The test that shows the effect of the setting, ``file::function`` below this folder; it names the setting."""
 
 
-class Hardware(str):
-    """Why the effect of a setting shows only on a device."""
+class Refused(tuple[str, ...]):
+    """Settings of a scenario that takes the setting nowhere, since it has no effect in one."""
+
+
+def differs(experiment: Callable[..., Any], *beside: str, **changed: Any) -> Outcomes:
+    """The outcome of an experiment without and with a change."""
+    return lambda: (experiment(*beside), experiment(*beside, **changed))
+
+
+def impairs(**changed: Any) -> Outcomes:
+    """Samples after a channel that does nothing, and after one with a change."""
+    return differs(impaired, **changed)
+
+
+def reaches(setting: str, *others: str) -> Outcomes:
+    """Levels that follow from positions, without and with a setting of the channel."""
+    base = ("from=positions", *others)
+    return lambda: (levels(*base), levels(*base, setting))
+
+
+def sends(phy: str, beside: Mapping[str, Any] = MappingProxyType({}), **changed: Any) -> Outcomes:
+    """The samples of a PHY, without and with a change."""
+    return lambda: (sent(phy, **beside), sent(phy, **beside, **changed))
+
+
+def sweeps(beside: Mapping[str, Any] = MappingProxyType({}), **changed: Any) -> Outcomes:
+    """What a sweep runs and draws, without and with a change."""
+    return lambda: (drawn(**beside), drawn(**beside, **changed))
+
+
+LINE = "gains_db=[[-100, -100, null], [-100, -100, -100], [null, -100, -100]]"
+
+
+def own_dictionary(end: str) -> str:
+    return f"ros_{end}.dictionaries=[{dictionary()}]"
 
 
 LOSSY, PAPER = "channel.packet_loss=0.2", ("version=0", "ros_source.topic_options={}")
@@ -128,10 +193,10 @@ DRIVE = (
 )
 BURSTS = "channel.burst_loss={{p_good_to_bad: 0.1, p_bad_to_good: 0.3{}}}"
 
-EFFECTS: dict[Row, Outcomes | Elsewhere | Hardware] = {}
+EFFECTS: dict[Row, Outcomes | Elsewhere | Refused] = {}
 
 
-def effects(section: str, **entries: Outcomes | Elsewhere | Hardware) -> None:
+def effects(section: str, **entries: Outcomes | Elsewhere | Refused) -> None:
     """Add the entries of a section."""
     EFFECTS.update({(section, name): entry for name, entry in entries.items()})
 
@@ -146,46 +211,51 @@ effects(
     max_rate=run(OPTION + "odom.max_rate=5"),
     max_age_s=lambda: (withheld(), withheld(topic_options={"cmd_vel": TopicOptions(max_age_s=2.0)})),
     codec=run(OPTION + "odom.codec=zstd"),
-    to=Elsewhere("tests/link/v1/test_relaying.py"),
-    keep_s=Elsewhere("tests/link/v1/test_latest_state.py"),
+    to=run(OPTION + "odom.to=3"),
+    keep_s=Elsewhere("link/v1/test_latest_state.py::test_keep_s_says_how_long_a_robot_out_of_range_can_still_get_it"),
     quantize=run(OPTION + "odom.quantize=pose.pose.position=0.1"),
     depth=run(OPTION + "odom.depth=1", OPTION + "odom={queue: auto}"),
     reliability=run(OPTION + "odom.reliability=best_effort", LOSSY, "reports={}", scenario="paper-ofdm-paced"),
     durability=run(OPTION + "odom.durability=transient_local", "ros_source.repeat_s=0.5"),
-    publish_as=Elsewhere("tests/gr/test_sink.py"),
+    publish_as=differs(published, topic_options={"odom": {"publish_as": "/here"}}),
 )
 effects(
     "ROS Source",
     packet_len=run("packet_len=300"),
     registry=run("registry=odom.csv", "ros_source.topics=[odom]", OPTION[:-1] + "={}"),
     version=run("version=0", OPTION[:-1] + "={}"),
-    key=Elsewhere("tests/radio/test_version1.py"),
-    seal=sealed(),
-    state=Elsewhere("tests/radio/test_version1.py"),
+    key=run("key=fleet.key"),
+    seal=run("seal=authenticate", "key=fleet.key"),
+    state=differs(kept, state="{}/mine.json"),
     robot_id=run("ros_source.robot_id=7"),
-    middleware=Elsewhere("tests/core/test_backends.py"),
-    domain_id=Elsewhere("tests/gr/test_source.py"),
+    middleware=Elsewhere("core/test_backends.py::test_choosing_what_is_not_installed_names_what_to_install"),
+    domain_id=Elsewhere("gr/test_source.py::test_a_loop_is_refused_whichever_comes_first"),
     commands=run("ros_source.commands=[]", OPTION + "cmd_vel={qos: auto}"),
-    dictionaries=Elsewhere("tests/compression/test_link_codec.py"),
+    dictionaries=lambda: (
+        outcome("paper-ofdm-paced"),
+        outcome("paper-ofdm-paced", own_dictionary("source"), own_dictionary("sink")),
+    ),
     topic_options=run(OPTION + "odom.max_rate=5"),
-    debug=Elsewhere("tests/gr/test_source.py"),
+    debug=Elsewhere("gr/test_source.py::test_debug_lines"),
     queue_depth=run("ros_source.queue_depth=2", OPTION + "odom={queue: fifo}"),
     topics=run("ros_source.topics=[odom, scan]"),
-    services=Elsewhere("tests/radio/test_calls.py"),
+    services=Elsewhere("radio/test_found_services.py::test_services_can_be_left_to_the_robot"),
     namespace=run("ros_source.namespace=/robot_2"),
     dst_id=run("ros_source.dst_id=9"),
     min_fragment=run("ros_source.min_fragment=150", *PAPER),
     greedy=run("ros_source.greedy=true", *PAPER),
     flush_timeout_s=run("ros_source.flush_timeout_s=0.2", *PAPER),
-    subscriber_depth=Elsewhere("tests/gr/test_source.py"),
+    subscriber_depth=Elsewhere(
+        "gr/test_source.py::test_what_the_graph_loses_before_it_reaches_the_source_is_a_row_that_adds_up"
+    ),
     hop=run("ros_source.hop=3", *PAPER),
     packet_rate=run("ros_source.packet_rate=10"),
-    backpressure=Elsewhere("tests/gr/test_source.py"),
+    backpressure=Elsewhere("gr/test_source.py::test_backpressure_holds_the_publisher_back_and_close_lets_it_go"),
     entry_ids=run("ros_source.entry_ids=random", *PAPER),
     repeat_s=run("ros_source.repeat_s=0.5"),
     compression=run("ros_source.compression=false"),
     repair=run("ros_source.repair='off'", scenario="paper-ofdm-paced"),
-    beacon_s=Elsewhere("tests/link/v1/test_commands.py"),
+    beacon_s=run("ros_source.beacon_s=0.05", LOSSY, "reports={}"),
     expected_loss=run("ros_source.expected_loss=0.6", LOSSY, "ros_source.repair=thrifty", scenario="paper-ofdm-paced"),
 )
 effects(
@@ -193,27 +263,32 @@ effects(
     packet_len=run("packet_len=300"),
     registry=run("registry=odom.csv", "ros_source.topics=[odom]", OPTION[:-1] + "={}"),
     version=run("version=0", OPTION[:-1] + "={}"),
-    key=Elsewhere("tests/radio/test_version1.py"),
-    seal=sealed(),
-    state=Elsewhere("tests/radio/test_version1.py"),
+    key=run("key=fleet.key"),
+    seal=run("seal=authenticate", "key=fleet.key"),
+    state=differs(kept, state="{}/mine.json"),
     robot_id=run("ros_sink.robot_id=9", "ros_source.dst_id=8"),
-    middleware=Elsewhere("tests/core/test_backends.py"),
-    domain_id=Elsewhere("tests/gr/test_sink.py"),
-    dictionaries=Elsewhere("tests/compression/test_link_codec.py"),
-    topic_options=Elsewhere("tests/gr/test_sink.py"),
-    debug=Elsewhere("tests/gr/test_readable.py"),
-    commands=Elsewhere("tests/link/v1/test_commands.py"),
-    namespace_format=Elsewhere("tests/gr/test_sink.py"),
-    publisher_depth=Elsewhere("tests/gr/test_sink.py"),
+    middleware=Elsewhere("core/test_backends.py::test_choosing_what_is_not_installed_names_what_to_install"),
+    domain_id=differs(published, domain_id=GRAPH + 1),
+    dictionaries=lambda: (
+        outcome("paper-ofdm-paced", own_dictionary("source")),
+        outcome("paper-ofdm-paced", own_dictionary("source"), own_dictionary("sink")),
+    ),
+    topic_options=differs(published, topic_options={"odom": {"publish_as": "/here"}}),
+    debug=Elsewhere("gr/test_readable.py::test_lines_appear_on_standard_output_where_nothing_else_takes_them"),
+    commands=Elsewhere(
+        "link/v1/test_commands.py::test_what_repair_brings_too_late_is_dropped_by_the_receiver_and_has_a_row"
+    ),
+    namespace_format=differs(published, namespace_format="/from_{src_id}"),
+    publisher_depth=differs(published, publisher_depth=3),
     reassembly_timeout_s=run("ros_sink.reassembly_timeout_s=0.05", *PAPER, LOSSY),
     max_age_s=lambda: (withheld(), withheld(max_age_s=2.0)),
     hold_s=run("ros_sink.hold_s=0.1", LOSSY, OPTION + "scan={queue: fifo}", "phy.sample_rate=400000"),
-    max_sources=Elsewhere("tests/link/v0/test_receiver.py"),
-    max_source_bytes=Elsewhere("tests/link/v1/test_endpoint.py"),
-    max_bytes=Elsewhere("tests/link/v0/test_receiver.py"),
-    use_sim_time=Elsewhere("tests/gr/test_sink.py"),
-    frame_prefix=Elsewhere("tests/gr/test_sink.py"),
-    merge_tf=Elsewhere("tests/gr/test_frame_ids.py"),
+    max_sources=Elsewhere("link/v0/test_receiver.py::test_sources_beyond_the_bound_wait_until_one_has_gone_silent"),
+    max_source_bytes=Elsewhere("link/v1/test_endpoint.py::test_a_long_message_is_given_up_when_its_memory_is_needed"),
+    max_bytes=Elsewhere("link/v0/test_receiver.py::test_forged_packets_never_raise_and_memory_stays_bounded"),
+    use_sim_time=Elsewhere("gr/test_sink.py::test_latency_by_simulated_clock"),
+    frame_prefix=differs(published, frame_prefix="robot_{src_id}/"),
+    merge_tf=Elsewhere("gr/test_frame_ids.py::test_two_robots_on_one_graph_of_a_real_dds"),
 )
 effects(
     "Simulator",
@@ -240,7 +315,7 @@ effects(
     imu_orientation_noise=drives(imu_orientation_noise=0.2),
     start_time_s=drives(start_time_s=1000.0),
     prefix_frames=drives(prefix_frames=True),
-    transforms=Elsewhere("tests/sim/test_transforms.py"),
+    transforms=Elsewhere("sim/test_transforms.py::test_every_frame_hangs_on_the_map"),
 )
 effects(
     "Losses in bursts",
@@ -255,24 +330,24 @@ effects(
     packet_loss=run(LOSSY),
     burst_loss=run(BURSTS.format("")),
     outages=run("channel.outages=[[0.5, 1]]"),
-    snr_db=Elsewhere("tests/phy/test_snr.py"),
-    frequency_offset=Elsewhere("tests/phy/test_channel.py"),
-    epsilon=Elsewhere("tests/phy/test_ofdm.py"),
-    taps=Elsewhere("tests/phy/test_channel.py"),
-    doppler_hz=Elsewhere("tests/phy/test_channel.py"),
+    snr_db=impairs(snr_db=10.0),
+    frequency_offset=impairs(frequency_offset=0.01),
+    epsilon=impairs(epsilon=1.001),
+    taps=impairs(taps=(1, 0.5)),
+    doppler_hz=impairs(doppler_hz=50.0),
 )
 effects(
     "Channel of a scenario",
-    carrier_hz=Elsewhere("tests/medium/test_propagation.py"),
-    decorrelation_m=Elsewhere("tests/medium/test_positions.py"),
-    exponent=Elsewhere("tests/medium/test_propagation.py"),
-    height_m=Elsewhere("tests/medium/test_propagation.py"),
-    model=Elsewhere("tests/medium/test_propagation.py"),
-    noise_figure_db=Elsewhere("tests/run/test_robots.py"),
-    shadowing_db=Elsewhere("tests/medium/test_positions.py"),
-    tx_power_dbm=Elsewhere("tests/medium/test_positions.py"),
-    walls_db=Elsewhere("tests/medium/test_positions.py"),
-    **{"from": Elsewhere("tests/medium/test_positions.py")},
+    carrier_hz=reaches("carrier_hz=868e6"),
+    decorrelation_m=reaches("decorrelation_m=1", "shadowing_db=6"),
+    exponent=reaches("exponent=2"),
+    height_m=reaches("height_m=2", "model=two_ray"),
+    model=reaches("model=free_space"),
+    noise_figure_db=reaches("noise_figure_db=3"),
+    shadowing_db=reaches("shadowing_db=6"),
+    tx_power_dbm=reaches("tx_power_dbm=3"),
+    walls_db=reaches("walls_db=6"),
+    **{"from": lambda: (levels(), levels("from=positions"))},
 )
 effects(
     "PHY",
@@ -280,7 +355,7 @@ effects(
     sample_rate=run("phy.sample_rate=200000"),
     headroom=run("phy.headroom=2", "phy.sample_rate=auto"),
     options=run("phy.options={payload_modulation: qpsk}", "phy.options={}"),
-    kernels=Elsewhere("tests/phy/kernels/test_library.py"),
+    kernels=Elsewhere("phy/kernels/test_library.py::test_the_setting_chooses"),
 )
 effects(
     "Scenario",
@@ -292,12 +367,12 @@ effects(
     ros_sink=run("ros_sink.robot_id=9", "ros_source.dst_id=8"),
     phy=run("phy.sample_rate=200000"),
     seed=run("seed=4"),
-    source=Elsewhere("tests/run/test_replay.py"),
+    source=lambda: (outcome("six-topics-paced", *DRIVE[1:]), outcome("six-topics-paced", *DRIVE)),
     duration_s=run("duration_s=3"),
     drain_s=run("drain_s=0", "ros_source.packet_rate=0"),
     sim=run("sim.odom_rate=20"),
-    task=Elsewhere("tests/run/test_task_run.py"),
-    controller=Elsewhere("tests/run/test_task_run.py"),
+    task=Elsewhere("run/test_task_run.py::test_followers_keep_their_places_by_the_link_alone"),
+    controller=Elsewhere("run/test_task_run.py::test_robots_meet_in_real_time_whoever_drives_them"),
     reports=run("reports={}", LOSSY),
     airtime=run("airtime=eu869.4"),
 )
@@ -307,7 +382,9 @@ effects(
     duty_cycle=run("airtime.duty_cycle=0.1"),
     window_s=run("airtime.window_s=10", "airtime.duty_cycle=0.1"),
     max_burst_s=run("airtime.max_burst_s=0.2"),
-    listen_before_send=Elsewhere("tests/radio/test_radio.py"),
+    listen_before_send=Elsewhere(
+        "radio/test_devices.py::test_a_device_listens_where_it_sends_and_does_not_hear_itself"
+    ),
 )
 effects(
     "Reports",
@@ -316,56 +393,93 @@ effects(
 )
 
 
-BOTH_ENDS = {
-    name: EFFECTS["ROS Source", name] for name in ("packet_len", "registry", "version", "key", "seal", "state")
-}
-LOCAL = Elsewhere("tests/middleware/test_dds.py")
+ENDS = {name: EFFECTS["ROS Source", name] for name in ("packet_len", "registry", "version", "key", "seal", "state")}
 effects(
     "Scenario",
-    name=Elsewhere("tests/run/test_scenario.py"),
-    key=BOTH_ENDS["key"],
-    seal=BOTH_ENDS["seal"],
-    state=BOTH_ENDS["state"],
-    localhost_only=LOCAL,
-    own_domains=Elsewhere("tests/run/test_domains.py"),
-    description=Elsewhere("tests/run/test_scenario.py"),
-    repetitions=Elsewhere("tests/run/test_repeat.py"),
-    time=Elsewhere("tests/run/test_simulated_runner.py"),
+    name=lambda: (printed(), printed("name=another")),
+    key=ENDS["key"],
+    seal=ENDS["seal"],
+    state=Refused(("state=robot.json",)),
+    localhost_only=Elsewhere("middleware/test_dds.py::test_a_domain_is_on_loopback_or_not_for_the_whole_process"),
+    own_domains=Elsewhere("run/test_domains.py::test_one_graph_is_that_of_the_shell"),
+    description=lambda: (printed(), printed("description=another")),
+    repetitions=lambda: (printed(), printed("repetitions=2")),
+    time=Elsewhere("run/test_simulated_runner.py::test_in_noise_packets_lose_what_samples_lose"),
     bag_speed=run("bag_speed=2", *DRIVE),
-    back=Elsewhere("tests/run/test_scenario.py"),
-    receivers=Elsewhere("tests/run/test_version1.py"),
+    back=run("back={ros_source: {namespace: /robot_2}}"),
+    receivers=Elsewhere("run/test_version1.py::test_every_receiver_has_losses_of_its_own"),
+    robots=run("robots=3", scenario="two-robots-half-duplex"),
+    duplex=run("duplex=full", scenario="two-robots-half-duplex"),
+    gains_db=lambda: (reached(), reached("gains_db=-90")),
+    medium=run("medium=aloha", "robots=2", scenario="team"),
+    relay=run("relay='off'", "robots=3", LINE, scenario="line"),
 )
-for part in ("channel", "ros_source", "ros_sink"):
-    EFFECTS["Reverse direction", part] = Elsewhere("tests/run/test_scenario.py")
-effects("Scenario", **dict.fromkeys(("robots", "duplex", "gains_db"), Elsewhere("tests/run/test_robots.py")))
 effects(
-    "Scenario",
-    medium=Elsewhere("tests/run/test_medium_access.py"),
-    relay=Elsewhere("tests/run/test_relaying.py"),
+    "Reverse direction",
+    channel=run("back.channel.packet_loss=0.5", scenario="two-way"),
+    ros_source=run("back.ros_source.compression=false", scenario="two-way"),
+    ros_sink=run("back.ros_sink.max_source_bytes=4096", LOSSY, scenario="two-way"),
 )
 effects(
     "Robot",
     ros_source=run("robots=[{ros_source: {repair: 'off'}}, {}]", scenario="two-robots-half-duplex"),
-    tx_power_dbm=Elsewhere("tests/run/test_robots.py"),
-    noise_figure_db=Elsewhere("tests/run/test_robots.py"),
+    tx_power_dbm=lambda: (reached(), reached("robots=[{tx_power_dbm: 10}, {}]")),
+    noise_figure_db=lambda: (reached(), reached("robots=[{noise_figure_db: 3}, {}]")),
 )
 effects(
     "Link",
-    **BOTH_ENDS,
-    name=Elsewhere("tests/radio/test_version1.py"),
-    channel=Elsewhere("tests/radio/test_radio.py"),
+    **ENDS,
+    name=differs(linked, name="another"),
+    channel=Elsewhere("radio/test_radio.py::test_a_channel_that_is_given_can_be_changed_while_it_runs"),
     ros_source=EFFECTS["Scenario", "ros_source"],
     ros_sink=EFFECTS["Scenario", "ros_sink"],
     phy=EFFECTS["Scenario", "phy"],
     airtime=EFFECTS["Scenario", "airtime"],
-    medium=Elsewhere("tests/radio/test_slots.py"),
-    relay=Elsewhere("tests/radio/test_slots.py"),
-    localhost_only=LOCAL,
-    front_end=Elsewhere("tests/radio/test_devices.py"),
-    transmit=Elsewhere("tests/radio/test_permission.py"),
-    open=Elsewhere("tests/radio/test_permission.py"),
-    record=Elsewhere("tests/radio/test_radio.py"),
-    diagnostics=Elsewhere("tests/radio/test_diagnostics.py"),
+    medium=differs(linked, medium="slots"),
+    relay=lambda: (linked(medium="slots"), linked(medium="slots", relay="gain")),
+    localhost_only=EFFECTS["Scenario", "localhost_only"],
+    front_end=Elsewhere("radio/test_devices.py::test_every_packet_goes_out_as_one_ended_burst_and_comes_back"),
+    transmit=differs(linked, transmit=False),
+    open=Elsewhere("radio/test_permission.py::test_a_radio_asks_first"),
+    record=Elsewhere("radio/test_radio.py::test_it_records_what_it_receives_and_finishes_it_without_being_closed"),
+    diagnostics=Elsewhere("radio/test_diagnostics.py::test_a_running_link_is_diagnosed"),
+)
+
+
+def crosses(*robots: dict[str, Any], beside: Mapping[str, Any] = MappingProxyType({}), **changed: Any) -> Outcomes:
+    """What a medium process makes of a burst, without and with a change."""
+    return lambda: (carried(**beside), carried(*robots, **{**beside, **changed}))
+
+
+def called(name: str) -> str:
+    """What `gr-ros2 medium` says first."""
+    with TemporaryDirectory() as folder:
+        robots = [{"connect": f"ipc://{folder}/robot{n}", "bind": f"ipc://{folder}/medium{n}"} for n in (1, 2)]
+        config = {"name": name, "phy": {"name": "psk", "sample_rate": 2e6}, "robots": robots}
+        (Path(folder) / "air.yaml").write_text(json.dumps(config))
+        return CliRunner().invoke(medium, [f"{folder}/air.yaml", "--duration", "0.001"]).output
+
+
+HERE, THERE, AWAY = ({"position": [x, 0.0]} for x in (0.0, 9.0, 90.0))
+GAINS, PLACED = {"gains_db": -90.0}, {"channel": {"from": "positions"}}
+effects(
+    "Medium",
+    name=lambda: (called("air"), called("hall")),
+    phy=crosses(phy={"name": "psk", "sample_rate": 1e6}),
+    packet_len=crosses(packet_len=200),
+    robots=crosses({}, {}, {}),
+    gains_db=crosses(gains_db=-90.0),
+    channel=crosses(channel={"snr_db": 3.0}),
+    time=crosses(time="real"),
+    seed=crosses(seed=3, beside={"channel": {"snr_db": 3.0}}),
+)
+effects(
+    "Robot of a medium",
+    tx_power_dbm=crosses({"tx_power_dbm": 3.0}, {}, beside=GAINS),
+    noise_figure_db=crosses({}, {"noise_figure_db": 3.0}, beside=GAINS),
+    connect=lambda: (addresses(), addresses(connect="ipc://{}/elsewhere")),
+    bind=lambda: (addresses(), addresses(bind="ipc://{}/elsewhere")),
+    position=lambda: (carried(HERE, THERE, **PLACED), carried(HERE, AWAY, **PLACED)),
 )
 
 
@@ -397,75 +511,161 @@ for item in fields(DiagnosticsConfig):
     EFFECTS["Diagnostics", item.name] = judged(item.name)
 effects(
     "Diagnostics",
-    period_s=Elsewhere("tests/radio/test_diagnostics.py"),
-    window_s=Elsewhere("tests/gr/test_health.py"),
+    period_s=Elsewhere("radio/test_diagnostics.py::test_no_period_no_diagnostics"),
+    window_s=Elsewhere("gr/test_health.py::test_what_is_long_past_does_not_count"),
 )
 
 
-def elsewhere(section: str, **tests: str) -> None:
-    """Entries of a section by the file that shows them: names of settings, with spaces between them."""
-    for file, names in tests.items():
-        folder, _, test = file.partition("_")
-        effects(section, **dict.fromkeys(names.split(), Elsewhere(f"tests/{folder}/test_{test}.py")))
-
-
-elsewhere(
+TWO = {"grid": {"channel.packet_loss": [0.0, 0.1], "packet_len": [64, 80]}}
+BOTH = {"set": {"registry": "table4", "duration_s": 1}, "value": "latency_p50_s", "topic": "/robot_1/imu"}
+effects(
     "Sweep",
-    study_sweep_definition="description repetitions scenario grid x by value list",
-    study_sweep_run="time",
-    study_sweep_summaries="set y topic",
+    description=sweeps(description="another"),
+    repetitions=sweeps(repetitions=3),
+    time=sweeps(time="real"),
+    scenario=sweeps(scenario="paper-ofdm"),
+    grid=sweeps(grid={"channel.packet_loss": [0.0, 0.2]}),
+    list=sweeps(list=[{"packet_len": 80}, {"packet_len": 96}]),
+    set=sweeps(set={"duration_s": 2}),
+    x=sweeps(TWO, x="packet_len"),
+    y=sweeps({"grid": {**TWO["grid"], "ros_source.queue_depth": [8, 16]}}, y="ros_source.queue_depth"),
+    by=sweeps(TWO, by=["packet_len"], x="channel.packet_loss"),
+    value=sweeps(value="goodput_Bps"),
+    topic=lambda: (drawn(**BOTH), drawn(**{**BOTH, "topic": "/robot_1/odom"})),
 )
-elsewhere("Race", race_race_settings="robots source duration_s packet_len sample_rate bag_topic peers loss load")
-for name in ("match_s", "drain_s", "seed"):
-    EFFECTS["Race", name] = Hardware("a race needs root: two network namespaces")
-elsewhere(
+effects(
+    "Race",
+    robots=differs(prepared, robots=3),
+    source=differs(prepared, source=DRIVE[0].removeprefix("source="), bag_topic="/robot_1/odom"),
+    duration_s=differs(prepared, duration_s=0.3),
+    packet_len=differs(raced, packet_len=96),
+    sample_rate=differs(prepared, sample_rate=50_000.0),
+    bag_topic=Elsewhere("race/test_race_settings.py::test_of_a_bag_the_named_topic_is_taken_for_as_long_as_asked"),
+    peers=lambda: (list(chosen((), "two")), list(chosen(("gr-ros2",), "two"))),
+    loss=differs(prepared, loss=(0.5,)),
+    load=differs(prepared, load=(0.8,)),
+    seed=differs(prepared, seed=3),
+)
+
+PULSES: dict[str, Any] = {"gap": 500, "lengths": "fixed", "fec": "cc"}
+for name, options in {
+    "ofdm": {
+        **PULSES, "payload_modulation": "qpsk", "fft_len": 128, "cp_len": 24, "scramble": True,
+        "pilots": (-20, -8, 8, 20),
+    },
+    "gfsk": {**PULSES, "sps": 8, "bt": 0.3},
+    "psk": {**PULSES, "sps": 8, "rolloff": 0.9, "modulation": "8psk"},
+    "lora": {**PULSES, "spreading_factor": 8, "coding_rate": 2},
+}.items():  # fmt: skip
+    effects(f"PHY `{name}`", **{key: sends(name, **{key: value}) for key, value in options.items()})
+effects(
     "PHY `ofdm`",
-    phy_ofdm="gap lengths fec payload_modulation fft_len carriers pilots scramble detection_threshold",
-    phy_ofdm_rate="cp_len rate rates",
+    carriers=sends("ofdm", {"pilots": (-20, -8, 8, 20)}, carriers=24),
+    rate=differs(rates, "ofdm", rate="adaptive"),
+    rates=lambda: (rates("ofdm", rate="adaptive"), rates("ofdm", rate="adaptive", rates=("bpsk-cc", "qpsk-cc"))),
+    detection_threshold=lambda: (heard("ofdm"), heard("ofdm", detection_threshold=0.95)),
 )
-elsewhere("PHY `gfsk`", phy_contract="gap lengths", phy_burst="fec sps bt")
-elsewhere("PHY `psk`", phy_contract="gap lengths", phy_burst="fec sps rolloff", phy_snr="modulation")
-elsewhere(
+LORA, WIFI = "phy/test_lora_sdr.py::test_", "phy/test_wifi.py::test_"
+effects(
     "PHY `lora`",
-    phy_lora_sdr="gap fec spreading_factor coding_rate implementation oversampling sync_word ldro carrier_hz",
-    phy_contract="lengths",
+    implementation=Elsewhere(f"{LORA}without_the_module_the_remedy_is_told"),
+    oversampling=Elsewhere(f"{LORA}the_samples_are_those_of_the_modules_own_transmitter"),
+    sync_word=Elsewhere(f"{LORA}another_networks_frames_are_not_heard"),
+    ldro=Elsewhere(f"{LORA}symbols_are_counted_as_in_lora_modems_data_sheets"),
+    carrier_hz=Elsewhere(f"{LORA}with_the_carrier_known_clocks_may_differ"),
 )
-elsewhere(
-    "PHY `wifi`", phy_wifi="gap encoding equalizer sensitivity network address channel_hz", phy_contract="lengths"
+HOME, GUEST = "02:67:72:2d:72:32", "02:00:00:00:00:01"
+effects(
+    "PHY `wifi`",
+    gap=differs(wifi, gap=1000),
+    lengths=differs(wifi, lengths="fixed"),
+    encoding=differs(wifi, encoding="qpsk-1/2"),
+    equalizer=Elsewhere(f"{WIFI}every_estimate_of_the_channel_receives"),
+    sensitivity=differs(wifi, sensitivity=0.4),
+    network=lambda: (DataFrames(HOME, HOME).wrap(b"x", 0), DataFrames(GUEST, HOME).wrap(b"x", 0)),
+    address=lambda: (DataFrames(HOME, HOME).wrap(b"x", 0), DataFrames(HOME, GUEST).wrap(b"x", 0)),
+    channel_hz=Elsewhere(f"{WIFI}with_the_channel_known_clocks_may_differ"),
 )
-elsewhere("PHY `modem`", phy_modem="bit_rate overhead_bytes overhead_s")
-for name in ("sim", "zmq", "file", "soapy", "uhd", "pluto", "kiss", "serial", "udp"):
-    elsewhere(f"Front end `{name}`", radio_devices="guard_s")
-elsewhere("Front end `zmq`", radio_zmq="bind connect burst_queue", radio_medium="medium_process")
-elsewhere("Front end `file`", radio_file="write read speed repeat")
-for name in ("soapy", "uhd"):
-    elsewhere(
+for name, value in {"bit_rate": 4800.0, "overhead_bytes": 8, "overhead_s": 0.1}.items():
+    EFFECTS["PHY `modem`", name] = differs(lasting, "modem", **{name: value})
+
+TUNED: dict[str, Any] = {"frequency": 433e6}
+PLACES: dict[str, dict[str, Any]] = {
+    "sim": {},
+    "zmq": {"bind": "ipc:///tmp/a", "connect": ("ipc:///tmp/b",)},
+    "file": {"write": "sent"},
+    "soapy": TUNED,
+    "uhd": TUNED,
+    "pluto": TUNED,
+    "kiss": {"device": "/dev/a"},
+    "serial": {"device": "/dev/a"},
+    "udp": {"listen": "5555", "send_to": ("10.0.0.1:5555",)},
+}
+"""What each front end cannot do without."""
+
+
+def opens(front_end: str, beside: Mapping[str, Any] = MappingProxyType({}), **changed: Any) -> Outcomes:
+    """What a front end asks of its device, without and with a change."""
+    base = {**PLACES[front_end], **beside}
+    return lambda: (opened(front_end, base), opened(front_end, {**base, **changed}))
+
+
+for name, needed in PLACES.items():
+    EFFECTS[f"Front end `{name}`", "guard_s"] = lambda name=name, needed=needed: (
+        guarded(name, needed),
+        guarded(name, {**needed, "guard_s": 0.1}),
+    )
+DEVICE: dict[str, Any] = {
+    "half_duplex": True, "frequency": 868e6, "args": "serial=1", "frequency_rx": 434e6, "gain_tx": -10.0,
+    "gain_rx": 20.0, "antenna_tx": "LEFT", "antenna_rx": "RIGHT", "bandwidth": 5e5, "level": 0.3, "lead": 64,
+    "tail": 100, "multiple": 500,
+}  # fmt: skip
+for name in ("soapy", "uhd", "pluto"):
+    effects(f"Front end `{name}`", **{key: opens(name, **{key: value}) for key, value in DEVICE.items()})
+    EFFECTS[f"Front end `{name}`", "turnaround_s"] = opens(name, {"half_duplex": True}, turnaround_s=0.1)
+for key, value in {"clock_source": "external", "subdev_tx": "A:A", "subdev_rx": "A:B"}.items():
+    EFFECTS["Front end `uhd`", key] = opens("uhd", **{key: value})
+EFFECTS["Front end `pluto`", "buffer_rx"] = opens("pluto", buffer_rx=4096)
+for name in ("kiss", "serial"):
+    effects(
         f"Front end `{name}`",
-        radio_devices="half_duplex frequency args frequency_rx gain_tx gain_rx antenna_tx antenna_rx bandwidth level "
-        "turnaround_s",
-        radio_bursts="lead tail multiple",
+        device=opens(name, device="/dev/b"),
+        baud=opens(name, baud=9600),
+        backoff_s=opens(name, backoff_s=1.0),
+        half_duplex=differs(linked, name, options={"half_duplex": False}),
     )
 effects(
-    "Front end `uhd`",
-    **dict.fromkeys(("clock_source", "subdev_tx", "subdev_rx"), Hardware("gr-uhd hands them to a USRP as they are")),
-)
-elsewhere(
-    "Front end `pluto`",
-    radio_pluto="frequency args frequency_rx gain_tx gain_rx bandwidth",
-    radio_devices="half_duplex level turnaround_s antenna_tx antenna_rx",
-    radio_bursts="lead tail multiple",
-)
-EFFECTS["Front end `pluto`", "buffer_rx"] = Hardware("gr-iio hands it to a Pluto as it is")
-for name in ("kiss", "serial", "udp"):
-    elsewhere(f"Front end `{name}`", radio_devices="half_duplex")
-elsewhere("Front end `kiss`", radio_modems="device baud callsign", radio_packet_radios="backoff_s")
-effects(
     "Front end `kiss`",
-    destination=lambda: (ui_header("GRROS2", "AA1AA"), ui_header("OTHERS", "AA1AA")),
-    tnc_port=lambda: (Kiss(64, Counter(), port=0).frame(b"x"), Kiss(64, Counter(), port=1).frame(b"x")),
+    tnc_port=opens("kiss", tnc_port=1),
+    callsign=opens("kiss", callsign="AA1AA"),
+    destination=opens("kiss", {"callsign": "AA1AA"}, destination="OTHERS"),
 )
-elsewhere("Front end `serial`", radio_modems="device baud framing", radio_packet_radios="rssi backoff_s")
-elsewhere("Front end `udp`", radio_modems="listen send_to")
+effects(
+    "Front end `serial`",
+    framing=opens("serial", framing="slip"),
+    rssi=Elsewhere("radio/test_packet_radios.py::test_the_byte_of_signal_strength_is_read_and_no_packet"),
+)
+effects(
+    "Front end `udp`",
+    listen=opens("udp", listen="5556"),
+    send_to=opens("udp", send_to=("10.0.0.2:5555",)),
+    half_duplex=differs(linked, "udp", options={"half_duplex": True}),
+)
+effects(
+    "Front end `zmq`",
+    bind=Elsewhere("radio/test_zmq.py::test_an_address_that_is_taken_or_wrong_is_said_in_a_line"),
+    connect=Elsewhere("radio/test_zmq.py::test_what_a_slow_computer_does_not_take_is_dropped_and_counted"),
+    burst_queue=Elsewhere("radio/test_zmq.py::test_what_a_slow_computer_does_not_take_is_dropped_and_counted"),
+    medium_process=opens("zmq", medium_process="lockstep"),
+)
+READ = {"read": "{}/heard"}
+effects(
+    "Front end `file`",
+    write=lambda: (replayed(**READ), replayed(**READ, write="{}/sent")),
+    read=lambda: (replayed(write="{}/sent"), replayed(**READ, write="{}/sent")),
+    speed=lambda: (replayed(**READ), replayed(**READ, speed=2.0)),
+    repeat=lambda: (replayed(**READ, speed=0.0), replayed(**READ, speed=0.0, repeat=True)),
+)
 
 
 def test_every_row_of_the_page_has_an_entry() -> None:
@@ -475,18 +675,42 @@ def test_every_row_of_the_page_has_an_entry() -> None:
     assert [row for row in EFFECTS if row not in found] == []
 
 
-@pytest.mark.parametrize("row", [row for row, entry in EFFECTS.items() if isinstance(entry, Elsewhere)], ids=": ".join)
-def test_a_test_elsewhere_names_the_setting(row: Row) -> None:
-    text = (REPOSITORY / str(EFFECTS[row])).read_text(encoding="utf-8")
-    assert re.search(rf"\b(set_)?{row[1]}\b", text)
+def of_kind(*kinds: type[Any]) -> list[Row]:
+    return [row for row, entry in EFFECTS.items() if isinstance(entry, kinds)]
 
 
-@pytest.mark.parametrize(
-    "row", [row for row, entry in EFFECTS.items() if not isinstance(entry, Elsewhere | Hardware)], ids=": ".join
-)
+@pytest.mark.parametrize("row", of_kind(Elsewhere), ids=": ".join)
+def test_a_test_elsewhere_shows_the_effect_of_the_setting(row: Row) -> None:
+    file, _, name = str(EFFECTS[row]).partition("::")
+    assert name in (sources := sources_in(file)), f"{file} has no {name}"
+    assert re.search(rf"\b(set_)?{row[1]}\b", sources[name]), f"{name} does not name {row[1]}"
+
+
+@functools.cache
+def sources_in(file: str) -> dict[str, str]:
+    """The source of each test of a file, with its decorators."""
+    text = (REPOSITORY / "tests" / file).read_text(encoding="utf-8")
+    found = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
+    lines = text.splitlines()
+    return {
+        node.name: "\n".join(lines[min([node.lineno, *(d.lineno for d in node.decorator_list)]) - 1 : node.end_lineno])
+        for node in found
+        if node.name.startswith("test_")
+    }
+
+
+@pytest.mark.parametrize("row", of_kind(Refused), ids=": ".join)
+def test_a_setting_that_has_no_effect_is_refused(row: Row) -> None:
+    entry = EFFECTS[row]
+    assert isinstance(entry, Refused)
+    with pytest.raises(ConfigError, match=rf"{row[1]} = .*leave it out"):
+        load_scenario("six-topics-paced", entry)
+
+
+@pytest.mark.parametrize("row", [row for row in EFFECTS if row not in of_kind(Elsewhere, Refused)], ids=": ".join)
 def test_a_setting_has_an_effect(row: Row) -> None:
     entry = EFFECTS[row]
-    assert not isinstance(entry, Elsewhere | Hardware)
+    assert not isinstance(entry, Elsewhere | Refused)
     without, with_it = entry()
     assert without != with_it
 
@@ -499,11 +723,15 @@ def other(setting: Setting) -> Any:
         return 7
     if isinstance(setting.default, bool):
         return not setting.default
-    if isinstance(setting.default, tuple):
-        return ("other",)
+    if isinstance(setting.default, tuple | dict):
+        return type(setting.default)()
+    if setting.kinds == (str,):
+        return "other"
     choices = [choice for choice in setting.choices if choice not in (setting.default, AUTO)]
     if choices:
         return choices[0]
+    if setting.default == AUTO and setting.kinds == (int,):
+        return 3
     return 0.5 if setting.default == AUTO or setting.below is not None else setting.default + 1
 
 
@@ -536,10 +764,123 @@ def test_a_version_refuses_what_only_the_other_one_has(cls: type[Any], setting: 
 def test_a_running_link_refuses_what_cannot_change(version: int) -> None:
     rows = Registry.from_rows({"odom": "nav_msgs/Odometry"})
     end = make_endpoint(rows, SourceConfig(version=version, robot_id=1), None)
-    with pytest.raises(ConfigError, match="greedy cannot change while running; these can: packet_rate, dst_id"):
-        end.reconfigure(greedy=True)
-    end.reconfigure(queue_depth=3)
-    assert end.messages.depth(0) == 3
+    for setting in settings_of(SourceConfig):
+        if setting.name == "dst_id" and version:
+            with pytest.raises(ConfigError, match="dst_id = 7: another destination needs a restart of the link"):
+                end.reconfigure(dst_id=7)
+        elif setting.name not in end.live_settings:
+            said = f"{setting.name} cannot change while running; these can: {', '.join(end.live_settings)}"
+            with pytest.raises(ConfigError, match=re.escape(said)):
+                end.reconfigure(**{setting.name: other(setting)})
+    for option in settings_of(TopicOptions):
+        if option.name not in end.live_options:
+            changed = replace(rows[0].options, **{option.name: other(option)})
+            with pytest.raises(
+                ConfigError, match=f"topic odom: ({option.name} cannot|with version 0, its options) change"
+            ):
+                end.messages.change(0, changed)
+
+
+def says(version: int, **changes: Any) -> list[Any]:
+    """What an end sends for 3 s, of which a setting changes in the first: packets with their times, and queues."""
+    options = TopicOptions(durability="transient_local", queue="fifo" if version else AUTO)
+    rows = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options)])
+    end = make_endpoint(
+        rows, SourceConfig(version=version, robot_id=1, packet_rate=20.0, repeat_s=1.0), None, rng=random.Random(1)
+    )
+    sent: list[Any] = []
+    for step in range(300):
+        now = step * 0.01
+        if step == 20:
+            end.reconfigure(**changes)
+        if step < 50 and step % 2 == 0:
+            end.messages.submit(0, b"message %d" % step * 20, now)
+        while (packet := end.next_packet(now)) is not None:
+            sent.append((now, packet.data))
+    return [*sent, dict(end.sent.refused)]
+
+
+LIVE = {"packet_rate": 50.0, "dst_id": 7, "repeat_s": 0.3, "queue_depth": 3}
+
+
+@pytest.mark.parametrize("version", [0, 1])
+def test_what_can_change_while_a_link_runs_has_its_effect_then(version: int) -> None:
+    end = make_endpoint(
+        Registry.from_rows({"odom": "nav_msgs/Odometry"}), SourceConfig(version=version, robot_id=1), None
+    )
+    same = says(version)
+    assert says(version) == same
+    for name in end.live_settings:
+        assert says(version, **{name: LIVE[name]}) != same, name
+    assert len(says(version, repeat_s=0.0)) < len(same), "0 is off"
+
+
+CHANGED: dict[str, tuple[dict[str, Any], Any]] = {
+    "to": ({}, 3),
+    "qos": ({}, "bulk"),
+    "queue": ({}, "latest"),
+    "queue_depth": ({}, 2),
+    "deadline_s": ({"queue": "deadline", "deadline_s": 2.0}, 0.1),
+    "weight": ({"queue": "latest"}, 50.0),
+    "max_rate": ({"queue": "latest"}, 2.0),
+    "keep_s": ({}, 5.0),
+}
+"""Options of a topic that runs, and the value that one takes."""
+
+
+def optioned(base: Mapping[str, Any], **changed: Any) -> list[bytes]:
+    """What an end sends of two topics that want more than there is, of which the options of one change."""
+    options = TopicOptions(**{"queue": "fifo", **base})
+    rows = Registry([Topic(n, name, "a_msgs/msg/B", options) for n, name in enumerate(("goal", "scan"))])
+    config = SourceConfig(robot_id=1, packet_rate=20.0, repeat_s=0.5, compression=False)
+    end = make_endpoint(rows, config, None)
+    sent, topic_id = [], 0
+    for step in range(300):
+        now = step * 0.01
+        if step == 20:
+            topic_id = end.messages.change(0, replace(options, **changed))[1].topic_id
+        if step < 200 and step % 10 == 0:
+            for topic in (topic_id, 1):
+                end.messages.submit(topic, b"message %3d of %d" % (step, topic) * 12, now)
+        while (packet := end.next_packet(now)) is not None:
+            sent.append(packet.data)
+    return sent
+
+
+@pytest.mark.parametrize("option", LIVE_OPTIONS)
+def test_an_option_that_can_change_has_its_effect_then(option: str) -> None:
+    base, value = CHANGED[option]
+    assert optioned(base) == optioned(base)
+    assert optioned(base, **{option: value}) != optioned(base)
+
+
+OF_A_GRAPH = {
+    "ros_source.middleware": "memory",
+    "ros_source.domain_id": 3,
+    "ros_source.subscriber_depth": 3,
+    "ros_source.backpressure": True,
+    "ros_source.debug": True,
+    "ros_sink.middleware": "memory",
+    "ros_sink.domain_id": 3,
+    "ros_sink.publisher_depth": 3,
+    "ros_sink.debug": True,
+    "ros_sink.use_sim_time": True,
+    "localhost_only": False,
+    "own_domains": False,
+    "sim.transforms": True,
+}
+"""Settings of ROS graphs, which a run in simulated time has not. They are taken all the same: a scenario is run in real
+and in simulated time, and planned, as it is. The page says so (`time`)."""
+
+
+@pytest.mark.parametrize("setting", OF_A_GRAPH)
+def test_simulated_time_takes_the_settings_of_a_graph_that_it_has_not(setting: str) -> None:
+    assert outcome("six-topics-paced") == outcome("six-topics-paced", f"{setting}={json.dumps(OF_A_GRAPH[setting])}")
+
+
+def test_a_recording_takes_the_settings_of_the_simulator() -> None:
+    """A scenario keeps its ``sim`` where ``--set source=bag:PATH`` puts a recording in its place."""
+    assert outcome("six-topics-paced", *DRIVE) == outcome("six-topics-paced", *DRIVE, "sim={robots: 5, seed: 7}")
 
 
 def test_a_seal_needs_a_key_and_a_shared_setting_is_refused_once() -> None:

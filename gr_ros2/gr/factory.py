@@ -19,9 +19,10 @@ from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import settings_of
 from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.settings.config import SinkConfig, SourceConfig, refuse_without_effect, robot_of
+from gr_ros2.settings.config import SinkConfig, SourceConfig, robot_of
+from gr_ros2.settings.effect import refuse_without_effect
 from gr_ros2.settings.registry import Registry, Topic
-from gr_ros2.state.keys import read_key_file
+from gr_ros2.state.keys import KEY_LEN, read_key_file
 
 if TYPE_CHECKING:
     from gr_ros2.compression import LinkCodec
@@ -154,3 +155,11 @@ def keys_of(config: SourceConfig | SinkConfig) -> Keys | None:
     :raises ConfigError: for a key file that cannot be read or understood
     """
     return Keys(read_key_file(config.key), config.seal) if config.key else None
+
+
+def keys_of_run(config: SourceConfig) -> Keys | None:
+    """Keys that stand in for a robot's in a run that counts no starts, None where it has no key file.
+
+    Not the fleet's own: packets of the same numbers come again in every run, and recordings of them would betray it.
+    """
+    return Keys((bytes(KEY_LEN),), config.seal) if config.key else None

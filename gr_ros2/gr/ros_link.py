@@ -27,8 +27,8 @@ from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.mac import GUARD_S, access_of
 from gr_ros2.middleware import Middleware
-from gr_ros2.settings.config import SinkConfig, SourceConfig, airtime_from, build
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, airtime_from, build
+from gr_ros2.settings.fields import AUTO, settings_of
 from gr_ros2.settings.registry import MAX_TOPICS, Registry
 
 _HEARD = EndpointSetup(reports=True)
@@ -107,7 +107,8 @@ def make_link(
     :param medium: see :class:`gr_ros2.settings.config.AnyLink`
     :param airtime_s: of the longest packet, s; needed unless ``medium`` is exclusive
     :param slot_guard_s: silence between the packets of two robots, s: the timing error of the radio
-    :param values: fields of SourceConfig and of SinkConfig; a field that both have applies to both halves
+    :param values: fields of SourceConfig and of SinkConfig; a field that both have applies to both halves, and of
+        ``topic_options`` to each half what it has
     :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
     halves: list[Any] = []
@@ -115,7 +116,8 @@ def make_link(
     for cls in (SourceConfig, SinkConfig):
         names = {field.name for field in fields(cls)}
         known |= names
-        halves.append(build(cls, {name: value for name, value in values.items() if name in names}))
+        own = {name: value for name, value in values.items() if name in names}
+        halves.append(build(cls, own | {"topic_options": _of_half(cls.end, own.get("topic_options", {}))}))
     unknown = sorted(values.keys() - known)
     if unknown:
         raise ConfigError(f"unknown key {unknown[0]}; known are {', '.join(sorted(known))}")
@@ -136,3 +138,16 @@ def make_link(
         airtime_share=sustained(limits.rule),
     )
     return RosLink(source.registry, source, sink, setup=setup)
+
+
+def _of_half(end: str, topic_options: Any) -> Any:
+    """Options of topics without those that the other half alone has."""
+    if not isinstance(topic_options, Mapping):
+        return topic_options  # build() says what is wrong with it
+    others = {setting.name for setting in settings_of(TopicOptions) if setting.end not in (None, end)}
+    return {
+        topic: {name: value for name, value in given.items() if name not in others}
+        if isinstance(given, Mapping)
+        else given
+        for topic, given in topic_options.items()
+    }

@@ -73,9 +73,12 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
     :param clock: s, monotonic
     :param end: endpoint of both directions, shared with a source; None: an endpoint that only receives is made
     :ivar live: this endpoint
+    :ivar live_settings: settings that may change while it runs, each by its setter
     :param values: the fields of :class:`gr_ros2.settings.config.SinkConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
     """
+
+    live_settings = ("debug",)
 
     def __init__(
         self,

@@ -222,6 +222,16 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "middleware": dict(self.middleware.counters),
             }
 
+    @property
+    def live_settings(self) -> tuple[str, ...]:
+        """Settings that may change while it runs, each by its setter. They depend on the version."""
+        return (*self._end.live_settings, *["topic_options"] * bool(self.live_options), "debug")
+
+    @property
+    def live_options(self) -> Sequence[str]:
+        """Options of a topic that may change while it runs."""
+        return self._end.live_options
+
     def set_packet_rate(self, packet_rate: float | Auto) -> None:
         """Set the largest packet rate, packets/s. With auto, the credits set the pace; with 0 there is no limit.
 
@@ -230,7 +240,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._reconfigure(packet_rate=packet_rate)
 
     def set_dst_id(self, dst_id: int) -> None:
-        """Set the destination id; 255 is broadcast."""
+        """Set the destination id; 255 is broadcast. With version 0 only."""
         self._reconfigure(dst_id=dst_id)
 
     def set_queue_depth(self, queue_depth: int) -> None:
@@ -242,8 +252,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._reconfigure(repeat_s=repeat_s)
 
     def set_topic_options(self, topic_options: Mapping[str, Any]) -> None:
-        """Set the options of single topics, of which those in :data:`gr_ros2.link.endpoint.LIVE_OPTIONS` may change. A
-        message is for the robot that ``to`` named when the ROS graph handed it over."""
+        """Set the options of single topics, of which ``live_options`` may change. A message is for the robot that
+        ``to`` named when the ROS graph handed it over."""
         with self._lock:
             config = replaced(self.config, topic_options=topic_options)
             self.subscriptions.change(config.topic_options)

@@ -27,23 +27,20 @@ from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
 
-LIVE_SETTINGS = ("packet_rate", "dst_id", "repeat_s", "queue_depth")
-"""Settings of a sending half that may change at run time, the same in every version."""
 
-
-def check_live(changes: Mapping[str, Any]) -> None:
-    """Refuse to change other settings than ``LIVE_SETTINGS``.
+def check_live(changes: Mapping[str, Any], live: Sequence[str]) -> None:
+    """Refuse to change other settings than those that may change at run time.
 
     :raises ConfigError: naming the setting and those that can change
     """
     for name in changes:
-        if name not in LIVE_SETTINGS:
-            raise ConfigError(f"{name} cannot change while running; these can: {', '.join(LIVE_SETTINGS)}")
+        if name not in live:
+            raise ConfigError(f"{name} cannot change while running; these can: {', '.join(live)}")
 
 
 LIVE_OPTIONS = ("to", "qos", "queue", "queue_depth", "deadline_s", "weight", "max_rate", "keep_s")
-"""Options of a topic that may change at run time, with version 1. The others are those of its subscription and of its
-codec, or of a sink."""
+"""Options of a topic that may change at run time in a version that allows it. The others are those of its subscription
+and of its codec, or of a sink."""
 
 
 def check_live_options(topic: str, before: TopicOptions, after: TopicOptions) -> None:
@@ -236,6 +233,14 @@ class Endpoint(PacketSide, Protocol):
     """An end, the same for every version of the wire format."""
 
     @property
+    def live_settings(self) -> Sequence[str]:
+        """Settings of its sending half that may change at run time."""
+
+    @property
+    def live_options(self) -> Sequence[str]:
+        """Options of a topic that may change at run time."""
+
+    @property
     def messages(self) -> MessageSide:
         """Its message side.
 
@@ -263,7 +268,7 @@ class Endpoint(PacketSide, Protocol):
         """Memory in use for incomplete messages."""
 
     def reconfigure(self, **changes: Any) -> None:
-        """Change settings of the sending half at run time, some of ``LIVE_SETTINGS``.
+        """Change settings of the sending half at run time, some of ``live_settings``.
 
         :raises ConfigError: for a value out of range or a setting that cannot change
         """

@@ -24,7 +24,6 @@ from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
 from gr_ros2.phy.preamble import parabola_peak
 from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
-from gr_ros2.settings.config import OnCarrier
 from gr_ros2.settings.fields import AUTO, Auto
 
 MAX_BURST = 1 << 22
@@ -60,7 +59,7 @@ _SDR_GAP, _SDR_LEAST_GAP = 32, 24
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class LoraOptions(OnCarrier, BurstOptions):
+class LoraOptions(BurstOptions):
     """Settings of this PHY beside packet length and sample rate, and those of every burst PHY.
 
     :param spreading_factor: bits per symbol of 2^this samples, 7..12; each step more takes about twice the time and

@@ -22,8 +22,8 @@ from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.race.contenders import MTU, chosen
-from gr_ros2.settings.config import PacketLen, PacketSettings, Populated, Sampled, Seconds, Text, Traffic
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.config import PacketLen, SampleRate, Text, Traffic
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire import FORMATS
@@ -38,12 +38,16 @@ _SIM_HZ = 35.0
 _LARGEST_IN_IP = MTU - 200
 """Bytes of the largest message that fits into an IP packet with the headers of any contender."""
 
+MATCH_S = 30.0
+"""s that all ends have to find each other."""
+DRAIN_S = 10.0
+"""s that what is on its way has after the last message was published."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Load = Annotated[float, Field(gt=0, le=100)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
-class RaceSettings(Populated, Sampled, PacketSettings, Traffic):
+class RaceSettings(Traffic):
     """One race: every contender at every load and every loss.
 
     :param robots: all of them send to all others on one channel, each a recording of its own; of a bag all the same,
@@ -56,8 +60,6 @@ class RaceSettings(Populated, Sampled, PacketSettings, Traffic):
     :param sample_rate: samples/s instead of ``load``; auto = chosen by it
     :param duration_s: s of the recording
     :param packet_len: bytes of gr-ros2's longest packets; of `gr-ros2-plain` they are as long as a message needs
-    :param match_s: s that both ends have to find each other
-    :param drain_s: s that what is on its way has after the last message was published
     :param seed: of the simulator, the losses and gr-ros2's sender
     """
 
@@ -65,11 +67,10 @@ class RaceSettings(Populated, Sampled, PacketSettings, Traffic):
     bag_topic: Text = AUTO
     peers: tuple[str, ...] = ()
     loss: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.0, 0.05, 0.2, 0.4)
+    sample_rate: SampleRate | Auto = AUTO
     load: Annotated[tuple[Load, ...], Field(min_length=1)] = (0.5, 2.0)
     duration_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     packet_len: PacketLen = 64
-    match_s: Seconds = 30.0
-    drain_s: Seconds = 10.0
 
 
 @plain_dataclass(frozen=True)

@@ -22,6 +22,8 @@ from gr_ros2.race.links import LinkReport, RaceIpLink, RaceRadio, RaceRosLink
 from gr_ros2.race.measure import Identity, Observed, RaceCell, RaceSender, RaceStream, measure
 from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.race_settings import (
+    DRAIN_S,
+    MATCH_S,
     PHY_NAME,
     Condition,
     RaceRecording,
@@ -113,12 +115,12 @@ def _run_cell(settings: RaceSettings, sender: RaceSender, condition: Condition, 
         listener = stack.enter_context(Worker("listener", paths[1], RaceProgram, contender, Seat(1), None, [output]))
         talker = stack.enter_context(Worker("talker", paths[0], RaceProgram, contender, Seat(0), plays))
         # The listener joins first, so that the talker can connect to it.
-        timeout_s = settings.match_s + _PLAY_SLACK_S
+        timeout_s = MATCH_S + _PLAY_SLACK_S
         began = listener.call("connect", timeout_s=timeout_s)
         talker.call("connect", timeout_s=timeout_s)
-        matched = _wait_matched(settings.match_s, talker, listener, air)
+        matched = _wait_matched(MATCH_S, talker, listener, air)
         t_sent = sender.sent(talker.call("play", timeout_s=settings.duration_s + _PLAY_SLACK_S))
-        _drain(settings.drain_s, [listener], len(t_sent))
+        _drain(DRAIN_S, [listener], len(t_sent))
         report: LinkReport = air.call("report")
         (heard,) = listener.call("heard")
         return Observed(began, matched, [RaceStream(sender.identity, t_sent, heard)], report, _busy())
@@ -144,14 +146,14 @@ def _run_team(
             robots.append(stack.enter_context(Worker(f"robot {number + 1}", path, RaceProgram, *arguments)))
         # One after the other, the last one first, to which the others connect. Of Zenoh's multicast the declarations
         # of robots that join at once go round for ever.
-        began = max(robot.call("connect", timeout_s=settings.match_s + _PLAY_SLACK_S) for robot in reversed(robots))
-        matched = _wait_matched(settings.match_s, *robots)
+        began = max(robot.call("connect", timeout_s=MATCH_S + _PLAY_SLACK_S) for robot in reversed(robots))
+        matched = _wait_matched(MATCH_S, *robots)
         begin = time.monotonic() + _TO_BEGIN_S
         for robot in robots:
             robot.ask("play", begin)
         firsts = [robot.answer(settings.duration_s + _PLAY_SLACK_S) for robot in robots]
         t_sent = [sender.sent(first) for sender, first in zip(senders, firsts, strict=True)]
-        _drain(settings.drain_s, robots, (count - 1) * sum(map(len, t_sent)))
+        _drain(DRAIN_S, robots, (count - 1) * sum(map(len, t_sent)))
         report: LinkReport = air.call("report")
         streams = []
         for receiver, robot in enumerate(robots):

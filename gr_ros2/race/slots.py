@@ -19,7 +19,7 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.race.contenders import Contender
 from gr_ros2.race.links import LinkLog, LinkReport
 from gr_ros2.race.measure import Observed, RaceSender, RaceStream
-from gr_ros2.race.race_settings import PHY_NAME, Condition, RaceSettings
+from gr_ros2.race.race_settings import DRAIN_S, MATCH_S, PHY_NAME, Condition, RaceSettings
 from gr_ros2.run.load import make_phy
 from gr_ros2.run.scenario import Scenario, scenario_from
 from gr_ros2.run.simulate import Offered, Simulation
@@ -43,7 +43,7 @@ def run_slots(
     """
     start = _Run(settings, senders, condition, contender)
     met = start.play(0.0, until_all_heard=True)
-    begin = min(met, settings.match_s)
+    begin = min(met, MATCH_S)
     run = _Run(settings, senders, condition, contender)
     run.play(begin)
     t_sent = [sender.sent(begin + sender.recording.phase_s) for sender in senders]
@@ -83,7 +83,7 @@ class _Run:
         """
         offered = [self._offered(sender, begin) for sender in self._senders]
         last = max(messages[-1].t for messages in offered)
-        scenario = self._scenario(self._settings.match_s if until_all_heard else last)
+        scenario = self._scenario(MATCH_S if until_all_heard else last)
         registry = Registry.from_rows([(_TOPIC, self._senders[0].recording.type_name)])
         phy = make_phy(scenario, registry)
         run = Simulation(scenario, registry, phy, messages=[iter(messages) for messages in offered], ideal=True)
@@ -102,7 +102,7 @@ class _Run:
                 met = min(met, now)
             if met < inf and until_all_heard:
                 break
-            if now > max(last, newest) + _QUIET_S or now > last + self._settings.drain_s:
+            if now > max(last, newest) + _QUIET_S or now > last + DRAIN_S:
                 break
         for now, size in sent:
             if now <= max(last, newest):
@@ -132,7 +132,7 @@ class _Run:
                 "channel": {"packet_loss": self._condition.loss},
                 "ros_source": options,
                 "duration_s": duration_s,
-                "drain_s": self._settings.drain_s,
+                "drain_s": DRAIN_S,
                 "seed": self._settings.seed,
             }
         )

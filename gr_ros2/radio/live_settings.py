@@ -1,7 +1,6 @@
 """The settings of a running link that can change, by their names in its YAML file.
 
-Invariant: a setting can change if its block has a method ``set_<name>``; an option of a topic, if it is in
-``LIVE_OPTIONS``.
+Invariant: what can change is what the blocks say, which have a method ``set_<name>`` for each.
 """
 
 from __future__ import annotations
@@ -12,10 +11,9 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.link.endpoint import LIVE_OPTIONS
 from gr_ros2.settings.config import TopicOptions
 
-_SETTER, _OPTIONS = "set_", "ros_source.topic_options"
+_OPTIONS = "ros_source.topic_options"
 
 
 class LiveSettings:
@@ -28,16 +26,16 @@ class LiveSettings:
     def __init__(self, source: RosSource, sink: RosSink) -> None:
         self._source = source
         self._setters: dict[str, Callable[[Any], None]] = {
-            f"{end}.{name.removeprefix(_SETTER)}": getattr(block, name)
+            f"{end}.{name}": getattr(block, f"set_{name}")
             for end, block in (("ros_source", source), ("ros_sink", sink))
-            for name in vars(type(block))
-            if name.startswith(_SETTER)
+            for name in block.live_settings
         }
+        self._options = source.live_options
 
     def can_change(self, name: str) -> bool:
         """Whether a setting can change while the link runs; ``ros_source.topic_options.TOPIC.OPTION`` for a topic."""
         place = _of_topic(name)
-        return name in self._setters if place is None else place[1] in LIVE_OPTIONS
+        return name in self._setters if place is None else place[1] in self._options
 
     def change(self, name: str, value: Any) -> str:
         """Change one setting; returns it in words.
@@ -45,9 +43,9 @@ class LiveSettings:
         :raises ConfigError: for one that cannot change, or a value that is not allowed
         """
         if not self.can_change(name):
-            options = f"{_OPTIONS}.TOPIC.{'|'.join(LIVE_OPTIONS)}"
-            others = ", ".join(other for other in self._setters if other != _OPTIONS)
-            raise ConfigError(f"{name} cannot change while the link runs; these can: {others}, {options}")
+            these = [other for other in self._setters if other != _OPTIONS]
+            these += [f"{_OPTIONS}.TOPIC.{'|'.join(self._options)}"] * bool(self._options)
+            raise ConfigError(f"{name} cannot change while the link runs; these can: {', '.join(these)}")
         place = _of_topic(name)
         if place is None:
             self._setters[name](value)

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from math import inf, isfinite, nan
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import zmq
@@ -41,7 +41,18 @@ from gr_ros2.medium.positions import Positions
 from gr_ros2.medium.samples import SampleMedium
 from gr_ros2.phy import PHY, configured
 from gr_ros2.radio.zmq import HEADER, MAGIC, SAMPLE, Address, OwnAddress, open_socket, prepare
-from gr_ros2.settings.config import STRICT, Decibels, PacketLen, PhyConfig, ScenarioChannel, Text, Transceiver, build
+from gr_ros2.settings.config import (
+    LEVELS,
+    STRICT,
+    Decibels,
+    PacketLen,
+    PhyConfig,
+    ScenarioChannel,
+    Text,
+    Transceiver,
+    build,
+)
+from gr_ros2.settings.effect import refuse_without_effect
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.files import read_settings
 from gr_ros2.wire import BROADCAST
@@ -75,9 +86,9 @@ class MediumRobot(Transceiver):
 class MediumConfig:
     """A medium process and its robots.
 
-    :param name: what errors and the status line call it
-    :param phy: the same as in the links
-    :param packet_len: the same as in the links
+    :param name: what errors and the first line call it
+    :param phy: physical layer and sample rate, those of the links
+    :param packet_len: bytes, that of the links
     :param robots: those that share the channel
     :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
         each other, null where nothing arrives; null = ``channel.snr_db`` between all
@@ -94,6 +105,7 @@ class MediumConfig:
     channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
     time: Literal["lockstep", "real"] = "lockstep"
     seed: int = 0
+    conditions: ClassVar = LEVELS
 
     @model_validator(mode="after")
     def _fits(self) -> MediumConfig:
@@ -114,6 +126,7 @@ class MediumConfig:
         for address, times in Counter(addresses).items():
             if times > 1:
                 raise ValueError(f"robots: address {address} stands there twice")
+        refuse_without_effect(self)
         return self
 
     def around(self) -> Surroundings:

@@ -33,7 +33,7 @@ from gr_ros2.run.robots import start_of_run
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.registry import Registry, options_of
 
 _QUIET_S = 0.3
 """A PHY is empty if nothing waits for it and it has given no packet for this time."""
@@ -185,7 +185,9 @@ def _apart(config: SinkConfig, registry: Registry, number: int) -> SinkConfig:
     """The settings of a further receiver's sink, which publishes on the same graph in a namespace of its own."""
     inside = f"/receiver_{number}/"
     options = {
-        topic.name: replaced(topic.options, publish_as=inside + topic.options.publish_as.lstrip("/"))
+        topic.name: replaced(
+            options_of(topic.name, config.topic_options), publish_as=inside + topic.options.publish_as.lstrip("/")
+        )
         for topic in registry.with_options(config.topic_options)
         if topic.options.publish_as != AUTO
     }

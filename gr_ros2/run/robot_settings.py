@@ -20,10 +20,8 @@ from gr_ros2.medium.gains import all_paths
 from gr_ros2.settings.config import (
     STRICT,
     OneWay,
-    OverChannel,
     ScenarioChannel,
     Seconds,
-    Sending,
     SinkConfig,
     SourceConfig,
     Transceiver,
@@ -52,7 +50,7 @@ class Back(OneWay):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Reports(OverChannel):
+class Reports:
     """The reverse direction for reports of what was heard, on a channel of its own (version 1).
 
     :param channel: what lies between them and the sender; what is not set is as forward, but for the seed
@@ -64,9 +62,14 @@ class Reports(OverChannel):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class RobotConfig(Transceiver, Sending):
+class RobotConfig(Transceiver):
     """One of the robots that share a medium. What is not set in its block is as in the scenario's, but for the
-    namespace: ``/robot_1``, ``/robot_2``, …"""
+    namespace: ``/robot_1``, ``/robot_2``, …
+
+    :param ros_source: its sending block
+    """
+
+    ros_source: SourceConfig = Field(default_factory=SourceConfig)
 
 
 @plain_dataclass(frozen=True)

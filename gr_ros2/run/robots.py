@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.factory import EndpointSetup
+from gr_ros2.gr.factory import EndpointSetup, keys_of_run
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.mac import access_of
 from gr_ros2.medium.base import FixedPaths, Surroundings
@@ -29,6 +29,7 @@ def start_of_run(scenario: Scenario, phy: Phy) -> EndpointSetup:
     """The start of every robot of a run."""
     return EndpointSetup(
         scenario.seed + 1,
+        keys=keys_of_run(scenario.ros_source),
         reports=any(robot.sink is not None and robot.paths for robot in scenario.all_robots),
         half_duplex=scenario.duplex == "half",
         any_length=phy.any_length,

@@ -35,9 +35,10 @@ from gr_ros2.run.robots import surroundings
 from gr_ros2.run.scenario import Scenario, changed
 from gr_ros2.run.simulated_runner import run_simulated
 from gr_ros2.run.task_run import TaskRun
-from gr_ros2.settings.config import Seeded
+from gr_ros2.settings.config import ChannelConfig, Traffic
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
+from gr_ros2.sim.sim_settings import SimSettings
 
 __all__ = ["DELIVERED_BAG", "Outcome", "Progress", "run_repetitions", "run_scenario"]
 
@@ -167,13 +168,18 @@ def run_repetitions(
     return results
 
 
+_Seeded = Traffic | ChannelConfig | SimSettings
+_SEEDED: tuple[type[_Seeded], ...] = (Traffic, ChannelConfig, SimSettings)
+"""Settings with a seed."""
+
+
 def repetitions(scenario: Scenario) -> Iterator[Scenario]:
     """The scenario once per repetition, each with its own seeds: in repetition k (from 0) every seed is k higher."""
     for k in range(scenario.repetitions):
-        yield replace(changed(scenario, Seeded, partial(_reseeded, by=k)), repetitions=1)
+        yield replace(changed(scenario, _SEEDED, partial(_reseeded, by=k)), repetitions=1)
 
 
-def _reseeded(part: Seeded, by: int) -> Seeded:
+def _reseeded(part: _Seeded, by: int) -> _Seeded:
     return replace(part, seed=part.seed + by)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
@@ -22,14 +22,16 @@ from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.run.robot_settings import Back, Reports, RobotConfig, RobotSettings, all_to_all, both_ways, one_way
 from gr_ros2.settings.config import (
+    LEVELS,
     STRICT,
     AnyLink,
     Decibels,
-    Populated,
     ScenarioChannel,
+    Seconds,
     Traffic,
     build,
 )
+from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
 from gr_ros2.settings.registry import Registry, check_outputs
@@ -57,7 +59,9 @@ class Experiment:
     :param time: what the clock of a run follows. `real`: the wall clock, packets pass at the pace of the air;
         `unthrottled`: the wall clock, packets pass as fast as the flowgraph runs, which measures its speed; `samples`:
         simulated time, as the samples of the flowgraph tell it, as fast as it can be computed; `packets`: simulated
-        time of the packets alone, which are lost as measured on the flowgraph (docs/explanation/simulated-time.md)
+        time of the packets alone, which are lost as measured on the flowgraph (docs/explanation/simulated-time.md).
+        Simulated time has no ROS graphs, so what says how one is joined (`middleware`, domains, depths of subscriptions
+        and publishers, `backpressure`, `use_sim_time`, `debug`) has no effect there
     """
 
     description: str = ""
@@ -66,11 +70,12 @@ class Experiment:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Scenario(Populated, Experiment, Traffic, AnyLink):
+class Scenario(Experiment, Traffic, AnyLink):
     """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
 
+    :param drain_s: s the link may go on delivering after ``duration_s``
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
-    :param sim: settings of the simulator; its seed is the scenario's unless given
+    :param sim: settings of the simulator, which a recording does not need; its seed is the scenario's unless given
     :param back: the reverse direction, where both robots talk; null = one way only
     :param reports: the reverse direction for reports alone (version 1); null = there is none
     :param receivers: channels of further receivers of the same sender; what is not set in one is as in ``channel``, but
@@ -91,6 +96,7 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     :param seed: of the simulator, the channel and the sender
     """
 
+    drain_s: Seconds = 2.0
     bag_speed: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
     sim: SimSettings = Field(default_factory=SimSettings)
     back: Back | None = None
@@ -104,9 +110,24 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
     controller: Literal["task", "ros"] = "task"
     localhost_only: bool | Auto = True
     own_domains: bool = True
+    conditions: ClassVar = (
+        ActsWhere(
+            ("bag_speed",),
+            lambda scenario: scenario.source != "sim",
+            "the simulator plays no recording; leave it out, or set source: bag:PATH",
+        ),
+        ActsWhere(("state",), lambda _: False, "a run counts no starts of its robots; leave it out"),
+        ActsWhere(
+            ("controller",),
+            lambda scenario: scenario.task and scenario.time == "real",
+            "stands in for that of a task in real time; set task and time: real",
+        ),
+        *LEVELS,
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
+        refuse_without_effect(self)
         if self.source == "sim" and self.duration_s == 0:
             raise ValueError("duration_s = 0: the simulator has no end; set duration_s above 0")
         for key, name, table in (
@@ -154,10 +175,6 @@ class Scenario(Populated, Experiment, Traffic, AnyLink):
             raise ValueError(
                 f"task = {self.task!r}: robots act on what they hear in real time or at packets; set robots, and time: "
                 "real or packets"
-            )
-        if self.controller != "task" and (not self.task or self.time != "real"):
-            raise ValueError(
-                f"controller = {self.controller!r}: stands in for that of a task in real time; set task and time: real"
             )
         matrix, count = self.gains_db, len(self.robots) or 2 + len(self.receivers)
         if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
@@ -244,10 +261,10 @@ def dump(scenario: Scenario) -> dict[str, Any]:
     return values
 
 
-def changed(scenario: Scenario, kind: type[_T], change: Callable[[_T], _T]) -> Scenario:
+def changed(scenario: Scenario, kind: type[_T] | tuple[type[_T], ...], change: Callable[[_T], _T]) -> Scenario:
     """The scenario with every part of a kind changed, of all its robots: all sources, for instance, or all channels.
 
-    :param kind: a class of settings; those with parts of this kind may be of it too
+    :param kind: a class of settings, or several; those with parts of this kind may be of it too
     """
 
     def inside(value: Any) -> Any:

@@ -54,7 +54,7 @@ class SharedChannel:
         stack: ExitStack,
     ) -> None:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="gr-ros2-")))
-        settings = replaced(scenario.phy, sample_rate=phy.sample_rate)
+        settings = replaced(scenario.phy, sample_rate=phy.sample_rate, headroom=PhyConfig.headroom)
         ends = [
             tuple(f"ipc://{folder}/{number}-{what}" for what in ("sends", "hears")) for number in range(len(robots))
         ]

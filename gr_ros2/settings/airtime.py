@@ -9,12 +9,13 @@ countries, a licence are up to the person who sends. Rules differ by country and
 from __future__ import annotations
 
 from dataclasses import dataclass as plain
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
 from gr_ros2.settings.fields import AUTO, Auto
 
 HOUR_S = 3600.0
@@ -82,17 +83,7 @@ _STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
-class Windowed:
-    """What counts over a time that moves along.
-
-    :param window_s: that time, s
-    """
-
-    window_s: float | Auto = AUTO
-
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
-class AirtimeConfig(Windowed):
+class AirtimeConfig:
     """How much a robot may send, whatever waits (docs/how-to/radios.md).
 
     :param band: rules of a band by name, which hold beside the other settings: `eu433`, `eu863`, `eu865`, `eu868`,
@@ -118,16 +109,20 @@ class AirtimeConfig(Windowed):
         Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Longest time without a pause (s)")
     ] = AUTO
     listen_before_send: bool = False
+    conditions: ClassVar = (
+        ActsWhere(
+            ("window_s",),
+            lambda airtime: airtime.duty_cycle != AUTO or airtime.of_band.duty_cycle < 1,
+            "has no effect without a share; set duty_cycle, or leave it out",
+        ),
+    )
 
     @model_validator(mode="after")
     def _within_band(self) -> AirtimeConfig:
         band = self.of_band
         if band is None:
             raise ValueError(f"band = {self.band!r}: no such band; known are {', '.join(BANDS)}")
-        if self.window_s != AUTO and self.duty_cycle == AUTO and band.duty_cycle == 1:
-            raise ValueError(
-                f"window_s = {self.window_s:g}: has no effect without a share; set duty_cycle, or leave it out"
-            )
+        refuse_without_effect(self)
         if not self.band:
             return self
         rule = self.rule

@@ -1,6 +1,6 @@
 """Every setting, once: names, units, ranges and defaults shared by YAML, CLI, GNU Radio blocks and ROS parameters.
 
-Invariants: each name is introduced by one dataclass, and other dataclasses inherit it; a derived value is written
+Invariants: what several dataclasses have is inherited, so that each text stands once; a derived value is written
 ``auto``; durations are in seconds; an unknown key or a value out of range is a ConfigError that names the key, the
 value and what is allowed.
 """
@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -33,9 +33,10 @@ from gr_ros2.core.names import (
     checked_namespace_form,
     checked_topic_form,
 )
-from gr_ros2.settings.airtime import Airtime, AirtimeConfig, Windowed
+from gr_ros2.settings.airtime import Airtime, AirtimeConfig
 from gr_ros2.settings.commands import COMMAND_TYPES, checked_commands
-from gr_ros2.settings.fields import AUTO, Auto, OnlyIn, settings_of
+from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
+from gr_ros2.settings.fields import AUTO, Auto, OnlyAt, OnlyIn
 from gr_ros2.settings.problems import explain
 from gr_ros2.settings.topic_choice import checked_words, words_of
 from gr_ros2.settings.yaml_bounds import read_bounded
@@ -77,47 +78,17 @@ DEFAULT_MIDDLEWARE = "dds"
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Named:
-    """What has a name.
-
-    :param name: what results, tables and errors call it
-    """
-
-    name: Text
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Seeded:
-    """What draws random numbers.
-
-    :param seed: of everything random in it; the same seed draws the same numbers
-    """
-
-    seed: Count = 0
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Populated:
-    """What robots take part in.
-
-    :param robots: how many, or the settings of each
-    """
-
-    robots: Any = ()
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Traffic(Seeded):
+class Traffic:
     """What a link is given to carry.
 
     :param source: where messages come from: `sim`, the simulated robots, or `bag:PATH`, a recording
     :param duration_s: s during which messages are submitted; 0 = no limit: as long as the recording
-    :param drain_s: s the link may go on delivering after that
+    :param seed: of everything random in it; the same seed draws the same numbers
     """
 
     source: str = "sim"
     duration_s: Seconds = 15.0
-    drain_s: Seconds = 2.0
+    seed: Count = 0
 
     @model_validator(mode="after")
     def _sim_or_bag(self) -> Traffic:
@@ -134,29 +105,10 @@ class Traffic(Seeded):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Sampled:
-    """What has samples.
-
-    :param sample_rate: samples/s; auto = an experiment chooses it by what it offers. A link of radios has to be told
-    """
-
-    sample_rate: Annotated[SampleRate | Auto, Field(title="Sample rate (samples/s)")] = AUTO
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class PacketSettings:
-    """What sends packets.
-
-    :param packet_len: bytes on the wire, 14..4095 (40 or more with version 1), the same at every end of a link
-    """
-
-    packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Agreed(PacketSettings):
+class Agreed:
     """What all ends of a link have to agree on.
 
+    :param packet_len: bytes on the wire, 14..4095 (40 or more with version 1), the same at every end of a link
     :param registry: CSV path or, in a YAML file, the name of a built-in one such as `table4`; the same at every end
     :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same at every end
     :param key: file of the fleet's keys (gr-ros2 key new); '' sends packets that anybody can read and forge; with one,
@@ -166,6 +118,7 @@ class Agreed(PacketSettings):
         user's state folder
     """
 
+    packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
     registry: Annotated[Text, Field(title="Registry CSV")]
     version: Annotated[WireVersion, Field(title="Version of the wire format")] = 1
     key: Annotated[str, OnlyIn(1), Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
@@ -174,28 +127,7 @@ class Agreed(PacketSettings):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Queued:
-    """What keeps messages waiting.
-
-    :param queue_depth: messages waiting per topic, the oldest dropped and counted; 0 unbounded, auto (of one topic)
-        takes the source's
-    """
-
-    queue_depth: Annotated[Count | Auto, Field(title="Queue depth (messages per topic)")] = AUTO
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Recent:
-    """What a message that comes late may be refused by.
-
-    :param max_age_s: s for which a sealed message may have been withheld
-    """
-
-    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class TopicOptions(Recent, Queued):
+class TopicOptions:
     """Options of one topic: named registry columns, or ``topic_options`` in the configuration.
 
     :param qos: class of its packets, the two QoS bits of the header; auto = latency for ``commands``, else default
@@ -207,6 +139,7 @@ class TopicOptions(Recent, Queued):
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
         ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
         publishers' QoS (docs/explanation/scheduling.md)
+    :param queue_depth: messages waiting, the oldest dropped and counted; 0 unbounded, auto takes the source's
     :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
         publishers' lifespan where ``queue`` is auto too, otherwise 0.3 for ``commands`` and none for others. Of a
         service: s that a call waits for its reply, auto 30
@@ -221,22 +154,32 @@ class TopicOptions(Recent, Queued):
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     """
 
-    qos: QosClass | Auto = AUTO
+    qos: Annotated[QosClass | Auto, OnlyAt("source")] = AUTO
     reliability: Literal["reliable", "best_effort"] | Auto = AUTO
     durability: Literal["volatile", "transient_local"] | Auto = AUTO
     depth: Count | Auto = AUTO
-    publish_as: TopicForm = AUTO
-    queue: Annotated[QueuePolicy | Auto, OnlyIn(1)] = AUTO
+    publish_as: Annotated[TopicForm, OnlyAt("sink")] = AUTO
+    queue_depth: Annotated[Count | Auto, OnlyAt("source"), Field(title="Queue depth (messages per topic)")] = AUTO
+    queue: Annotated[QueuePolicy | Auto, OnlyIn(1), OnlyAt("source")] = AUTO
     deadline_s: Annotated[Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto, OnlyIn(1)] = AUTO
-    weight: Annotated[float, OnlyIn(1), Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
-    max_rate: Annotated[float, OnlyIn(1), Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
-    keep_s: Annotated[Seconds, OnlyIn(1)] = 0.0
-    to: Annotated[Annotated[int, Field(ge=0, le=254)] | Auto, OnlyIn(1)] = AUTO
-    codec: str = AUTO
-    quantize: str = ""
+    weight: Annotated[float, OnlyIn(1), OnlyAt("source"), Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
+    max_rate: Annotated[float, OnlyIn(1), OnlyAt("source"), Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
+    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
+    keep_s: Annotated[Seconds, OnlyIn(1), OnlyAt("source")] = 0.0
+    to: Annotated[Annotated[int, Field(ge=0, le=254)] | Auto, OnlyIn(1), OnlyAt("source")] = AUTO
+    codec: Annotated[str, OnlyAt("source")] = AUTO
+    quantize: Annotated[str, OnlyAt("source")] = ""
+    conditions: ClassVar = (
+        ActsWhere(
+            ("queue_depth",),
+            lambda topic: topic.queue != "latest",
+            "queue latest keeps the newest message alone; leave it out, or set another queue",
+        ),
+    )
 
     @model_validator(mode="after")
     def _deadline(self) -> TopicOptions:
+        refuse_without_effect(self)
         if self.queue == "deadline" and self.deadline_s in (0, AUTO):
             raise ValueError("queue = 'deadline': deadline_s is missing; set it above 0")
         return self
@@ -267,19 +210,26 @@ class EndConfig(Agreed):
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     debug: Annotated[bool, Field(title="Debug log")] = False
+    end: ClassVar = ""
+    """``source`` or ``sink``."""
+    conditions: ClassVar[tuple[ActsWhere, ...]] = (
+        ActsWhere(
+            ("seal", "topic_options.*.max_age_s"),
+            lambda end: bool(end.key),
+            "nothing is sealed without a key; set key, or leave it out",
+        ),
+    )
 
     @model_validator(mode="after")
     def _has_effect(self) -> EndConfig:
-        refuse_without_effect(self, self.version)
         for name, options in self.topic_options.items():
-            refuse_without_effect(options, self.version, f"topic_options.{name}.")
-        if self.seal != "encrypt" and not self.key:
-            raise ValueError(f"seal = {self.seal!r}: nothing is sealed without a key; set key")
+            refuse_without_effect(options, self.version, f"topic_options.{name}.", self.end)
+        refuse_without_effect(self, self.version)
         return self
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class SourceConfig(Queued, EndConfig):
+class SourceConfig(EndConfig):
     """ROS Source (the paper, section 4.3; docs/reference/parameters.md).
 
     :param topics: which topics are sent: names, in which * and ? stand for others; auto = every topic of the namespace;
@@ -288,7 +238,7 @@ class SourceConfig(Queued, EndConfig):
     :param services: whether these names choose services and actions of the ROS graph too, which other robots may then
         call; this needs both directions of a link
     :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
-    :param dst_id: destination id, 255 broadcast
+    :param dst_id: destination id, 255 broadcast; while a link runs it can change with version 0 only
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
     :param greedy: several entries of one topic in a packet, back to back
     :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
@@ -335,6 +285,19 @@ class SourceConfig(Queued, EndConfig):
     compression: bool | Auto = AUTO
     repair: Annotated[Repairs | Auto, OnlyIn(1)] = AUTO
     expected_loss: Annotated[float, OnlyIn(1), Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
+    end: ClassVar = "source"
+    conditions: ClassVar = (
+        ActsWhere(
+            ("dictionaries", "topic_options.*.codec", "topic_options.*.quantize"),
+            lambda source: source.compresses,
+            "no message is coded without compression; set compression: true, or leave it out",
+        ),
+        ActsWhere(
+            ("expected_loss",),
+            lambda source: source.repair != "off",
+            "nothing is repaired; set repair to thrifty, or leave it out",
+        ),
+    )
 
     @field_validator("repair", mode="before")
     @classmethod
@@ -383,7 +346,7 @@ class SourceConfig(Queued, EndConfig):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class SinkConfig(Recent, EndConfig):
+class SinkConfig(EndConfig):
     """ROS Sink (the paper, section 4.4).
 
     :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
@@ -406,12 +369,19 @@ class SinkConfig(Recent, EndConfig):
     publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
     reassembly_timeout_s: Annotated[float, OnlyIn(0), Field(gt=0, allow_inf_nan=False)] = 1.0
     hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
+    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
     max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 72_000_000
     max_bytes: Annotated[int, OnlyIn(0), Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
     use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
     frame_prefix: FrameForm = ""
     merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
+    end: ClassVar = "sink"
+    conditions: ClassVar = (
+        ActsWhere(
+            ("max_age_s",), lambda sink: bool(sink.key), "only sealed messages have an age; set key, or leave it out"
+        ),
+    )
 
     @model_validator(mode="after")
     def _frames_stay_apart(self) -> SinkConfig:
@@ -458,7 +428,7 @@ class BurstLoss:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class ChannelConfig(Seeded):
+class ChannelConfig:
     """The simulated channel between transmitter and receiver (docs/reference/channels.md).
 
     ``snr_db`` to ``doppler_hz`` act on samples, and a PHY without samples refuses them; ``packet_loss`` to ``outages``
@@ -487,6 +457,7 @@ class ChannelConfig(Seeded):
     packet_loss: Annotated[Probability, Field(title="Packet loss (share of packets)")] = 0.0
     burst_loss: BurstLoss | None = None
     outages: tuple[tuple[Seconds, Seconds], ...] = ()
+    seed: Count = 0
 
     @model_validator(mode="after")
     def _outages_in_order(self) -> ChannelConfig:
@@ -513,16 +484,6 @@ class ChannelConfig(Seeded):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class OnCarrier:
-    """What is on a carrier.
-
-    :param carrier_hz: carrier frequency, Hz
-    """
-
-    carrier_hz: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Transceiver:
     """What levels at a receiver follow from.
 
@@ -534,12 +495,8 @@ class Transceiver:
     noise_figure_db: Decibels | Auto = AUTO
 
 
-_ONLY_FOR = {"exponent": "log_distance", "height_m": "two_ray"}
-"""Settings that one model of the path loss has alone."""
-
-
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, populate_by_name=True))
-class ScenarioChannel(OnCarrier, Transceiver, ChannelConfig):
+class ScenarioChannel(Transceiver, ChannelConfig):
     """The channel of a scenario, which may follow from where the robots are (docs/explanation/medium.md).
 
     :param from_: what says the levels: settings = ``snr_db``; positions = where the robots are, in the simulator's
@@ -565,6 +522,33 @@ class ScenarioChannel(OnCarrier, Transceiver, ChannelConfig):
     tx_power_dbm: Decibels = 20.0
     noise_figure_db: Decibels = 6.0
     carrier_hz: Annotated[float, Field(ge=1e3, le=1e12)] = 2.4e9
+    conditions: ClassVar = (
+        ActsWhere(
+            ("model", "exponent", "height_m", "walls_db", "shadowing_db", "decorrelation_m", "carrier_hz"),
+            lambda channel: channel.from_positions,
+            "acts only where levels follow from positions; set from: positions",
+        ),
+        ActsWhere(
+            ("snr_db",),
+            lambda channel: not channel.from_positions,
+            "follows from positions; leave it out, or set from: settings",
+        ),
+        ActsWhere(
+            ("exponent",),
+            lambda channel: channel.model == "log_distance",
+            "only model log_distance has it; leave it out, or set model: log_distance",
+        ),
+        ActsWhere(
+            ("height_m",),
+            lambda channel: channel.model == "two_ray",
+            "only model two_ray has it; leave it out, or set model: two_ray",
+        ),
+        ActsWhere(
+            ("decorrelation_m",),
+            lambda channel: channel.shadowing_db > 0,
+            "nothing is shadowed; set shadowing_db above 0",
+        ),
+    )
 
     @property
     def from_positions(self) -> bool:
@@ -583,27 +567,29 @@ class ScenarioChannel(OnCarrier, Transceiver, ChannelConfig):
 
     @model_validator(mode="after")
     def _one_origin(self) -> ScenarioChannel:
-        default = {name: getattr(ScenarioChannel, name) for name in ScenarioChannel.__annotations__}
-        changed = [name for name, value in default.items() if getattr(self, name) != value]
-        if not self.from_positions:
-            if changed:
-                raise ValueError(f"{changed[0]}: acts only where levels follow from positions; set from: positions")
-            return self
-        if self.snr_db is not None:
-            raise ValueError(f"snr_db = {self.snr_db:g}: follows from positions; leave it out, or set from: settings")
-        for name, model in _ONLY_FOR.items():
-            if name in changed and self.model != model:
-                raise ValueError(f"{name}: only model {model} has it; leave it out, or set model: {model}")
-        if "decorrelation_m" in changed and not self.shadowing_db:
-            raise ValueError("decorrelation_m: nothing is shadowed; set shadowing_db above 0")
+        refuse_without_effect(self)
         return self
 
 
+LEVELS = (
+    ActsWhere(
+        ("channel.snr_db",), lambda robots: robots.gains_db is None, "follows from gains_db; leave one of them out"
+    ),
+    ActsWhere(
+        ("channel.tx_power_dbm", "channel.noise_figure_db", "robots.*.tx_power_dbm", "robots.*.noise_figure_db"),
+        lambda robots: robots.gains_db is not None or robots.channel.from_positions,
+        "no level follows from it; set gains_db, or channel.from: positions",
+    ),
+)
+"""Of what has ``robots`` with ``gains_db`` and a ``channel``."""
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class PhyConfig(Sampled, Named):
+class PhyConfig:
     """Which physical layer, and how fast.
 
     :param name: a name of ``gr_ros2.phy.PHY``
+    :param sample_rate: samples/s; auto = an experiment chooses it by what it offers. A link of radios has to be told
     :param headroom: capacity over offered load where sample_rate is auto; a recording counts with one message per
         second at least
     :param kernels: what works on the samples of this end: auto = compiled kernels where they were built, else numpy;
@@ -612,9 +598,22 @@ class PhyConfig(Sampled, Named):
     """
 
     name: str = "ofdm"
+    sample_rate: Annotated[SampleRate | Auto, Field(title="Sample rate (samples/s)")] = AUTO
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
     kernels: Kernels = AUTO
     options: dict[str, Any] = Field(default_factory=dict)
+    conditions: ClassVar = (
+        ActsWhere(
+            ("headroom",),
+            lambda phy: phy.sample_rate == AUTO,
+            "acts where the sample rate is chosen by it; leave it out, or set sample_rate: auto",
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> PhyConfig:
+        refuse_without_effect(self)
+        return self
 
     @property
     def takes_airtime(self) -> bool:
@@ -623,37 +622,21 @@ class PhyConfig(Sampled, Named):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class OverChannel:
-    """What crosses a channel.
-
-    :param channel: what lies between transmitter and receiver
-    """
-
-    channel: ChannelConfig = Field(default_factory=ChannelConfig)
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Sending:
-    """What sends.
-
-    :param ros_source: the sending block
-    """
-
-    ros_source: SourceConfig = Field(default_factory=SourceConfig)
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class OneWay(Sending, OverChannel):
+class OneWay:
     """One direction: the block that sends, what lies between, and the block that receives.
 
+    :param ros_source: the sending block
+    :param channel: what lies between transmitter and receiver
     :param ros_sink: the receiving block
     """
 
+    ros_source: SourceConfig = Field(default_factory=SourceConfig)
+    channel: ChannelConfig = Field(default_factory=ChannelConfig)
     ros_sink: SinkConfig = Field(default_factory=SinkConfig)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class AnyLink(OneWay, Agreed, Named):
+class AnyLink(OneWay, Agreed):
     """What an experiment and a robot's end of a real link have in common.
 
     :param name: what results, tables and errors call it; the file's name unless it is set
@@ -667,6 +650,7 @@ class AnyLink(OneWay, Agreed, Named):
     :param relay: gain = a robot sends on the messages of others that make those who hear it youngest; medium: slots
     """
 
+    name: Text
     phy: PhyConfig = Field(default_factory=PhyConfig)
     medium: Medium = "exclusive"
     relay: Literal["off", "gain"] = "off"
@@ -698,7 +682,7 @@ class AnyLink(OneWay, Agreed, Named):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class DiagnosticsConfig(Windowed):
+class DiagnosticsConfig:
     """What a live link says about itself on ``/diagnostics``, and when it calls that a warning or an error.
 
     :param period_s: s between two messages, 0 = none at all
@@ -729,23 +713,6 @@ class DiagnosticsConfig(Windowed):
     silence_warn_s: Seconds = 3.0
     silence_error_s: Seconds = 10.0
     queue_warn: Probability = 0.8
-
-
-def refuse_without_effect(config: Any, version: int, where: str = "") -> None:
-    """Refuse settings that only the other version of the wire format has. At their defaults they are taken.
-
-    :param config: an object of a settings class
-    :param version: the version that runs
-    :param where: what the names of the settings begin with in the error
-    :raises ValueError: naming setting, value and version
-    """
-    for setting in settings_of(type(config)):
-        value = getattr(config, setting.name)
-        if setting.version not in (None, version) and value != setting.default:
-            raise ValueError(
-                f"{where}{setting.name} = {value!r}: version {version} has no such setting; leave it out, or set "
-                f"version: {setting.version}"
-            )
 
 
 def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:

@@ -257,7 +257,7 @@ class Registry(Sequence[Topic]):
             topic = self.named(name)
             changed = {f.name: getattr(override, f.name) for f in fields(TopicOptions)}
             changed = {key: value for key, value in changed.items() if value != getattr(DEFAULT_OPTIONS, key)}
-            merged = build(TopicOptions, {**asdict(topic.options), **changed})
+            merged = build(TopicOptions, {**asdict(topic.options), **changed}, f"topic {name}")
             topics[topic.topic_id] = Topic(topic.topic_id, topic.name, topic.type_name, merged)
         return Registry(topics)
 

@@ -10,14 +10,14 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.settings.config import Populated, Seeded
+from gr_ros2.settings.config import Count
 
 Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
 Noise = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
-class SimSettings(Populated, Seeded):
+class SimSettings:
     """Robots, world, rates and noise.
 
     :param seed: of the world, the routes and all noise; in a scenario that of the scenario unless it is set
@@ -46,6 +46,7 @@ class SimSettings(Populated, Seeded):
     :param transforms: robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries
     """
 
+    seed: Count = 0
     robots: Annotated[int, Field(ge=1, le=255)] = 2
     size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
     obstacles: Annotated[int, Field(ge=0, le=100)] = 12

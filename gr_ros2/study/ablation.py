@@ -18,6 +18,7 @@ from gr_ros2.report.page import Run, read_runs
 from gr_ros2.report.table import Grid, milliseconds, number
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, load_scenario
+from gr_ros2.settings.config import SourceConfig
 
 WHOLE = "whole"
 """Name of the unchanged scenario, for its folder and in tables."""
@@ -43,11 +44,16 @@ def variants(scenario: Scenario) -> list[Variant]:
     source = scenario.ros_source
     found = [Variant(WHOLE)]
     if source.compresses:
-        found.append(Variant("no-compression", ("ros_source.compression=false",)))
+        details = [
+            f"topic_options.{name}.{of}" for name in source.topic_options for of in ("codec=auto", "quantize=''")
+        ]
+        off = ("compression=false", "dictionaries=[]", *details)
+        found.append(Variant("no-compression", tuple(f"ros_source.{setting}" for setting in off)))
     if source.packet_rate != 0:
         found.append(Variant("no-pull", ("ros_source.packet_rate=0",)))
     if source.version and source.repair != "off":
-        found.append(Variant("no-repair", ("ros_source.repair='off'",)))
+        details = [f"ros_source.expected_loss={SourceConfig.expected_loss}"]
+        found.append(Variant("no-repair", ("ros_source.repair='off'", *details)))
     if scenario.reports is not None:
         found.append(Variant("no-reports", ("reports=null",)))
     registry = scenario.load_registry().with_options(source.topic_options)

@@ -33,7 +33,7 @@ from gr_ros2.run.robot_settings import sources_of
 from gr_ros2.run.robots import surroundings
 from gr_ros2.run.scenario import Scenario, changed
 from gr_ros2.run.simulate import Simulated, coupled, offered_by, simulate
-from gr_ros2.settings.config import ChannelConfig, PacketSettings, SourceConfig, TopicOptions, replaced
+from gr_ros2.settings.config import Agreed, ChannelConfig, SourceConfig, TopicOptions, replaced
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry, Topic
 
@@ -569,7 +569,7 @@ def _limited(source: SourceConfig, *, row: str, rate_hz: float) -> SourceConfig:
 
 
 def _with_packet_len(scenario: Scenario, packet_len: int) -> Scenario:
-    return changed(scenario, PacketSettings, lambda part: replace(part, packet_len=packet_len))
+    return changed(scenario, Agreed, lambda part: replace(part, packet_len=packet_len))
 
 
 def _fair_level(loads: Sequence[tuple[float, float]]) -> float:

@@ -48,7 +48,7 @@ def files(folder: Path) -> dict[str, str]:
     ("words", "says"),
     [
         ("run nonsense", "scenario 'nonsense' is neither a file nor built in; built in are "),
-        ("run {f}/key.yaml", "unknown key colour; known are name, packet_len, registry"),
+        ("run {f}/key.yaml", "unknown key colour; known are packet_len, registry"),
         ("run {f}/list.yaml", "expected keys and values, found list"),
         ("run {f}/half.yaml", "no YAML"),
         ("run paper-direct --set registry={f}/columns.csv", "columns.csv:1: 3 columns where 2 were expected"),

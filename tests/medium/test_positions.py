@@ -149,17 +149,20 @@ def test_a_recording_tells_places_by_its_odometry() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["channel={from: positions, snr_db: 3}"], r"channel: snr_db = 3: follows from positions; leave it out"),
-        (["channel={walls_db: 3}"], "walls_db: acts only where levels follow from positions; set from: positions"),
+        (["channel={from: positions, snr_db: 3}"], r"channel: snr_db = 3.0: follows from positions; leave it out"),
+        (
+            ["channel={walls_db: 3}"],
+            "walls_db = 3.0: acts only where levels follow from positions; set from: positions",
+        ),
         (["channel={from: places}"], "channel.from = 'places': must be 'settings' or 'positions'"),
         (
             ["channel={from: positions, model: hata}"],
             "channel.model = 'hata': must be 'log_distance', 'two_ray' or 'fr",
         ),
-        (["channel={from: positions, height_m: 2}"], "height_m: only model two_ray has it"),
+        (["channel={from: positions, height_m: 2}"], "height_m = 2.0: only model two_ray has it"),
         (
             ["channel={from: positions, decorrelation_m: 2}"],
-            "decorrelation_m: nothing is shadowed; set shadowing_db above 0",
+            "decorrelation_m = 2.0: nothing is shadowed; set shadowing_db above 0",
         ),
         (["channel={from: positions}", "gains_db=-100"], "gains_db: levels follow from positions"),
         (["channel={from: positions}", "phy={name: direct}"], "phy direct has no samples, so no level"),

@@ -11,7 +11,7 @@ from gr_ros2.race.slots import HOST_S, run_slots
 
 
 def test_three_robots_in_slots_hear_everything_in_spite_of_losses(tmp_path: Path) -> None:
-    settings = RaceSettings(robots=3, duration_s=2, loss=(0.05,), load=(2.0,), packet_len=96, drain_s=3)
+    settings = RaceSettings(robots=3, duration_s=2, loss=(0.05,), load=(2.0,), packet_len=96)
     recordings = read_recordings(settings, tmp_path)
     senders = [RaceSender(recording, Identity(recording)) for recording in recordings]
     (condition,) = conditions(settings, recordings)

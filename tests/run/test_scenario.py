@@ -121,7 +121,7 @@ def test_override_values_are_yaml() -> None:
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("foo=1", "unknown key foo; known are name, packet_len, registry"),
+        ("foo=1", "unknown key foo; known are packet_len, registry"),
         ("phy.foo=1", "unknown key phy.foo; known are name, sample_rate"),
         ("phy.sample_rate=-1", "phy.sample_rate = -1: write auto"),
         ("phy.sample_rate=-2", "phy.sample_rate = -2: must be greater than 0, or 'auto'"),

@@ -6,8 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, is_dataclass
-from inspect import get_annotations
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -18,13 +17,14 @@ from gr_ros2.phy import PHY
 from gr_ros2.race.race_settings import RaceSettings
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
+from gr_ros2.radio.medium import MediumConfig
 from gr_ros2.run.scenario import Scenario
 from gr_ros2.settings.config import TopicOptions
-from gr_ros2.settings.fields import AUTO, REQUIRED, Auto, Setting, label, members, settings_of
+from gr_ros2.settings.fields import AUTO, REQUIRED, Auto, Setting, label, meanings, members, settings_of
 from gr_ros2.study.sweep.definition import Sweep
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-ROOTS = (Scenario, LinkConfig, Sweep, RaceSettings, TopicOptions)
+ROOTS = (Scenario, LinkConfig, MediumConfig, Sweep, RaceSettings, TopicOptions)
 ANOTHER_TIME = {"max_rate", "packet_rate", "speed", "bag_speed", "clock_rate", "time"}
 """Rates and clocks: no durations."""
 
@@ -98,15 +98,17 @@ def test_a_label_is_the_name_in_words_with_its_unit() -> None:
     assert label("greedy") == "Greedy"
 
 
-def test_no_name_is_introduced_by_two_classes() -> None:
-    """A class may narrow what it inherits; another one may not have a setting of the same name of its own."""
+def test_no_text_is_written_twice() -> None:
+    """A class has settings of others by inheriting from them; of the same name it may have another one."""
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    introduced: dict[str, set[str]] = {}
-    for cls in classes():
-        for item in fields(cls):
-            first = next(part for part in reversed(cls.__mro__) if item.name in get_annotations(part))
-            introduced.setdefault(item.name, set()).add(first.__qualname__)
-    assert {name: found for name, found in introduced.items() if len(found) > 1} == {}
+    written: dict[tuple[str, str], set[str]] = {}
+    for part in {part for cls in classes() for part in cls.__mro__}:
+        above = [meanings(base) for base in part.__bases__]
+        for name, text in meanings(part).items():
+            if all(base.get(name) != text for base in above):
+                written.setdefault((name, text), set()).add(part.__qualname__)
+    assert len(written) > 250
+    assert {name: found for name, found in written.items() if len(found) > 1} == {}
 
 
 def test_every_setting_says_what_it_is() -> None:

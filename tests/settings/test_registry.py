@@ -172,7 +172,7 @@ def test_named_columns_are_options_and_empty_cells_defaults(tmp_path: Path) -> N
             "topic,type,colour",
             "odom,a/B,red",
             1,
-            "unknown column 'colour'; known are queue_depth, max_age_s, qos, reliability",
+            "unknown column 'colour'; known are qos, reliability, durability, depth",
         ),
         ("topic,type,qos,qos", "odom,a/B,bulk,bulk", 1, "column 'qos' stands twice"),
         ("topic,type,qos", "odom,a/B,urgent", 2, "topic 'odom': qos = 'urgent'"),

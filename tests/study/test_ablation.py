@@ -31,6 +31,13 @@ def test_each_part_that_is_on_has_a_variant() -> None:
         named("paper-ofdm")
 
 
+def test_a_part_goes_with_its_details_which_have_no_effect_without_it() -> None:
+    details = ["ros_source.expected_loss=0.4", "ros_source.topic_options.odom.quantize=pose.pose.position=0.1"]
+    whole = load_scenario("six-topics-paced", details)
+    for variant in variants(whole):
+        assert load_scenario("six-topics-paced", [*details, *variant.settings]) != whole or variant.name == "whole"
+
+
 def flat(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Every setting by its dotted name."""
     for key, value in config.items():

@@ -33,6 +33,8 @@ class EndpointV0:
     answers = urged = False
     boot = 0
     mcs_table: Sequence[Mcs] = ()
+    live_settings = ("packet_rate", "dst_id", "repeat_s", "queue_depth")
+    live_options = ()
 
     def __init__(
         self,
@@ -73,7 +75,7 @@ class EndpointV0:
 
     def reconfigure(self, **changes: float) -> None:
         """See :class:`Endpoint`."""
-        check_live(changes)
+        check_live(changes, self.live_settings)
         self.messages.reconfigure(**changes)
 
     def next_packet(self, now: float) -> SentPacket | None:

@@ -217,7 +217,9 @@ class Sender:
 
         :raises ConfigError: for a value out of range
         """
-        self.config = replaced(self.config, **settings)
+        before, self.config = self.config, replaced(self.config, **settings)
+        for topic_id in self._repeat_at:
+            self._repeat_at[topic_id] += self.config.repeat_s - before.repeat_s
         self._scheduler.config = self.config
         self._stale = True
         if "packet_rate" in settings:

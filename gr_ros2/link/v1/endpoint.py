@@ -18,7 +18,7 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.access import Access
-from gr_ros2.link.endpoint import HeardRobot, check_live
+from gr_ros2.link.endpoint import LIVE_OPTIONS, HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs, RateController
@@ -63,6 +63,9 @@ class EndpointV1:
     :ivar neighbours: the robots that are heard
     :ivar pings: its questions to other robots, and its answers
     """
+
+    live_settings = ("packet_rate", "repeat_s", "queue_depth")
+    live_options = LIVE_OPTIONS
 
     def __init__(
         self,
@@ -180,17 +183,15 @@ class EndpointV1:
 
     def reconfigure(self, **changes: Any) -> None:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""
-        check_live(changes)
-        settings = replace(self.settings, **changes)
-        if settings.dst_id != self.settings.dst_id:
+        if (dst_id := changes.pop("dst_id", self.settings.dst_id)) != self.settings.dst_id:
             raise ConfigError(
-                f"dst_id = {settings.dst_id}: another destination needs a restart of the link: repairs combine packets "
-                f"to {self.settings.dst_id}, and nobody else may recover these"
+                f"dst_id = {dst_id}: another destination needs a restart of the link: repairs combine packets to "
+                f"{self.settings.dst_id}, and nobody else may recover these"
             )
-        self.settings = self._sending.settings = settings
+        check_live(changes, self.live_settings)
+        self.settings = settings = replace(self.settings, **changes)
+        self._sending.reconfigure(settings, self._now)
         self.messages.reconfigure(settings)
-        if "packet_rate" in changes:
-            self.pace.change(settings.packet_rate)
 
     @property
     def questions(self) -> Pings:

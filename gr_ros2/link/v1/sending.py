@@ -140,15 +140,24 @@ class SendingSide:
     def met(self, now: float) -> None:
         """A robot is heard for the first time, or again: kept messages are repeated soon, and hellos sent."""
         if self._repeats > 1:
-            self._repeats, self._repeat_at = 1, now + self.settings.repeat_s
+            self._repeats = 1
+            self._plan_repeat(now)
         if self.settings.hears:
             self.hellos.met(now)
+
+    def reconfigure(self, settings: Settings, now: float) -> None:
+        """Use other settings from now on."""
+        before, self.settings = self.settings, settings
+        if settings.repeat_s != before.repeat_s and self._started and self._messages.kept.digest:
+            self._plan_repeat(now)
+        if settings.packet_rate != before.packet_rate:
+            self.pace.change(settings.packet_rate)
 
     def topics_changed(self, now: float, *, added: bool, asked: bool) -> None:
         """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self.hellos.hurry(now)
-        if added and self._started and self._repeat_at == inf and self.settings.repeat_s:
-            self._repeat_at = now + self.settings.repeat_s
+        if added and self._started and self._repeat_at == inf:
+            self._plan_repeat(now)
         if asked and self._started:
             self._messages.kept.ask(TABLE_TOPIC, now)
 
@@ -170,13 +179,16 @@ class SendingSide:
         self.hellos.start(now)
         if self._messages.kept.digest:
             self._messages.kept.ask(TABLE_TOPIC, now)
-            if self.settings.repeat_s:
-                self._repeat_at = now + self.settings.repeat_s
+            self._plan_repeat(now)
+
+    def _plan_repeat(self, now: float) -> None:
+        every = self.settings.repeat_s * self._repeats
+        self._repeat_at = now + every if every else inf
 
     def _repeat(self, now: float) -> None:
         """Repeat the kept messages, if no robot reports that it has them."""
         self._repeats = min(2 * self._repeats, MOST_REPEATS) if self.hellos.lone else 1
-        self._repeat_at = now + self.settings.repeat_s * self._repeats
+        self._plan_repeat(now)
         if not self._window.peers:
             self._messages.kept.announce(now)
 

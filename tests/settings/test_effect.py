@@ -1,0 +1,197 @@
+"""What has no effect where it is given is refused in one line: each condition, and each option of one end alone."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr.ros_link import make_link
+from gr_ros2.radio.config import LinkConfig, link_from
+from gr_ros2.radio.medium import MediumConfig
+from gr_ros2.run.scenario import Scenario, scenario_from
+from gr_ros2.settings.airtime import AirtimeConfig
+from gr_ros2.settings.config import PhyConfig, ScenarioChannel, SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.settings.effect import conditions_of
+from gr_ros2.settings.fields import Setting, settings_of
+from gr_ros2.settings.registry import Registry
+from tests.settings.test_fields import classes
+
+ROBOTS = [{"connect": f"tcp://127.0.0.1:555{n}", "bind": f"tcp://127.0.0.1:655{n}"} for n in (1, 2)]
+BASE: Mapping[type[Any], Mapping[str, Any]] = {
+    Scenario: {"name": "one", "registry": "table4.csv", "ros_source": {"namespace": "/robot_1"}},
+    LinkConfig: {"phy": {"sample_rate": 1e6}, "ros_source": {"robot_id": 1}},
+    MediumConfig: {"phy": {"sample_rate": 1e6}, "robots": ROBOTS},
+}
+TWO = {"robots": [{}, {}], "time": "packets"}
+PLACED = {"channel": {"from": "positions"}}
+COMPRESSES = "set compression: true, or leave it out"
+
+Values = Mapping[str, Any]
+IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
+    (TopicOptions, "queue_depth"): ({"queue_depth": 3}, {"queue": "latest"}, {"queue": "fifo"}, "set another queue"),
+    (SourceConfig, "seal"): ({"seal": "authenticate"}, {}, {"key": "fleet.key"}, "set key"),
+    (SourceConfig, "topic_options.*.max_age_s"): (
+        {"topic_options": {"odom": {"max_age_s": 5.0}}},
+        {},
+        {"key": "fleet.key"},
+        "set key",
+    ),
+    (SinkConfig, "seal"): ({"seal": "authenticate"}, {}, {"key": "fleet.key"}, "set key"),
+    (SinkConfig, "topic_options.*.max_age_s"): (
+        {"topic_options": {"odom": {"max_age_s": 5.0}}},
+        {},
+        {"key": "fleet.key"},
+        "set key",
+    ),
+    (SinkConfig, "max_age_s"): ({"max_age_s": 5.0}, {}, {"key": "fleet.key"}, "set key"),
+    (SourceConfig, "dictionaries"): ({"dictionaries": ("my.dict",)}, {"compression": False}, {}, COMPRESSES),
+    (SourceConfig, "topic_options.*.codec"): (
+        {"topic_options": {"odom": {"codec": "zstd"}}},
+        {"version": 0},
+        {"version": 0, "compression": True},
+        COMPRESSES,
+    ),
+    (SourceConfig, "topic_options.*.quantize"): (
+        {"topic_options": {"odom": {"quantize": "pose=0.1"}}},
+        {"compression": False},
+        {},
+        COMPRESSES,
+    ),
+    (SourceConfig, "expected_loss"): ({"expected_loss": 0.5}, {"repair": "off"}, {"repair": "idle"}, "set repair to"),
+    (PhyConfig, "headroom"): (
+        {"headroom": 2.0},
+        {"sample_rate": 1e6},
+        {"sample_rate": "auto"},
+        "set sample_rate: auto",
+    ),
+    (AirtimeConfig, "window_s"): ({"window_s": 60.0}, {}, {"band": "eu868"}, "set duty_cycle"),
+    (ScenarioChannel, "snr_db"): ({"snr_db": 3.0}, {"from": "positions"}, {}, "set from: settings"),
+    (ScenarioChannel, "model"): ({"model": "two_ray"}, {}, {"from": "positions"}, "set from: positions"),
+    (ScenarioChannel, "exponent"): (
+        {"exponent": 2.0},
+        {"from": "positions", "model": "two_ray"},
+        {"from": "positions"},
+        "set model: log_distance",
+    ),
+    (ScenarioChannel, "height_m"): (
+        {"height_m": 2.0},
+        {"from": "positions"},
+        {"from": "positions", "model": "two_ray"},
+        "set model: two_ray",
+    ),
+    (ScenarioChannel, "walls_db"): ({"walls_db": 2.0}, {}, {"from": "positions"}, "set from: positions"),
+    (ScenarioChannel, "shadowing_db"): ({"shadowing_db": 2.0}, {}, {"from": "positions"}, "set from: positions"),
+    (ScenarioChannel, "decorrelation_m"): (
+        {"decorrelation_m": 2.0},
+        {"from": "positions"},
+        {"from": "positions", "shadowing_db": 4.0},
+        "set shadowing_db above 0",
+    ),
+    (ScenarioChannel, "carrier_hz"): ({"carrier_hz": 868e6}, {}, {"from": "positions"}, "set from: positions"),
+    (Scenario, "bag_speed"): ({"bag_speed": 2.0}, {}, {"source": "bag:a"}, "set source: bag:PATH"),
+    (Scenario, "state"): ({"state": "robot.json"}, {}, {}, "leave it out"),
+    (Scenario, "controller"): (
+        {"controller": "ros", "robots": [{}, {}]},
+        {},
+        {"task": "formation"},
+        "set task and time: real",
+    ),
+}
+for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
+    for name, given in (
+        ("channel.tx_power_dbm", {"channel": {"tx_power_dbm": 3.0}}),
+        ("channel.noise_figure_db", {"channel": {"noise_figure_db": 3.0}}),
+        ("robots.*.tx_power_dbm", {"robots": [{}, {"tx_power_dbm": 3.0}]}),
+        ("robots.*.noise_figure_db", {"robots": [{}, {"noise_figure_db": 3.0}]}),
+    ):
+        IDLE[cls, name] = (given, beside, {**beside, "gains_db": -90.0}, "set gains_db, or channel.from: positions")
+    IDLE[cls, "channel.snr_db"] = ({"channel": {"snr_db": 9.0}}, {**beside, "gains_db": -90.0}, beside, "leave one")
+NEVER = {(Scenario, "state")}
+"""Nothing makes them act."""
+
+
+def made(cls: type[Any], *parts: Values) -> Any:
+    """An object of a settings class from values, of which later ones are merged into earlier ones."""
+    values: dict[str, Any] = {}
+    for part in (BASE.get(cls, {}), *parts):
+        values = merged(values, part)
+    makers = {Scenario: scenario_from, LinkConfig: link_from}
+    return makers[cls](values) if cls in makers else build(cls, values)
+
+
+def merged(below: Any, above: Any) -> Any:
+    if isinstance(below, Mapping) and isinstance(above, Mapping):
+        return {key: merged(below.get(key), above.get(key, below.get(key))) for key in {**below, **above}}
+    if isinstance(below, list) and isinstance(above, list):
+        return [merged(one, other) for one, other in zip(below, above, strict=True)]
+    return above
+
+
+def test_every_condition_is_here() -> None:
+    held = {(cls, name) for cls in classes() for condition in conditions_of(cls) for name in condition.settings}
+    assert set(IDLE) == held
+
+
+@pytest.mark.parametrize(("cls", "name"), IDLE, ids=lambda one: one if isinstance(one, str) else one.__name__)
+def test_what_has_no_effect_is_refused_in_a_line(cls: type[Any], name: str) -> None:
+    given, idle, acting, remedy = IDLE[cls, name]
+    with pytest.raises(ConfigError) as error:
+        made(cls, idle, given)
+    pattern = re.escape(name).replace(r"\.\*", r"(\.\w+|\[\d\])")
+    assert re.search(rf"(^|: ){pattern} = \S+: .*{re.escape(remedy)}", str(error.value))
+    assert "\n" not in str(error.value)
+    made(cls, idle)
+    if (cls, name) not in NEVER:
+        made(cls, acting, given)
+
+
+def test_a_default_is_taken_wherever_it_stands() -> None:
+    assert build(SourceConfig, {"repair": "off", "expected_loss": 0.2}) == SourceConfig(repair="off")
+    assert build(PhyConfig, {"sample_rate": 1e6, "headroom": 1.2}) == PhyConfig(sample_rate=1e6)
+    assert made(Scenario, {"bag_speed": 1, "robots": [{"tx_power_dbm": "auto"}, {}]}) == made(
+        Scenario, TWO, {"time": "real"}
+    )
+
+
+AT_ONE_END = [setting for setting in settings_of(TopicOptions) if setting.end is not None]
+OTHER: dict[str, Any] = {
+    "qos": "bulk", "queue": "fifo", "weight": 2.0, "max_rate": 3.0, "keep_s": 3.0, "to": 3, "codec": "zstd",
+    "quantize": "pose.pose.position=0.1", "publish_as": "/here", "queue_depth": 3,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("setting", AT_ONE_END, ids=lambda setting: setting.name)
+def test_an_option_of_one_end_is_refused_at_the_other(setting: Setting, tmp_path: Path) -> None:
+    options = {"odom": {setting.name: OTHER[setting.name]}}
+    for cls in (SourceConfig, SinkConfig):
+        if cls.end == setting.end:
+            build(cls, {"topic_options": options})
+            continue
+        said = f"topic_options.odom.{setting.name} = {OTHER[setting.name]!r}: acts at the {setting.end} alone; give it"
+        with pytest.raises(ConfigError, match=re.escape(f"{said} to ros_{setting.end}, or leave it out")):
+            build(cls, {"topic_options": options})
+    registry = tmp_path / "both.csv"  # which both ends have
+    registry.write_text(f"name,type,{setting.name}\nodom,nav_msgs/Odometry,{OTHER[setting.name]}\n")
+    assert getattr(Registry.from_csv(registry)[0].options, setting.name) == OTHER[setting.name]
+
+
+def test_a_block_of_both_ends_gives_each_its_options() -> None:
+    link = make_link(
+        middleware="memory",
+        namespace="/robot_1",
+        topic_options={"odom": {"max_rate": 5.0, "publish_as": "/here", "depth": 3}},
+    )
+    try:
+        assert link.source.config.topic_options == {"odom": TopicOptions(max_rate=5.0, depth=3)}
+        assert link.sink.config.topic_options == {"odom": TopicOptions(publish_as="/here", depth=3)}
+    finally:
+        link.close()
+    with pytest.raises(ConfigError, match=r"unknown key topic_options\.odom\.colour"):
+        make_link(middleware="memory", namespace="/robot_1", topic_options={"odom": {"colour": 1}})
