@@ -30,8 +30,8 @@ from gr_ros2.wire.format import (
     Format,
     Packet,
     Span,
+    unwrap,
 )
-from gr_ros2.wire.numbers import unwrap
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v0 import V0
 from gr_ros2.wire.v1 import V1, is_sealed
