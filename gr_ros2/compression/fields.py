@@ -158,7 +158,7 @@ class FieldsCodec:
             return None
         values = self._static_values(prepared, *found)
         return found[0].shape.counts, push_static(
-            0, values, prepared.plan.static_values, self._model.words, self._model.constants
+            values, prepared.plan.static_values, self._model.words, self._model.constants
         )
 
     # Preparation, cached
@@ -206,7 +206,7 @@ class FieldsCodec:
             number = prepared.templates.get(key, PARTS)
             x = 0
             if number == PARTS:
-                x = push_static(0, key, prepared.plan.static_values, self._model.words, self._model.constants)
+                x = push_static(key, prepared.plan.static_values, self._model.words, self._model.constants)
             if self._model.templates:
                 x = TEMPLATES.push(x, number)
             _remember(self._coded, known, x)
@@ -269,7 +269,7 @@ class FieldsCodec:
         max_items = min(MAX_CODED_ITEMS, self._fixed + bounds.most_items(len(coded)))
         blob = b""
         if with_blob:
-            length, start = read_varint(coded, 0)
+            length, start = read_varint(coded)
             if length > len(coded) - start:
                 raise DamagedError("damaged message: its number is cut off")
             coded, blob = coded[start : start + length], coded[start + length :]

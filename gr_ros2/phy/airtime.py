@@ -28,7 +28,6 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
-    :param lead: s before the channel is free at which a credit is given at the earliest
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
     :param timed, listens, ready: see :class:`AirtimeClock`
@@ -45,7 +44,6 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         airtime: float,
         *,
         airtime_of: Callable[[int, int], float] | None = None,
-        lead: float = LEAD_S,
         ahead: float | None = None,
         limit: AirtimeLimit | None = None,
         timed: bool = False,
@@ -58,7 +56,7 @@ class AirtimeGate(gr.basic_block):  # type: ignore[misc]
         super().__init__("gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
         self._clock: AirtimeClock[Any] = AirtimeClock(
-            airtime, lead, ahead, limit, measured=True, timed=timed, listens=listens, ready=ready
+            airtime, LEAD_S, ahead, limit, measured=True, timed=timed, listens=listens, ready=ready
         )
         self._admits = admits
         self._now = clock
