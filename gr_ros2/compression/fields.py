@@ -42,8 +42,9 @@ from gr_ros2.compression.prepared import PARTS, TEMPLATES, Model, Prepared
 from gr_ros2.compression.schema import BIG, LITTLE, MAX_PARTS, Composite, Node, Repeat, Shape, is_open, shape_of
 from gr_ros2.compression.stamps import pop_stamp, push_stamp
 from gr_ros2.compression.static_values import Value, pop_static, push_static
-from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
+from gr_ros2.compression.zstd_frames import Zstd, read_varint
 from gr_ros2.core.errors import DamagedError
+from gr_ros2.wire import varint
 
 MAX_NUMBER = 8192
 """Bytes of the number part: the most that MAX_SLOTS values can need; a longer number is damage."""

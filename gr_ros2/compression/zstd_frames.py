@@ -14,6 +14,7 @@ import sys
 from typing import Any
 
 from gr_ros2.core.errors import DamagedError
+from gr_ros2.wire import varint
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -106,16 +107,6 @@ def train(samples: list[bytes], size: int) -> bytes:
     except zstd.ZstdError as error:
         raise ValueError(" ".join(str(error).split())) from error
     return content
-
-
-def varint(value: int) -> bytes:
-    """Seven bits a byte, lowest first; the top bit says that more follow."""
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
 
 
 def read_varint(data: bytes) -> tuple[int, int]:

@@ -31,6 +31,7 @@ from gr_ros2.wire.format import (
     Packet,
     Span,
     unwrap,
+    varint,
 )
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v0 import V0
@@ -62,6 +63,7 @@ __all__ = [
     "format_of",
     "is_sealed",
     "unwrap",
+    "varint",
 ]
 
 FORMATS: Mapping[int, Format] = {V0.version: V0, V1.version: V1}

@@ -154,3 +154,15 @@ def unwrap(low: int, least: int, bits: int) -> int:
     :return: ``least`` .. ``least + 2**bits - 1``
     """
     return least + (low - least & (1 << bits) - 1)
+
+
+def varint(value: int) -> bytes:
+    """Seven bits per byte, the lowest first; the top bit says that more bytes follow."""
+    if value < 128:
+        return bytes((value,))
+    parts = bytearray()
+    while value > 127:
+        parts.append(value & 127 | 128)
+        value >>= 7
+    parts.append(value)
+    return bytes(parts)

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.compression import bulk
-from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
+from gr_ros2.compression.zstd_frames import Zstd, read_varint
 from gr_ros2.core.errors import DamagedError
+from gr_ros2.wire import varint
 
 special = st.sampled_from([math.inf, -math.inf, math.nan, -0.0])
 ranges = st.lists(st.floats(0, 100) | special, min_size=1, max_size=99)
