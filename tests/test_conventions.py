@@ -1,6 +1,7 @@
-"""What holds of every test and of the names of classes.
+"""What holds of every test, of the names of classes, and of docstrings.
 
-A test says what it expects, and expects nothing of the machine's speed. A class has its name to itself.
+A test says what it expects, and expects nothing of the machine's speed. A class has its name to itself. What is public
+says what it is.
 """
 
 from __future__ import annotations
@@ -172,3 +173,56 @@ def test_two_classes_of_one_name_are_found() -> None:
     one, two = ast.parse("class Pace: ...\nclass _End: ..."), ast.parse("class Pace: ...\nclass _End: ...")
     assert shared([("a/one.py", one), ("b/two.py", two)]) == {"Pace": ["a/one.py", "b/two.py"]}
     assert set(shared([("a/one.py", one), ("a/two.py", two)])) == {"Pace", "_End"}
+
+
+def undocumented(trees: Iterable[ast.Module]) -> set[str]:
+    """Public classes, functions and methods without a docstring. A method that a base class or a protocol has says
+    what that says; of a base class from elsewhere, every method may be. A class may say it of its properties."""
+    trees = list(trees)
+    classes = {node.name: node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    known = {"ABC", "Protocol", "Generic", "NamedTuple", "Enum", "str", "object"}
+
+    protocols = {
+        node.name
+        for one in classes.values()
+        if "Protocol" in map(name_of, one.bases)
+        for node in one.body
+        if isinstance(node, ast.FunctionDef) and ast.get_docstring(node)
+    }
+
+    def overrides(method: str, bases: list[ast.expr]) -> bool:
+        names = {name_of(base) for base in bases} - known
+        return method in protocols or any(
+            name not in classes
+            or any(getattr(node, "name", "") == method for node in classes[name].body)
+            or overrides(method, classes[name].bases)
+            for name in names
+        )
+
+    def says(node: ast.stmt) -> bool:
+        """Whether something needs no docstring, or has one."""
+        if not isinstance(node, ast.ClassDef | ast.FunctionDef) or node.name.startswith("_"):
+            return True
+        return bool(ast.get_docstring(node)) or "setter" in map(name_of, node.decorator_list)
+
+    found = {node.name for tree in trees for node in tree.body if not says(node)}
+    for name, one in classes.items():
+        if not name.startswith("_"):
+            told = ast.get_docstring(one) or ""
+            quiet = [node.name for node in one.body if not says(node) and f":ivar {node.name}:" not in told]
+            found |= {f"{name}.{method}" for method in quiet if not overrides(method, one.bases)}
+    return found
+
+
+def test_what_is_public_has_a_docstring() -> None:
+    found = undocumented(ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py")))
+    assert found == set()
+
+
+def test_what_has_no_docstring_is_found() -> None:
+    base = ast.parse('class Base(ABC):\n "x"\n def close(self): ...\n def read(self): "y"\ndef alone(): ...')
+    derived = ast.parse(
+        'class End(Base):\n "x"\n def close(self): ...\n def more(self): ...\n def _own(self): ...\n'
+        'class Page(Handler):\n "x"\n def get(self): ...\nclass _Hidden:\n def get(self): ...'
+    )
+    assert undocumented([base, derived]) == {"Base.close", "alone", "End.more"}

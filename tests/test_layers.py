@@ -49,7 +49,7 @@ PURE_CODECS = {"backports", "cryptography"}
 CONFINED = {
     "gnuradio": ("gr/", "phy/", "radio/", "race/links.py"),
     "pmt": ("gr/", "phy/", "radio/", "race/links.py"),
-    "rclpy": ("middleware/rclpy.py", "ros/"),
+    "rclpy": ("middleware/rclpy.py", "middleware/rclpy_executor.py", "ros/"),
     "rcl_interfaces": ("ros/",),
     "distributed": ("study/sweep/cluster.py",),
     "zenoh": ("middleware/zenoh.py", "race/"),

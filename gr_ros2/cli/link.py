@@ -217,7 +217,7 @@ def _opening(running: Any) -> str:
 def _show(console: Console, running: Any, duration: float | None) -> None:
     """Print what runs and what it waits for, with a live table, or plain lines where there is no terminal,
     until the time is over or the link has finished."""
-    from gr_ros2.radio.waiting import Findings, Waiting
+    from gr_ros2.radio.waiting import NewFindings, Waiting
 
     guarded, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
     guarded(say, _opening(running))
@@ -229,7 +229,7 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
     waiting = Waiting(running.source)
     with Live("", console=console, auto_refresh=False) if live else ExitStack() as shows:
         shown = time.monotonic()
-        findings = Findings(running.findings)
+        findings = NewFindings(running.findings)
         while (now := time.monotonic()) < end and not running.finished:
             time.sleep(min(_SHOW_S, end - now))
             _watch(running)

@@ -42,8 +42,9 @@ from gr_ros2.compression.prepared import PARTS, TEMPLATES, Model, Prepared
 from gr_ros2.compression.schema import BIG, LITTLE, MAX_PARTS, Composite, Node, Repeat, Shape, is_open, shape_of
 from gr_ros2.compression.stamps import pop_stamp, push_stamp
 from gr_ros2.compression.static_values import Value, pop_static, push_static
-from gr_ros2.compression.zstd_frames import Zstd, read_varint, varint
+from gr_ros2.compression.zstd_frames import Zstd, read_varint
 from gr_ros2.core.errors import DamagedError
+from gr_ros2.wire import varint
 
 MAX_NUMBER = 8192
 """Bytes of the number part: the most that MAX_SLOTS values can need; a longer number is damage."""
@@ -158,7 +159,7 @@ class FieldsCodec:
             return None
         values = self._static_values(prepared, *found)
         return found[0].shape.counts, push_static(
-            0, values, prepared.plan.static_values, self._model.words, self._model.constants
+            values, prepared.plan.static_values, self._model.words, self._model.constants
         )
 
     # Preparation, cached
@@ -206,7 +207,7 @@ class FieldsCodec:
             number = prepared.templates.get(key, PARTS)
             x = 0
             if number == PARTS:
-                x = push_static(0, key, prepared.plan.static_values, self._model.words, self._model.constants)
+                x = push_static(key, prepared.plan.static_values, self._model.words, self._model.constants)
             if self._model.templates:
                 x = TEMPLATES.push(x, number)
             _remember(self._coded, known, x)
@@ -269,7 +270,7 @@ class FieldsCodec:
         max_items = min(MAX_CODED_ITEMS, self._fixed + bounds.most_items(len(coded)))
         blob = b""
         if with_blob:
-            length, start = read_varint(coded, 0)
+            length, start = read_varint(coded)
             if length > len(coded) - start:
                 raise DamagedError("damaged message: its number is cut off")
             coded, blob = coded[start : start + length], coded[start + length :]

@@ -81,7 +81,7 @@ class Types:
     """
 
     def __init__(self, definitions: Mapping[str, str] | None = None) -> None:
-        humble = _humble().fielddefs
+        humble = _humble_types().fielddefs
         self.definitions: dict[str, str] = {}
         self._own: dict[str, Typesdict] = {}
         for name, text in (definitions or {}).items():
@@ -109,7 +109,7 @@ class Types:
 def tree_of(types: Mapping[str, Any], type_name: str) -> Composite | None:
     """The tree of a type by these definitions alone; None where :meth:`Types.tree` gives none, or where they define a
     time or a quaternion in another way than ROS does."""
-    humble = _humble().fielddefs
+    humble = _humble_types().fielddefs
     if any(name in types and types[name][1] != humble[name][1] for name in (*TIME_TYPES, QUATERNION_TYPE)):
         return None
     try:
@@ -149,7 +149,7 @@ def _parsed(text: str, name: str) -> Typesdict:
 
 
 @cache
-def _humble() -> Typestore:
+def _humble_types() -> Typestore:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 

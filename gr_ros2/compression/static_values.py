@@ -52,8 +52,9 @@ def numbered(text: bytes) -> bool:
     return match is not None and match[2].decode() in STEMS
 
 
-def push_static(x: int, values: Sequence[Value], slots: Sequence[Slot], words: Words, constants: KnownNumbers) -> int:
-    """Push all values, so that they are popped in order."""
+def push_static(values: Sequence[Value], slots: Sequence[Slot], words: Words, constants: KnownNumbers) -> int:
+    """A state with all values pushed, so that they are popped in order."""
+    x = 0
     last: dict[int, bytes] = {}
     again = []
     for value, slot in zip(values, slots, strict=True):

@@ -14,6 +14,7 @@ import sys
 from typing import Any
 
 from gr_ros2.core.errors import DamagedError
+from gr_ros2.wire import varint
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -73,7 +74,7 @@ class Zstd:
         :param size: size that both ends know, None where the coded form contains it
         :raises DamagedError: not such data, or more than ``max_size``
         """
-        value, start = read_varint(coded, 0)
+        value, start = read_varint(coded)
         if size is None:
             size = value >> 1
         elif value > 1:
@@ -108,28 +109,14 @@ def train(samples: list[bytes], size: int) -> bytes:
     return content
 
 
-def varint(value: int) -> bytes:
-    """Seven bits a byte, lowest first; the top bit says that more follow."""
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
-
-
-def read_varint(data: bytes, at: int) -> tuple[int, int]:
+def read_varint(data: bytes) -> tuple[int, int]:
     """(value, where the rest begins)
 
     :raises DamagedError: when it does not end within 5 bytes
     """
     value = 0
-    for shift in range(0, 35, 7):
-        if at >= len(data):
-            break
-        byte = data[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
+    for at, byte in enumerate(data[:5]):
+        value |= (byte & 0x7F) << 7 * at
         if byte < 0x80:
-            return value, at
+            return value, at + 1
     raise DamagedError("damaged message: a number that does not end")

@@ -3,13 +3,13 @@
     GrRos2Error
     ├── ConfigError (ValueError)        a setting, file or argument is wrong: exit status 2
     │   └── RegistryError               the same, with file and line of a registry CSV
-        ├── WireError (ValueError)          bytes that are not a valid packet, or a packet that cannot be encoded
+    ├── WireError (ValueError)          bytes that are not a valid packet, or a packet that cannot be encoded
     │   ├── LengthError · CrcError · VersionError · NoEntriesError
     │   ├── EntryBoundsError · PadError · TotalError · IndexRangeError
     │   ├── EntryKindError · VarintError · WindowError · SourcesError
     │   ├── SealError
     │   │   └── NoKeyError · NotSealedError · WrongKeyError · TagError · ReplayedError
-    │           NotStoredError · SameIdError
+    │   │       NotStoredError · SameIdError
     │   └── EncodeError
     ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``fate`` names why
     │   └── UnknownDictionaryError · DamagedError

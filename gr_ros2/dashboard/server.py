@@ -113,7 +113,7 @@ class Dashboard(Closing, RunMonitor):
             started.set_exception(error)
             return
         server.start()
-        for callback, seconds in ((self._beat, TICK_S), (self._glance, _LOOK_S)):
+        for callback, seconds in ((self._beat, TICK_S), (self._look_if_viewed, _LOOK_S)):
             PeriodicCallback(callback, seconds * 1000).start()
         self._loop = loop
         started.set_result(None)
@@ -159,7 +159,7 @@ class Dashboard(Closing, RunMonitor):
         self.tick()
         self._show()
 
-    def _glance(self) -> None:
+    def _look_if_viewed(self) -> None:
         if self._pages:
             self.look()
 

@@ -18,7 +18,7 @@ import numpy as np
 from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.topic_names import Key, TopicNames
 from gr_ros2.dashboard.views import AirView, PathView, RobotView, SeriesView, Snapshot, TopicView
-from gr_ros2.dashboard.windows import AgeMeter, PathComparison, Rate
+from gr_ros2.dashboard.windows import RATE_S, AgeMeter, PathComparison, Rate
 from gr_ros2.link.events import (
     Accepted,
     AirKind,
@@ -42,8 +42,6 @@ from gr_ros2.settings.registry import Registry, Topic
 
 HISTORY_S = 180.0
 """Length of the shown curves and paths, s."""
-RATE_S = 5.0
-"""The window of all numbers called "now", s."""
 LATENCIES = 2000
 """Newest deliveries of a topic from which its latency is computed."""
 UNDER_WAY = 4096
@@ -73,8 +71,8 @@ class _Topic:
         self.repaired = 0
         self.delivered_bytes = 0
         self.ended: Counter[str] = Counter()
-        self.sent_rate = Rate(RATE_S)
-        self.delivered_rate = Rate(RATE_S)
+        self.sent_rate = Rate()
+        self.delivered_rate = Rate()
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         self.age = AgeMeter()
         self.read_position = read_position
@@ -137,7 +135,7 @@ class DashboardState:
         self._topics: dict[Key, _Topic] = {}
         self._received: deque[tuple[float, Received | Rejected]] = deque(maxlen=PACKETS_SHOWN + 1)
         self._packets: Counter[str] = Counter()
-        self._packets_sent, self._packets_received = Rate(RATE_S), Rate(RATE_S)
+        self._packets_sent, self._packets_received = Rate(), Rate()
         self._phase = "waiting"
         self._airtime, self._received_as = airtime, received_as
         self._tick_s = tick_s

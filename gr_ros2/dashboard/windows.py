@@ -14,23 +14,22 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 Point = tuple[float, float]
+RATE_S = 5.0
+"""The window of all numbers called "now", s."""
 _SLOTS = 20
 """Slots in a window of :class:`Rate`; the window moves by one slot at a time; memory is one item per slot."""
+_SLOT_S = RATE_S / _SLOTS
 
 
 class Rate:
-    """Number and bytes of the events in the last ``window_s`` seconds.
+    """Number and bytes of the events in the last ``RATE_S`` seconds."""
 
-    :param window_s: length of the window, s
-    """
-
-    def __init__(self, window_s: float) -> None:
-        self._slot_s = window_s / _SLOTS
+    def __init__(self) -> None:
         self._slots: deque[tuple[int, int, int]] = deque(maxlen=_SLOTS + 1)
 
     def add(self, now: float, size: int = 0) -> None:
         """Add one event of ``size`` bytes."""
-        slot = int(now / self._slot_s)
+        slot = int(now / _SLOT_S)
         if self._slots and self._slots[-1][0] >= slot:
             last, count, total = self._slots.pop()
             self._slots.append((last, count + 1, total + size))
@@ -39,7 +38,7 @@ class Rate:
 
     def totals(self, now: float) -> tuple[int, int]:
         """Count and bytes in the window that ends now."""
-        oldest = int(now / self._slot_s) - (self._slots.maxlen or 1) + 1
+        oldest = int(now / _SLOT_S) - (self._slots.maxlen or 1) + 1
         recent = [slot for slot in self._slots if slot[0] > oldest]
         return sum(slot[1] for slot in recent), sum(slot[2] for slot in recent)
 

@@ -72,7 +72,7 @@ class Status:
             self.problems.append(f"{count - before} {what}")
 
 
-class _Look(NamedTuple):
+class _Snapshot(NamedTuple):
     """The relevant counters at one moment. For each topic: messages delivered and messages lost."""
 
     now: float
@@ -99,7 +99,7 @@ class LinkHealth:
     def __init__(self, config: DiagnosticsConfig, name: str) -> None:
         self._config = config
         self._name = name
-        self._looks: deque[_Look] = deque()
+        self._snapshots: deque[_Snapshot] = deque()
         self._heard_at: float | None = None
         self._reached: dict[int, float] = {}
         """When something of each robot came last, itself or over others, s."""
@@ -110,23 +110,23 @@ class LinkHealth:
         :param stats: statistics of a ``RobotLink``
         :param now: s, monotonic
         """
-        look = _look(stats, now)
-        if look.received > (self._looks[-1].received if self._looks else 0):
+        snapshot = _snapshot(stats, now)
+        if snapshot.received > (self._snapshots[-1].received if self._snapshots else 0):
             self._heard_at = now
-        while len(self._looks) > 1 and self._looks[1].now <= now - self._config.window_s:
-            self._looks.popleft()
-        before = self._looks[0] if self._looks else look
-        front_end = self._front_end(look, self._looks[-1].front_end_lost if self._looks else {})
-        self._looks.append(look)
-        topics = [self._topic(name, topic, before, look) for name, topic in stats["sink"]["topics"].items()]
-        receiver, transmitter = self._receiver(stats, before, look), self._transmitter(stats, before, look)
-        first = before is look
-        for kind, count in look.locked.items():
+        while len(self._snapshots) > 1 and self._snapshots[1].now <= now - self._config.window_s:
+            self._snapshots.popleft()
+        before = self._snapshots[0] if self._snapshots else snapshot
+        front_end = self._front_end(snapshot, self._snapshots[-1].front_end_lost if self._snapshots else {})
+        self._snapshots.append(snapshot)
+        topics = [self._topic(name, topic, before, snapshot) for name, topic in stats["sink"]["topics"].items()]
+        receiver, transmitter = self._receiver(stats, before, snapshot), self._transmitter(stats, before, snapshot)
+        first = before is snapshot
+        for kind, count in snapshot.locked.items():
             receiver.warn(f"packets refused: {LOCKED[kind]}", count, 0 if first else before.locked.get(kind, 0))
         unsaved = 0 if first else before.state_unsaved
-        receiver.warn("times that the state file could not be written", look.state_unsaved, unsaved)
-        receiver.warn("messages not published", look.unpublished, 0 if first else before.unpublished)
-        transmitter.warn("messages lost on the ROS graph", look.lost_on_graph, 0 if first else before.lost_on_graph)
+        receiver.warn("times that the state file could not be written", snapshot.state_unsaved, unsaved)
+        receiver.warn("messages not published", snapshot.unpublished, 0 if first else before.unpublished)
+        transmitter.warn("messages lost on the ROS graph", snapshot.lost_on_graph, 0 if first else before.lost_on_graph)
         return [receiver, transmitter, *front_end, *topics]
 
     def links(self, stats: Stats, receiver: Status) -> dict[int, Status]:
@@ -134,7 +134,7 @@ class LinkHealth:
 
         :param receiver: as :meth:`judge` has it; what troubles it troubles all links
         """
-        limits, found, now = self._config, {}, self._looks[-1].now
+        limits, found, now = self._config, {}, self._snapshots[-1].now
         far = {peer["robot"]: peer for peer in stats["peers"] if peer["hops"]}
         ages = [*stats["sink"]["silence_s"].items(), *((robot, peer["heard_s"]) for robot, peer in far.items())]
         for src_id, age in ages:
@@ -153,18 +153,18 @@ class LinkHealth:
             found[src_id] = state
         return found
 
-    def _receiver(self, stats: Stats, before: _Look, look: _Look) -> Status:
+    def _receiver(self, stats: Stats, before: _Snapshot, snapshot: _Snapshot) -> Status:
         status, limits = Status(f"{self._name}: receiver"), self._config
-        received, missing = look.received - before.received, look.missing - before.missing
+        received, missing = snapshot.received - before.received, snapshot.missing - before.missing
         if received + missing > 0:
             lost = max(missing, 0) / (received + max(missing, 0))
             status.judge("packet loss", lost, "", limits.packet_loss_warn, limits.packet_loss_error)
-        status.judge("packets received", _rate(received, before, look), "1/s", 0)
-        status.judge("packets rejected", _rate(look.rejected - before.rejected, before, look), "1/s", 0)
+        status.judge("packets received", _rate(received, before, snapshot), "1/s", 0)
+        status.judge("packets rejected", _rate(snapshot.rejected - before.rejected, before, snapshot), "1/s", 0)
         if self._heard_at is None:
             status.values["silence (s)"] = "nothing received yet"
         else:
-            silence = look.now - self._heard_at
+            silence = snapshot.now - self._heard_at
             status.judge("silence", silence, "s", limits.silence_warn_s, limits.silence_error_s)
         status.values["packets damaged"] = str(stats["packets"]["damaged"])
         status.values["frames of others"] = str(stats["packets"]["foreign"])
@@ -174,9 +174,9 @@ class LinkHealth:
             status.values["SNR (dB)"] = f"{snr:.1f}"
         return status
 
-    def _transmitter(self, stats: Stats, before: _Look, look: _Look) -> Status:
+    def _transmitter(self, stats: Stats, before: _Snapshot, snapshot: _Snapshot) -> Status:
         status = Status(f"{self._name}: transmitter")
-        rate = _rate(look.sent - before.sent, before, look)
+        rate = _rate(snapshot.sent - before.sent, before, snapshot)
         status.judge("packets sent", rate, "1/s", 0)
         status.values["airtime of a packet (s)"] = f"{stats['phy']['airtime_s']:.3g}"
         status.values["airtime used"] = f"{min(1.0, rate * stats['phy']['airtime_s']):.3g}"
@@ -207,23 +207,23 @@ class LinkHealth:
             status.values[f"{name} (sent, dropped)"] = f"{topic['sent']}, {dropped}"
         return status
 
-    def _front_end(self, look: _Look, before: Mapping[str, int]) -> list[Status]:
+    def _front_end(self, snapshot: _Snapshot, before: Mapping[str, int]) -> list[Status]:
         """The counters of the front end, with a warning of new losses. Empty if it counts nothing."""
         status = Status(f"{self._name}: front end")
-        status.values |= {name.replace("_", " "): str(count) for name, count in look.front_end_passed.items()}
-        for name, count in look.front_end_lost.items():
+        status.values |= {name.replace("_", " "): str(count) for name, count in snapshot.front_end_passed.items()}
+        for name, count in snapshot.front_end_lost.items():
             status.warn(name.replace("_", " "), count, before.get(name, 0))
         return [status] if status.values else []
 
-    def _topic(self, name: str, topic: Stats, before: _Look, look: _Look) -> Status:
+    def _topic(self, name: str, topic: Stats, before: _Snapshot, snapshot: _Snapshot) -> Status:
         status, limits = Status(f"{self._name}: {name}"), self._config
         delivered, lost = (
-            new - old for new, old in zip(look.topics[name], before.topics.get(name, (0, 0)), strict=True)
+            new - old for new, old in zip(snapshot.topics[name], before.topics.get(name, (0, 0)), strict=True)
         )
         if delivered + lost:
             share = lost / (delivered + lost)
             status.judge("messages lost", share, "", limits.message_loss_warn, limits.message_loss_error)
-        status.judge("messages", _rate(delivered, before, look), "1/s", 0)
+        status.judge("messages", _rate(delivered, before, snapshot), "1/s", 0)
         status.values["messages delivered"] = str(topic["delivered"])
         status.values |= {f"messages lost: {reason}": str(count) for reason, count in sorted(topic["lost"].items())}
         latency = topic["recent_latency_s"]
@@ -237,12 +237,12 @@ class LinkHealth:
         return status
 
 
-def _look(stats: Stats, now: float) -> _Look:
+def _snapshot(stats: Stats, now: float) -> _Snapshot:
     sink = stats["sink"]
     topics = {name: (topic["delivered"], sum(topic["lost"].values())) for name, topic in sink["topics"].items()}
     rejected = sum(sink["rejected"].values())
     lost_on_graph = sum(topic[Fate.LOST_ON_GRAPH] for topic in stats["source"]["topics"].values())
-    return _Look(
+    return _Snapshot(
         now=now,
         sent=stats["packets"]["out"],
         received=sink["packets"],
@@ -259,5 +259,5 @@ def _look(stats: Stats, now: float) -> _Look:
     )
 
 
-def _rate(count: int, before: _Look, look: _Look) -> float:
-    return count / (look.now - before.now) if look.now > before.now else 0.0
+def _rate(count: int, before: _Snapshot, snapshot: _Snapshot) -> float:
+    return count / (snapshot.now - before.now) if snapshot.now > before.now else 0.0

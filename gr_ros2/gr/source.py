@@ -70,6 +70,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     :param mcs_table: the rates of an adaptive rate (:attr:`gr_ros2.phy.Phy.mcs_table`). Each packet then is a PDU whose
         metadata names its ``mcs``
     :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
+    :ivar live: this endpoint
     :param values: the fields of :class:`gr_ros2.settings.config.SourceConfig`
     :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
     """
@@ -101,7 +102,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 lambda observer: make_endpoint(topics, self.config, None, start=start, rng=rng, observer=observer)
             )
         end.observer = self._observe
-        self._live, self._end = end, end.endpoint
+        self.live, self._end = end, end.endpoint
         self._observer = observer
         self._guard = Guard(f"observer of ros2_source {self.src_id}")
         self.clock = clock
@@ -159,7 +160,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """
         if not self._running:
             return 0.0
-        return self._live.stalled_s(now) if self._thread.alive else inf
+        return self.live.stalled_s(now) if self._thread.alive else inf
 
     def due(self, now: float) -> bool:
         """Whether a packet has to be composed by now. For an end that knows when its packets leave."""
@@ -181,7 +182,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._unread = not self._port.find_readers()
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
-        self._live.looked = self.clock()
+        self.live.looked = self.clock()
         with self._lock:
             self._running = True
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
@@ -258,7 +259,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             config = replaced(self.config, topic_options=topic_options)
             self.subscriptions.change(config.topic_options)
             self.config = config
-            self._live.wake()
+            self.live.wake()
             self._room.notify_all()
 
     def set_debug(self, debug: bool) -> None:
@@ -281,11 +282,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             since = None  # whoever waits for room in a queue wants nothing dropped
         with self._lock:
             self._end.pace.credit(max(0, packets), since)
-            self._live.wake(credited=True)
+            self.live.wake(credited=True)
 
     def _pump(self) -> None:
         while self._running:
-            self._live.looked = self.clock()
+            self.live.looked = self.clock()
             try:
                 if packets := self._compose():
                     self._emit(packets)
@@ -307,7 +308,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 self._mcs = packets[-1].mcs
                 self._room.notify_all()
             elif self._running:
-                self._live.sleep(self.clock)
+                self.live.sleep(self.clock)
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:

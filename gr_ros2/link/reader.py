@@ -90,7 +90,7 @@ class Dissection:
 
 
 @dataclass(slots=True)
-class _Start:
+class _AnnouncedStart:
     """A start of a robot that a hello announced."""
 
     hello: Hello
@@ -114,7 +114,7 @@ class Reader:
     def __init__(self, packet_len: int, keys: Sequence[bytes] = ()) -> None:
         self._packet_len = max(packet_len, MIN_PACKET_LEN)
         self._keys = Keys(keys, "encrypt") if keys else None
-        self._starts: dict[int, list[_Start]] = {}
+        self._starts: dict[int, list[_AnnouncedStart]] = {}
         self._current: dict[int, int] = {}
         """The boot number of each robot that is heard now, by its id."""
         self._tables: dict[int, Reassembly] = {}
@@ -133,7 +133,7 @@ class Reader:
             return
         starts = self._starts.setdefault(header.src_id, [])
         if all(known.hello.boot != hello.boot for known in starts):
-            starts.append(_Start(hello, trailers, _number(header, hello)))
+            starts.append(_AnnouncedStart(hello, trailers, _number(header, hello)))
         if len(starts) > _STARTS:
             del starts[0]
             self._current[header.src_id] = max(self._current.get(header.src_id, 0) - 1, 0)

@@ -22,6 +22,8 @@ STEP_S = 0.1
 """s between two computations of a level: at 2 m/s and a distance of 5 m it changes by 0.5 dB meanwhile."""
 LEAST_DB, MOST_DB = -30.0, 100.0
 """SNRs below the first are not heard and do not disturb; above the second nothing gets better."""
+_MAP_CELLS = 100
+"""Cells of a map of SNRs along each axis."""
 _SIGMAS = 4.0
 """Shadowing that makes up for a longer distance, in standard deviations. One link in 30,000 has more."""
 
@@ -141,16 +143,14 @@ class Positions(Surroundings):
         return self._one, self._other
 
 
-def snr_map(
-    channel: ScenarioChannel, world: World, origin: Floats, bandwidth: float, cells: int = 100
-) -> tuple[Floats, Floats]:
+def snr_map(channel: ScenarioChannel, world: World, origin: Floats, bandwidth: float) -> tuple[Floats, Floats]:
     """The SNR at every place of a world for a sender in one.
 
     :param origin: where the sender is, m, shape (2,)
     :param bandwidth: of the noise, Hz
-    :returns: the middles of the cells along both axes, m, and the SNRs in dB, shape (cells, cells), rows of growing y
+    :returns: the middles of the cells along both axes, m, and the SNRs in dB, shape (100, 100), rows of growing y
     """
-    middles = (np.arange(cells) + 0.5) * world.size / cells
+    middles = (np.arange(_MAP_CELLS) + 0.5) * world.size / _MAP_CELLS
     there = np.stack(np.meshgrid(middles, middles), -1).reshape(-1, 2)
     loss_db = _loss_db(channel, world, origin, there)
     if channel.shadowing_db:
@@ -158,7 +158,7 @@ def snr_map(
         one, other = field.ends(origin[None])
         loss_db = loss_db + field.between((one[0], other[0]), field.ends(there), np.hypot(*(there - origin).T))
     snr_db = snr_over_db(-loss_db, channel.tx_power_dbm, channel.noise_figure_db, bandwidth)
-    return middles, snr_db.reshape(cells, cells)
+    return middles, snr_db.reshape(_MAP_CELLS, _MAP_CELLS)
 
 
 def _loss_db(channel: ScenarioChannel, world: World | None, here: Floats, there: Floats) -> Floats:

@@ -96,7 +96,8 @@ class Publisher(ABC):
         """Number of subscriptions currently matched."""
 
     @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the graph. Idempotent."""
 
 
 class Subscription(ABC):
@@ -128,7 +129,8 @@ class Subscription(ABC):
             self._tell()
 
     @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the graph; no callback begins afterwards. Idempotent."""
 
     # For back-ends
 
@@ -188,7 +190,8 @@ class Middleware(Closing, ABC):
         return False
 
     @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the graph with all publishers and subscriptions; no callback begins afterwards. Idempotent."""
 
     def count(self, key: str, text: str, n: int = 1, level: int = logging.WARNING) -> None:
         """Add to a counter, from any thread; log the text at its first occurrence."""

@@ -70,6 +70,7 @@ class DdsError(MiddlewareError):
 
     @property
     def timeout(self) -> bool:
+        """The call did not end in the time that it was given."""
         return self.code == -10
 
     @property

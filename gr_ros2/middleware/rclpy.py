@@ -1,9 +1,8 @@
 """A ROS graph through rclpy, for users with a sourced ROS 2 (Humble or later).
 
-Invariants: this is the only module of the package that imports rclpy; it has its own context, node and executor, so a
-host application keeps its node, arguments and signal handlers; only the executor's thread destroys endpoints and runs
-callbacks, so no callback runs after ``close`` has returned; no exception of a callback or of rclpy ends that thread:
-each is counted, and the first of a kind is logged.
+Invariants: this module and ``rclpy_executor`` are the only ones of the package that import rclpy; it has its own
+context, node and executor, so a host application keeps its node, arguments and signal handlers; only the executor's
+thread destroys endpoints and runs callbacks, so no callback runs after ``close`` has returned.
 
 Adaptive subscriptions follow adapt.Adaptation; while one joins again, messages in transit may be missed, and repeated
 messages of transient-local publishers are dropped.
@@ -16,17 +15,13 @@ import contextlib
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from importlib import import_module
 from typing import Any
 
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle, NameValidationException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
@@ -35,7 +30,6 @@ from rclpy.serialization import deserialize_message, serialize_message
 from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.middleware.adapt import Adaptation, Replays, compatible
 from gr_ros2.middleware.base import (
-    JOIN_S,
     MessageCallback,
     Publisher,
     Qos,
@@ -44,6 +38,7 @@ from gr_ros2.middleware.base import (
     finite,
 )
 from gr_ros2.middleware.rcl import node_of, ros_localhost_only, translated
+from gr_ros2.middleware.rclpy_executor import RclpyExecutor
 from gr_ros2.middleware.rclpy_services import RclpyClient, RclpyParticipant, RclpyServer
 from gr_ros2.middleware.ros_graph import check_node, check_topic, resolve_domain_id
 from gr_ros2.middleware.services import (
@@ -63,9 +58,6 @@ except ImportError:  # Humble
     from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks, UnsupportedEventTypeError
 
 _log = logging.getLogger(__name__)
-
-ADAPT_PERIOD_S = 0.1
-"""How often adaptive subscriptions look for publishers; rclpy has no callback for changes of the graph."""
 
 ENCAPSULATION = 4
 """Bytes of the encapsulation header of a serialized message."""
@@ -180,26 +172,12 @@ class RclpyMiddleware(RclpyParticipant):
         except (RuntimeError, NameValidationException) as error:
             self._context.try_shutdown()
             raise MiddlewareError(f"rclpy cannot start a node on domain {domain_id}: {error}") from error
-        self._lock = threading.Lock()
-        self._open = True  # guarded by _lock: the node and its guard condition exist
-        self._work: deque[tuple[Callable[[], None], threading.Event]] = deque()
         self._subscriptions: list[_RclpySubscription] = []
         self._clients: list[RclpyClient] = []
         self._shown: dict[str, tuple[Any, list[Any]]] = {}
         """Nodes of other robots that are shown here, and the services of each."""
         self._showing = threading.Lock()
-        self._closing = threading.Event()
-        self._failed = False
-        # Reentrant; otherwise an error of rclpy while it takes a message would block the whole group permanently.
-        self._group = ReentrantCallbackGroup()
-        self._wake = self._node.create_guard_condition(self._tend, callback_group=self._group)
-        # Steady, so that a paused simulation clock does not stop it.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._node.create_timer(ADAPT_PERIOD_S, self._tend, callback_group=self._group, clock=steady)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._thread = threading.Thread(target=self._spin, name="gr_ros2-rclpy", daemon=True)
-        self._thread.start()
+        self._executor = RclpyExecutor(self._context, self._node, tend=self._tend, leave=self._leave, count=self.count)
         atexit.register(self.close)  # a daemon thread inside rcl must not outlive the interpreter
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
@@ -284,20 +262,19 @@ class RclpyMiddleware(RclpyParticipant):
     def close(self) -> None:
         """Leave the graph; waits ``JOIN_S`` for a callback that is running, unless called from it."""
         atexit.unregister(self.close)
-        self._closing.set()
-        self._trigger()
-        self.wait_for_thread(self._thread)
+        self._executor.close()
+        self.wait_for_thread(self._executor.thread)
 
     # For our endpoints
 
     @property
     def closing(self) -> bool:
         """Whether the middleware is closing; no callback starts then."""
-        return self._closing.is_set()
+        return self._executor.closing
 
     def check_open(self) -> None:
         """:raises MiddlewareError: closed, or its context was shut down from outside"""
-        if not self._open or self._closing.is_set():
+        if not self._executor.open:
             raise MiddlewareError("rclpy: the middleware is closed")
 
     def publishers_of(self, topic: str, type_name: str) -> dict[bytes, Qos]:
@@ -318,7 +295,7 @@ class RclpyMiddleware(RclpyParticipant):
         while True:
             supported = events(use_default_callbacks=False, **{name: handlers[name] for name in names})
             try:
-                return make(event_callbacks=supported, callback_group=self._group, **arguments)
+                return make(event_callbacks=supported, callback_group=self._executor.group, **arguments)
             except UnsupportedEventTypeError:
                 if not names:
                     raise
@@ -336,7 +313,11 @@ class RclpyMiddleware(RclpyParticipant):
                 owner = self._shown_node(node) if node else self._node
                 make = getattr(owner, f"create_{kind}")
                 endpoint = make(
-                    service_type, name, *callback, qos_profile=_to_profile(SERVICE_QOS), callback_group=self._group
+                    service_type,
+                    name,
+                    *callback,
+                    qos_profile=_to_profile(SERVICE_QOS),
+                    callback_group=self._executor.group,
                 )
             except (RuntimeError, NameValidationException) as error:
                 raise MiddlewareError(f"{kind} of {name} failed: {error}") from error
@@ -360,21 +341,14 @@ class RclpyMiddleware(RclpyParticipant):
                     endpoints.remove(endpoint)
                     if not endpoints:
                         del self._shown[name]
-                        self._executor.remove_node(node)
+                        self._executor.remove(node)
                         node.destroy_node()
                     return
             getattr(self._node, f"destroy_{kind}")(endpoint)
 
     def in_executor(self, work: Callable[[], None]) -> None:
-        """Run work in the executor's thread, and wait at most ``JOIN_S``; does nothing after ``close``, when everything
-        is destroyed."""
-        if threading.current_thread() is self._thread:
-            work()
-            return
-        done = threading.Event()
-        self._work.append((work, done))
-        if self._trigger():
-            done.wait(JOIN_S)
+        """See :meth:`RclpyExecutor.run`."""
+        self._executor.run(work)
 
     def forget(self, subscription: _RclpySubscription) -> None:
         """Stop adapting a subscription."""
@@ -397,16 +371,9 @@ class RclpyMiddleware(RclpyParticipant):
                 start_parameter_services=False,
                 parameter_overrides=[Parameter("start_type_description_service", value=False)],
             )
-            self._executor.add_node(node)
+            self._executor.add(node)
             self._shown[name] = (node, [])
         return self._shown[name][0]
-
-    def _trigger(self) -> bool:
-        """Wake the executor; False when it has ended."""
-        with self._lock:
-            if self._open:
-                self._wake.trigger()
-            return self._open
 
     def _foreign(self, infos: Iterable[Any], topic: str, own_endpoints: Iterable[Any]) -> list[Any]:
         """The endpoints of other nodes. Another node may have the same name; so from the endpoints with this node's
@@ -423,15 +390,8 @@ class RclpyMiddleware(RclpyParticipant):
                     break
         return others
 
-    def _tend(self) -> None:
-        """In the executor's thread: run queued work, then adapt subscriptions."""
-        while self._work:
-            work, done = self._work.popleft()
-            try:
-                work()
-            finally:
-                done.set()
-        failed, self._failed = self._failed, False
+    def _tend(self, failed: bool) -> None:
+        """In the executor's thread: adapt subscriptions, and join again those that may have failed."""
         for subscription in tuple(self._subscriptions):
             if failed:
                 subscription.revive()
@@ -439,32 +399,12 @@ class RclpyMiddleware(RclpyParticipant):
         for client in tuple(self._clients):
             client.look()
 
-    def _spin(self) -> None:
-        try:
-            while not self._closing.is_set():
-                try:
-                    self._executor.spin_once()
-                except ExternalShutdownException:
-                    _log.warning("rclpy: the context was shut down from outside; the middleware closes")
-                    break
-                except Exception as error:  # noqa: BLE001 - the thread must live on
-                    self.count("executor_failed", f"rclpy failed in the executor: {type(error).__name__}: {error}")
-                    _log.debug("in the executor", exc_info=True)
-                    self._failed = True
-                    self._closing.wait(0.01)  # a lasting error must not use the whole core
-        finally:
-            self._tear_down()
-
-    def _tear_down(self) -> None:
-        with self._lock:
-            self._open = False
-        self._executor.shutdown()
+    def _leave(self) -> None:
+        """In the executor's thread, at its end."""
         for node, _ in self._shown.values():
             node.destroy_node()
         self._node.destroy_node()
         self._context.try_shutdown()
-        while self._work:
-            self._work.popleft()[1].set()
 
 
 class _RclpySubscription(Subscription):

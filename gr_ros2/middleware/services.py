@@ -55,7 +55,8 @@ class ServiceServer(ABC):
         """
 
     @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the graph. Idempotent."""
 
 
 class ServiceClient(ABC):
@@ -69,7 +70,8 @@ class ServiceClient(ABC):
         """
 
     @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the graph. Idempotent."""
 
 
 class ServiceGraph(Middleware):

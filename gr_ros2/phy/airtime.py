@@ -27,7 +27,6 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same
-    :param lead: s before the channel is free at which a credit is given at the earliest
     :param ahead: s before the begin of its airtime at which a packet passes, see :class:`AirtimeClock`
     :param limit: what limits the airtime, see :class:`AirtimeClock`; None = nothing
     :param timed, listens, ready: see :class:`AirtimeClock`
@@ -44,7 +43,6 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         airtime: float,
         *,
         airtime_of: Callable[[int, int], float] | None = None,
-        lead: float = LEAD_S,
         ahead: float | None = None,
         limit: AirtimeLimit | None = None,
         timed: bool = False,
@@ -57,7 +55,7 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         super().__init__("gr-ros2-airtime", "gr_ros2_airtime_gate", None, None)
         self._airtime_of = airtime_of
         self._clock: AirtimeClock[Any] = AirtimeClock(
-            airtime, lead, ahead, limit, measured=True, timed=timed, listens=listens, ready=ready
+            airtime, LEAD_S, ahead, limit, measured=True, timed=timed, listens=listens, ready=ready
         )
         self._admits = admits
         self._now = clock

@@ -88,7 +88,8 @@ class Network(ABC):
         """Create a subscription."""
 
     @abstractmethod
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the network with all publishers and subscriptions."""
 
 
 class DdsNetwork(Network):

@@ -30,6 +30,7 @@ from gr_ros2.phy.pdus import PDUS, packets_of, pdu_of
 from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
 from gr_ros2.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2.race.namespaces import inside
+from gr_ros2.race.race_settings import PHY_NAME
 from gr_ros2.race.tun import Tun, loopback_up, own_air
 from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry
@@ -47,19 +48,18 @@ _SHORT_FRAME = 100
 
 @dataclass(frozen=True)
 class RaceRadio:
-    """The radio of all contenders: a PHY at a sample rate, and the share of its frames that are lost.
+    """The radio of all contenders: their PHY at a sample rate, and the share of its frames that are lost.
 
     :param seed: seed of the losses; each direction has its own losses
     """
 
-    phy: str
     sample_rate: float
     packet_loss: float
     seed: int
 
     def with_frames_of(self, length: int) -> Phy:
         """The PHY for frames of at most ``length`` bytes."""
-        phy: Phy = PHY.load(self.phy)(length, self.sample_rate)
+        phy: Phy = PHY.load(PHY_NAME)(length, self.sample_rate)
         return phy
 
     @cached_property

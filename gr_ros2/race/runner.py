@@ -24,7 +24,6 @@ from gr_ros2.race.namespaces import Namespace, check_means
 from gr_ros2.race.race_settings import (
     DRAIN_S,
     MATCH_S,
-    PHY_NAME,
     Condition,
     RaceRecording,
     RaceSettings,
@@ -99,7 +98,7 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
 def _run_cell(settings: RaceSettings, sender: RaceSender, condition: Condition, contender: Contender) -> Observed:
     """One robot sends to another one; each direction has its own air."""
     recording = sender.recording
-    radio = RaceRadio(PHY_NAME, condition.sample_rate, condition.loss, settings.seed)
+    radio = RaceRadio(condition.sample_rate, condition.loss, settings.seed)
     with ExitStack() as stack:
         spaces = (stack.enter_context(Namespace()), stack.enter_context(Namespace()))
         paths = (spaces[0].path, spaces[1].path)
@@ -130,7 +129,7 @@ def _run_team(
     settings: RaceSettings, senders: Sequence[RaceSender], condition: Condition, contender: Contender
 ) -> Observed:
     """All robots send to all others over IP on one channel."""
-    radio = RaceRadio(PHY_NAME, condition.sample_rate, condition.loss, settings.seed)
+    radio = RaceRadio(condition.sample_rate, condition.loss, settings.seed)
     count = len(senders)
     topics = [
         RaceTopic(f"/robot_{number}/race", sender.recording.type_name) for number, sender in enumerate(senders, 1)

@@ -97,6 +97,10 @@ class FileFrontEnd(FrontEnd):
         not_finite = {} if self._replay is None else {"not_finite": self._replay.not_finite}
         return FrontEndCounters({}, {**unwritten, **not_finite})
 
+    def drain(self, packets: int) -> None:
+        if self._recorder is not None:
+            self._recorder.wait_for_bursts(packets)
+
     def close(self) -> None:
         if self._recorder is not None:
             self._recorder.close()

@@ -206,5 +206,11 @@ class FrontEnd(ABC):
         """What passed and what was lost here."""
         return FrontEndCounters({}, {})
 
+    def drain(self, packets: int) -> None:  # noqa: B027 - a radio that is stopped is silent at once
+        """Wait until all packets that have passed to it are where they have to be; the flowgraph stops next.
+
+        :param packets: their number
+        """
+
     def close(self) -> None:  # noqa: B027 - most have nothing to release
         """Release device, sockets and files. The flowgraph must have stopped."""

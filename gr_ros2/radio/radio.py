@@ -148,6 +148,11 @@ class Radio(PacketPath, HierBlock):
         self.front_end.close()
         self.closing.close()
 
+    def drain(self) -> None:
+        """Wait for what GNU Radio still holds of the packets sent, where a front end keeps them. Call this before the
+        flowgraph stops."""
+        self.front_end.drain(self.gate.passed - self.refused)
+
     def transmit(self, *, on: bool) -> None:
         """Switch sending off, at once for all packets that have not reached the device, or on again.
 

@@ -230,6 +230,8 @@ class RobotLink(Flowgraph):
 
     def stop(self) -> None:
         """Stop, leave the ROS graph and close the front end. Idempotent. A stopped link cannot start again."""
+        if self._running:
+            self.radio.drain()
         self._retry_at = inf
         super().stop()
         # A device is released with its blocks. The flowgraph would keep them as long as it exists itself.

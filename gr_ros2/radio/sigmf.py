@@ -8,6 +8,7 @@ the recording.
 from __future__ import annotations
 
 import json
+import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
@@ -144,7 +145,8 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._about = about
         self._bursts = bursts
         self._began = datetime.now(timezone.utc)
-        self._came = self._written = 0
+        self._came = self._written = self._cut = 0
+        self._changed = threading.Condition()
         self._refused = self._unwritten = 0
         self._guard = Guard(f"recording {self._data}")
         try:
@@ -178,7 +180,17 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         bursts, taken = self._bursts.cut(self, samples)
         for burst in bursts:
             self._record(burst.samples)
+        with self._changed:
+            self._cut += len(bursts)
+            self._changed.notify_all()
         return taken
+
+    def wait_for_bursts(self, number: int) -> None:
+        """Wait until so many bursts have come, in a flowgraph that runs; no longer once none comes for a while."""
+        with self._changed:
+            while self._cut < number:
+                if not self._changed.wait(_PATIENCE_S):
+                    return
 
     def _record(self, samples: NDArray[np.complex64]) -> None:
         data = samples.astype(SAMPLE, copy=False).tobytes()

@@ -63,7 +63,7 @@ def foreign(published: Iterable[str], outputs: Iterable[str]) -> str | None:
     )
 
 
-class Findings:
+class NewFindings:
     """Tells what a person should know about a link, each line once.
 
     :param look: returns all lines that are true now

@@ -28,7 +28,7 @@ from gr_ros2.core.systemd import notify
 from gr_ros2.radio.config import load_link
 from gr_ros2.radio.live_settings import LiveSettings
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.radio.waiting import Findings, Waiting
+from gr_ros2.radio.waiting import NewFindings, Waiting
 from gr_ros2.ros.parameters import Parameter, overrides, parameters
 
 CONFIG = "config"
@@ -172,7 +172,7 @@ def main(args: Sequence[str] | None = None) -> None:
         node.get_logger().info(f"robot {node.link.source.src_id} on {node.link.front_end.name}, {phy.name}{runs_on}")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        waiting, findings = Waiting(node.link.source), Findings(node.link.findings)
+        waiting, findings = Waiting(node.link.source), NewFindings(node.link.findings)
         notify("READY=1")
         while not (asked or node.link.finished):
             executor.spin_once(timeout_sec=_LOOK_S)

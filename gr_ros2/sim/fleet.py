@@ -109,11 +109,6 @@ class Fleet:
         """Drive now for up to so many s of simulated time; see :class:`gr_ros2.sim.publisher.Robots`."""
         self.state(1, min(duration_s, _DRIVEN_S))
 
-    def true_pose(self, robot_id: int, t: float) -> tuple[float, float, float]:
-        """x and y, m, and heading, rad (not wrapped), in the map frame."""
-        state = self.state(robot_id, t)
-        return state.x, state.y, state.heading
-
     def at(self, now: float, robot_ids: Sequence[int]) -> tuple[Floats, Floats]:
         """Places in m and velocities in m/s of robots at simulated time ``now``, each of shape (robots, 2)."""
         return places_and_velocities(self.state(robot_id, now) for robot_id in robot_ids)

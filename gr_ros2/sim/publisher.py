@@ -30,23 +30,39 @@ class Playable(Protocol):
     """A message for a graph. ``payload`` is asked for at ``t``, so it may depend on what came before."""
 
     @property
-    def t(self) -> float: ...
+    def t(self) -> float:
+        """When it is due, s after the start."""
+
     @property
-    def topic(self) -> str: ...
+    def topic(self) -> str:
+        """Absolute name."""
+
     @property
-    def payload(self) -> bytes: ...
+    def payload(self) -> bytes:
+        """Serialized."""
 
 
 class Robots(Protocol):
     """Who publishes: :class:`gr_ros2.sim.fleet.Fleet`, or the robots of a task."""
 
     @property
-    def settings(self) -> SimSettings: ...
+    def settings(self) -> SimSettings:
+        """Of all robots."""
+
     @property
-    def robot_ids(self) -> Sequence[int]: ...
-    def namespace(self, robot_id: int) -> str: ...
-    def topics(self) -> Mapping[str, str]: ...
-    def messages(self, duration_s: float, start_time_s: float | None = None) -> Iterator[Playable]: ...
+    def robot_ids(self) -> Sequence[int]:
+        """From 1 on."""
+
+    def namespace(self, robot_id: int) -> str:
+        """Of a robot's topics, absolute."""
+
+    def topics(self) -> Mapping[str, str]:
+        """Types of all topics, by absolute name."""
+
+    def messages(self, duration_s: float, start_time_s: float | None = None) -> Iterator[Playable]:
+        """All messages with 0 <= t < duration_s, in time order; their stamps are ``start_time_s`` + t, None takes that
+        of the settings."""
+
     def drive_ahead(self, duration_s: float) -> None:
         """Plan what does not depend on what robots hear, so that planning takes no time from the links later: with a
         third of the processor time that the demo needs, its messages were published .4 to 2.5 s late, and are .1 s late

@@ -56,7 +56,7 @@ class Sensors:
         self._prefix = settings.frame_prefix(robot_id)
         # One generator per topic. The 2 separates their seeds from those of world and routes, which have 0 and 1.
         self._rng = {name: np.random.default_rng([settings.seed, 2, robot_id, i]) for i, name in enumerate(ALL_TYPES)}
-        self._believed = (start.x, start.y, start.heading)
+        self._odom_pose = (start.x, start.y, start.heading)
         self._odom_t = 0.0
         rng = self._rng["imu"]
         self._gyro_bias = rng.normal(0.0, settings.imu_gyro_noise / 5, 3)
@@ -82,7 +82,7 @@ class Sensors:
 
     def localize(self, t: float, state: State) -> None:
         """Let the odometry go on from the true place, which it drifts away from otherwise."""
-        self._believed, self._odom_t = (state.x, state.y, state.heading), t
+        self._odom_pose, self._odom_t = (state.x, state.y, state.heading), t
 
     def _time(self, t: float) -> Any:
         ns = self._start_ns + round(t * 1e9)
@@ -116,10 +116,10 @@ class Sensors:
         speed = state.speed + settings.odom_linear_noise * speed_noise
         turn = state.turn + settings.odom_angular_noise * turn_noise
         dt, self._odom_t = t - self._odom_t, t
-        x, y, heading = self._believed
+        x, y, heading = self._odom_pose
         middle = heading + 0.5 * turn * dt
         x, y, heading = x + speed * dt * math.cos(middle), y + speed * dt * math.sin(middle), heading + turn * dt
-        self._believed = (x, y, heading)
+        self._odom_pose = (x, y, heading)
         pose = _POSE(position=_POINT(x=x, y=y, z=0.0), orientation=_quaternion(0.0, 0.0, heading))
         return _TYPE["nav_msgs/msg/Odometry"](
             header=self._header(t, "odom"),

@@ -30,8 +30,9 @@ from gr_ros2.wire.format import (
     Format,
     Packet,
     Span,
+    unwrap,
+    varint,
 )
-from gr_ros2.wire.numbers import unwrap
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v0 import V0
 from gr_ros2.wire.v1 import V1, is_sealed
@@ -62,6 +63,7 @@ __all__ = [
     "format_of",
     "is_sealed",
     "unwrap",
+    "varint",
 ]
 
 FORMATS: Mapping[int, Format] = {V0.version: V0, V1.version: V1}

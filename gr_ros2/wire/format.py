@@ -1,4 +1,4 @@
-"""The interface of every version of the wire format, and the constants that all of them share.
+"""The interface of every version of the wire format, and what all of them share: constants, counters that wrap around.
 
 Invariants: a format object has no state; sizes are in bytes; a size that a scheduler asks for is exact or too small,
 never too large.
@@ -141,3 +141,28 @@ class Format(Protocol):
 
         :raises WireError: they are not a packet of this version
         """
+
+
+def unwrap(low: int, least: int, bits: int) -> int:
+    """The smallest number, not below ``least``, with the lowest bits that the wire carries.
+
+    A counter may be up to ``n`` behind the newest number seen; then ``least = newest - n``. Numbers up to
+    ``2**bits - 1 - n`` ahead of the newest are then told apart from numbers behind it.
+
+    :param low: as received, 0..2**bits - 1
+    :param bits: width on the wire
+    :return: ``least`` .. ``least + 2**bits - 1``
+    """
+    return least + (low - least & (1 << bits) - 1)
+
+
+def varint(value: int) -> bytes:
+    """Seven bits per byte, the lowest first; the top bit says that more bytes follow."""
+    if value < 128:
+        return bytes((value,))
+    parts = bytearray()
+    while value > 127:
+        parts.append(value & 127 | 128)
+        value >>= 7
+    parts.append(value)
+    return bytes(parts)

@@ -30,7 +30,7 @@ from gr_ros2.core.errors import (
     WindowError,
 )
 from gr_ros2.wire.control import Control, Hello, read_control, write_control
-from gr_ros2.wire.format import Span
+from gr_ros2.wire.format import Span, varint
 from gr_ros2.wire.mac_block import MOST_LEN, block_len
 
 VERSION = 1
@@ -371,7 +371,7 @@ def _write_part(part: Part, room: int) -> bytes:
         raise EncodeError(f"a fragment {back} packets and {offset} bytes after the begin of its message, {size} long")
     if kind and not size:
         raise EncodeError("a fragment has at least one byte")
-    place = _varint(back) + _varint(offset) if offset else b""
+    place = varint(back) + varint(offset) if offset else b""
     flags = kind << 6 | coded * _CODED
     if 2 + len(place) + size == room:
         return bytes((topic_id + 1, flags | _FILL)) + place + payload
@@ -380,18 +380,6 @@ def _write_part(part: Part, room: int) -> bytes:
     if size > 0xFFF:
         raise EncodeError(f"an entry of {size} bytes")
     return bytes((topic_id + 1, flags | size >> 8, size & 255)) + place + payload
-
-
-def _varint(value: int) -> bytes:
-    """Seven bits per byte, the lowest first; the top bit says that more bytes follow."""
-    if value < 128:
-        return bytes((value,))
-    parts = bytearray()
-    while value > 127:
-        parts.append(value & 127 | 128)
-        value >>= 7
-    parts.append(value)
-    return bytes(parts)
 
 
 def _varint_len(value: int) -> int:

@@ -14,9 +14,10 @@ from gr_ros2.compression import LinkCodec
 from gr_ros2.compression.dictionary import OWN
 from gr_ros2.compression.link_codec import ANNOUNCED, FIELDS, FIELDS_AND_MORE, MAX_LEARNED, STORED, ZSTD
 from gr_ros2.compression.train import learn
-from gr_ros2.compression.zstd_frames import Zstd, varint
+from gr_ros2.compression.zstd_frames import Zstd
 from gr_ros2.core.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
 from gr_ros2.settings.registry import Registry
+from gr_ros2.wire import varint
 from tests.compression.support import STORE, Writer, codec_for, simulated
 
 ODOMETRY = "nav_msgs/msg/Odometry"

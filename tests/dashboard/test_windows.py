@@ -12,17 +12,17 @@ from gr_ros2.record.metrics import age
 
 
 def test_a_rate_forgets_what_is_older_than_its_window() -> None:
-    rate = Rate(5.0)
+    rate = Rate()
     for step in range(100):
         rate.add(step / 10, size=3)
     assert rate.totals(9.99) == (50, 150)
     assert rate.totals(12.49) == (25, 75)
     assert rate.totals(100.0) == (0, 0)
-    assert Rate(5.0).totals(1.0) == (0, 0)
+    assert Rate().totals(1.0) == (0, 0)
 
 
 def test_a_rate_takes_what_comes_a_little_late() -> None:
-    rate = Rate(1.0)
+    rate = Rate()
     rate.add(10.0)
     rate.add(9.9)
     assert rate.totals(10.0) == (2, 0)

@@ -169,11 +169,11 @@ def test_one_that_hangs_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None
     bad, good = RecordingObserver(gate.wait), RecordingObserver()
     try:
         result = run_scenario(scenario(1.0), observers=[bad, good]).result
+        assert bad.heard == 0, "the whole run has gone by while it hung"
     finally:
         gate.set()
     check_complete(result)
     assert result.topics[0].latency_s.p50 is not None
-    assert result.topics[0].latency_s.p50 < 1
     (line,) = result.incomplete
     assert line.startswith("observer: ended (it has not come back for 0.2 s); ")
     assert int(line.split("; ")[1].split()[0]) >= good.heard

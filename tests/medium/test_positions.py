@@ -221,8 +221,8 @@ def test_a_report_has_the_map_and_a_plan_the_range() -> None:
     result = run_scenario(scenario).result
     figure = map_of(result)
     assert figure is not None
-    middles, snr_db = snr_map(scenario.channel, Fleet.of(scenario.sim).world, np.array([20.0, 20.0]), 2e5, 50)
-    place = np.array([middles[40], middles[10]])
+    middles, snr_db = snr_map(scenario.channel, Fleet.of(scenario.sim).world, np.array([20.0, 20.0]), 2e5)
+    place = np.array([middles[80], middles[20]])
     paths = [[Way(1, scenario.channel)], [Way(0, scenario.channel)]]
     places = np.array([[20.0, 20.0], place])
     there = Positions(
@@ -234,7 +234,7 @@ def test_a_report_has_the_map_and_a_plan_the_range() -> None:
         paths=paths,
         world=Fleet.of(scenario.sim).world,
     )
-    assert snr_db[10, 40] == pytest.approx(there.hearers(0, 0.0).snr_db[0], abs=0.01)
+    assert snr_db[20, 80] == pytest.approx(there.hearers(0, 0.0).snr_db[0], abs=0.01)
     assert map_of(run_scenario(load_scenario("two-robots-half-duplex", ["duration_s=0.5"])).result) is None
     one_way = load_scenario("paper-ofdm-paced", ["channel={from: positions, tx_power_dbm: -20}", "time=packets"])
     half_m, most_m = (Planner(replace(one_way, duration_s=1.0)).range_m(pdr) for pdr in (0.5, 0.95))

@@ -374,8 +374,8 @@ def test_context_shut_down_from_outside_ends_in_errors_not_in_a_hang(start: Star
     subscription = one.subscribe("/chatter", STRING, RELIABLE, print)
     publisher = one.advertise("/chatter", STRING, RELIABLE)
     one._context.shutdown()  # as rclpy's handler of SIGINT in a host does to every context
-    one._thread.join(PATIENCE_S)
-    assert not one._thread.is_alive()
+    one._executor.thread.join(PATIENCE_S)
+    assert not one._executor.thread.is_alive()
     with pytest.raises(MiddlewareError, match="the middleware is closed"):
         one.advertise("/chatter", STRING, RELIABLE)
     with pytest.raises(MiddlewareError, match="the middleware is closed"):
@@ -403,8 +403,8 @@ def test_close_does_not_wait_for_a_callback_that_never_returns(start: Start) -> 
     assert not release.is_set()
     entered.clear()
     release.set()
-    one._thread.join(PATIENCE_S)
-    assert not one._thread.is_alive()
+    one._executor.thread.join(PATIENCE_S)
+    assert not one._executor.thread.is_alive()
     assert not entered.is_set(), "a callback began after close"
 
 

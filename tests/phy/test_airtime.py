@@ -113,7 +113,7 @@ def test_it_stops_with_packets_on_the_air(top: Flowgraph) -> None:
     assert probe.handled == 0
 
 
-@pytest.mark.parametrize("settings", [{"airtime": -1.0}, {"airtime": 1.0, "lead": -1}])
+@pytest.mark.parametrize("settings", [{"airtime": -1.0}, {"airtime": 1.0, "ahead": -1.0}])
 def test_senseless_settings_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         AirtimeGate(**settings)

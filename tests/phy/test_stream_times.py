@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -69,16 +68,19 @@ def test_a_burst_at_a_known_sample_is_received_with_its_time(
 def test_a_packet_that_asks_for_a_time_is_received_with_it() -> None:
     """Through the gate, the transmitter and the receiver; the samples themselves take no time."""
     phy, probe, top = PHY.load("ofdm")(64, RATE), Probe(), Flowgraph("test", "test")
-    gate, transmitter, receiver = AirtimeGate(phy.airtime()), phy.transmitter(), phy.receiver()
+    now = 1000.0
+    gate = AirtimeGate(phy.airtime(), clock=lambda: now)
+    transmitter, receiver = phy.transmitter(), phy.receiver()
     top.connect(transmitter, receiver)
     top.msg_connect(probe, "pdus", gate, "pdus")
     top.msg_connect(gate, "pdus", transmitter, "pdus")
     top.msg_connect(receiver, "pdus", probe, "pdus")
     with top:
-        first = time.monotonic() + 0.1
-        asked = [first + number * 0.025 for number in range(4)]
+        asked = [now + 0.1 + number * 0.025 for number in range(4)]
         for number, at in enumerate(asked):
             probe.post_message(pdu_to_send(AirPacket(bytes([number]) * 60, leave_at=at)))
+        wait_for(lambda: gate.arrived == len(asked), "the gate to know of every packet")
+        now = 1001.0  # not before: a packet that comes late leaves late
         wait_for(lambda: len(heard(probe.messages)) == len(asked), "every packet")
     got = heard(probe.messages)
     assert [packet.at for packet in got] == pytest.approx(asked, abs=2 / RATE)

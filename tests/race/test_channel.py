@@ -20,7 +20,7 @@ pytestmark = needs_namespaces
 HEADERS = 28
 """Bytes of IP and UDP."""
 GROUP, PORT = "239.1.2.3", 5000
-RADIO = RaceRadio("ofdm", 2e5, 0.0, 0)
+RADIO = RaceRadio(2e5, 0.0, 0)
 ROBOTS = 3
 
 
@@ -79,7 +79,7 @@ def test_robots_are_served_in_turn_one_after_the_other_from_bounded_queues(
     assert min(gaps) >= RADIO.airtime_s(size + HEADERS) * 0.999
 
 
-@pytest.mark.parametrize("joined", [RaceRadio("ofdm", 1e8, 0.5, 1)], indirect=True)
+@pytest.mark.parametrize("joined", [RaceRadio(1e8, 0.5, 1)], indirect=True)
 def test_each_receiver_loses_by_itself(joined: tuple[RaceChannel, list[socket.socket]]) -> None:
     air, (one, *others) = joined
     sent = 100

@@ -19,7 +19,7 @@ pytestmark = needs_namespaces
 HEADERS = 28
 """Bytes of IP and UDP."""
 PORT = 5000
-RADIO = RaceRadio("ofdm", 2e5, 0.0, 0)
+RADIO = RaceRadio(2e5, 0.0, 0)
 
 
 def udp(namespace: Namespace, address: str) -> socket.socket:

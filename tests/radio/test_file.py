@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ from gnuradio import blocks, gr
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.radio.bursts import BurstCutter
+from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from tests.radio.robots import RATE, Robot, config
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 
 def sent_recording(path: Path, phy: str = "psk", count: int = 10) -> list[bytes]:
@@ -65,6 +67,30 @@ def test_what_was_sent_is_received_again(tmp_path: Path, phy: str) -> None:
         assert (
             robot.link.stats()["uptime_s"] > metadata(tmp_path / "sent")["annotations"][-1]["core:sample_start"] / RATE
         )
+
+
+def test_a_link_that_is_stopped_at_once_has_recorded_what_has_passed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recorder gets nothing before the link stops: until then GNU Radio holds all samples."""
+    stopping, work, drain = threading.Event(), SigmfRecorder.work, Radio.drain
+
+    def held(recorder: SigmfRecorder, inputs: list[Any], outputs: list[Any]) -> int:
+        stopping.wait(PATIENCE_S)
+        return work(recorder, inputs, outputs)
+
+    def released(radio: Radio) -> None:
+        stopping.set()
+        drain(radio)
+
+    monkeypatch.setattr(SigmfRecorder, "work", held)
+    monkeypatch.setattr(Radio, "drain", released)
+    with Robot(1, {"name": "file", "write": str(tmp_path / "sent")}) as robot:
+        robot.say(*range(10))
+        wait_for(lambda: robot.silent, "all to pass")
+        samples = robot.link.stats()["packets"]["out"] * robot.link.phy.airtime_samples()
+    assert samples > 0
+    assert len(read_recording(tmp_path / "sent")[1]) == samples
 
 
 def test_a_recording_is_sigmf(tmp_path: Path) -> None:

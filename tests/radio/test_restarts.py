@@ -5,6 +5,7 @@ Both robots publish numbered messages all the time; a start continues the number
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,10 +59,15 @@ class Pair:
         took = []
         for number, robot in self.robots.items():
             newest = APART * self._starts[3 - number]
-            wait_for(lambda: any(h.number >= newest for h in robot.heard), f"robot {number} to hear")  # noqa: B023
+            wait_for(partial(self._hears, number, newest), f"robot {number} to hear")
             at = next(place for place, heard in enumerate(robot.heard) if heard.number >= newest)
             took.append(robot.heard[at].packets - (robot.heard[at - 1].packets if at else 0))
         return max(took)
+
+    def _hears(self, number: int, newest: int) -> bool:
+        """Whether a robot has heard a start of the other; both have to be alive."""
+        assert [robot for robot, process in self.robots.items() if not process.alive] == []
+        return any(heard.number >= newest for heard in self.robots[number].heard)
 
     def check(self) -> None:
         """Nothing twice, nothing out of order, through all starts."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -36,14 +37,36 @@ def front_end(folder: Path, number: int) -> dict[str, Any]:
     return {"name": "zmq", "medium_process": "lockstep", **addresses}
 
 
+class Still:
+    """A clock that stands still within its block: what a test does there, it does at one time, however slow it is."""
+
+    def __init__(self) -> None:
+        self._lock, self._stood_s = threading.Lock(), 0.0
+
+    def now(self) -> float:
+        """s; waits for the end of a block."""
+        with self._lock:
+            return time.monotonic() - self._stood_s
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+        self._began = time.monotonic()
+
+    def __exit__(self, *_: object) -> None:
+        self._stood_s += time.monotonic() - self._began
+        self._lock.release()
+
+
 @contextmanager
-def air(folder: Path, robots: int, **settings: Any) -> Iterator[MediumProcess]:
+def air(
+    folder: Path, robots: int, clock: Callable[[], float] = time.monotonic, **settings: Any
+) -> Iterator[MediumProcess]:
     """A medium in lock step, in a thread."""
     addresses = [
         {"connect": f"ipc://{folder}/robot{n}", "bind": f"ipc://{folder}/medium{n}"} for n in range(1, robots + 1)
     ]
     values = {"phy": PHY, "packet_len": PACKET_LEN, "robots": addresses, "channel": {"snr_db": 20.0}, **settings}
-    process = MediumProcess(build(MediumConfig, values))
+    process = MediumProcess(build(MediumConfig, values), clock)
     over = threading.Event()
     thread = threading.Thread(target=process.run, kwargs={"over": over}, daemon=True)
     thread.start()
@@ -56,8 +79,10 @@ def air(folder: Path, robots: int, **settings: Any) -> Iterator[MediumProcess]:
 
 
 def heard(folder: Path, medium: str, robots: int = 2) -> tuple[list[int], MediumProcess]:
-    """How many of ``SAID`` messages of each robot came out at each other one."""
-    with air(folder, robots) as process, ExitStack() as stack:
+    """How many of ``SAID`` messages of each robot came out at each other one; all say theirs at the same time, and
+    nothing is repaired."""
+    still = Still()
+    with air(folder, robots, still.now) as process, ExitStack() as stack:
         numbers = range(1, robots + 1)
         graphs = [
             stack.enter_context(
@@ -69,6 +94,7 @@ def heard(folder: Path, medium: str, robots: int = 2) -> tuple[list[int], Medium
                     medium=medium,
                     phy=PHY,
                     packet_len=PACKET_LEN,
+                    ros_source={"repair": "off"},
                 )
             )
             for number in numbers
@@ -77,8 +103,9 @@ def heard(folder: Path, medium: str, robots: int = 2) -> tuple[list[int], Medium
         begin = clock()
         for number in range(SAID):  # 10 Hz on the clock of the medium
             wait_for(lambda: clock() >= begin + number / 10, "the next message")  # noqa: B023 - called at once
-            for robot in graphs:
-                robot.publish(message(number, 40))
+            with still:
+                for robot in graphs:
+                    robot.publish(message(number, 40))
         over = clock() + 3.0
         whole = (robots - 1) * SAID
         wait_for(lambda: clock() > over or all(len(robot.heard) == whole for robot in graphs), "what is on its way")
@@ -91,7 +118,7 @@ def test_in_slots_two_links_lose_nothing_both_ways_and_at_once_most(tmp_path: Pa
     assert process.counted["overlapping"] <= 0.05 * process.counted["bursts"]  # of about 100: those of the entry
     (tmp_path / "again").mkdir()
     at_once, process = heard(tmp_path / "again", "exclusive")
-    assert sum(at_once) < sum(whole)
+    assert sum(at_once) < 0.25 * sum(whole)
     assert process.counted["overlapping"] > 0.3 * process.counted["bursts"]
 
 

@@ -76,12 +76,14 @@ def test_the_robot_stands_still_when_its_operator_is_gone(tmp_path: Path, how: s
         guard = threading.Thread(target=recipe["watch"], args=arguments, daemon=True)
         guard.start()
         stick = desk.advertise("/robot_2/cmd_vel", TWIST, Qos())
-        silent = threading.Event()
+        silent, turns = threading.Event(), 0
 
         def steer() -> None:
+            nonlocal turns
             while not over.wait(0.1):
                 if not silent.is_set():
                     stick.publish(drive)
+                turns += 1
 
         pilot = threading.Thread(target=steer, daemon=True)
         pilot.start()
@@ -92,8 +94,8 @@ def test_the_robot_stands_still_when_its_operator_is_gone(tmp_path: Path, how: s
             else:
                 silent.set()
             wait_for(lambda: wheels.state.speed == 0, "the robot to stop")
-            stood = wheels.x
-            time.sleep(1.0)
+            stood, until = wheels.x, turns + 10
+            wait_for(lambda: turns >= until, "ten turns at the stick")
             assert wheels.x == stood, "no late command moves it"
             operator.transmit(on=True)
             silent.clear()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import pytest
@@ -64,8 +63,8 @@ def test_the_state_of_a_link_is_a_latched_topic() -> None:
         robot.say(1)
         wait_for(lambda: robot.heard, "a message")
         states: list[Any] = []
-        time.sleep(0.2)  # somebody who comes later
         with MemoryMiddleware(domain_id=domain(1)) as graph:
+            wait_for(lambda: "/gr_ros2/link_1" in {info.topic for info in graph.discover()}, "a state that was told")
             graph.subscribe(
                 "/gr_ros2/link_1",
                 STATUS_TYPE,

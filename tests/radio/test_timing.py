@@ -33,10 +33,14 @@ def errors_s(sending: Radio, receiving: Radio) -> list[float]:
         return {packet.data: packet.at for packet in packets if packet.data in asked}
 
     def one_more() -> bool:
-        data = len(asked).to_bytes(64, "big")
-        asked[data] = time.monotonic() + 0.05
-        probe.post_message(pdu_to_send(AirPacket(data, leave_at=asked[data])))
-        time.sleep(0.1)
+        """Send another one when the last one's time is over; whether enough were heard."""
+        if time.monotonic() > max(asked.values(), default=0.0) + 0.05:
+            data, at, before = probe.emitted.to_bytes(64, "big"), time.monotonic() + 0.05, sending.gate.arrived
+            probe.post_message(pdu_to_send(AirPacket(data, leave_at=at)))
+            wait_for(lambda: sending.gate.arrived > before, "a packet to wait for its time")
+            if time.monotonic() >= at:
+                return False  # a busy machine has brought it too late
+            asked[data] = at
         return len(heard()) >= 5
 
     with top:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gr_ros2.middleware import Qos, TopicInfo
-from gr_ros2.radio.waiting import Findings, foreign, shortcut, waiting_line
+from gr_ros2.radio.waiting import NewFindings, foreign, shortcut, waiting_line
 from tests.domains import domain
 from tests.waiting import wait_for
 
@@ -96,7 +96,7 @@ def test_who_else_publishes_what_was_received_is_named() -> None:
 
 def test_a_finding_is_told_once() -> None:
     true = ["one"]
-    findings = Findings(lambda: true)
+    findings = NewFindings(lambda: true)
     assert findings.new(0.0) == []
     assert findings.new(3.0) == ["one"]
     true.append("two")

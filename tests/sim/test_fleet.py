@@ -35,6 +35,12 @@ def parsed(messages: list[SimMessage], topic: str) -> list[tuple[float, Any]]:
     return [(m.t, STORE.deserialize_cdr(m.payload, m.type_name)) for m in messages if m.topic == topic]
 
 
+def place(fleet: Fleet, robot: int, t: float) -> tuple[float, float]:
+    """Where a robot is at a time, m."""
+    state = fleet.state(robot, t)
+    return state.x, state.y
+
+
 def test_same_seed_same_bytes(fleet: Fleet, messages: list[SimMessage]) -> None:
     assert list(fleet.messages(DURATION, start_time_s=1000.5)) == messages
     assert list(Fleet(SimSettings(seed=3, start_time_s=1000.5)).messages(DURATION)) == messages
@@ -118,7 +124,7 @@ def test_robots_drive_and_touch_nothing(seed: int) -> None:
 def test_a_crowd_touches_nothing() -> None:
     fleet = Fleet(SimSettings(seed=1, robots=8, size_m=15, obstacles=6, max_speed=2.0))
     for t in np.arange(0, 30, 0.05):
-        here = np.array([fleet.true_pose(robot, float(t))[:2] for robot in fleet.robot_ids])
+        here = np.array([place(fleet, robot, float(t)) for robot in fleet.robot_ids])
         assert fleet.world.clearance(here).min() >= RADIUS
         assert min(math.hypot(*(one - two)) for one, two in itertools.combinations(here, 2)) >= 2 * RADIUS
 
@@ -126,9 +132,9 @@ def test_a_crowd_touches_nothing() -> None:
 def test_scans_agree_with_geometry(fleet: Fleet, messages: list[SimMessage]) -> None:
     errors = []
     for t, scan in parsed(messages, "/robot_1/scan"):
-        x, y, heading = fleet.true_pose(1, t)
-        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges)) + heading
-        truth = fleet.world.cast(x, y, angles, np.array([(*fleet.true_pose(2, t)[:2], RADIUS)]))
+        here = fleet.state(1, t)
+        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges)) + here.heading
+        truth = fleet.world.cast(here.x, here.y, angles, np.array([(*place(fleet, 2, t), RADIUS)]))
         seen = np.isfinite(scan.ranges)
         assert (truth[~seen] > scan.range_max - 0.1).all()
         errors.append((scan.ranges - truth)[seen])
@@ -189,7 +195,7 @@ def test_map_message(fleet: Fleet, messages: list[SimMessage]) -> None:
 
 
 def test_the_true_path_is_continuous_across_ticks(fleet: Fleet) -> None:
-    path = np.array([fleet.true_pose(1, float(t))[:2] for t in np.arange(0, 10, 0.001)])
+    path = np.array([place(fleet, 1, float(t)) for t in np.arange(0, 10, 0.001)])
     assert np.hypot(*np.diff(path, axis=0).T).max() <= 0.001 * fleet.settings.max_speed + 1e-9
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import CrcError, EncodeError, LengthError, VersionError
-from gr_ros2.wire import FORMATS, Format, decode, format_of
+from gr_ros2.wire import FORMATS, Format, decode, format_of, unwrap
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0, with_crc, without_crc
 
 VERSIONS = pytest.mark.parametrize("wire", FORMATS.values(), ids=lambda wire: f"v{wire.version}")
@@ -84,3 +84,15 @@ def test_an_unknown_version_is_damage_unless_the_packet_is_intact(version: int) 
 def test_what_is_too_short_is_refused_by_its_length(data: bytes) -> None:
     with pytest.raises(LengthError):
         decode(data, 64)
+
+
+@given(st.integers(1, 32), st.integers(-(2**40), 2**40), st.data())
+def test_what_lies_in_the_window_comes_back(bits: int, least: int, data: st.DataObject) -> None:
+    number = data.draw(st.integers(least, least + 2**bits - 1))
+    assert unwrap(number % 2**bits, least, bits) == number
+
+
+def test_both_edges_of_the_window() -> None:
+    assert [unwrap(low, 1000 - 63, 8) for low in (937 % 256, 936 % 256)] == [937, 936 + 256]
+    assert unwrap(0xFFFF, 0x1_0000 - 64, 16) == 0xFFFF
+    assert unwrap(0, 0, 16) == 0
