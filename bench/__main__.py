@@ -32,6 +32,7 @@ BENCHMARKS = {
     "recording": "bench.runs",
     "links": "bench.links",
     "rate": "bench.rate",
+    "rate_rules": "bench.rate_rules",
     "receivers": "bench.receivers",
     "half_points": "bench.receivers",
     "rates": "bench.phys",
@@ -57,7 +58,7 @@ BENCHMARKS = {
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
-    *("cells", "hidden", "changes", "scale", "crowd", "energy"),
+    *("rate_rules", "cells", "hidden", "changes", "scale", "crowd", "energy"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

@@ -7,7 +7,7 @@ gain on any promise does not earn its place. A variant runs with all seeds, or u
 wholly beyond ``SHOWN``: what is needed is known then.
 
 ``gr-ros2 ablate`` does not run over them: its variants differ in settings, which any user can repeat with ``--set``.
-These are no settings.
+These are no settings. The rules of the adaptive rate have promises of their own: :mod:`bench.rate_rules`.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from itertools import repeat
-from math import exp, inf, isfinite, log, sqrt
+from math import exp, isfinite, log, sqrt
 from statistics import mean, stdev
 from typing import Any
 
-from bench import rate, repair, repair_backlog, saturated
+from bench import repair, repair_backlog, saturated
 from bench.rows import Row
 
 SEEDS = range(1, 7)
 SECONDS = 20.0
-"""Simulated s of a run. A seed of all promises takes about 10 s of processor time, one of the adaptive rate's 15 s."""
+"""Simulated s of a run. A seed of all promises takes about 10 s of processor time."""
 SHOWN = 0.03
 """Relative change of a promise from which on a rule earns its place."""
 _T = {3: 4.303, 4: 3.182, 5: 2.776, 6: 2.571}
 """97.5 % quantile of Student's t, by the number of seeds."""
 
 Patch = tuple[str, str, Any]
-"""Module of ``gr_ros2.link.v1``, or ``rate``; name in it (a dot leads into a class), and its value."""
+"""Module of ``gr_ros2.link.v1``; name in it (a dot leads into a class), and its value."""
 
 
 def _module(name: str) -> Any:
-    return import_module(f"gr_ros2.link.{name}" if name == "rate" else f"gr_ros2.link.v1.{name}")
+    return import_module(f"gr_ros2.link.v1.{name}")
 
 
 def _scaled(module: str, name: str, *factors: float) -> Iterator[tuple[str, list[Patch]]]:
@@ -56,24 +56,14 @@ RULES: dict[str, list[Patch]] = {
     "no turns of topics": [("freshness", "TURN", 1 << 30)],
     "long messages by value alone": [("packing", "LONG", 1 << 30)],
     "no knowledge of what gaps held": [("gap_contents", "GapContents.learn", lambda _self, _number: None)],
-    "silence in fading as otherwise": [("rate", "_FADING_SILENT_S", 0.05), ("rate", "_FADING_UNANSWERED", 12)],
-    "silence otherwise as in fading": [("rate", "_LEAST_SILENT_S", 0.02), ("rate", "_UNANSWERED", 4)],
-    "no limit of a change of SNR": [("rate", "_MOST_DRIFT_DB_S", inf)],
 }
 CONSTANTS = (
     ("lifetime", "WORTH"), ("thrift", "_ENOUGH"),
     ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"), ("freshness", "FIRST_AGE_S"),
-    ("freshness", "LARGE"), ("packing", "SHARE"), ("packing", "MIN_FRAGMENT"), ("packing", "LONG"),
+    ("packing", "SHARE"), ("packing", "MIN_FRAGMENT"), ("packing", "LONG"),
     ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
     ("reports", "CALM"), ("reports", "_SLOWER"), ("hold", "OVERLAP"), ("hold", "WAITED"), ("hold", "_STEADY"),
 )  # fmt: skip
-RATE = (
-    "GAIN_UP", "GAIN_DOWN", "SETTLED", "_HASTY", "_MOST_PATIENCE", "MOST_SILENT_S", "_GAPS", "_UNANSWERED",
-    "_FADING_SILENT_S", "_FADING_UNANSWERED", "_LOOK_BACK_S", "_REPORT_S", "_ERROR_DB", "_CHANGE_DB",
-    "_DRIFT_SMOOTHING", "_MOST_DRIFT_DB_S", "_CALM_DB_S", "_CORRECTION_DB_S", "_FADE_S", "_LEAST_SILENT_S",
-    "_LONGEST_GAP_S", "_SMOOTHING",
-)  # fmt: skip
-"""Constants of the adaptive rate, whose promises are its own."""
 
 
 def _six(seed: int) -> float:
@@ -84,18 +74,6 @@ def _six(seed: int) -> float:
 def _paced(name: str, seed: int, *, back: bool) -> float:
     ages = saturated.paced(name, 0.2, back=back, seed=seed, best_effort=(), duration_s=SECONDS)
     return exp(mean(log(age) for age in ages.values()))
-
-
-def rate_promises(seed: int) -> dict[str, float]:
-    """The same of the adaptive rate, in fading and at constant SNRs: s per message delivered, at a load that it cannot
-    carry. The constant SNRs differ by seed, so that edges of MCSs are among them."""
-    channels = {
-        f"fading, {mean_db:g} dB": {"snr_db": mean_db, "doppler_hz": rate.DOPPLER_HZ, "seed": seed}
-        for mean_db in rate.MEANS_DB
-    }
-    channels |= {f"about {snr_db} dB": {"snr_db": snr_db + (seed - 2) / 2, "seed": seed} for snr_db in (2, 6, 9, 12)}
-    rates = tuple(rate.RATES)
-    return {name: 1 / rate.carried(rates, channel, rate.FASTEST, 4.0)[0] for name, channel in channels.items()}
 
 
 def promises(seed: int) -> dict[str, float]:
@@ -153,10 +131,6 @@ def patched(patches: Sequence[Patch]) -> Iterator[None]:
             setattr(holder, name, value)
 
 
-def _base(seed: int) -> dict[str, float]:
-    return {**promises(seed), **rate_promises(seed)}
-
-
 def variant(name: str, base: Sequence[dict[str, float]]) -> list[dict[str, float]]:
     """The promises with one change, by seed; no more seeds than show that some promise needs what was changed.
 
@@ -165,21 +139,16 @@ def variant(name: str, base: Sequence[dict[str, float]]) -> list[dict[str, float
     found: list[dict[str, float]] = []
     with patched(variants()[name]):
         for seed in SEEDS:
-            found.append(_promises(name)(seed))
+            found.append(promises(seed))
             if len(found) in _T and any(change - half >= SHOWN for change, half in changes(base, found).values()):
                 break
     return found
 
 
-def _promises(name: str) -> Callable[[int], dict[str, float]]:
-    return rate_promises if any(module == "rate" for module, _, _ in variants()[name]) else promises
-
-
 @cache
 def variants() -> dict[str, list[Patch]]:
     """What is changed, by name."""
-    every = (*CONSTANTS, *(("rate", name) for name in RATE))
-    scaled = [item for module, name in every for item in _scaled(module, name)]
+    scaled = [item for module, name in CONSTANTS for item in _scaled(module, name)]
     return {**RULES, **dict(scaled)}
 
 
@@ -204,7 +173,7 @@ def constants(chosen: Callable[[str], bool] = lambda _: True) -> list[Row]:
     names = [name for name in variants() if chosen(name)]
     rows = []
     with ProcessPoolExecutor(2) as pool:
-        base = list(pool.map(_base, SEEDS))
+        base = list(pool.map(promises, SEEDS))
         for name, found in zip(names, pool.map(variant, names, repeat(base)), strict=True):
             shown = {p: c for p, (c, half) in changes(base, found).items() if abs(c) >= SHOWN and abs(c) > half}
             note = ", ".join(f"{promise} {change:+.1%}" for promise, change in shown.items())

@@ -21,12 +21,12 @@ from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire import QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 
-STANDING_S = 0.25
+OVERLOAD_S = 0.25
 """s for which a message of a stream waits at most while the computer is too slow. At a third of the processor time that
 the demo needs (``python -m bench slow_computer``), its IMU was 1.9 s old where only the queue's bound dropped. With 0.5
 s its oldest topic was 0.7 to 1.6 s old, with 0.25 s 0.8 s."""
 
-OVERLOADED = f"it waited for {STANDING_S:g} s and newer ones came"
+OVERLOADED = f"it waited for {OVERLOAD_S:g} s and newer ones came"
 
 
 @dataclass(slots=True, eq=False)
@@ -169,7 +169,7 @@ class TopicQueue(deque[M], Generic[M]):
         """A message has come while the computer is too slow: drop those before it that have waited for too long."""
         if self.policy != "fifo":
             return
-        for message in [waiting for waiting in self if now - waiting.submitted > STANDING_S and not waiting.started]:
+        for message in [waiting for waiting in self if now - waiting.submitted > OVERLOAD_S and not waiting.started]:
             self.remove(message)
             yield Dropped(message, Fate.OVERLOAD, OVERLOADED)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SentPacket
-from gr_ros2.link.queues import STANDING_S, Outgoing, PublisherQos, TopicQueue, queue_for
+from gr_ros2.link.queues import OVERLOAD_S, Outgoing, PublisherQos, TopicQueue, queue_for
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.settings.config import TopicOptions, build
 from gr_ros2.settings.registry import Registry, Topic
@@ -81,7 +81,7 @@ def test_a_computer_that_is_too_slow_drops_the_oldest_and_starves_no_topic() -> 
     assert set(refused(source.end)) == {"overload"}
     for late in ages.values():
         assert max(late) < 1.5  # the queue of two topics while the third has its turn, at the beginning
-        assert max(late[len(late) // 2 :]) < STANDING_S + 0.05 * (3 + 1)
+        assert max(late[len(late) // 2 :]) < OVERLOAD_S + 0.05 * (3 + 1)
     counts = [len(late) for late in ages.values()]
     assert len(counts) == 3
     assert min(counts) > 0.5 * max(counts)
@@ -124,7 +124,7 @@ def test_a_sending_thread_that_does_not_run_is_a_computer_that_is_too_slow() -> 
     for tick in range(200):
         source.end.messages.submit(0, bytes(45), 1.0 + tick / 50)
     assert set(refused(source.end)) == {"overload"}
-    assert source.end.messages.queued() == {0: 1 + round(STANDING_S * 50)}
+    assert source.end.messages.queued() == {0: 1 + round(OVERLOAD_S * 50)}
 
 
 def test_what_waited_too_long_on_the_ros_graph_of_a_slow_computer_is_dropped_before_it_is_coded() -> None:

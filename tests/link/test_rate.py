@@ -51,7 +51,7 @@ def test_at_an_edge_the_rate_hardly_changes_though_the_snr_is_measured_with_erro
 ) -> None:
     later = settled(faster.half_db + above_db, noise_db=0.3, reports=1000, seed=seed)[500:]
     changes = sum(one != two for one, two in pairwise(later))
-    assert changes <= len(later) / 8, "the most seen in 2000 trials was 38; 190 if it were not more patient each time"
+    assert changes <= len(later) / 8, "the most seen in 400 trials was 47; 209 if it did not wait"
     assert max(later) - min(later) <= 1
 
 
@@ -149,9 +149,9 @@ def faded(depth_db: float, *, slope_db_s: float = 150.0, report_s: float = 0.006
 def test_in_a_fade_the_rate_goes_down_though_no_report_comes() -> None:
     rate, now, mcs = faded(12.0)
     assert mcs >= 2
-    after = [rate.sent(7, now + wait / 1000) for wait in range(1, 40, 3)]
+    after = [rate.sent(7, now + wait / 1000) for wait in range(1, 52, 3)]
     assert after == sorted(after, reverse=True)
-    assert after[0] >= after[3] > after[-1] == 0
+    assert after[0] > after[3] > after[-1] == 0
 
 
 def test_in_a_constant_channel_the_rate_stays_for_the_same_time() -> None:

@@ -150,7 +150,7 @@ class RepairDecoder:
             right ^= int.from_bytes(held[1].translate(factor), "little")
         else:
             if right:
-                return self._disbelieve()
+                return self._reject()
             self.counts["redundant"] += 1
             return self._solve()
         factor = TIMES[INVERSE[left & 255]]
@@ -254,11 +254,11 @@ class RepairDecoder:
     def _accept(self, number: int, body: bytes) -> Found:
         """Return a body that follows from equations, if it is plausible."""
         if not self._plausible(body):
-            return self._disbelieve()
+            return self._reject()
         self.counts["recovered"] += 1
         return [(number, body)]
 
-    def _disbelieve(self) -> Found:
+    def _reject(self) -> Found:
         """Discard all equations: one of them is wrong, and it is not known which."""
         self.counts["implausible"] += 1
         self._equations.clear()

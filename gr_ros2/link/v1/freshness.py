@@ -23,9 +23,8 @@ from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 TURN = 4
 """One packet in this many belongs to the topic whose last turn is longest ago."""
 FIRST_AGE_S = 1.0
-"""Age in s that a topic is assumed to have when its first message arrives."""
-LARGE = 4
-"""A message of this many packets or more is cut with slack, so that it can fill the space that others leave."""
+"""Age in s that a topic is assumed to have when its first message arrives. Where first messages go before all others,
+commands on a full link of 9,600 bit/s have a p99 of 0.31 instead of 0.30 s (``tests/study/test_forecast.py``)."""
 
 RANK = {QOS_LATENCY: 0, QOS_DEFAULT: 1, QOS_BULK: 2}
 """The order of the classes."""

@@ -34,7 +34,8 @@ _STEADY = 1 / 4
 _FEW = 3
 """Number of intervals from which on a topic may be called periodic."""
 _MOST_IN_VAIN = 6
-"""Waits in vain that are counted: at most 4^5 repairs go without waiting before the next one waits."""
+"""Waits in vain that are counted: at most 4^5 repairs go without waiting before the next one waits. With none,
+odometry in slots is 14 % older with reports, and three times as old one way, at 20 % loss."""
 _GAIN = 1 / 16
 """Part of a packet's airtime that a wait must gain to be worth it."""
 

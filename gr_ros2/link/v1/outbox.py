@@ -19,7 +19,7 @@ from gr_ros2.link.endpoint import check_live_options
 from gr_ros2.link.events import Accepted, Missed, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.queues import OVERLOADED, STANDING_S, Dropped, PublisherQos
+from gr_ros2.link.queues import OVERLOAD_S, OVERLOADED, Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -191,7 +191,7 @@ class Outbox:
             self.drop(list(topic.queue.shed(now)))
         if not (waited_s and topic.is_stream and self._owner.slow):
             waited_s = 0.0  # one delay of a computer that keeps up costs no message
-        over = waited_s > STANDING_S
+        over = waited_s > OVERLOAD_S
         self.packing.turns.join(topic_id)
         serial = self._serial
         self._serial += 1

@@ -20,7 +20,7 @@ from math import inf
 
 from gr_ros2.link.events import SentEntry
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.link.v1.freshness import FIRST_AGE_S, LARGE, RANK, Turns, value
+from gr_ros2.link.v1.freshness import FIRST_AGE_S, RANK, Turns, value
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
@@ -101,9 +101,7 @@ class Packing:
             message = queue[position]
             remaining = message.remaining
             taken, size = fit(room - used, remaining, number - message.begin, message.offset)
-            if taken < 0 or not (
-                taken == remaining or _may_cut(message, taken, used, room, large=1 if self._shares else LARGE)
-            ):
+            if taken < 0 or not (taken == remaining or _may_cut(message, taken, used, room)):
                 continue
             picks.append((message, taken))
             used += size
@@ -195,13 +193,10 @@ class Packing:
         return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, since)
 
 
-def _may_cut(message: Message, taken: int, used: int, room: int, *, large: int) -> bool:
-    """Whether a fragment of this many bytes is worth its header.
-
-    :param large: packets from which on a message is cut with slack
-    """
+def _may_cut(message: Message, taken: int, used: int, room: int) -> bool:
+    """Whether a fragment of this many bytes is worth its header. A message that fits one packet is not cut."""
     if not used:
         return True
     if taken < (MIN_FRAGMENT if message.qos == 1 else room // SHARE):
         return False
-    return message.started or message.qos == 1 or message.remaining > large * room
+    return message.started or message.qos == 1 or message.remaining > room

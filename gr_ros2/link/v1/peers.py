@@ -26,6 +26,8 @@ PROMPT = 1 / 64
 """Share of packets lost from which on a peer reports every packet at once, if that takes no slot from anything. The
 sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
 _DELAYS = 16
+"""Newest times of reports from which the shortest and the longest are taken. Without the shortest, packets are repaired
+whose reports are under way: odometry takes 38 % more packets where reports take eight slots."""
 _TIMES = 512
 _INTERVAL_S = 0.1
 """s between two reports of a peer, until its reports tell. With 0, a sender repairs packets before the first report can
@@ -219,7 +221,7 @@ class Peers:
 
     def urgent(self, now: float) -> Sent | None:
         """The oldest packet that a report names as lost and for which later messages wait; packets of long messages go
-        after others. It is returned once."""
+        after others: otherwise odometry beside 1 MB is 5 to 11 % older at 20 % loss. It is returned once."""
         while self.urges and self.urges[0][1] <= self._ordered:
             _, number = heappop(self.urges)
             record = self._packets.records.get(number)
