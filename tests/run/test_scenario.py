@@ -11,7 +11,7 @@ import pytest
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.medium.base import Path as Way
 from gr_ros2.run.scenario import builtin_scenarios, changed, dump, load_scenario, scenario_from
-from gr_ros2.settings.config import ChannelConfig, PacketSettings, replaced
+from gr_ros2.settings.config import Agreed, ChannelConfig, replaced
 from gr_ros2.settings.files import parse_override
 
 BUILTIN = {scenario.name: scenario for scenario in builtin_scenarios()}
@@ -102,11 +102,11 @@ def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
 
 def test_a_part_is_changed_at_all_robots() -> None:
     for name in ("two-way", "team", "demo"):
-        scenario = changed(BUILTIN[name], PacketSettings, lambda part: replaced(part, packet_len=99))
+        scenario = changed(BUILTIN[name], Agreed, lambda part: replaced(part, packet_len=99))
         halves = [half for robot in scenario.all_robots for half in (robot.source, robot.sink) if half is not None]
         assert {scenario.packet_len, *(half.packet_len for half in halves)} == {99}
-        assert changed(scenario, PacketSettings, lambda part: replaced(part, packet_len=64)) == changed(
-            BUILTIN[name], PacketSettings, lambda part: replaced(part, packet_len=64)
+        assert changed(scenario, Agreed, lambda part: replaced(part, packet_len=64)) == changed(
+            BUILTIN[name], Agreed, lambda part: replaced(part, packet_len=64)
         )
 
 

@@ -108,7 +108,7 @@ def test_a_robot_that_drives_behind_a_wall_is_heard_no_more(walls_db: float) -> 
 
 
 def test_the_numbers_of_a_team_are_those_of_its_pairs() -> None:
-    ran = result("team", "duration_s=5", "time=packets", "channel={snr_db: 20}")
+    ran = result("team", "duration_s=5", "time=packets")
     numbers = team_numbers(ran)
     pairs = [topic for topics in (ran.topics, *(one.topics for one in ran.receivers)) for topic in topics]
     assert len(pairs) == 4 * 3
