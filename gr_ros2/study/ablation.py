@@ -19,6 +19,7 @@ from gr_ros2.report.table import Grid, milliseconds, number
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.settings.config import SourceConfig
+from gr_ros2.settings.fields import AUTO
 
 WHOLE = "whole"
 """Name of the unchanged scenario, for its folder and in tables."""
@@ -44,28 +45,33 @@ def variants(scenario: Scenario) -> list[Variant]:
     source = scenario.ros_source
     found = [Variant(WHOLE)]
     if source.compresses:
-        details = [
-            f"topic_options.{name}.{of}" for name in source.topic_options for of in ("codec=auto", "quantize=''")
-        ]
-        off = ("compression=false", "dictionaries=[]", *details)
-        found.append(Variant("no-compression", tuple(f"ros_source.{setting}" for setting in off)))
+        details = ["dictionaries=[]"] * bool(source.dictionaries)
+        for name, options in source.topic_options.items():
+            details += [f"topic_options.{name}.codec=auto"] * (options.codec != AUTO)
+            details += [f"topic_options.{name}.quantize=''"] * bool(options.quantize)
+        found.append(Variant("no-compression", _source("compression=false", *details)))
     if source.packet_rate != 0:
-        found.append(Variant("no-pull", ("ros_source.packet_rate=0",)))
+        found.append(Variant("no-pull", _source("packet_rate=0")))
     if source.version and source.repair != "off":
-        details = [f"ros_source.expected_loss={SourceConfig.expected_loss}"]
-        found.append(Variant("no-repair", ("ros_source.repair='off'", *details)))
+        expected = SourceConfig.expected_loss
+        details = [f"expected_loss={expected}"] * (source.expected_loss != expected)
+        found.append(Variant("no-repair", _source("repair='off'", *details)))
     if scenario.reports is not None:
         found.append(Variant("no-reports", ("reports=null",)))
     registry = scenario.load_registry().with_options(source.topic_options)
     latest = [topic.name for topic in registry if source.version and queue_for(topic.options)[0] == "latest"]
     if latest:
-        found.append(Variant("no-latest", tuple(f"ros_source.topic_options.{name}.queue=fifo" for name in latest)))
+        found.append(Variant("no-latest", _source(*(f"topic_options.{name}.queue=fifo" for name in latest))))
     if len(found) == 1:
         raise ConfigError(
             f"scenario {scenario.name}: nothing to switch off; it has no compression, pull, repair, reports or queue "
             "latest"
         )
     return found
+
+
+def _source(*settings: str) -> tuple[str, ...]:
+    return tuple(f"ros_source.{setting}" for setting in settings)
 
 
 def run_variants(
