@@ -241,7 +241,7 @@ def test_sending_is_switched_off_at_once_and_on_again() -> None:
         ({"airtime": {"band": "eu868", "duty_cycle": 0.1}}, "band eu868 allows 0.01 of 3600 s; leave it out"),
         ({"airtime": {"band": "us915", "max_burst_s": 0}}, "band us915 allows 0.4 s"),
         ({"airtime": "amateur"}, "a station says its callsign in clear"),
-        ({"airtime": {"window_s": 60}}, "window_s = 60: has no effect without a share; set duty_cycle"),
+        ({"airtime": {"window_s": 60}}, "window_s = 60.0: has no effect without a share; set duty_cycle"),
         ({"airtime": {"duty_cycle": 0.1}, "ros_source": {"packet_rate": 0}}, "sends whatever airtime allows; set auto"),
         (
             {"airtime": "eu868", "front_end": {"name": "uhd", "frequency": 433.2e6}},
