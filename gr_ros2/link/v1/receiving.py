@@ -189,8 +189,7 @@ class ReceivingSide:
             self.neighbours.check_own(data, header)
             self.stats.dropped["own"] += 1
             return None
-        if header.dst_id != BROADCAST and self._access is None and not self._for_us(header):
-            # Where the channel is shared, all have to know whose slot it is.
+        if self._access is None and not self._for_us(header):  # where it is shared, all have to know whose slot it is
             self.stats.dropped["not_for_us"] += 1
             return None
         if header.sealed and not self._sealed:
@@ -214,7 +213,9 @@ class ReceivingSide:
         if opened.met:
             self._meet(opened, now)
         self._sender, inbox = neighbour, neighbour.inbox
-        mask, clear, repair_id = (0, False, NOT_A_REPAIR) if repair is None else (repair.mask, repair.clear, repair[0])
+        mask, clear, repair_id = 0, False, NOT_A_REPAIR
+        if repair is not None:
+            mask, clear, repair_id = repair.mask, repair.clear, repair.repair_id
         entries: Sequence[EntryV1] = ()
         if not mask:
             entries = opened.entries or read_body(opened.body, header.room(self._settings.packet_len))
