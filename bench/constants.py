@@ -25,6 +25,7 @@ from typing import Any
 
 from bench import repair, repair_backlog, saturated
 from bench.rows import Row
+from gr_ros2.link.v1.reports import Reporter
 
 SEEDS = range(1, 7)
 SECONDS = 20.0
@@ -49,20 +50,34 @@ def _scaled(module: str, name: str, *factors: float) -> Iterator[tuple[str, list
         yield f"{name} = {new:.4g}, not {value:.4g}", [(module, name, new)]
 
 
+def _newest_only(make: Callable[[Any, float], Any]) -> Callable[[Any, float], Any]:
+    """Reports of the newest packets only."""
+
+    def made(reporter: Any, now: float) -> Any:
+        reporter._old_turn = True
+        return make(reporter, now)
+
+    return made
+
+
 RULES: dict[str, list[Patch]] = {
     "no waiting for a message that is due": [("hold", "Hold.until", lambda _self, now, _end, _airtime: now)],
     "no early reports": [("peers", "PROMPT", 2.0), ("reports", "PROMPT", 2.0)],
     "no resending before new packets": [("repair", "RepairWindow.urgent", lambda _self, _now: None)],
     "no turns of topics": [("freshness", "TURN", 1 << 30)],
     "long messages by value alone": [("packing", "LONG", 1 << 30)],
+    "no reports of the oldest missing packets": [("reports", "Reporter.make", _newest_only(Reporter.make))],
     "no knowledge of what gaps held": [("gap_contents", "GapContents.learn", lambda _self, _number: None)],
 }
 CONSTANTS = (
-    ("lifetime", "WORTH"), ("thrift", "_ENOUGH"),
+    ("lifetime", "WORTH"), ("thrift", "_ENOUGH"), ("order", "_SMOOTHING"),
     ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"), ("freshness", "FIRST_AGE_S"),
     ("packing", "SHARE"), ("packing", "MIN_FRAGMENT"), ("packing", "LONG"),
     ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
-    ("reports", "CALM"), ("reports", "_SLOWER"), ("hold", "OVERLAP"), ("hold", "WAITED"), ("hold", "_STEADY"),
+    ("reports", "CALM"), ("reports", "_SLOWER"), ("reports", "_AGAIN_S"), ("reports", "SHARE"),
+    ("reports", "PER_LOSS"), ("reports", "PER_VAIN"), ("reports", "_MOST"),
+    ("hold", "OVERLAP"), ("hold", "WAITED"), ("hold", "_MOST_LOSS"), ("hold", "_MOST_OWED"), ("hold", "_SMOOTHING"),
+    ("hold", "_STEADY"), ("hold", "_FEW"), ("hold", "_MOST_IN_VAIN"), ("hold", "_GAIN"),
 )  # fmt: skip
 
 
@@ -85,12 +100,16 @@ def promises(seed: int) -> dict[str, float]:
         outcome = repair.run(seed=seed, repair="auto", seconds=SECONDS, **settings)
         found[f"{name}: age"], found[f"{name}: p99"] = outcome.age, outcome.p99
         found[f"{name}: packets"] = outcome.packets
+        if outcome.reports:
+            found[f"{name}: reports"] = outcome.reports
 
     add("odometry, reports", loss=0.2, back=0.2)
     add("odometry, one way", loss=0.2)
     add("odometry, late reports", loss=0.2, back=0.2, delay=8)
     add("odometry, bursts", loss=0.2, back=0.2, burst=3.0)
     add("odometry, 5 %", loss=0.05, back=0.05)
+    add("odometry, nothing lost", loss=0.0, back=0.0)
+    add("odometry, 2 of 5 s silent", loss=0.2, back=0.2, outage=2.0)
     add("busy", hz=55.0, loss=0.1, back=0.1)
     add("busy, one way", hz=55.0, loss=0.2)
     add("15 packets", hz=3.0, size=700, loss=0.2, back=0.2)

@@ -25,6 +25,7 @@ from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry, Topic
 
 RATE = 75.0
+OUTAGE_EVERY_S = 5.0
 
 
 @dataclass
@@ -38,6 +39,8 @@ class Outcome:
     """s, mean over time of the newest delivered message's age, mean over receivers."""
     packets: float
     """Packets sent per message, reports and hellos apart."""
+    reports: float = 0.0
+    """Reports per message, of all receivers."""
     air: Counter[str] = field(default_factory=Counter)
     done: float = inf
     """s until everything was delivered, counted from the first packet; and the packets sent until then."""
@@ -97,6 +100,7 @@ def run(
     tail: float = 3.0,
     options: TopicOptions | None = None,
     delay: int = 0,
+    outage: float = 0.0,
 ) -> Outcome:
     """One sender and some receivers.
 
@@ -105,6 +109,7 @@ def run(
     :param once: one message only
     :param tail: s after the last message
     :param delay: slots that reports take beside their own
+    :param outage: s at the end of each ``OUTAGE_EVERY_S``, in which nothing arrives in either direction
     """
     registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options or TopicOptions())])
     events: list[SenderEvent] = []
@@ -147,8 +152,9 @@ def run(
         if sender.pace.out_of_credit:
             sender.pace.credit()
         sent = sender.next_packet(now)
+        silent = now % OUTAGE_EVERY_S >= OUTAGE_EVERY_S - outage
         for number, end in enumerate(ends):
-            lost = next(forward[number])
+            lost = next(forward[number]) or silent
             if sent is not None and not lost:
                 for event in [*end.receive(AirPacket(sent.data), now + slot), *end.handle_timeout(now + slot)]:
                     if isinstance(event, Delivered):
@@ -161,7 +167,7 @@ def run(
                 if end.pace.out_of_credit:
                     end.pace.credit()
                 answer = end.next_packet(now)
-                if answer is not None and not next(backward[number]):
+                if answer is not None and not next(backward[number]) and not silent:
                     under_way.append((index + delay, answer.data))
         while under_way and under_way[0][0] <= index:
             sender.receive(AirPacket(under_way.popleft()[1]), now + slot)
@@ -178,6 +184,7 @@ def run(
     during = Counter(event.kind for event in events if isinstance(event, SentPacket) and event.now < until)
     outcome.packets = (during["new"] + during["repair"]) / count
     outcome.air = Counter(sender.sent.air)
+    outcome.reports = sum(end.sent.air["report"] for end in ends) / count
     return outcome
 
 
