@@ -147,8 +147,8 @@ def attack(kind: Kind, count: int, seed: int = 1) -> Outcome:
     now += 100.0
     for event in receiver.handle_timeout(now):
         outcome.taken += isinstance(event, Delivered) and event.payload not in sent and kind != "forged"
-    assert len(receiver.neighbours) <= SOURCES
-    assert all(neighbour.inbox.held <= SOURCE_BYTES for neighbour in receiver.neighbours)
+    assert len(receiver.neighbours.all) <= SOURCES
+    assert all(neighbour.inbox.held <= SOURCE_BYTES for neighbour in receiver.neighbours.all.values())
     outcome.growth = _resident() - base
     return outcome
 
@@ -161,7 +161,7 @@ def _bad(pool: list[bytes], rng: random.Random, seed: int) -> Iterator[bytes]:
 
 def _signed(data: bytes, receiver: EndpointV1) -> bytes:
     """The packet with the CRC that makes the receiver believe it."""
-    neighbour, turns = receiver.neighbours.get(_SENDER), 0
+    neighbour, turns = receiver.neighbours.all.get(_SENDER), 0
     body = data[: -v1.CRC_LEN]
     if neighbour is not None and len(body) >= v1.HEADER_LEN:
         try:

@@ -52,8 +52,8 @@ def endpoint(data: bytes) -> None:
                 name, order = (event.src_id, event.topic_id, event.key.boot), (event.key.number, event.key.place)
                 assert order > latest.get(name, (-1, -1))
                 latest[name] = order
-        assert len(end.neighbours) <= _SETTINGS.max_sources
-        for neighbour in end.neighbours:
+        assert len(end.neighbours.all) <= _SETTINGS.max_sources
+        for neighbour in end.neighbours.all.values():
             assert neighbour.inbox.held <= _SETTINGS.max_source_bytes
 
 
@@ -64,7 +64,7 @@ def _turns(end: EndpointV1, body: bytes) -> int:
         if header.qos == v1.QOS_REPAIR and (repair := v1.read_repair_header(body, header.size, len(body))).clear:
             entries = v1.read_body(body[header.size + repair.size :], v1.body_room(PACKET_LEN))
             return next((entry.turns for entry in entries if isinstance(entry, Hello)), 0)
-        neighbour = end.neighbours.get(header.src_id)
+        neighbour = end.neighbours.all.get(header.src_id)
         return 0 if neighbour is None else neighbour.number(header.number) >> 16
     except WireError:
         return 0

@@ -48,16 +48,24 @@ class AirPacket(NamedTuple):
 
 
 class Received(NamedTuple):
-    """A packet arrived: its bytes and their meaning. Events that it causes follow it.
+    """A packet arrived: its bytes, their meaning, and the fields of its name. Events that it causes follow it.
 
     :param received_at, snr_db: ``at`` and ``snr_db`` of its :class:`AirPacket`
     """
 
     data: bytes
     packet: Packet
-    identity: PacketId
+    src_id: int
+    boot: int
+    number: int
+    repair_id: int
     received_at: float | None = None
     snr_db: float | None = None
+
+    @property
+    def identity(self) -> PacketId:
+        """Its name. It is made when somebody asks: a value more for each packet costs an endpoint 1 %."""
+        return PacketId(*self[2:6])
 
 
 class Rejected(NamedTuple):
@@ -185,7 +193,8 @@ requests, and questions that try out the link."""
 
 
 class SentPacket(NamedTuple):
-    """A packet that left the sender: its bytes, their meaning, and the messages to which its entries belong, in order.
+    """A packet that left the sender: its bytes, their meaning, the fields of its name, and the messages to which its
+    entries belong, in order.
 
     ``entries`` are those of messages that are sent for the first time; a repair has none. ``mcs`` is that of the
     adaptive rate (:mod:`gr_ros2.link.rate`), 0 where the rate is fixed. ``leave_at`` is the time in s, on the clock of
@@ -194,12 +203,20 @@ class SentPacket(NamedTuple):
 
     data: bytes
     packet: Packet
-    identity: PacketId
+    src_id: int
+    boot: int
+    number: int
+    repair_id: int
     entries: tuple[SentEntry, ...]
     now: float
     kind: AirKind = "new"
     mcs: int = 0
     leave_at: float | None = None
+
+    @property
+    def identity(self) -> PacketId:
+        """Its name, see :class:`Received`."""
+        return PacketId(*self[2:6])
 
 
 SenderEvent = Accepted | Refused | Missed | SentPacket

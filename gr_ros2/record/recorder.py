@@ -72,7 +72,7 @@ class Recorder:
         if isinstance(event, Received):
             number = self.ledger.packet_received(event.identity)
             if number is not None:
-                self._packets[event.identity.src_id].received(number, now)
+                self._packets[event.src_id].received(number, now)
         submitted = self.ledger.receiver_event(event, now)
         if isinstance(event, Delivered):
             if self._on_delivery is not None:

@@ -147,7 +147,7 @@ class TeamRecord:
             self._now = max(self._now, now)
             if isinstance(event, Received):
                 send = self._under_way.get(event.identity)
-                pair = self._pairs.get((robot, event.identity.src_id))
+                pair = self._pairs.get((robot, event.src_id))
                 if send is None or pair is None:
                     return
                 send.heard += 1

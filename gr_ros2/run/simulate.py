@@ -195,7 +195,7 @@ def simulate(
     recorder = make_recorder(registry, sources)
     for timed_event in run.events():
         _, robot, event = timed_event
-        if not isinstance(event, _OfSender) or listeners.get(_sender(event), robot.number) == robot.number:
+        if not isinstance(event, _OfSender) or listeners.get(event.src_id, robot.number) == robot.number:
             pass_on(recorder, timed_event, overhead_s)
         if on_packet is not None and isinstance(event, SentPacket):
             on_packet(event)
@@ -216,10 +216,6 @@ def coupled(scenario: Scenario) -> Scenario:
 
 _OfSender = Received | Delivered | Lost
 """Events of a receiver about what one sender has sent."""
-
-
-def _sender(event: Received | Delivered | Lost) -> int:
-    return event.identity.src_id if isinstance(event, Received) else event.src_id
 
 
 def pass_on(observer: LinkObserver, timed_event: TimedEvent, overhead_s: float = 0.0) -> None:

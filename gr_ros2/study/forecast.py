@@ -462,7 +462,7 @@ class Planner:
         def share(sent: SentPacket) -> None:
             nonlocal padded, sent_bytes, begun, ended
             own_airtime = phy.airtime(len(sent.data))
-            senders.setdefault(str(sent.identity.src_id), Counter())[sent.kind] += own_airtime  # type: ignore[assignment]
+            senders.setdefault(str(sent.src_id), Counter())[sent.kind] += own_airtime  # type: ignore[assignment]
             sent_bytes += len(sent.data)
             begun, ended = min(begun, sent.now), max(ended, sent.now + own_airtime)
             layout = wire.layout(sent.packet, scenario.packet_len, len(sent.data))
@@ -470,7 +470,7 @@ class Planner:
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:
                 if span.entry is not None:
-                    key = sent.identity.src_id, span.entry.topic_id
+                    key = sent.src_id, span.entry.topic_id
                     shares[key] += own_airtime * span.size / whole  # type: ignore[assignment]
 
         run = simulate(

@@ -41,8 +41,8 @@ NOBODY = PacketId(1, 0, 0, 0)
 def capture(path: Path, packets: list[bytes]) -> Path:
     with PacketCapture(path, clock=lambda: 0.0) as writing:
         for number, data in enumerate(packets):
-            writing.sender_event(1, SentPacket(data, NOTHING, NOBODY, (), number * 0.5))
-            writing.receiver_event(Received(data, NOTHING, NOBODY), number * 0.5 + 0.25)
+            writing.sender_event(1, SentPacket(data, NOTHING, *NOBODY, (), number * 0.5))
+            writing.receiver_event(Received(data, NOTHING, *NOBODY), number * 0.5 + 0.25)
     return path
 
 
@@ -286,7 +286,7 @@ def test_a_conversation_is_read_with_the_topics_that_it_announces(mode: SealMode
     path = tmp_path / "talk.pcapng"
     with PacketCapture(path, clock=lambda: 0.0) as writing:
         for number, data in enumerate(packets):
-            writing.receiver_event(Received(data, NOTHING, NOBODY), number / 75)
+            writing.receiver_event(Received(data, NOTHING, *NOBODY), number / 75)
     assert not tshark(path, "-Y", "_ws.expert")
     hidden = tshark(path, "-Y", "gr_ros2.ciphertext").count("\n")
     named = tshark(path, "-Y", 'gr_ros2.topic == "scan"').count("\n")

@@ -20,8 +20,8 @@ REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry"})
 
 def test_header_and_entries() -> None:
     packet = PacketV0(1, 255, 7, 1, (EntryV0(0, 9, 2, 5, b"abc"), EntryV0(3, 1, 0, 1, b"x")), qos=1)
-    line = describe(Received(b"", packet, IDENTITY), REGISTRY)
-    assert line == describe(SentPacket(b"", packet, IDENTITY, (), 0.0), REGISTRY)
+    line = describe(Received(b"", packet, *IDENTITY), REGISTRY)
+    assert line == describe(SentPacket(b"", packet, *IDENTITY, (), 0.0), REGISTRY)
     assert line == "v0 qos=latency flags=- src=1 dst=255 seq=7 hop=1 entries=2: 0:odom#9[2/5]=3B 3:?#1[0/1]=1B"
 
 

@@ -71,11 +71,11 @@ def recorded() -> Recorder:
             number += 1
             left = now + (index + 1) * 0.02 - 0.02
             identity = PacketId(1, 0, number, 0)
-            recorder.sender_event(1, SentPacket(data, packet, identity, tuple(record), left))
+            recorder.sender_event(1, SentPacket(data, packet, *identity, tuple(record), left))
             lost = step % 4 == 3 and index == 1 and step < 4 * LOST + 2
             if lost or step >= ODOM - UNSENT - IN_FLIGHT:
                 continue
-            recorder.receiver_event(Received(data, packet, identity), left + 0.05)
+            recorder.receiver_event(Received(data, packet, *identity), left + 0.05)
             if imu >= 0 and index == 0:
                 recorder.receiver_event(Delivered(1, 1, b"imu %d" % step, 0, step), left + 0.05)
             if index == 1:

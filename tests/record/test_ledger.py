@@ -44,7 +44,7 @@ def packet(number: int, *entries: SentEntry) -> SentPacket:
 
 
 def sent(number: int, entries: tuple[SentEntry, ...], now: float) -> SentPacket:
-    return SentPacket(b"", PacketV0(SRC, 255, 0, 1, ()), named(number), entries, now)
+    return SentPacket(b"", PacketV0(SRC, 255, 0, 1, ()), *named(number), entries, now)
 
 
 def named(number: int) -> PacketId:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.events import Accepted, Delivered, PacketId, Received, SentPacket
+from gr_ros2.link.events import Accepted, Delivered, Received, SentPacket
 from gr_ros2.record.team import TEAM_FILE, TeamRecord, read_team
 from tests.dashboard.feed import at
 
@@ -24,11 +24,11 @@ def record() -> TeamRecord:
 
 
 def sent(robot: int, number: int, begin: float, kind: str = "new") -> SentPacket:
-    return SentPacket(b"x", None, PacketId(robot, 1, number, 0), (), begin - 0.005, kind, 0, begin)  # type: ignore[arg-type]
+    return SentPacket(b"x", None, robot, 1, number, 0, (), begin - 0.005, kind, 0, begin)  # type: ignore[arg-type]
 
 
 def received(robot: int, number: int, snr_db: float = 20.0) -> Received:
-    return Received(b"x", None, PacketId(robot, 1, number, 0), None, snr_db)  # type: ignore[arg-type]
+    return Received(b"x", None, robot, 1, number, 0, None, snr_db)  # type: ignore[arg-type]
 
 
 def test_packets_that_overlap_are_marked_at_both_and_others_by_who_heard_them() -> None:

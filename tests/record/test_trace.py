@@ -14,7 +14,7 @@ import pyarrow.parquet as pa_parquet
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.events import Accepted, Delivered, PacketId, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Delivered, SentEntry, SentPacket
 from gr_ros2.record.ledger import Ledger
 from gr_ros2.record.trace import PacketLog, Track, make_trace, read_trace, write_trace
 from gr_ros2.wire.v0 import EntryV0, PacketV0
@@ -156,7 +156,7 @@ def test_a_packet_costs_numbers_and_no_objects() -> None:
             ledger.sender_event(1, Accepted(number, 0, b"x%d" % number, float(number)))
             packet = PacketV0(1, 255, number & 255, 1, (EntryV0(0, number & 255, 0, 1, b""),))
             entry = SentEntry(number, 0, number & 255, 0, 1)
-            event = SentPacket(b"", packet, PacketId(1, 0, number, 0), (entry,), float(number))
+            event = SentPacket(b"", packet, 1, 0, number, 0, (entry,), float(number))
             log.sent(event)
             ledger.sender_event(1, event)
             assert ledger.packet_received(event.identity) == number
@@ -193,7 +193,7 @@ def test_reading_what_grows_disturbs_nobody() -> None:
                 track.add(float(number), 1.0, 2.0)
                 packet = PacketV0(1, 255, number & 255, 1, (EntryV0(0, number & 255, 0, 1, b""),) * 2)
                 entries = (SentEntry(number, 0, number & 255, 0, 1),) * 2
-                log.sent(SentPacket(b"", packet, PacketId(1, 0, number, 0), entries, float(number)))
+                log.sent(SentPacket(b"", packet, 1, 0, number, 0, entries, float(number)))
         finally:
             done.set()
 

@@ -134,14 +134,14 @@ def test_a_hello_that_is_not_first_in_the_clear_and_a_message_in_a_control_packe
     boot = VECTORS["packets"][0]["boot"]
     one.start(boot)
     Air(one, two).run(1.0)
-    known = two.end.neighbours.get(1)
+    known = two.end.neighbours.all.get(1)
     assert known is not None
     before = (known.boot, known.hello, len(two.delivered()))
     cases = {case["name"]: bytes.fromhex(case["hex"]) for case in VECTORS["packets"]}
     two.receive(cases["a message in a control packet, which has no effect there"], 1.1)
     assert (known.boot, known.hello, len(two.delivered())) == before
     two.receive(cases["a hello in a source packet, which has no effect there"], 1.1)
-    assert two.end.neighbours.get(1) is known and 6 in known.inbox.decoder
+    assert two.end.neighbours.all.get(1) is known and 6 in known.inbox.decoder
     assert (known.boot, known.hello) == before[:2]
     assert two.end.received.rejected.total() == 0
 

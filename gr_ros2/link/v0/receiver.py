@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from zlib import crc32
 
 from gr_ros2.core.errors import CodecError, WireError
-from gr_ros2.link.events import AirPacket, Delivered, Lost, PacketId, Received, ReceiverEvent, Rejected
+from gr_ros2.link.events import AirPacket, Delivered, Lost, Received, ReceiverEvent, Rejected
 from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
@@ -71,9 +71,7 @@ class Receiver:
             events.append(Rejected(data, error))
             return events
         self.stats.packets += 1
-        events.append(
-            Received(data, packet, PacketId(packet.src_id, 0, packet.seq, crc32(data)), arrival.at, arrival.snr_db)
-        )
+        events.append(Received(data, packet, packet.src_id, 0, packet.seq, crc32(data), arrival.at, arrival.snr_db))
         source = self._admit(packet, now)
         if source is not None:
             self._take(source, packet, data, now, events)

@@ -14,7 +14,7 @@ from typing import Any
 from zlib import crc32
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.events import Accepted, Missed, PacketId, Refused, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
@@ -265,7 +265,7 @@ class Sender:
             compressed=self._codec is not None,
         )
         data = V0.encode(packet, config.packet_len)
-        sent = SentPacket(data, packet, PacketId(self.src_id, 0, self._seq, crc32(data)), tuple(record), now)
+        sent = SentPacket(data, packet, self.src_id, 0, self._seq, crc32(data), tuple(record), now)
         self._seq = (self._seq + 1) % self._numbers
         self._scheduler.sent(plan)
         self._stale = True

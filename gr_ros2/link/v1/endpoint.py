@@ -179,7 +179,7 @@ class EndpointV1:
     @property
     def held_bytes(self) -> int:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""
-        return sum(neighbour.inbox.held for neighbour in self.neighbours)
+        return sum(neighbour.inbox.held for neighbour in self.neighbours.all.values())
 
     def reconfigure(self, **changes: Any) -> None:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""
@@ -215,7 +215,7 @@ class EndpointV1:
                 self.received.missed[neighbour.src_id],
                 len(neighbour.inbox.announced.topics),
             )
-            for neighbour in self.neighbours
+            for neighbour in self.neighbours.all.values()
             if neighbour.src_id not in over
         ]
 
@@ -230,7 +230,7 @@ class EndpointV1:
 
     def _inbox(self, src_id: int) -> Inbox | None:
         """What has come of a robot, directly or over others."""
-        neighbour, relaying = self.neighbours.get(src_id), self._receiving.relaying
+        neighbour, relaying = self.neighbours.all.get(src_id), self._receiving.relaying
         if neighbour is not None:
             return neighbour.inbox
         return None if relaying is None else relaying.far.get(src_id)

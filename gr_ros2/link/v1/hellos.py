@@ -125,12 +125,15 @@ class Hellos:
     @property
     def lone(self) -> bool:
         """Whether no robot is heard, though one could be."""
-        return self._settings.hears and all(neighbour.gone for neighbour in self._neighbours)
+        return self._settings.hears and all(neighbour.gone for neighbour in self._neighbours.all.values())
 
     @property
     def _calm(self) -> bool:
         """Whether a robot is heard, and nothing is lost either way."""
-        losses = [self._window.peers.loss, *(neighbour.inbox.reports.loss for neighbour in self._neighbours)]
+        losses = [
+            self._window.peers.loss,
+            *(neighbour.inbox.reports.loss for neighbour in self._neighbours.all.values()),
+        ]
         return len(losses) > 1 and max(losses) < CALM
 
     def entries(self, room: int, now: float) -> list[Control]:

@@ -18,7 +18,7 @@ where packets are sealed, nothing is given out that was sealed before this start
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 
@@ -139,6 +139,7 @@ class Neighbours:
     :param heard: what ``save`` has stored, by robot id: boot number and packet number
     :param dropped: counts packets that are kept (``early``), packets that may have been sealed before this robot
         started (``unproven``), and failures of ``save`` (``state_not_written``)
+    :ivar all: the robots, by id
     :ivar own_hellos: what others can prove to have heard
     :param inbox: makes the inbox of a start of a robot: (src_id, boot, first packet that may be needed, bytes of its
         longest body)
@@ -165,22 +166,12 @@ class Neighbours:
         self._stores = save is not None and keys.sealed
         self.own_hellos = OwnHellos(own[0])
         self._make_inbox = inbox
-        self._known: dict[int, Neighbour] = {}
+        self.all: dict[int, Neighbour] = {}
         self._early: dict[int, deque[bytes]] = {}
         self._met_at: dict[int, float] = {}
         """When the present start of each robot was heard for the first time."""
         self._ended: dict[tuple[int, int], int] = {}
         """By id and boot number of a start that was replaced: the first packet of it that was not heard."""
-
-    def __iter__(self) -> Iterator[Neighbour]:
-        return iter(self._known.values())
-
-    def __len__(self) -> int:
-        return len(self._known)
-
-    def get(self, src_id: int) -> Neighbour | None:
-        """A robot by its id; None if it is not known."""
-        return self._known.get(src_id)
 
     def early(self, src_id: int) -> list[bytes]:
         """Packets of a robot that could not be opened before; they are returned once."""
@@ -188,9 +179,7 @@ class Neighbours:
 
     def silent(self, now: float, after: float) -> list[Neighbour]:
         """Robots not heard for so many s. Their state is kept until another robot needs the room."""
-        silent = [
-            neighbour for neighbour in self._known.values() if neighbour.heard + after <= now and not neighbour.gone
-        ]
+        silent = [neighbour for neighbour in self.all.values() if neighbour.heard + after <= now and not neighbour.gone]
         for neighbour in silent:
             neighbour.gone = True
         return silent
@@ -208,7 +197,7 @@ class Neighbours:
             if repair.clear:
                 return self._hello(data, header, repair, now)
             start += repair.size
-        neighbour = self._known.get(header.src_id)
+        neighbour = self.all.get(header.src_id)
         if neighbour is None:
             self._keep(header.src_id, data)
             self.dropped["early"] += 1
@@ -241,7 +230,7 @@ class Neighbours:
     @property
     def unproven(self) -> bool:
         """Whether a robot is heard whose messages cannot be taken before it has proven that it hears this start."""
-        return any(n.proofs.proven is None and not n.gone and n.proves for n in self._known.values())
+        return any(n.proofs.proven is None and not n.gone and n.proves for n in self.all.values())
 
     def proved(self, neighbour: Neighbour, number: int, entries: Sequence[EntryV1]) -> bool:
         """Take the proofs among the entries of a control packet; returns whether they are the first of its sender."""
@@ -256,12 +245,12 @@ class Neighbours:
 
         :param newest: number of this robot's newest source packet
         """
-        echoes = [(n.src_id, *n.echo) for n in self._known.values() if n.echo and n.proves and not n.gone]
+        echoes = [(n.src_id, *n.echo) for n in self.all.values() if n.echo and n.proves and not n.gone]
         return [Heard(src_id, echo, since & 0xFFFF) for src_id, echo, since in echoes if newest - since < 1 << 16]
 
     def since(self, src_id: int) -> int:
         """The number that this robot had reached when it heard the newest hello of another one."""
-        neighbour = self._known.get(src_id)
+        neighbour = self.all.get(src_id)
         return 0 if neighbour is None or neighbour.echo is None else neighbour.echo[1]
 
     def check_own(self, data: bytes, header: Header) -> None:
@@ -284,7 +273,7 @@ class Neighbours:
 
     def settle(self, now: float) -> None:
         """Store the exact packet number reached by robots that are quiet."""
-        for neighbour in self._known.values():
+        for neighbour in self.all.values():
             counts, exact = self._counts_on_store(neighbour.hello), neighbour.inbox.newest + 1
             self.floors.settle(neighbour.floor, exact, neighbour.heard, now, counts=counts)
 
@@ -304,7 +293,7 @@ class Neighbours:
         src_id, sealed = header.src_id, self._keys.sealed
         hello, entries, clear, rest = self._read_hello(data, header, repair)
         number = hello.turns << 16 | header.number
-        neighbour = self._known.get(src_id)
+        neighbour = self.all.get(src_id)
         if neighbour is not None and neighbour.boot == hello.boot:
             neighbour.trailer.open(clear, rest, number, repair.repair_id, plain=True)
             jumps = not sealed and abs(number - neighbour.inbox.newest) > _HALF
@@ -356,7 +345,7 @@ class Neighbours:
             inbox.deliveries.sealed_after = proofs.sealed_after
         self._met_at[src_id] = now
         met.new(number, repair.repair_id)
-        self._known[src_id] = met
+        self.all[src_id] = met
         self.floors.store(met.floor, max(first, number + 1) if stores else 0, now)
         return Opened(met, header, number, repair, b"", entries, True, neighbour)
 
@@ -383,12 +372,12 @@ class Neighbours:
 
     def _room_for(self, src_id: int) -> Neighbour | None:
         """The robot whose state is dropped to make room for another one, if there is no more room."""
-        if len(self._known) < self._settings.max_sources:
+        if len(self.all) < self._settings.max_sources:
             return None
-        quiet = min(self._known.values(), key=lambda neighbour: neighbour.heard)
+        quiet = min(self.all.values(), key=lambda neighbour: neighbour.heard)
         if not quiet.gone:
-            raise SourcesError(f"robot {src_id}: {len(self._known)} others are heard; raise max_sources")
-        return self._known.pop(quiet.src_id)
+            raise SourcesError(f"robot {src_id}: {len(self.all)} others are heard; raise max_sources")
+        return self.all.pop(quiet.src_id)
 
     def _keep(self, src_id: int, data: bytes) -> None:
         if src_id not in self._early and len(self._early) >= self._settings.max_sources:

@@ -16,7 +16,6 @@ from gr_ros2.link.events import (
     Gone,
     Lost,
     Met,
-    PacketId,
     Received,
     ReceiverEvent,
     Rejected,
@@ -112,7 +111,7 @@ class ReceivingSide:
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Give up missing packets, and forget robots that are silent."""
         self._now = now
-        for neighbour in self.neighbours:
+        for neighbour in self.neighbours.all.values():
             neighbour.inbox.handle_timeout(now)
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now, self._give_up_s):
@@ -123,7 +122,7 @@ class ReceivingSide:
                 self._outcomes.events.append(Gone(gone.src_id, gone.boot))
         if self.relaying is not None:
             self.relaying.handle_timeout(now)
-        for neighbour in self.neighbours:
+        for neighbour in self.neighbours.all.values():
             neighbour.timeout = None
         self._messages.reported = bool(self._window.peers)
         return self._outcomes.take()
@@ -131,7 +130,7 @@ class ReceivingSide:
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
         # Asked after each packet, so only its sender is looked at anew.
-        times = [n.timeout if n.timeout is not None else self._timeout(n) for n in self.neighbours]
+        times = [n.timeout if n.timeout is not None else self._timeout(n) for n in self.neighbours.all.values()]
         if self.relaying is not None and (at := self.relaying.next_timeout()) is not None:
             times.append(at)
         soonest = min(times, default=inf)
@@ -145,7 +144,7 @@ class ReceivingSide:
 
     def unpublished(self, event: Delivered) -> Lost:
         """Count a message that was delivered but not published on the ROS graph. A latched message may come again."""
-        neighbour = self.neighbours.get(event.src_id)
+        neighbour = self.neighbours.all.get(event.src_id)
         if neighbour is not None:
             neighbour.inbox.deliveries.marks.pop(event.topic_id, None)
         self.stats.lost[event.src_id, event.topic_id, Fate.PUBLISH_FAILED.value] += 1
@@ -221,8 +220,10 @@ class ReceivingSide:
             entries = opened.entries or read_body(opened.body, header.room(self._settings.packet_len))
         encrypted = neighbour.trailer.encrypts and not clear
         packet = PacketV1(header, tuple(entries), repair, opened.body if mask else b"", encrypted)
-        identity = PacketId(neighbour.src_id, neighbour.boot, number, repair_id)
-        self._outcomes.events.append(Received(arrival.data, packet, identity, arrival.at, arrival.snr_db))
+        received = Received(
+            arrival.data, packet, neighbour.src_id, neighbour.boot, number, repair_id, arrival.at, arrival.snr_db
+        )
+        self._outcomes.events.append(received)
         if repair is None:
             inbox.source(number, opened.body, entries, header.qos, now)
         elif mask:

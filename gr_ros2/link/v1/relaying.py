@@ -89,7 +89,7 @@ class Relaying:
         names = () if block is None else [name for name in block.names if name != NOBODY]
         self.gains.neighbour(src_id, now, names, 0 if block is None else block.heard)
         self.custody.routes.note(src_id, src_id, 0, now)
-        neighbour = self._neighbours.get(src_id)
+        neighbour = self._neighbours.all.get(src_id)
         boot, table, at = self._tables.get(src_id, (0, b"", now))
         if neighbour is not None and not neighbour.hello.digest and boot != neighbour.boot:
             boot, table, at = neighbour.boot, write_table(()), -inf  # others learn that it is there, and where
@@ -155,7 +155,7 @@ class Relaying:
 
     def _reached(self, inbox: Inbox, now: float) -> None:
         """Something of a robot came over others."""
-        neighbour = self._neighbours.get(inbox.src_id)
+        neighbour = self._neighbours.all.get(inbox.src_id)
         known = neighbour is not None and not neighbour.gone
         met = not known and self._here.get(inbox.src_id, (-1, 0.0))[0] != inbox.boot
         self._here[inbox.src_id] = inbox.boot, now
@@ -174,7 +174,7 @@ class Relaying:
         """
         found = []
         for src_id, (boot, at) in self._here.items():
-            neighbour, inbox = self._neighbours.get(src_id), self._inbox(src_id, boot & 0xFFFF)
+            neighbour, inbox = self._neighbours.all.get(src_id), self._inbox(src_id, boot & 0xFFFF)
             if inbox is not None and (neighbour is None or neighbour.gone):
                 hops, over = self.hops.get(src_id, 0), self.custody.routes.over(src_id, now, lambda _: True)
                 topics = len(inbox.announced.topics)
@@ -186,7 +186,7 @@ class Relaying:
         for src_id, (boot, at) in list(self._here.items()):
             if now >= at + STALE_S:
                 del self._here[src_id]
-                neighbour = self._neighbours.get(src_id)
+                neighbour = self._neighbours.all.get(src_id)
                 if neighbour is None or neighbour.gone:
                     self._outcomes.events.append(Gone(src_id, boot))
 
@@ -196,7 +196,7 @@ class Relaying:
 
     def _carried(self, src_id: int, topic_id: int) -> bool:
         """Whether a robot's messages of a topic are handed on to the one for which they are."""
-        neighbour = self._neighbours.get(src_id)
+        neighbour = self._neighbours.all.get(src_id)
         topic = None if neighbour is None else neighbour.inbox.announced.topics.get(topic_id)
         return topic is not None and topic.reliable and (topic.dst_id != BROADCAST or topic.type_name == CALLS_TYPE)
 
@@ -239,7 +239,7 @@ class Relaying:
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
         """Where messages of a start of a robot come together, directly or over others."""
-        neighbour = self._neighbours.get(origin)
+        neighbour = self._neighbours.all.get(origin)
         for inbox in (None if neighbour is None else neighbour.inbox, self.far.get(origin)):
             if inbox is not None and inbox.boot & 0xFFFF == start:
                 return inbox

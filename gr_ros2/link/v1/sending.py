@@ -64,7 +64,7 @@ class SendingSide:
         self.hellos = hellos
         self.pings = Pings()
         self.repairs = RepairSlots(settings, self.pace, window, writer=writer, hold=hold)
-        self.reports = ReportSlots(settings, neighbours, writer)
+        self.reports = ReportSlots(settings, neighbours.all.values(), writer)
         self.urged = False
         self.heard_at = inf
         self._messages, self._window, self._neighbours = messages, window, neighbours
@@ -88,7 +88,7 @@ class SendingSide:
             if hellos.urgent(now, idle=idle, latency=packing.urgent, heard=bool(self._window.peers)):
                 return self._hello(now)
         if now >= self.pings.due:
-            snrs_db = {n.src_id: n.inbox.reports.snr.snr_db for n in self._neighbours}
+            snrs_db = {n.src_id: n.inbox.reports.snr.snr_db for n in self._neighbours.all.values()}
             return self._writer.control(self.pings.entries(self._writer.room, snrs_db, now), "hello", now)
         if now >= self._repeat_at:
             self._repeat(now)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from gr_ros2.link.events import AirKind, PacketId, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link.events import AirKind, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.rate import RateController
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.combining import Repair
@@ -105,8 +105,7 @@ class PacketWriter:
         if lifetimes:
             self._hold.left(now, self._window.peers.loss)
         packet = PacketV1(header, tuple(entries), encrypted=self._encrypts)
-        identity = PacketId(self._src_id, self._boot, number, NOT_A_REPAIR)
-        return self._leave(data, packet, identity, "new", now, parts=parts)
+        return self._leave(data, packet, number, "new", now, parts=parts)
 
     def control(self, entries: Sequence[EntryV1], kind: AirKind, now: float, *, clear: bool = False) -> SentPacket:
         """Write a packet of entries that are not messages; it stands at the newest number."""
@@ -134,8 +133,7 @@ class PacketWriter:
         header = read_header(chosen.data, self._packet_len)
         entries = tuple(read_body(chosen.body, self.room))
         packet = PacketV1(header, entries, encrypted=self._encrypts)
-        identity = PacketId(self._src_id, self._boot, chosen.number, NOT_A_REPAIR)
-        return self._leave(chosen.data, packet, identity, "repair", now)
+        return self._leave(chosen.data, packet, chosen.number, "repair", now)
 
     def _repair_packet(
         self, repair: RepairHeader, number: int, body: bytes, entries: Sequence[EntryV1], *, kind: AirKind, now: float
@@ -147,13 +145,13 @@ class PacketWriter:
         encrypted = self._encrypts and not repair.clear
         combined = body if repair.mask else b""
         packet = PacketV1(header, tuple(entries), repair, combined, encrypted)
-        return self._leave(data, packet, PacketId(self._src_id, self._boot, number, repair.repair_id), kind, now)
+        return self._leave(data, packet, number, kind, now)
 
     def _leave(
         self,
         data: bytes,
         packet: PacketV1,
-        identity: PacketId,
+        number: int,
         kind: AirKind,
         now: float,
         *,
@@ -168,7 +166,10 @@ class PacketWriter:
             mcs = self._rate.sent(None if self._dst_id == BROADCAST else self._dst_id, now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
-        sent = SentPacket(data, packet, identity, parts, now, kind, mcs, self.leave_at)
+        repair_id = NOT_A_REPAIR if packet.repair is None else packet.repair.repair_id
+        sent = SentPacket(
+            data, packet, self._src_id, self._boot, number, repair_id, parts, now, kind, mcs, self.leave_at
+        )
         if self._observer is not None:
             self._observer(sent)
         return sent

@@ -62,7 +62,7 @@ def test_nothing_is_lost_while_receivers_learn(hears: bool, table_lost: bool) ->
     air.run(5.0)
     assert receiver.delivered(1) == [payload(number) for number in range(60)]
     assert codec.encode(0, payload(1))[0] >> 4 == ANNOUNCED
-    assert sender.end.messages.kept.digest == next(iter(receiver.end.neighbours)).inbox.announced.digest
+    assert sender.end.messages.kept.digest == next(iter(receiver.end.neighbours.all.values())).inbox.announced.digest
 
 
 def test_what_is_never_announced_is_lost_by_name_and_memory_is_bounded() -> None:

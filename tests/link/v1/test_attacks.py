@@ -347,7 +347,7 @@ def test_a_recorded_packet_is_no_sign_of_life(mode: SealMode) -> None:
         air.run(0.1)
         for data in recorded[-30:]:
             two.events += two.end.receive(AirPacket(data, snr_db=40.0), air.now)
-        known = two.end.neighbours.get(1)
+        known = two.end.neighbours.all.get(1)
         assert known is not None
         assert not known.inbox.reports.unreported or air.now < 3.0
         snr_db.append(known.inbox.reports.snr.snr_db)

@@ -430,14 +430,14 @@ def test_a_long_message_is_given_up_when_its_memory_is_needed() -> None:
     lost = [event for event in two.events if isinstance(event, Lost)]
     assert lost
     assert {event.reason for event in lost} <= {"memory", "expired", "given_up"}
-    assert two.end.neighbours.get(1).inbox.held <= 20_000  # type: ignore[union-attr]
+    assert two.end.neighbours.all.get(1).inbox.held <= 20_000  # type: ignore[union-attr]
 
 
 def test_an_announced_length_reserves_nothing() -> None:
     one, two = Robot(1, registry()), Robot(2)
     air = Air(one, two)
     air.run(1.0)
-    inbox = two.end.neighbours.get(1).inbox  # type: ignore[union-attr]
+    inbox = two.end.neighbours.all.get(1).inbox  # type: ignore[union-attr]
     inbox._take(inbox.newest, [Part(MAP, b"x", 0, MAX_MESSAGE - 1, True)], 0, repaired=False)
     assert 0 < inbox.held < 1000
 

@@ -153,7 +153,7 @@ def test_nothing_is_reserved_for_a_message_that_is_announced(per_topic: int) -> 
     one, two = Robot(1, registry()), Robot(2, max_source_bytes=200_000)
     for n in range(5):
         two.end.receive(AirPacket(one.slot(n * SLOT_S) or b""), n * SLOT_S)
-    inbox = two.end.neighbours.get(1).inbox  # type: ignore[union-attr]
+    inbox = two.end.neighbours.all.get(1).inbox  # type: ignore[union-attr]
     body_len, number = 30, inbox.newest
     tracemalloc.start()
     try:

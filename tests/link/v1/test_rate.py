@@ -90,7 +90,7 @@ def test_hellos_are_for_everybody_and_reports_tell_the_snr() -> None:
     fleet = Fleet({2: 30.0})
     fleet.run(300)
     assert {event.mcs for event in fleet.sent if event.kind == "hello"} == {0}
-    (inbox,) = (neighbour.inbox for neighbour in fleet.receivers[2].neighbours)
+    (inbox,) = (neighbour.inbox for neighbour in fleet.receivers[2].neighbours.all.values())
     report = inbox.reports.make(fleet.now)
     assert isinstance(report, Report)
     assert report.snr_db == 30.0
@@ -103,7 +103,7 @@ def test_without_an_mcs_table_nothing_is_chosen_and_without_an_snr_none_is_repor
     while (sent := sender.next_packet(0.0)) is not None:
         receiver.receive(AirPacket(sent.data), 0.0)
         assert sent.mcs == 0
-    (neighbour,) = receiver.neighbours
+    (neighbour,) = receiver.neighbours.all.values()
     assert neighbour.inbox.reports.make(0.0).snr_db is None
 
 
@@ -129,7 +129,7 @@ def test_reports_leave_at_the_most_robust_rate() -> None:
 def test_the_reported_snr_follows_a_channel_that_changes_and_averages_one_that_does_not() -> None:
     fleet = Fleet({2: 20.0})
     fleet.run(100)
-    (inbox,) = (neighbour.inbox for neighbour in fleet.receivers[2].neighbours)
+    (inbox,) = (neighbour.inbox for neighbour in fleet.receivers[2].neighbours.all.values())
     for error_db in (1.0, -1.0) * 20:
         inbox.reports.snr.measured(20.0 + error_db)
     assert inbox.reports.snr.snr_db is not None
