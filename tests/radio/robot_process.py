@@ -78,7 +78,8 @@ class RobotProcess:
     """
 
     def __init__(self, number: int, front_end: dict[str, Any], first: int, **values: Any) -> None:
-        self.heard: list[Heard] = []
+        self._heard: list[Heard] = []
+        self._killed = False
         self._pipe, theirs = _FORKS.Pipe(duplex=False)
         self._process = _FORKS.Process(target=_run, args=(number, front_end, first, values, theirs), daemon=True)
         self._process.start()
@@ -88,11 +89,18 @@ class RobotProcess:
 
     def kill(self) -> list[Heard]:
         """SIGKILL; what was heard until then."""
+        self._killed = True
         self._process.kill()
         self._process.join()
         self._reader.join()
         self._pipe.close()
         return self.heard
+
+    @property
+    def heard(self) -> list[Heard]:
+        """See the class. Who waits for more of a process that has ended by itself is told so at once."""
+        assert self._killed or self.alive, f"the process of a robot has ended with code {self._process.exitcode}"
+        return self._heard
 
     @property
     def alive(self) -> bool:
@@ -101,6 +109,6 @@ class RobotProcess:
     def _read(self) -> None:
         while True:
             try:
-                self.heard.append(self._pipe.recv())
+                self._heard.append(self._pipe.recv())
             except (EOFError, OSError):
                 return
