@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from itertools import repeat
-from math import exp, isfinite, log, sqrt
+from math import exp, inf, isfinite, log, sqrt
 from statistics import mean, stdev
 from typing import Any
 
@@ -60,14 +60,35 @@ def _newest_only(make: Callable[[Any, float], Any]) -> Callable[[Any, float], An
     return made
 
 
+def _nothing(*_: Any) -> None:
+    pass
+
+
 RULES: dict[str, list[Patch]] = {
     "no waiting for a message that is due": [("hold", "Hold.until", lambda _self, now, _end, _airtime: now)],
+    "waiting also where repairs are owed": [("hold", "_MOST_OWED", 0.0), ("hold", "WAITED", 0.0)],
+    "waiting also where it gained nothing": [("hold", "_MOST_IN_VAIN", 0)],
+    "waiting for any gain": [("hold", "_GAIN", 0.0)],
+    "waiting for topics that are not periodic": [("hold", "_STEADY", inf), ("hold", "_FEW", 1)],
+    "waiting for the shortest overlap": [("hold", "OVERLAP", 0.0)],
     "no early reports": [("peers", "PROMPT", 2.0), ("reports", "PROMPT", 2.0)],
-    "no resending before new packets": [("repair", "RepairWindow.urgent", lambda _self, _now: None)],
-    "no turns of topics": [("freshness", "TURN", 1 << 30)],
-    "long messages by value alone": [("packing", "LONG", 1 << 30)],
+    "no rarer reports": [("reports", "CALM", 0.0)],
+    "no reports again while messages wait": [("reports", "_AGAIN_S", inf)],
     "no reports of the oldest missing packets": [("reports", "Reporter.make", _newest_only(Reporter.make))],
-    "no knowledge of what gaps held": [("gap_contents", "GapContents.learn", lambda _self, _number: None)],
+    "no resending before new packets": [("repair", "RepairWindow.urgent", lambda _self, _now: None)],
+    "no repairs before new packets one way": [("unreported", "Unreported.due", lambda _self, _newest: False)],
+    "no end of repairs one way": [("unreported", "Unreported.cover", _nothing)],
+    "no account of repairs under way": [("thrift", "Thrift.combined", _nothing)],
+    "repairs for any expected loss": [("thrift", "_ENOUGH", 0.0)],
+    "only the newest delay of a report": [("peers", "_DELAYS", 1)],
+    "late reports waited for too": [("peers", "_SOON", inf)],
+    "windows of repairs that do not move": [("combining", "_GOLDEN", 0.0)],
+    "gaps waited for where few come back": [("order", "_SMOOTHING", 0.0)],
+    "no knowledge of what gaps held": [("gap_contents", "GapContents.learn", _nothing)],
+    "no turns of topics": [("freshness", "TURN", 1 << 30)],
+    "no age before the first message": [("freshness", "FIRST_AGE_S", 0.0)],
+    "long messages by value alone": [("packing", "LONG", 1 << 30)],
+    "fragments of any size": [("packing", "MIN_FRAGMENT", 1)],
 }
 CONSTANTS = (
     ("lifetime", "WORTH"), ("thrift", "_ENOUGH"), ("order", "_SMOOTHING"),
