@@ -214,15 +214,25 @@ def ratios(name: str, loss: float, *, back: bool = False) -> dict[str, tuple[flo
 
 
 def paced(
-    name: str, loss: float, *, back: bool, seed: int, best_effort: Sequence[str], duration_s: float | None = None
+    name: str,
+    loss: float,
+    *,
+    back: bool,
+    seed: int,
+    best_effort: Sequence[str],
+    duration_s: float | None = None,
+    odom_rate: float | None = None,
 ) -> dict[str, float]:
     """Mean age in s of each topic of a scenario in simulated time; of one that delivers nothing, its duration.
 
     :param back: see :func:`run`
     :param best_effort: topics whose publishers are not reliable, so that no message waits for an earlier one
     :param duration_s: simulated s; None for those of the scenario
+    :param odom_rate: messages/s of odometry; None for those of the scenario
     """
     options = [f"ros_source.topic_options.{topic}.reliability=best_effort" for topic in best_effort]
+    if odom_rate is not None:
+        options.append(f"sim.odom_rate={odom_rate}")
     channel = {"packet_loss": loss}
     settings: dict[str, Any] = {"channel": channel, "seed": seed, "time": "packets"}
     if back:
