@@ -11,6 +11,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -199,9 +200,10 @@ def changed(constants: dict[str, float]) -> Iterator[None]:
         vars(engine).update(before)
 
 
-def airtimes() -> dict[str, list[float]]:
-    """s on the air per packet that arrives, on each channel with each seed."""
-    return {name: [run(snr(seed), link, seed) for seed in SEEDS] for name, (snr, link) in CHANNELS.items()}
+def airtimes(constants: dict[str, float]) -> dict[str, list[float]]:
+    """s on the air per packet that arrives, on each channel with each seed, with other constants."""
+    with changed(constants):
+        return {name: [run(snr(seed), link, seed) for seed in SEEDS] for name, (snr, link) in CHANNELS.items()}
 
 
 def changes(base: dict[str, list[float]], found: dict[str, list[float]]) -> dict[str, float]:
@@ -217,16 +219,16 @@ def changes(base: dict[str, list[float]], found: dict[str, list[float]]) -> dict
 
 def rate_rules() -> list[Row]:
     """One row per rule and constant: the channels that it changes."""
-    base = airtimes()
     variants = dict(RULES)
     for name in CONSTANTS:
         value = getattr(engine, name)
         for new in (value / 2, value * 2):
             variants[f"{name} = {new:.3g}, not {value:.3g}"] = {name: type(value)(new)}
+    with ProcessPoolExecutor(2) as pool:
+        base, *found = pool.map(airtimes, [{}, *variants.values()])
     rows = []
-    for what, constants in variants.items():
-        with changed(constants):
-            shown = changes(base, airtimes())
+    for what, result in zip(variants, found, strict=True):
+        shown = changes(base, result)
         note = ", ".join(f"{name} {change:+.0%}" for name, change in sorted(shown.items(), key=lambda item: -item[1]))
         rows.append(
             Row(f"rate: {what}: worst change", max([0.0, *shown.values()]) * 100, "%", form="{:.1f}", note=note)
