@@ -173,13 +173,11 @@ CHANNELS: dict[str, tuple[Callable[[int], Snr], Link]] = {
 }
 """The SNR by seed, and the link. A constant SNR has .2 to .8 dB more with other seeds, so that edges are among them."""
 CONSTANTS = (
-    *("GAIN", "SETTLED", "RISE_DB", "LOOK_BACK_S", "ERROR_DB", "CORRECTION_DB_S", "FORGET_S", "GAPS"),
+    *("GAIN", "LOOK_BACK_S", "ERROR_DB", "CORRECTION_DB_S", "FORGET_S", "GAPS"),
     *("LEAST_SILENT_S", "MOST_SILENT_S", "UNANSWERED", "SMOOTHING"),
 )
 RULES: dict[str, dict[str, float]] = {
     "any gain is enough": {"GAIN": 1.0},
-    "no waiting before a faster MCS": {"SETTLED": 0},
-    "always waiting before a faster MCS": {"RISE_DB": inf},
     "no fall since the last report": {"LOOK_BACK_S": inf},
     "no allowance for errors": {"ERROR_DB": 0.0},
     "no correction": {"CORRECTION_DB_S": 0.0},

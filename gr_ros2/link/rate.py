@@ -8,9 +8,8 @@ so the MCS with the greatest expected goodput can be chosen. The SNR to count on
   does not fit the radio, or reports come too late for the channel.
 
 Invariants: a packet for several robots is sent with an MCS that suits the weakest of them; a packet for nobody who is
-known, and one for a robot that has fallen silent, is sent with the most robust MCS. A slower MCS is taken at once. A
-faster one is taken at a report, if the SNR has risen or some reports have come since the last change. There is no clock
-here: ``now`` is seconds, monotonic.
+known, and one for a robot that has fallen silent, is sent with the most robust MCS. A slower MCS is taken at once, a
+faster one at a report. There is no clock here: ``now`` is seconds, monotonic.
 
 ``python -m bench rate_rules`` measures each rule and constant: on some channel each rule gains 3 % or more.
 """
@@ -26,9 +25,6 @@ from gr_ros2.core.errors import ConfigError
 
 GAIN = 1.1
 """How many times the present MCS's goodput another MCS must promise to be taken."""
-SETTLED, RISE_DB = 20, 1.25
-"""A faster MCS is tried so many reports after a change, or once the SNR has risen by so many dB since. So the rate is
-calm at the edge of an MCS."""
 LOOK_BACK_S = 0.06
 """s over which a change of the SNR is measured: long against the errors of single reports."""
 ERROR_DB = 1.0
@@ -79,10 +75,6 @@ class _Peer:
     """What is known of a receiver."""
 
     mcs: int = 0
-    reports: int = SETTLED
-    """Reports since the last change of the MCS."""
-    changed_db: float = -inf
-    """The SNR to count on at that change."""
     reported_db: float = -inf
     """The newest SNR reported."""
     heard: float = -inf
@@ -102,7 +94,6 @@ class _Peer:
         gap = min(max(now - self.heard, 0.0), longest)
         self.gap_s += SMOOTHING * (gap - self.gap_s)
         self.reported_db, self.heard, self.unanswered = snr_db, now, 0
-        self.reports += 1
         at, before_db = self.before
         if now - at >= LOOK_BACK_S:
             change = abs(snr_db - before_db) if now - at < longest else 0.0
@@ -145,7 +136,7 @@ class RateController:
         gap = known.report(snr_db, now)
         surplus = loss - (1 - self.mcs_table[known.mcs].pdr(known.snr_db(now)))
         known.correction_db += gap * (CORRECTION_DB_S * surplus - known.correction_db / FORGET_S)
-        self._choose(known, now, faster=known.reports >= SETTLED or known.snr_db(now) > known.changed_db + RISE_DB)
+        self._choose(known, now, faster=True)
 
     def meet(self, robot: int) -> None:
         """A robot that can report is known. It counts for packets to everybody from now on."""
@@ -163,7 +154,7 @@ class RateController:
     def _next(self, known: _Peer, now: float) -> int:
         known.unanswered += 1
         if known.silent(now):
-            known.mcs, known.reports = 0, SETTLED
+            known.mcs = 0
         else:
             self._choose(known, now, faster=False)
         return known.mcs
@@ -177,4 +168,4 @@ class RateController:
         worth = [mcs.goodput(snr_db) for mcs in (self.mcs_table if faster else self.mcs_table[: known.mcs + 1])]
         best = max(range(len(worth)), key=worth.__getitem__)
         if worth[best] > GAIN * worth[known.mcs]:
-            known.mcs, known.reports, known.changed_db = best, 0, snr_db
+            known.mcs = best

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import random
-from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.rate import MOST_SILENT_S, SETTLED, Mcs, RateController
+from gr_ros2.link.rate import MOST_SILENT_S, Mcs, RateController
 
 MCS_TABLE = tuple(
     Mcs(name, airtime_s, half_db, 0.4)
@@ -46,12 +45,10 @@ def test_the_rate_is_nearly_the_best_at_every_snr(snr_db: float) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(MCS_TABLE[1:]), st.floats(-1.0, 1.5), st.integers(0, 10_000))
-def test_at_an_edge_the_rate_hardly_changes_though_the_snr_is_measured_with_errors(
+def test_at_an_edge_the_rate_is_one_of_two_though_the_snr_is_measured_with_errors(
     faster: Mcs, above_db: float, seed: int
 ) -> None:
     later = settled(faster.half_db + above_db, noise_db=0.3, reports=1000, seed=seed)[500:]
-    changes = sum(one != two for one, two in pairwise(later))
-    assert changes <= len(later) / 8, "the most seen in 400 trials was 47; 209 if it did not wait"
     assert max(later) - min(later) <= 1
 
 
@@ -93,8 +90,7 @@ def test_a_robot_that_falls_silent_gets_the_most_robust_rate() -> None:
     for _ in range(20):
         rate.sent(7, now + MOST_SILENT_S / 2)
     assert rate.sent(7, now + MOST_SILENT_S / 2) == 0
-    for _ in range(SETTLED):
-        rate.report(7, 30.0, 0.0, now + MOST_SILENT_S / 2)
+    rate.report(7, 30.0, 0.0, now + MOST_SILENT_S / 2)
     assert rate.sent(7, now + MOST_SILENT_S / 2) == 4, "it is heard again"
     assert rate.sent(7, now + 2 * MOST_SILENT_S) == 0
 

@@ -23,8 +23,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
-OVERLAP = 1 / 4
-"""Part of a packet's airtime by which a repair may delay a message."""
+OVERLAP = 1 / 2
+"""Part of a packet's airtime by which a repair may delay a message. With a quarter, odometry at 20 % loss one way is
+17 % older at 40 Hz; with none, another 9 %."""
 SURPLUS, _MOST_OWED = 2.5, 2.0
 """Repairs owed per packet that is expected to be lost, and at most. With 1, a sixteenth of the messages at 45 and 50 Hz
 are lost one way at 20 % loss, and odometry is 6 to 7 times as old; with 2.5 none is. With 4, it is older by a sixth at

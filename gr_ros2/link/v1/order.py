@@ -22,6 +22,8 @@ from gr_ros2.link.v1.peers import MAP
 _VOID = 1024
 """Packets noted as left out of repairs before the notes about old ones are dropped."""
 _SMOOTHING = 1 / 16
+"""How fast the share of missing packets that come back is learned. With a quarter, messages of a sender that repairs
+nothing are 38 % younger at first, but one way at 55 Hz and 20 % loss 1.3 % of the messages are lost in addition."""
 _COST = 250
 """Bytes beside its payload that a message takes which waits (``sys.getsizeof`` and its share of lists)."""
 

@@ -24,7 +24,8 @@ MAP = 64
 """Number of packets that a report covers."""
 PROMPT = 1 / 64
 """Share of packets lost from which on a peer reports every packet at once, if that takes no slot from anything. The
-sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet."""
+sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet. With
+twice as much, odometry at 1 % loss takes 29 % fewer reports, but its p99 at 5 % loss is 8 % longer."""
 _DELAYS = 16
 """Newest times of reports from which the shortest and the longest are taken. Without the shortest, packets are repaired
 whose reports are under way: odometry takes 38 % more packets where reports take eight slots."""
@@ -286,9 +287,9 @@ class Peers:
         peer.interval += (now - peer.heard - peer.interval) / 8
         peer.heard, peer.loss = now, loss
         sent_at = self._times.get(number)
-        if sent_at is not None and number >= peer.newest:
+        if sent_at is not None and number > peer.newest:  # a report that is repeated says nothing about the way
             peer.delays.append(now - sent_at)
-            if loss >= PROMPT and number > peer.newest and number in self.once:
+            if loss >= PROMPT and number in self.once:
                 peer.answers.append(now - sent_at)
         peer.newest = max(peer.newest, number)
         soon = bool(peer.answers) and max(peer.answers) <= _SOON * self._period

@@ -95,12 +95,12 @@ class RepairSlots:
 
     def _next_look(self, now: float) -> float:
         """When a thrifty sender may want to repair something."""
-        window = self._window
+        window, since = self._window, self._calm_since
         if not window.peers.loss:
-            return min(now + _CALM_POLL_S, window.thrift.next_doubt(now))
-        if self._calm_since == inf or window.packets.newest != self._calm_number:
+            return min(now + _CALM_POLL_S, window.thrift.next_doubt(-inf if since == inf else since))
+        if since == inf or window.packets.newest != self._calm_number:
             return now
-        return min(now + _POLL_S, window.thrift.next_doubt(self._calm_since))
+        return min(now + _POLL_S, window.thrift.next_doubt(since))
 
     def _held(self, now: float) -> bool:
         """Whether a repair that could leave now waits for a new message."""

@@ -57,15 +57,15 @@ class Thrift:
                 return True
         return False
 
-    def next_doubt(self, now: float) -> float:
-        """When a report about one of the newest packets, or about a repair, is overdue next, s; inf if none is
-        expected."""
-        soonest = next((at for at, _, _ in self._flight if at > now), inf)
+    def next_doubt(self, since: float) -> float:
+        """When a report about one of the newest packets, or about a repair, is overdue first after a time, s; inf if
+        none is expected."""
+        soonest = next((at for at, _, _ in self._flight if at > since), inf)
         waits = [(peer.bit, peer.patience) for peer in self._peers.all.values()]
         for record in reversed(self._packets.records.values()):
             if record.number <= self._packets.newest - MAX_WINDOW:
                 break
             for bit, patience in waits:
-                if not record.confirmed & bit and now < record.at + patience < soonest:
+                if not record.confirmed & bit and since < record.at + patience < soonest:
                     soonest = record.at + patience
         return soonest

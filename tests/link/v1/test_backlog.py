@@ -60,8 +60,9 @@ def test_a_message_given_up_by_its_sender_keeps_nothing_back() -> None:
     assert two.delivered() == [b"next"]
 
 
-def test_a_receiver_waits_as_long_as_its_sender_repairs() -> None:
-    """Every repair is lost for a minute."""
+@pytest.mark.parametrize("later", [1, 80])
+def test_a_receiver_waits_as_long_as_its_sender_repairs(later: int) -> None:
+    """Every repair is lost for a minute, in which nothing new is sent. After 80 more packets the loss is forgotten."""
     one, two = Robot(1, registry(fifo=FIFO)), Robot(2, hold_s=0.1)
     air = Air(one, two)
     air.run(2.0)
@@ -73,12 +74,15 @@ def test_a_receiver_waits_as_long_as_its_sender_repairs() -> None:
         return sender is one and next(e.kind for e in reversed(one.events) if isinstance(e, SentPacket)) == "repair"
 
     air.lost = repairs
-    one.end.messages.submit(0, b"second", air.now)
+    said = [str(number).encode() for number in range(later)]
+    for text in said:
+        one.end.messages.submit(0, text, air.now)
+        air.step()
     air.run(60.0)
     assert two.delivered() == []
     air.lost = lambda *_: False
     air.run(2.0)
-    assert two.delivered() == [b"first", b"second"]
+    assert two.delivered() == [b"first", *said]
 
 
 def test_a_receiver_goes_on_when_its_sender_is_gone() -> None:
