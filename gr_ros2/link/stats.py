@@ -32,12 +32,14 @@ class SenderStats:
 class ReceiverStats:
     """Counters of the receiving half.
 
-    ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, max_sources, unknown_topic, and
-    early (kept until their sender had said how to open them); ``delivered`` by (src_id, topic_id); ``repaired``, those
-    delivered messages of which a packet was lost at first; ``lost`` by (src_id, topic_id, reason). Two counters are
-    estimates: ``missed``, the packets of each robot that were lost since it was heard, from gaps in their numbers,
-    repaired or not, and ``message_loss_est`` from gaps in entry ids and messages given up. ``unknown_gaps`` counts how
-    often a sender restarted or was silent for long, so that the number of lost packets is unknown.
+    ``rejected`` by kind of WireError; ``dropped`` by name: own, not_for_us, duplicate, late (older than what is
+    remembered), max_sources, unknown_topic, early (kept until their sender had said how to open them), and of what
+    is in them: overtaken (fragments of a message older than one delivered), bad_table (cannot be read);
+    ``delivered`` by (src_id, topic_id); ``repaired``, those delivered messages of which a packet was lost at first;
+    ``lost`` by (src_id, topic_id, reason). Two counters are estimates: ``missed``, the packets of each robot that
+    were lost since it was heard, from gaps in their numbers, repaired or not, and ``message_loss_est`` from gaps in
+    entry ids and messages given up. ``unknown_gaps`` counts how often a sender restarted or was silent for long, so
+    that the number of lost packets is unknown.
     """
 
     packets: int = 0

@@ -10,7 +10,6 @@ ends in one Delivered or Lost; memory is bounded.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
@@ -108,8 +107,6 @@ class Inbox:
         relaying: Passing | None = None,
     ) -> None:
         self.src_id, self.boot = src_id, boot
-        self.counts: Counter[str] = Counter()
-        """Packets by result: ``packets``, ``duplicate``, ``late``, ``missing``, ``repaired``."""
         self.deliveries = DeliveryRules(settings, marks)
         self._room = room
         self._control, self._relaying = control, relaying
@@ -148,13 +145,11 @@ class Inbox:
         """
         decoder = self.decoder
         if number in decoder.bodies:
-            self.counts["duplicate"] += 1
             self._stats.dropped["duplicate"] += 1
             return
         if number < decoder.floor:
-            self.counts["late"] += 1
+            self._stats.dropped["late"] += 1
             return
-        self.counts["packets"] += 1
         late = number < decoder.newest
         self._advance(number, now, here=True)
         self.reports.arrived(late=late)
@@ -190,6 +185,7 @@ class Inbox:
         :param over: the sender repairs no packet up to that number
         """
         self._advance(number, now, here=False)
+        self.decoder.advance(number)
         if over:
             self.order.repaired_from(number + 1)
         self._settle()
@@ -240,16 +236,15 @@ class Inbox:
         return True
 
     def _advance(self, number: int, now: float, *, here: bool) -> None:
-        """The sender has reached this number: the packets between the newest one and this one are missing for now."""
+        """The sender has reached this number, of which the decoder is told next. Packets between the newest one and it
+        are missing for now."""
         self._now = now
         newest = self.decoder.newest
         if number <= newest:
             return
         gone = number - newest - here
         self.deliveries.reached(number, now)
-        self.decoder.advance(number)
         if gone:
-            self.counts["missing"] += gone
             met = newest >= self._first  # what came before the first packet that was heard is not lost
             self._stats.missed[self.src_id] += gone * met
             self.reports.missed(gone, counts=met)
@@ -257,7 +252,6 @@ class Inbox:
 
     def _recovered(self, found: tuple[int, bytes]) -> None:
         number, body = found
-        self.counts["repaired"] += 1
         self._take(number, read_body(body, self._room), -1, repaired=True)
 
     def _take(self, number: int, entries: Sequence[EntryV1], qos: int, *, repaired: bool) -> None:
@@ -278,7 +272,7 @@ class Inbox:
     def _fragment(self, part: Part, number: int, place: int, qos: int, *, repaired: bool) -> None:
         begin = number - part.back
         if begin < self.deliveries.newest.get(part.topic_id, (0, 0))[0] or begin < 0:
-            self.counts["overtaken"] += 1
+            self._stats.dropped["overtaken"] += 1
             return
         whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
         for partial in self._reassembly.overflowing():
@@ -363,14 +357,16 @@ class Inbox:
             self._give_up([ready], FATES[error.fate])
             return
         qos = ready.qos if ready.qos >= 0 else topic.qos
-        key, way = Key(self.boot, *ready.order), (ready.repaired, ready.hops, ready.over)
-        self._outcomes.delivered(Delivered(self.src_id, ready.topic_id, payload, qos, key, *way))
+        key = Key(self.boot, ready.order[0], ready.order[1])
+        self._outcomes.delivered(
+            Delivered(self.src_id, ready.topic_id, payload, qos, key, ready.repaired, ready.hops, ready.over)
+        )
 
     def _table(self, payload: bytes) -> None:
         try:
             topics = self.announced.take(payload)
         except WireError:
-            self.counts["bad_table"] += 1
+            self._stats.dropped["bad_table"] += 1
             return
         if topics is None:
             return

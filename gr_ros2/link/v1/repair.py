@@ -13,7 +13,6 @@ What is alive says ``sent_packets``, what reports tell ``peers``, and what holds
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from typing import Literal
 
@@ -41,7 +40,6 @@ class RepairWindow:
     :param expected_loss: share of packets lost, used until a report arrives
     :param shares: whether others send on the same channel
     :param proves: see :class:`Unreported`
-    :ivar counts: repair packets by kind: ``resent``, ``combined``
     :ivar packets: what has left and may be repaired
     :ivar peers: what reports tell of them
     :ivar thrift: when a report is overdue
@@ -58,7 +56,6 @@ class RepairWindow:
         proves: bool = False,
     ) -> None:
         self.mode = mode
-        self.counts: Counter[str] = Counter()
         self.packets = SentPackets(span)
         self._unreported = Unreported(expected_loss, proves=proves)
         self._shared = SharedRepairs(self.packets) if shares else None
@@ -177,7 +174,6 @@ class RepairWindow:
 
     def _again(self, record: Sent, now: float) -> Sent:
         record.at = now
-        self.counts["resent"] += 1
         self.peers.once.discard(record.number)
         return record
 
@@ -193,5 +189,4 @@ class RepairWindow:
         if self.mode == "thrifty":
             self.thrift.combined(now, first, repair.number)
         self.peers.once.difference_update(range(first, repair.number + 1))
-        self.counts["combined"] += 1
         return repair
