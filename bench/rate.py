@@ -6,6 +6,7 @@ their airtime. An MCS alone is the same link with a table of this one MCS.
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -28,7 +29,7 @@ LATE_S = 2.0
 """s after which a message in the fading channel does not count as delivered: a backlog must not hide an overload."""
 HOLD_S = 0.2
 """s that a message waits for an earlier one that may yet be repaired."""
-LOADS = tuple(round(100 * 1.05**step) for step in range(30))
+LOADS = tuple(round(50 * 1.05**step) for step in range(70))
 """messages/s that are tried in the fading channel."""
 PDR = 0.99
 NEAR, GAIN = 0.9, 1.5
@@ -89,14 +90,12 @@ def constant() -> list[tuple[int, float, dict[str, float]]]:
 
 def most(rates: tuple[str, ...], mean_db: float) -> float:
     """The highest load, messages/s, of which at least ``PDR`` is delivered in the fading channel."""
-    within = 0.0
-    for load in LOADS:
+
+    def too_much(load: float) -> bool:
         fading = [{"snr_db": mean_db, "doppler_hz": DOPPLER_HZ, "seed": seed} for seed in (1, 2)]
-        pdr = min(carried(rates, channel, load, FADING_S)[1] for channel in fading)
-        if pdr < PDR:
-            break
-        within = load
-    return within
+        return min(carried(rates, channel, load, FADING_S)[1] for channel in fading) < PDR
+
+    return (0.0, *LOADS)[bisect(LOADS, False, key=too_much)]
 
 
 def rate() -> list[Row]:
