@@ -29,7 +29,7 @@ from gr_ros2.link.v1.reports import Reporter
 
 SEEDS = range(1, 7)
 SECONDS = 20.0
-"""Simulated s of a run. A seed of all promises takes about 10 s of processor time."""
+"""Simulated s of a run. A seed of all promises takes about 7 s of processor time."""
 SHOWN = 0.03
 """Relative change of a promise from which on a rule earns its place."""
 _T = {3: 4.303, 4: 3.182, 5: 2.776, 6: 2.571}

@@ -26,6 +26,7 @@ from gr_ros2.settings.registry import Registry, Topic
 
 RATE = 75.0
 OUTAGE_EVERY_S = 5.0
+"""s from the end of one outage to that of the next."""
 
 
 @dataclass

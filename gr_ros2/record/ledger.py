@@ -274,8 +274,9 @@ class Ledger:
                 message.last_packet = ordinal
                 if message.sent == 1:
                     self._retire(source, message)
-        source.in_air.append((ordinal, event.identity))
-        source.waiting.setdefault(event.identity, deque()).append((ordinal, event.entries))
+        identity = event.identity
+        source.in_air.append((ordinal, identity))
+        source.waiting.setdefault(identity, deque()).append((ordinal, event.entries))
 
     def _retire(self, source: _SourceBook, newer: _OpenMessage) -> None:
         """Close older messages with the same key that cannot arrive any more. Keys are reused after a while."""

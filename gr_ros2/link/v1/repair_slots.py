@@ -33,8 +33,8 @@ class RepairSlots:
         self._setting = settings.repair
         self._pace, self._window, self._writer, self._hold = pace, window, writer, hold
         self.waits_until = -inf
-        self._calm_since = inf
-        """Time in s at which no repair was wanted, if no report has come since; otherwise infinite."""
+        self._calm_since = -inf
+        """Time in s at which no repair was wanted, if no report has come since; otherwise -inf."""
         self._calm_number = 0
         """The newest packet then."""
 
@@ -50,7 +50,7 @@ class RepairSlots:
 
     def reported(self) -> None:
         """A report has come."""
-        self._calm_since = inf
+        self._calm_since = -inf
 
     def first(self, now: float) -> SentPacket | None:
         """What goes before new messages: what a receiver lacks or waits for in vain, so that later messages wait."""
@@ -85,7 +85,7 @@ class RepairSlots:
         self.waits_until = -inf
         chosen = self._window.next(now, self._held)
         held = self.waits_until > now
-        self._calm_since = now if chosen is None and not held else inf
+        self._calm_since = now if chosen is None and not held else -inf
         self._calm_number = self._window.packets.newest
         if chosen is not None:
             self._hold.repaired(waiting=held)
@@ -97,8 +97,8 @@ class RepairSlots:
         """When a thrifty sender may want to repair something."""
         window, since = self._window, self._calm_since
         if not window.peers.loss:
-            return min(now + _CALM_POLL_S, window.thrift.next_doubt(-inf if since == inf else since))
-        if since == inf or window.packets.newest != self._calm_number:
+            return min(now + _CALM_POLL_S, window.thrift.next_doubt(since))
+        if since == -inf or window.packets.newest != self._calm_number:
             return now
         return min(now + _POLL_S, window.thrift.next_doubt(since))
 
