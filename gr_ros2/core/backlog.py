@@ -9,6 +9,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from math import inf
+
+from gr_ros2.core.watch import wait_until
 
 _GATHER_S = 0.01
 """s that the thread collects work after it was woken. Waking it for every piece would cost the caller more than the
@@ -70,7 +73,7 @@ class Backlog:
         :return: whether it was done in time
         """
         with self._changed:
-            return self._changed.wait_for(lambda: not self.pending, timeout_s)
+            return wait_until(lambda: not self.pending, timeout_s, self._changed.wait)
 
     def close(self, timeout_s: float | None = None) -> bool:
         """Accept no more work, and wait until all accepted work is done. Idempotent.
@@ -82,7 +85,7 @@ class Backlog:
             self._closed = True
             self._changed.notify_all()
         if self._thread is not threading.current_thread():
-            self._thread.join(timeout_s)
+            wait_until(lambda: not self._thread.is_alive(), inf if timeout_s is None else timeout_s, self._thread.join)
         return not self._thread.is_alive()
 
     def _take(self, size: int, work: Work) -> None:

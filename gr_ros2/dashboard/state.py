@@ -15,6 +15,7 @@ from typing import get_args
 
 import numpy as np
 
+from gr_ros2.core.watch import Watch
 from gr_ros2.dashboard.packets import packet_views
 from gr_ros2.dashboard.topic_names import Key, TopicNames
 from gr_ros2.dashboard.views import AirView, PathView, RobotView, SeriesView, Snapshot, TopicView
@@ -138,7 +139,7 @@ class DashboardState:
         self._packets_sent, self._packets_received = Rate(), Rate()
         self._phase = "waiting"
         self._airtime, self._received_as = airtime, received_as
-        self._tick_s = tick_s
+        self._tick_s, self._silence = tick_s, Watch(2 * tick_s)
         self._spent: Counter[str] = Counter()
         """s of air since the last tick, by what the packets were for."""
         self._air: deque[tuple[float, ...]] = deque(maxlen=self._history)
@@ -289,7 +290,7 @@ class DashboardState:
                 [f"the computer is up to {late_s:.2f} s late: what this page shows is the computer's, not the link's"],
             )
         silent = [now - last for last, _ in self._robots.values()]
-        if elapsed > _SILENT_S and min(silent, default=elapsed) > _SILENT_S:
+        if self._silence.age(min(silent, default=elapsed), now) > _SILENT_S:
             yield "down", ["no robot has been heard" + (f" for {min(silent):.0f} s" if silent else " yet")]
         poor = []
         for key in keys:

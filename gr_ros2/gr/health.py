@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+from gr_ros2.core.watch import Watch
 from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import DiagnosticsConfig
 
@@ -103,6 +104,8 @@ class LinkHealth:
         self._heard_at: float | None = None
         self._reached: dict[int, float] = {}
         """When something of each robot came last, itself or over others, s."""
+        self._silence, self._silences = self._watch(), dict[int, Watch]()
+        """Of all robots, and of each."""
 
     def judge(self, stats: Stats, now: float) -> list[Status]:
         """The status of receiver, transmitter, front end (if it counts anything) and every topic received.
@@ -129,6 +132,9 @@ class LinkHealth:
         transmitter.warn("messages lost on the ROS graph", snapshot.lost_on_graph, 0 if first else before.lost_on_graph)
         return [receiver, transmitter, *front_end, *topics]
 
+    def _watch(self) -> Watch:
+        return Watch(2 * self._config.period_s)
+
     def links(self, stats: Stats, receiver: Status) -> dict[int, Status]:
         """How the link to each robot is that was ever heard or reached over others: ``up``, ``degraded`` or ``lost``.
 
@@ -144,9 +150,10 @@ class LinkHealth:
             state = Status(f"gr_ros2/link_{src_id}", values={"age (s)": f"{silence:.2f}"})
             if src_id in far:
                 state.values |= {"hops": str(far[src_id]["hops"]), "over robot": str(far[src_id]["over"])}
-            if limits.silence_error_s and silence > limits.silence_error_s:
+            watched = self._silences.setdefault(src_id, self._watch()).age(silence, now)
+            if limits.silence_error_s and watched > limits.silence_error_s:
                 state.level, state.problems = Level.ERROR, ["lost"]
-            elif receiver.level or (limits.silence_warn_s and silence > limits.silence_warn_s):
+            elif receiver.level or (limits.silence_warn_s and watched > limits.silence_warn_s):
                 state.level, state.problems = Level.WARN, ["degraded"]
             else:
                 state.problems = ["up"]
@@ -164,7 +171,7 @@ class LinkHealth:
         if self._heard_at is None:
             status.values["silence (s)"] = "nothing received yet"
         else:
-            silence = snapshot.now - self._heard_at
+            silence = self._silence.age(snapshot.now - self._heard_at, snapshot.now)
             status.judge("silence", silence, "s", limits.silence_warn_s, limits.silence_error_s)
         status.values["packets damaged"] = str(stats["packets"]["damaged"])
         status.values["frames of others"] = str(stats["packets"]["foreign"])

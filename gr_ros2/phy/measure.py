@@ -17,6 +17,7 @@ import pmt
 from gnuradio import blocks, gr
 
 from gr_ros2.core.errors import PhyError
+from gr_ros2.core.watch import Watch
 from gr_ros2.phy.base import Phy
 from gr_ros2.phy.channel import Channel
 from gr_ros2.phy.flowgraph import Flowgraph
@@ -76,11 +77,9 @@ def modulated(phy: Phy, packets: Sequence[bytes]) -> SampleRecording:
         top.start()
         for packet in packets:
             outlet.message_port_pub(PDUS, pdu_of(packet))
-        came, deadline = 0, time.monotonic() + _PATIENCE_S
+        still = Watch()
         while (now := sink.nitems_read(0)) < wanted:
-            if now > came:
-                came, deadline = now, time.monotonic() + _PATIENCE_S
-            elif time.monotonic() > deadline:
+            if still.still_s(now, time.monotonic()) > _PATIENCE_S:
                 raise PhyError(f"phy {phy.name}: {now} of {wanted} samples came, and no more for {_PATIENCE_S} s")
             time.sleep(_POLL_S)
     finally:

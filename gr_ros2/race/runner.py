@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gr_ros2.core.errors import RunError
+from gr_ros2.core.watch import Watch, wait_until
 from gr_ros2.race.channel import RaceChannel
 from gr_ros2.race.contenders import Contender, chosen
 from gr_ros2.race.endpoints import Playback, RaceProgram, RaceTopic, Seat
@@ -172,20 +173,15 @@ def _busy() -> float:
 
 
 def _wait_matched(limit_s: float, *parts: Worker) -> bool:
-    limit = time.monotonic() + limit_s
-    while not (matched := all(part.call("matched") for part in parts)) and time.monotonic() < limit:
-        time.sleep(_POLL_S)
-    return matched
+    return wait_until(lambda: all(part.call("matched") for part in parts), limit_s, lambda _: time.sleep(_POLL_S))
 
 
 def _drain(limit_s: float, listeners: Sequence[Worker], expected: int) -> None:
     """Wait until all messages on their way have arrived, or none has arrived for ``_QUIET_S``; ``limit_s`` at most."""
-    limit = time.monotonic() + limit_s
-    count, quiet = -1, 0.0
-    while (found := sum(robot.call("count") for robot in listeners)) < expected and time.monotonic() < limit:
-        now = time.monotonic()
-        if found != count:
-            count, quiet = found, now + _QUIET_S
-        if now > quiet:
-            return
-        time.sleep(_POLL_S)
+    quiet = Watch()
+
+    def over() -> bool:
+        found = sum(robot.call("count") for robot in listeners)
+        return found >= expected or quiet.still_s(found, time.monotonic()) > _QUIET_S
+
+    wait_until(over, limit_s, lambda _: time.sleep(_POLL_S))

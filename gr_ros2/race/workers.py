@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from gr_ros2.core.errors import GrRos2Error, RunError
+from gr_ros2.core.watch import wait_until
 from gr_ros2.race.namespaces import enter
 
 _START_S = 60.0
@@ -73,7 +74,7 @@ class Worker:
         :raises RunError: see :meth:`call`
         """
         try:
-            if not self._ours.poll(timeout_s):
+            if not wait_until(self._ours.poll, timeout_s, self._ours.poll):
                 raise RunError(f"the race's {self._name} has not answered for {timeout_s:g} s")
             failed, value = self._ours.recv()
         except (EOFError, ConnectionError) as error:

@@ -18,6 +18,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import RadioError
+from gr_ros2.core.watch import Watch
 from gr_ros2.phy import Phy
 from gr_ros2.radio.bursts import Blanker, BurstLayout, BurstShaper
 from gr_ros2.radio.device_checks import DeviceChecks
@@ -29,7 +30,6 @@ from gr_ros2.settings.fields import AUTO, Auto
 
 SILENT_S = 3.0
 """A device without a sample given or taken for this time, s, counts as dead; a change of direction takes a tenth."""
-
 _TIMED_S = 0.001
 """``timing_error_s`` of a device that tags what it receives with the time, and sends at a time."""
 _FOLLOWED_S = 1.0
@@ -107,7 +107,7 @@ class DeviceFrontEnd(FrontEnd):
         if chosen.half_duplex and self.transmits:
             self._blanker = Blanker(self._shaper.sent, chosen.turnaround_s, phy.sample_rate)
         self._gaps, self._energy = GapCounter(), EnergyCounter(phy.sample_rate)
-        self._given, self._taken = _Progress(), _Progress()
+        self._given, self._taken = Watch(), Watch()
         self._transmitting: Any = None
         self._receiving: Any = None
         self._offset: float | None = None
@@ -263,17 +263,3 @@ class DeviceFrontEnd(FrontEnd):
 def _silence(chosen: DeviceOptions) -> float:
     """How long nothing is sent after each burst, s."""
     return chosen.guard_s + (chosen.turnaround_s if chosen.half_duplex else 0.0)
-
-
-class _Progress:
-    """Watches whether a count still changes."""
-
-    def __init__(self) -> None:
-        self._count: int | None = None
-        self._since = 0.0
-
-    def still_s(self, count: int | None, now: float) -> float:
-        """How long the count has been the same, s. It is 0 if there is no count (None)."""
-        if count is None or count != self._count:
-            self._count, self._since = count, now
-        return now - self._since

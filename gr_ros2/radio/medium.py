@@ -7,7 +7,7 @@ that overlap at a receiver disturb each other, and a robot hears nothing while i
 *Lock step* (``time: lockstep``): the process tells every robot the time in steps of ``STEP_S``, and goes on when all of
 them have answered that they have sent what begins before. Links take it as their clock. So a machine that is too slow,
 or a robot that stands still for a moment, delays everybody and changes nothing. The time never goes faster than real
-time. A robot that has not answered for ``GONE_S`` is not waited for until it is heard again.
+time. A robot that has not answered for ``GONE_S`` is not waited for until it answers again, whatever else it sends.
 
 *Real time* (``time: real``): a burst begins when it arrives here, and nobody waits for anybody.
 
@@ -35,6 +35,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.watch import Watch
 from gr_ros2.medium.base import FixedPaths, Surroundings, Transmission
 from gr_ros2.medium.gains import all_paths, at_gains
 from gr_ros2.medium.positions import Positions
@@ -158,7 +159,11 @@ class _Link:
     """The two sockets to one robot's link.
 
     :ivar answered: newest time that it has answered, s; -inf before the first
-    :ivar heard: s, monotonic, when it last answered
+    :ivar waited_for: whether it answers, so that the time waits for it
+    :ivar gone_at: when it was last given up, s of the medium
+    :ivar heard: s, monotonic, when something of it came last
+    :ivar sends: whether a burst has come since its last answer, or since it was given up
+    :ivar unanswered: for how long that has been so
     """
 
     def __init__(self, context: Any, robot: MediumRobot, samples: int, stack: ExitStack) -> None:
@@ -169,7 +174,9 @@ class _Link:
         open_socket(self.publisher.bind, "bind", robot.bind, "medium")
         self.subscriber.subscribe(b"")
         open_socket(self.subscriber.connect, "connect", robot.connect, "medium")
-        self.answered, self.heard = -inf, -inf
+        self.answered = self.gone_at = self.heard = -inf
+        self.waited_for = self.sends = False
+        self.unanswered = Watch(_AGAIN_S)
         self.number = 0
 
 
@@ -181,7 +188,8 @@ class MediumProcess:
     :raises ConfigError: for a PHY whose bursts cannot be summed here
     :raises RadioError: when an address cannot be used
     :ivar counted: ``bursts``: from the robots; ``overlapping``: those that began while another robot sent;
-        ``malformed``, ``wrong_rate``: refused messages; ``waited``: steps for which a robot was waited for in vain
+        ``malformed``, ``wrong_rate``: refused messages; ``waited``: steps for which a robot was waited for in vain;
+        ``unanswered``: times ``GONE_S`` in which a robot sent and did not answer the time
     :ivar lost_s: s by which its clock is behind real time, in lock step: robots or this process were late
     """
 
@@ -199,6 +207,7 @@ class MediumProcess:
                 f"phy {phy.name}: a medium process needs one of this package's modems: ofdm, psk, gfsk, lora"
             )
         self.counted: Counter[str] = Counter()
+        self._said: set[tuple[str, int]] = set()
         self._rate = phy.sample_rate
         self._longest = phy.airtime_samples()
         self._medium = SampleMedium(
@@ -250,8 +259,8 @@ class MediumProcess:
     def _step(self) -> None:
         """Tell the time of the next step, and wait until all have answered."""
         self._now += STEP_S
-        told = -inf
-        waiting = [link for link in self._links if self._clock() - link.heard < GONE_S]
+        told, patience = -inf, Watch(_AGAIN_S)
+        waiting = [link for link in self._links if link.waited_for]
         while True:
             now = self._clock()
             if now - told >= _AGAIN_S:
@@ -259,12 +268,24 @@ class MediumProcess:
                 for link in self._links:
                     if link.answered < self._now:
                         self._send(link, self._now, b"")
-            late = [link for link in waiting if link.answered < self._now and now - link.heard < GONE_S]
+            late = any(link.answered < self._now for link in waiting) and patience.age(inf, now) < GONE_S
             left = self._began + self._now - now
             if not late and left <= 0:
                 break
             self._take(min(max(left, 0.0), _AGAIN_S) if not late else _AGAIN_S)
-        self.counted["waited"] += sum(link.answered < self._now for link in waiting)
+        for link in waiting:
+            if link.answered < self._now:
+                self.counted["waited"] += 1
+                link.waited_for, link.sends, link.gone_at = False, False, self._now
+        for number, link in enumerate(self._links):
+            if link.unanswered.still_s(link.sends or None, now) >= GONE_S:
+                link.sends = False
+                self._refuse(
+                    "unanswered",
+                    number,
+                    "it sends and does not answer the time, so nobody waits for it; set medium_process: lockstep at "
+                    "its front end",
+                )
         lost_s = max(0.0, -left - STEP_S)  # it is not made up for
         self._began += lost_s
         self.lost_s += lost_s
@@ -283,11 +304,11 @@ class MediumProcess:
     def _arrived(self, number: int, message: bytes) -> None:
         size = len(message) - HEADER.size
         if size < 0 or size % SAMPLE.itemsize or message[: len(MAGIC)] != MAGIC:
-            self._refuse("malformed", f"robot {number + 1}: a message of {len(message)} bytes is no burst of samples")
+            self._refuse("malformed", number, f"a message of {len(message)} bytes is no burst of samples")
             return
         _, _, _, rate, at = HEADER.unpack_from(message)
         if rate != self._rate:
-            self._refuse("wrong_rate", f"robot {number + 1} sends {rate:g} samples/s, not {self._rate:g}")
+            self._refuse("wrong_rate", number, f"it sends {rate:g} samples/s, not {self._rate:g}")
             return
         link = self._links[number]
         link.heard = self._clock()
@@ -295,12 +316,14 @@ class MediumProcess:
             samples = np.frombuffer(message, SAMPLE, offset=HEADER.size).astype(np.complex64, copy=False)
             self._burst(number, samples, at)
         elif isfinite(at):
-            link.answered = min(at, self._now)
+            link.answered, link.sends = min(at, self._now), False
+            link.waited_for |= link.answered >= link.gone_at
 
     def _burst(self, number: int, samples: NDArray[np.complex64], at: float) -> None:
         if not np.isfinite(samples).all():
-            self._refuse("malformed", f"robot {number + 1}: a burst has samples that are no finite numbers")
+            self._refuse("malformed", number, "a burst has samples that are no finite numbers")
             return
+        self._links[number].sends = self.config.time == "lockstep"
         earliest = self._now if self.config.time == "real" else self._handed
         told = at if isfinite(at) and at < self._now + GONE_S else earliest
         start = max(told, earliest, self._busy[number])  # a robot sends one burst after the other
@@ -324,7 +347,8 @@ class MediumProcess:
     def _send(self, link: _Link, at: float, samples: bytes) -> None:
         link.publisher.send(HEADER.pack(MAGIC, self._id, link.number, self._rate, at) + samples, zmq.NOBLOCK)
 
-    def _refuse(self, name: str, problem: str) -> None:
+    def _refuse(self, name: str, number: int, problem: str) -> None:
         self.counted[name] += 1
-        if self.counted[name] == 1:
-            _log.warning("medium: %s", problem)
+        if (name, number) not in self._said:
+            self._said.add((name, number))
+            _log.warning("medium: robot %d: %s", number + 1, problem)

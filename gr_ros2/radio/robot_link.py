@@ -15,6 +15,7 @@ from math import inf
 from typing import Any
 
 from gr_ros2.core.errors import RadioError
+from gr_ros2.core.watch import Watch
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware
@@ -74,6 +75,7 @@ class RobotLink(Flowgraph):
         self._worked = False
         """Whether the front end has worked once; if not, nothing has vanished."""
         self._outrun: dict[str, int] = {}
+        self._watches = Watch(), Watch()
         self._stack = ExitStack()
         self._observers = Observers[LinkObserver](() if observer is None else (observer,))
         try:
@@ -250,17 +252,19 @@ class RobotLink(Flowgraph):
             self._retry()
         if not self._running:
             return
-        for thread, stalled_s in (
-            ("sending thread", self.source.stalled_s(self._clock())),
-            ("thread that paces packets", self.radio.gate.stalled_s()),
+        now, pacing, sending = self._clock(), *self._watches
+        for thread, watch, told_s in (
+            ("sending thread", sending, self.source.stalled_s(now)),
+            ("thread that paces packets", pacing, self.radio.gate.stalled_s()),
         ):
+            stalled_s = inf if told_s == inf else watch.age(told_s, now)  # infinite: it has ended
             if stalled_s > STALLED_S:
                 raise RadioError(
                     f"link {self.config.name}: the {thread} has not gone on for {stalled_s:.0f} s; start the link "
                     "again, and report what it was doing (py-spy dump)"
                 )
         try:
-            self.front_end.check(self._clock())
+            self.front_end.check(now)
             self._worked = True
         except RadioError as error:
             if not (self.front_end.may_return and self._worked):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
@@ -24,6 +25,7 @@ from gr_ros2.core.backlog import Backlog
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.files import replacing
 from gr_ros2.core.guard import Guard, one_line
+from gr_ros2.core.watch import LOOK_S, Watch
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.bursts import BurstCutter
 
@@ -187,10 +189,10 @@ class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
     def wait_for_bursts(self, number: int) -> None:
         """Wait until so many bursts have come, in a flowgraph that runs; no longer once none comes for a while."""
+        watch = Watch()
         with self._changed:
-            while self._cut < number:
-                if not self._changed.wait(_PATIENCE_S):
-                    return
+            while self._cut < number and watch.still_s(self._cut, time.monotonic()) < _PATIENCE_S:
+                self._changed.wait(LOOK_S)
 
     def _record(self, samples: NDArray[np.complex64]) -> None:
         data = samples.astype(SAMPLE, copy=False).tobytes()

@@ -17,12 +17,14 @@ import threading
 import time
 from collections import Counter
 from ctypes import POINTER, byref, c_bool, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
+from math import inf
 from typing import Any
 
 import numpy as np
 from gnuradio import gr
 from numpy.typing import NDArray
 
+from gr_ros2.core.watch import Watch
 from gr_ros2.phy.threads import ThreadState
 from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.stream_events import BURSTS_OUT
@@ -244,10 +246,12 @@ class SoapySink(gr.sync_block):  # type: ignore[misc]
 
     def _send(self, burst: NDArray[np.complex64], leave_at: float | None) -> None:
         """:param leave_at: s of the device's clock; None for now"""
-        deadline = time.monotonic() + self._patience
+        watch = Watch(_PATIENCE_S / 4)
         at_ns = 0 if leave_at is None else round(leave_at * 1e9)
         done = result = 0
-        while done < len(burst) and (result > 0 or (result in _AGAIN and time.monotonic() < deadline)):
+        while done < len(burst) and (
+            result > 0 or (result in _AGAIN and watch.age(inf, time.monotonic()) < self._patience)
+        ):
             rest = burst[done:]
             timed = leave_at is not None and not done  # the rest of a burst follows its begin
             where, flags = c_void_p(rest.ctypes.data), c_int(_END_BURST | (_HAS_TIME if timed else 0))

@@ -19,6 +19,7 @@ from typing import Any
 from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.core.files import make_folder, write_whole
 from gr_ros2.core.guard import Guard, one_line
+from gr_ros2.core.watch import Watch, wait_until
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.record.lateness import lateness_result
@@ -300,11 +301,8 @@ class _Run:
             self._wait(lambda: not task.uncommanded(), _CONTROLLERS_S, what, remedy)
 
     def _wait(self, condition: Callable[[], bool], most_s: float, otherwise: str, remedy: str) -> None:
-        limit = time.monotonic() + most_s
-        while not condition():
-            if time.monotonic() > limit:
-                raise RunError(f"{self.scenario.name}: {otherwise} within {most_s:g} s; {remedy}")
-            time.sleep(_POLL_S)
+        if not wait_until(condition, most_s, lambda _: time.sleep(_POLL_S)):
+            raise RunError(f"{self.scenario.name}: {otherwise} within {most_s:g} s; {remedy}")
 
     def _sim_matched(self) -> bool:
         if (sim := self.sim) is None:
@@ -326,13 +324,13 @@ class _Run:
     def _drain(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
         """Let the link deliver what it holds, for at most ``drain_s``. With time unthrottled, each further message
         restarts that time."""
-        limit = time.monotonic() + self.scenario.drain_s
-        before = (0, 0)
-        while time.monotonic() < limit and self.records.unresolved():
+        waited, unthrottled = Watch(), self.scenario.time == "unthrottled"
+        while self.records.unresolved():
+            came = self.records.recorder.progress() if unthrottled else 0
+            if waited.still_s(came, time.monotonic()) >= self.scenario.drain_s:
+                return
             time.sleep(_POLL_S)
             self._report(on_progress, begin)
-            if self.scenario.time == "unthrottled" and (now := self.records.recorder.progress()) != before:
-                before, limit = now, time.monotonic() + self.scenario.drain_s
 
     def _check_alone(self) -> None:
         """Check that the links sent only what this run's robots published, and that nobody else published what comes

@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from gr_ros2.core.errors import GrRos2Error, RunError
+from gr_ros2.core.watch import wait_until
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.medium.base import Surroundings
 from gr_ros2.phy import Phy
@@ -97,15 +98,15 @@ class SharedChannel:
         for link in self._robots:
             link.start()
         self._thread.start()
-        limit = time.monotonic() + _FOUND_S
-        while self._medium.robots < len(self._robots):
-            self.check()
-            if time.monotonic() > limit:
-                raise RunError(
-                    f"{self._medium.robots} of {len(self._robots)} robots have answered the medium within "
-                    f"{_FOUND_S:g} s; this computer is too slow for them: take fewer, or simulated time"
-                )
-            time.sleep(_POLL_S)
+        if not wait_until(self._found, _FOUND_S, lambda _: time.sleep(_POLL_S)):
+            raise RunError(
+                f"{self._medium.robots} of {len(self._robots)} robots have answered the medium within "
+                f"{_FOUND_S:g} s; this computer is too slow for them: take fewer, or simulated time"
+            )
+
+    def _found(self) -> bool:
+        self.check()
+        return self._medium.robots == len(self._robots)
 
     def run_began(self, now: float) -> None:  # noqa: ARG002 - the medium has a clock of its own
         """Count from now on where the robots are, and how long the medium waits for the computer."""

@@ -285,3 +285,16 @@ def test_packets_that_stand_at_the_newest_number_are_not_a_turn_ahead() -> None:
     air = state.tick(now).packets
     assert air["air_repair"] > 0
     assert air["air_new"] + air["air_repair"] + air["air_report"] + air["air_hello"] == air["sent"]
+
+
+def test_a_page_of_a_program_that_was_frozen_accuses_nobody() -> None:
+    """Who was heard before it is `down` only after as long a silence from then on."""
+    sender, state = Robot(SRC, registry()), DashboardState(registry(), {}, 64, tick_s=0.5)
+    other = Robot(5)
+    sender.end.messages.submit(0, b"x" * 20, 0.0)
+    data = sender.slot(0.0)
+    assert data is not None
+    for event in other.receive(data, 0.0):
+        state.receiver_event(event, 0.0)
+    assert [state.tick(now).state for now in (0.5, 1.0, 60.0, 61.0)] == ["up"] * 4
+    assert {state.tick(61.0 + 0.5 * n).state for n in range(1, 12)} == {"up", "down"}

@@ -110,7 +110,7 @@ def test_a_state_file_that_cannot_be_written_is_shown() -> None:
 
 
 def test_silence_counts_from_the_last_packet() -> None:
-    health = make(silence_warn_s=3, silence_error_s=10)
+    health = make(silence_warn_s=3, silence_error_s=10, period_s=5)
     assert parts(health, 0.0)[0].values["silence (s)"] == "nothing received yet"
     levels = [parts(health, now, packets=1)[0].level for now in (1.0, 4.0, 4.1, 11.1)]
     assert levels == [Level.OK, Level.OK, Level.WARN, Level.ERROR]
@@ -153,7 +153,7 @@ def test_the_snr_is_told_where_it_is_known() -> None:
 
 
 def test_what_comes_over_others_says_over_whom_and_its_link_is_lost_when_nothing_comes_any_more() -> None:
-    health = make()
+    health = make(period_s=10)
     assert "hops" not in parts(health, 0.0)[2].values
     topic = parts(health, 1.0, hops=2)[2]
     assert (topic.values["hops"], topic.values["over robot"]) == ("2", "3")
@@ -162,6 +162,23 @@ def test_what_comes_over_others_says_over_whom_and_its_link_is_lost_when_nothing
     assert (state.message, state.values) == ("up", {"age (s)": "0.50", "hops": "2", "over robot": "3"})
     state = health.links(stats(), health.judge(stats(), 20.0)[0])[7]
     assert (state.message, state.values) == ("lost", {"age (s)": "18.50"})
+
+
+def test_a_link_that_was_frozen_itself_accuses_nobody_and_counts_anew() -> None:
+    health = make()
+
+    def judged(now: float, silence_s: float) -> tuple[Status, Status]:
+        values = stats(packets=9)
+        values["sink"]["silence_s"] = {2: silence_s}
+        receiver = health.judge(values, now)[0]
+        return receiver, health.links(values, receiver)[2]
+
+    judged(0.0, 0.1)
+    for receiver, link in (judged(1.0, 0.6), judged(13.0, 12.6)):
+        assert (receiver.level, link.message) == (Level.OK, "up")
+    assert link.values == {"age (s)": "12.60"}, "how old it is remains true"
+    told = [judged(13.0 + n, 12.6 + n)[1].message for n in range(1, 10)]
+    assert (told[0], told[-1]) == ("degraded", "lost")
 
 
 def test_a_limit_of_zero_is_none() -> None:

@@ -271,6 +271,22 @@ def test_what_a_device_cannot_do_is_said_in_a_line(driver: Path, tmp_path: Path)
         assert log.read_text().splitlines()[-1] == "tx closed"
 
 
+def test_a_device_is_not_dead_because_the_link_was_frozen(driver: Path) -> None:
+    code = (
+        "from gr_ros2.radio.soapy import SoapyFrontEnd\n"
+        "from gr_ros2.phy.psk import PskPhy\n"
+        "one = SoapyFrontEnd(PskPhy(64, 2e6), args='driver=loopback', frequency=1e8, transmits=True)\n"
+        "for now in (0.0, 0.5, 12.5, 13.0, 14.0):\n"
+        "    one.check(now)\n"
+        "try:\n"
+        "    one.check(15.0)\n"
+        "    one.check(16.0)\n"
+        "except Exception as error:\n"
+        "    print(error)\n"
+    )
+    assert "no samples for 3 s" in python(driver, code).stdout
+
+
 @pytest.mark.slow
 def test_a_device_that_falls_silent_is_waited_for_and_opened_again(driver: Path, tmp_path: Path) -> None:
     """Each time it is opened, it dies after 0.2 s. In between, the robot hears its own packets."""

@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from math import nan
 from pathlib import Path
@@ -158,6 +159,56 @@ def test_in_lock_step_a_robot_that_stands_still_stops_the_time(medium: Start, tm
             wait_for(lambda: len(one.heard) > heard + 2, "robot 1 to hear it again")
         finally:
             other.kill()
+
+
+@pytest.fixture
+def process(tmp_path: Path) -> Iterator[MediumProcess]:
+    """A medium process that runs in a thread of this one, with a clock that can jump."""
+    path, over = tmp_path / "medium.yaml", threading.Event()
+    path.write_text(yaml.safe_dump(settings(tmp_path)))
+    made = MediumProcess(load_medium(path))
+    running = threading.Thread(target=made.run, kwargs={"over": over})
+    running.start()
+    yield made
+    over.set()
+    running.join()
+    made.close()
+
+
+def test_nobody_waits_for_a_robot_that_sends_and_never_answers_the_time(
+    process: MediumProcess, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with (
+        Robot(1, front_end(tmp_path, 1), hears=(2,)) as one,
+        Robot(2, {**front_end(tmp_path, 2), "medium_process": "none"}, hears=(1,)) as two,
+    ):
+        clock = one.link.front_end.clock
+        wait_for(lambda: two.say(1) and process.counted["bursts"] > 2, "bursts of robot 2")
+        before = clock()
+        wait_for(lambda: two.say(1) and clock() > before + 2.0, "the time to go on, whatever robot 2 sends")
+        wait_for(lambda: two.say(1) and process.counted["unanswered"], "robot 2 to be named")
+    (named,) = (record.message for record in caplog.records if "does not answer the time" in record.message)
+    assert named.startswith("medium: robot 2: ")
+
+
+def test_a_medium_that_was_frozen_itself_goes_on_waiting_for_its_robots(
+    process: MediumProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left, slept = [5], [0.0]
+    clock, take = process._clock, process._take
+
+    def freeze(timeout_s: float) -> None:
+        left[0], slept[0] = max(0, left[0] - 1), slept[0] + 12.0 * bool(left[0])
+        take(timeout_s)
+
+    with Robot(1, front_end(tmp_path, 1), hears=(2,)), Robot(2, front_end(tmp_path, 2), hears=(1,)):
+        wait_for(lambda: process.robots == 2, "both robots")
+        monkeypatch.setattr(process, "_clock", lambda: clock() + slept[0])
+        monkeypatch.setattr(process, "_take", freeze)
+        wait_for(lambda: not left[0], "the jumps")
+        after = process.now
+        wait_for(lambda: process.now > after + 0.2, "the time to go on")
+        assert process.counted["waited"] == 0
 
 
 def test_the_clock_of_a_link_follows_the_medium_and_never_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,6 +56,20 @@ def test_a_sending_thread_that_hangs_is_named(tmp_path: Path, monkeypatch: pytes
         hung.set()
 
 
+def test_a_link_that_was_frozen_as_a_whole_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Robot(1, udp(), version=1, phy=MODEM, state=str(tmp_path / "state")) as one:
+        wait_for(lambda: one.link.stats()["packets"]["out"] > 2, "some hellos")
+        one.link.check()
+        clock, stalled_s = one.link._clock, one.link.radio.gate.stalled_s
+        # It looks first, before the threads that stood still with it.
+        monkeypatch.setattr(one.link, "_clock", lambda: clock() + 12.0)
+        monkeypatch.setattr(one.link.radio.gate, "stalled_s", lambda: stalled_s() + 12.0)
+        assert one.link.source.stalled_s(one.link._clock()) > robot_link.STALLED_S
+        one.link.check()
+        monkeypatch.undo()
+        one.link.check()
+
+
 def test_a_sending_thread_that_has_ended_is_named(tmp_path: Path) -> None:
     with Robot(1, udp(), version=1, phy=MODEM, state=str(tmp_path / "state")) as one:
         one.link.source.stop()
