@@ -14,6 +14,7 @@ from gr_ros2.core.errors import CodecError
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.order import Ready
+from gr_ros2.wire.relayed import Relayed
 from gr_ros2.wire.table import AnnouncedTopic, read_table
 
 _WAITING = 256
@@ -42,7 +43,7 @@ class AnnouncedTopics:
         self._bytes = 0
         self._most = most
 
-    def topic_of(self, ready: Ready) -> AnnouncedTopic | None:
+    def topic_of(self, ready: Ready | Relayed) -> AnnouncedTopic | None:
         """The topic of a message; None if the message has to wait for a table."""
         topic = self.topics.get(ready.topic_id)
         if topic is None or (

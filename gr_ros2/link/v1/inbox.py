@@ -11,6 +11,7 @@ ends in one Delivered or Lost; memory is bounded.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from math import inf
 from typing import NamedTuple, Protocol
 
 from gr_ros2.core.errors import CodecError, WireError
@@ -86,6 +87,7 @@ class Inbox:
     :param outcomes: takes what comes of its packets, shared with other inboxes
     :param control: called with entries that are not messages
     :param relaying: is told of messages that came, where they are relayed
+    :param give_up_s: s of silence after which the robot is regarded as gone
     :ivar reports: what the robot is told of its packets
     :ivar announced: its topics
     :ivar order: which of its messages wait for an earlier one
@@ -105,6 +107,7 @@ class Inbox:
         outcomes: Outcomes,
         control: Callable[[Control], None],
         relaying: Passing | None = None,
+        give_up_s: float = inf,
     ) -> None:
         self.src_id, self.boot = src_id, boot
         self.deliveries = DeliveryRules(settings, marks)
@@ -116,7 +119,7 @@ class Inbox:
         self.decoder.begin(first)
         self.decoder.newest = first - 1
         self._first = first
-        self.order = Order(self.decoder, first, settings.hold_s, bounds.ordered, room)
+        self.order = Order(self.decoder, first, settings.hold_s, most=bounds.ordered, room=room, give_up_s=give_up_s)
         self._reassembly = Reassembly(bounds.fragments)
         of, share = (src_id, boot), settings.airtime_share
         self.reports: Reporter = (
@@ -239,6 +242,7 @@ class Inbox:
         """The sender has reached this number, of which the decoder is told next. Packets between the newest one and it
         are missing for now."""
         self._now = now
+        self.order.heard()
         newest = self.decoder.newest
         if number <= newest:
             return
@@ -304,12 +308,12 @@ class Inbox:
         self._known(ready)
 
     def _known(self, ready: Ready) -> None:
-        """Deliver a message as soon as its topic is known. One of a reliable topic waits for those before it, unless it
-        came over another robot."""
+        """Deliver a message as soon as its topic is known. One of a reliable topic waits for those before it, unless
+        robots that kept all of them have handed it on."""
         topic = self.announced.topic_of(ready)
         if topic is None:
             self._await_table(ready)
-        elif topic.reliable and ready.over is None and ready.order[0] > self.order.low:
+        elif topic.reliable and not ready.carried and ready.order[0] > self.order.low:
             self.order.wait(ready)
         else:
             self._deliver(ready, topic)
@@ -328,15 +332,19 @@ class Inbox:
     def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""
         self._now = now
+        self.order.over_others(now)
         if ready.topic_id == TABLE_TOPIC:
             self._table(ready.payload)
         else:
             self.deliveries.came_over(ready)
             self._known(ready)
+        self._settle()
 
     def adopt(self, far: Inbox) -> None:
         """Go on from what has come of this start over other robots."""
         self.deliveries.adopt(far.deliveries)
+        for ready in far.order.without(()):
+            self.order.wait(ready)
         if not self.announced.topics:
             self.announced = far.announced
 

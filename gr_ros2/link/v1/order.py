@@ -6,6 +6,9 @@ repairs a missing packet, or says that it does not any more. Only then it is giv
 when the messages that wait fill the memory. From a sender without reports a missing packet is also given up ``hold_s``
 after it was missed, or at once if hardly any missing packet comes back.
 
+A message that came over other robots waits in the same way: what its sender repairs is older, and would come too late.
+Only when other robots have brought messages for ``give_up_s`` and the sender itself nothing, no message waits for it.
+
 Invariants: messages of one topic come out in the order in which they began; the bytes that wait are bounded.
 """
 
@@ -14,6 +17,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass
+from math import inf
 
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.gap_contents import GapContents
@@ -36,6 +40,7 @@ class Ready:
     :param qos: QoS class of the packet that completed it; -1 if that packet was recovered
     :param hops: robots that have sent it on
     :param over: the last of them; None where it came from the robot that made it
+    :param carried: it was handed on to this robot
     """
 
     topic_id: int
@@ -46,6 +51,7 @@ class Ready:
     repaired: bool
     hops: int = 0
     over: int | None = None
+    carried: bool = False
 
 
 class Order:
@@ -56,6 +62,7 @@ class Order:
     :param hold_s: s that a message waits for an earlier one whose sender gets no reports
     :param most: bytes of messages that may wait
     :param room: bytes of the longest body
+    :param give_up_s: s of silence after which a sender is regarded as gone
     :ivar contents: which topics missing packets can have carried
     :ivar told: whether the sender gets reports. It then says which packets it does not repair any more
     :ivar low: every packet before this number is here or given up
@@ -63,7 +70,9 @@ class Order:
     :ivar held: bytes of the messages that wait
     """
 
-    def __init__(self, decoder: RepairDecoder, first: int, hold_s: float, most: int, room: int) -> None:
+    def __init__(
+        self, decoder: RepairDecoder, first: int, hold_s: float, *, most: int, room: int, give_up_s: float = inf
+    ) -> None:
         self.told = False
         self.low = self.wanted = first
         self.held = 0
@@ -71,7 +80,9 @@ class Order:
         self._passed: dict[int, int] = {}
         """By topic: no missing packet before this number can have carried something of it."""
         self._decoder = decoder
-        self._hold_s = hold_s
+        self._hold_s, self._give_up_s = hold_s, give_up_s
+        self._over_at = inf
+        """When another robot brought a message for the first time since the sender was heard, s."""
         self._most = most
         self._dead = first
         """The sender does not repair packets before this number any more."""
@@ -104,6 +115,14 @@ class Order:
             self._void = {left_out for left_out in self._void if left_out >= self.wanted}
             self._most_void = 2 * len(self._void) + _VOID
 
+    def heard(self) -> None:
+        """The sender itself was heard."""
+        self._over_at = inf
+
+    def over_others(self, now: float) -> None:
+        """Another robot has brought a message of the sender."""
+        self._over_at = min(self._over_at, now)
+
     def wait(self, ready: Ready) -> None:
         """Keep a message until nothing before it is missing."""
         self.held += len(ready.payload) + _COST
@@ -117,7 +136,8 @@ class Order:
         low = max(self.low, dead if dead <= newest else newest + 1)
         while gaps and gaps[0][2] < floor:
             gaps.popleft()
-        if self.held > self._most:
+        waits = self.held <= self._most and now < self._over_at + self._give_up_s
+        if not waits:
             low = newest + 1
         elif gaps and not self.told:
             low = self._give_up(low, dead, now)
@@ -137,16 +157,18 @@ class Order:
                     passed += 1
                 self._passed[topic_id] = passed
                 line.sort(key=lambda ready: ready.order)
-                while line and line[0].order[0] <= passed:
+                while line and (line[0].order[0] <= passed or not waits):
                     due.append(line.pop(0))
                     self.held -= len(due[-1].payload) + _COST
         return due
 
     def next_timeout(self) -> float | None:
         """Time in s at which missing packets are given up for which messages wait."""
-        if not self.told and self._gaps and any(self._waiting.values()):
-            return self._gaps[0][0] + self._hold_s
-        return None
+        if not any(self._waiting.values()):
+            return None
+        held = self._gaps[0][0] + self._hold_s if self._gaps and not self.told else inf
+        soonest = min(held, self._over_at + self._give_up_s)
+        return None if soonest == inf else soonest
 
     def without(self, topic_ids: Collection[int]) -> list[Ready]:
         """Give up the messages that wait, except those of these topics."""

@@ -319,6 +319,7 @@ class ReceivingSide:
             outcomes=self._outcomes,
             control=self._entry,
             relaying=self.relaying,
+            give_up_s=self._give_up_s,
         )
         far = None if self.relaying is None else self.relaying.far.get(src_id)
         if far is not None and far.boot == boot:

@@ -131,6 +131,9 @@ class Relaying:
                 if taker == self.src_id:
                     self.custody.take(message, via, now)
                 return
+        elif not self._known(message):
+            self._dropped["unknown_origin"] += 1  # It is not taken, so whoever has it does not learn that it is here.
+            return
         elif not self._take(via, message, now):
             self._dropped["relayed_before"] += 1
             return
@@ -140,23 +143,30 @@ class Relaying:
         if message.topic_id == TABLE_TOPIC:
             self._announced(message, via, now)
         elif (inbox := self._inbox(message.origin, message.start)) is not None:
-            self._delivered(inbox, message, via, now)
-        elif taker == BROADCAST:
-            self._dropped["unknown_origin"] += 1
+            self._delivered(inbox, message, via, now, carried=taker != BROADCAST)
         else:  # Whoever has handed it on has forgotten it by now. It waits until the table of its origin is here.
             self._dropped["unknown_origin"] += len(self._early) == MOST_EARLY
             self._early.append((message, via))
 
-    def _delivered(self, inbox: Inbox, message: Relayed, via: int, now: float) -> None:
+    def _delivered(self, inbox: Inbox, message: Relayed, via: int, now: float, *, carried: bool = False) -> None:
         order = message.number, message.place
-        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False, message.hops, via)
+        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False, message.hops, via, carried)
         self._reached(inbox, now)
         inbox.relayed(ready, now)
+
+    def _known(self, message: Relayed) -> bool:
+        """Whether a table of topics says what a message is."""
+        if message.topic_id == TABLE_TOPIC or message.origin == self.src_id:
+            return True
+        inbox = self._inbox(message.origin, message.start)
+        return inbox is not None and inbox.announced.topic_of(message) is not None
 
     def _reached(self, inbox: Inbox, now: float) -> None:
         """Something of a robot came over others."""
         neighbour = self._neighbours.all.get(inbox.src_id)
         known = neighbour is not None and not neighbour.gone
+        if neighbour is not None:
+            neighbour.timeout = None
         met = not known and self._here.get(inbox.src_id, (-1, 0.0))[0] != inbox.boot
         self._here[inbox.src_id] = inbox.boot, now
         if met:
@@ -182,7 +192,9 @@ class Relaying:
         return found
 
     def handle_timeout(self, now: float) -> None:
-        """Give up robots of which nothing comes any more."""
+        """Give up robots of which nothing comes any more, and robots that are never heard themselves."""
+        for inbox in self.far.values():
+            inbox.handle_timeout(now)
         for src_id, (boot, at) in list(self._here.items()):
             if now >= at + STALE_S:
                 del self._here[src_id]
@@ -192,7 +204,9 @@ class Relaying:
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do."""
-        return min((at + STALE_S for _, at in self._here.values()), default=None)
+        times = [at + STALE_S for _, at in self._here.values()]
+        times += [at for inbox in self.far.values() if (at := inbox.next_timeout()) is not None]
+        return min(times, default=None)
 
     def _carried(self, src_id: int, topic_id: int) -> bool:
         """Whether a robot's messages of a topic are handed on to the one for which they are."""
@@ -233,7 +247,7 @@ class Relaying:
         for early in [early for early in self._early if early[0].origin == message.origin]:
             self._early.remove(early)
             if early[0].start == message.start:
-                self._delivered(inbox, *early, now)
+                self._delivered(inbox, *early, now, carried=True)
             else:
                 self._dropped["unknown_origin"] += 1
 

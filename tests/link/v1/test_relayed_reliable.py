@@ -1,0 +1,95 @@
+"""Reliable topics for all, with relaying on: what arrives with it off arrives with it on, too, once and in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.settings.config import TopicOptions
+from tests.link.v1.air import Robot, registry
+from tests.link.v1.test_relaying import Line, robot
+
+TOPICS = registry(odom=TopicOptions(queue="latest"), goal=TopicOptions())
+LATE = registry(odom=TopicOptions(queue="latest"), map=TopicOptions(durability="transient_local"))
+Apart = Callable[[int, int], bool]
+"""Whether two robots are out of reach of each other now."""
+
+
+class Cell(Line):
+    """Robots of which each hears all others, unless ``apart`` says otherwise."""
+
+    apart: Apart = staticmethod(lambda _, __: False)  # type: ignore[assignment]
+
+    def near(self, one: int) -> list[int]:
+        return [other for other in range(len(self.robots)) if other != one and not self.apart(one, other)]
+
+
+def cell(mode: SealMode, loss: float) -> Cell:
+    met = Cell(*(robot(src_id, mode, TOPICS) for src_id in (1, 2, 3)), loss=loss)
+    met.run(5)
+    return met
+
+
+def talk(cell: Cell, count: int) -> list[bytes]:
+    """Every robot publishes so many goals."""
+    goals = [b"goal %d" % n for n in range(count)]
+    for goal in goals:
+        for one in cell.robots:
+            one.end.messages.submit(1, goal, cell.now)
+        cell.run(0.3)
+    return goals
+
+
+def came(one: Robot, src_id: int) -> list[bytes]:
+    return [payload for payload in one.delivered(src_id) if payload.startswith(b"goal")]
+
+
+def whole(cell: Cell, goals: list[bytes]) -> bool:
+    """Whether all robots have all goals of all others, once and in order."""
+    return all(came(one, other.src_id) == goals for one in cell.robots for other in cell.robots if other is not one)
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.2, 0.3])
+def test_a_relayed_message_does_not_overtake_what_repair_brings(loss: float, mode: SealMode) -> None:
+    everybody = cell(mode, loss)
+    goals = talk(everybody, 150)
+    everybody.run(20)
+    assert whole(everybody, goals)
+    assert any(one.end.received.dropped["relayed_before"] for one in everybody.robots), "messages were relayed"
+
+
+def test_eight_seconds_out_of_reach_cost_nothing() -> None:
+    """A third robot hears both meanwhile."""
+    everybody = cell("encrypt", 0.1)
+    everybody.apart = lambda one, other: 10 <= everybody.now < 18 and {one, other} == {0, 2}
+    goals = talk(everybody, 80)
+    everybody.run(30)
+    assert whole(everybody, goals)
+
+
+def test_a_robot_that_stays_out_of_reach_is_heard_over_others() -> None:
+    """They met, so goals wait for repair at first; then what others bring comes out as of any far robot."""
+    everybody = cell("encrypt", 0.1)
+    talk(everybody, 10)
+    everybody.apart = lambda one, other: {one, other} == {0, 2}
+    everybody.run(40)
+    before = everybody.now
+    everybody.robots[0].end.messages.submit(1, b"goal at last", before)
+    everybody.run(3)
+    assert came(everybody.robots[2], 1)[-1] == b"goal at last"
+
+
+def test_what_was_relayed_before_its_table_came_comes_out() -> None:
+    """It is not noted as here, so the robot that has it sends it again."""
+    for seed in range(3):
+        line = Line(robot(1, "encrypt", LATE), robot(2, "encrypt"), loss=0.2)
+        line._rng.seed(seed)
+        line.run(8)
+        line.robots[0].end.messages.submit(1, b"the map", line.now)
+        line.run(8)
+        line.robots.append(robot(3, "encrypt"))
+        line.run(40)
+        assert line.robots[2].delivered(1).count(b"the map") == 1
