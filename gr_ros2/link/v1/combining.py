@@ -10,6 +10,7 @@ Invariant: no two repairs of the same packets have the same coefficients.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from gr_ros2.link.v1.gf256 import combine
@@ -73,14 +74,17 @@ class Combining:
         first, last = max(number - half, packets.oldest), min(number + half, packets.newest)
         return packets.live(first, last, now)[::-1]
 
-    def combine(self, window: list[Sent], proven: int, now: float) -> tuple[Repair, list[Sent]] | None:
+    def combine(self, window: list[Sent], provens: Sequence[int], now: float) -> tuple[Repair, list[Sent]] | None:
         """The combination of a window, and the packets that it combines: all in its span if a mask does not fit beside
         the bodies. None if none can be sent.
 
-        :param proven: it must stand at a later number
+        :param provens: it must stand at a later number than the first of these for which that is possible
         """
-        window = self._anchored(window, proven, now)
-        if not window:
+        for proven in provens:
+            if anchored := self._anchored(window, proven, now):
+                window = anchored
+                break
+        else:
             return None
         packets = self._packets
         newest, first = window[0].number, window[-1].number

@@ -14,6 +14,7 @@ from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.shared import SharedRepairs, newest_of
 from gr_ros2.link.v1.unreported import Unreported
+from gr_ros2.wire.v1 import MAX_WINDOW
 
 START = 64
 """If a robot is first heard within this number of packets of its start, its packets count from its start on."""
@@ -22,6 +23,9 @@ UNDER_WAY_S = 1e-3
 where a report comes at once."""
 MAP = 64
 """Number of packets that a report covers."""
+REACH = MAX_WINDOW - 2
+"""How many packets before the last one that a peer may take for a replay a combination brings back, which stands at a
+later number. A peer needs no older ones."""
 PROMPT = 1 / 64
 """Share of packets lost from which on a peer reports every packet at once, if that takes no slot from anything. The
 sender then notices a missing report as soon as it is overdue, and repairs without waiting for the next packet. With
@@ -179,9 +183,17 @@ class Peers:
         if number > self._packets.newest:
             return
         peer = self.meet(src_id, now)
+        if peer.newest < 0:
+            peer.lost.clear()  # what it was expected to lack
         self._note_times(peer, number, loss, now)
         records, bit, delay = self._packets.records, peer.bit, peer.delay
         peer.waits = -1
+        if settled:
+            lacks = ~arrived & (1 << MAP) - 1
+            needs = number - lacks.bit_length() + 1
+            if peer.proven > needs + REACH:  # it has taken an earlier proof than the last one that was sent
+                peer.proven = needs + REACH
+                peer.lost.clear()
         before = number if self._shared is None else self._shared.waited_for(now, self._period)
         missing: list[Sent] = []
         for back in range(MAP):
@@ -206,7 +218,7 @@ class Peers:
                 if record is not None:
                     record.confirmed |= bit
                     peer.lost.discard(older)
-            peer.settled = max(peer.settled, number - MAP + 1)
+            peer.settled = max(peer.settled, needs)
         self._packets.retire(now)
 
     def _lacks(self, peer: Peer, missing: list[Sent]) -> None:
@@ -256,6 +268,15 @@ class Peers:
                 if record is not None and not record.confirmed & peer.bit and record.alive(now):
                     return record
         return None
+
+    def replayed(self, number: int) -> bool:
+        """Whether a peer that may need a packet may take it for a replay."""
+        return any(peer.settled <= number <= peer.proven for peer in self.all.values())
+
+    @property
+    def provens(self) -> list[int]:
+        """Up to which packets peers may take them for replays, the highest first."""
+        return sorted({peer.proven for peer in self.all.values()}, reverse=True) or [0]
 
     def lack(self, packets: list[Sent]) -> bool:
         """Whether a report names one of these packets as lost."""

@@ -28,6 +28,7 @@ from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.outcomes import Outcomes
+from gr_ros2.link.v1.peers import REACH
 from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.replays import Save
@@ -243,6 +244,9 @@ class ReceivingSide:
             if neighbour.hello.capabilities & WANTS_PROOF:
                 sending.hellos.answer(now)
         proved = self.neighbours.proved(neighbour, number, entries)
+        if proved:
+            assert neighbour.proofs.proven is not None
+            inbox.order.repaired_from(neighbour.proofs.proven - REACH)
         for entry in entries:
             if isinstance(entry, Hello):
                 inbox.order.told = self._settings.hears and entry.capabilities & REPORTED != 0

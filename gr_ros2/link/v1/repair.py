@@ -108,7 +108,7 @@ class RepairWindow:
             return self._urgent_of_all(now)
         again = self.peers.urgent(now)
         if again is not None:
-            return self._again(again, now)
+            return self._bring(again, now)
         if not self._unreported.due(self.packets.newest):
             return None
         self.packets.retire(now)
@@ -129,12 +129,19 @@ class RepairWindow:
         return self._unreported.due(self.packets.newest)
 
     def tell(self, number: int, now: float) -> Repair | None:
-        """A repair from which peers learn that a packet is not repaired any more; None if there is none."""
-        self.peers.told()
-        if self._shared is not None:
-            return self._for_all(now, number, lacking=False)
-        self.packets.retire(now)
-        window = self._combining.around(number, now)
+        """A repair from which peers learn that a packet is not repaired any more, or that brings it back; None if there
+        is none."""
+        packets = self.packets
+        packets.retire(now)
+        if self._shared is None:
+            self.peers.told()
+            window = self._combining.around(number, now)
+        else:
+            window = self._of_all(now, number)
+        spans = bool(window) and window[0].number >= number >= window[-1].number
+        record = packets.records.get(number)
+        if record is not None and (not spans or self.peers.replayed(number)):
+            window = [record]
         return self._combination(window, now) if window else None
 
     def exhausted(self, now: float) -> tuple[Lifetime, ...]:
@@ -155,22 +162,32 @@ class RepairWindow:
             return None
         again = self.peers.urgent(now)
         if again is not None:
-            return self._for_all(now, again.number) if len(self.peers.all) > 1 else self._again(again, now)
+            return self._bring(again, now)
         return self._for_all(now) if self._shared.due else None
 
-    def _for_all(self, now: float, lost: int = -1, *, lacking: bool = True) -> Repair | None:
-        """A combination of all that is alive.
+    def _for_all(self, now: float, lost: int = -1) -> Repair | None:
+        """A combination of all that is alive, which brings one packet back to each peer.
 
         :param lost: a packet that it contains, -1 for none
-        :param lacking: whether it counts as bringing one packet back to each peer
         """
+        window = self._of_all(now, lost)
+        self.peers.served(window)
+        return self._combination(window, now) if window else None
+
+    def _of_all(self, now: float, lost: int) -> list[Sent]:
+        """The window of a combination of all that is alive, around a packet unless that is -1."""
         assert self._shared is not None
-        window = self._shared.window(now, lost)
         self._shared.combined()
         self.peers.told()
-        if lacking:
-            self.peers.served(window)
-        return self._combination(window, now) if window else None
+        return self._shared.window(now, lost)
+
+    def _bring(self, record: Sent, now: float) -> Sent | Repair | None:
+        """What brings a packet back that peers lack."""
+        if self.peers.replayed(record.number):
+            return self._combination([record], now)
+        if self._shared is not None and len(self.peers.all) > 1:
+            return self._for_all(now, record.number)
+        return self._again(record, now)
 
     def _again(self, record: Sent, now: float) -> Sent:
         record.at = now
@@ -178,7 +195,7 @@ class RepairWindow:
         return record
 
     def _combination(self, window: list[Sent], now: float) -> Repair | None:
-        found = self._combining.combine(window, self.peers.proven, now)
+        found = self._combining.combine(window, self.peers.provens, now)
         if found is None:
             return None
         repair, combined = found

@@ -15,6 +15,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys, SealMode
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry, Topic
+from tests.link.v1.invariants import PacketsEnd
 from tests.packets import data_of
 
 KEY = bytes(range(32))
@@ -106,6 +107,7 @@ class Air:
         self.rng = random.Random(seed)
         self.lost: Callable[[Robot, Robot], bool] = lambda _, __: self.rng.random() < loss
         self.recorded: list[tuple[Robot, bytes]] = []
+        self.invariant = PacketsEnd(self.robots)
 
     def step(self) -> None:
         """One slot."""
@@ -119,6 +121,7 @@ class Air:
                     other.receive(data, self.now)
         for robot in self.robots:
             robot.events += robot.end.handle_timeout(self.now)
+        self.invariant.step()
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
         """So long, or until something is so; the time it took."""

@@ -19,6 +19,7 @@ from gr_ros2.settings.registry import MAX_TOPICS
 from gr_ros2.wire import FORMATS
 from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC, Part
 from tests.link.v1.air import SLOT_S, Robot, registry
+from tests.link.v1.invariants import PacketsEnd
 from tests.link.v1.test_custody import line_of
 from tests.link.v1.test_relaying import robot
 
@@ -52,6 +53,7 @@ class Air:
 
     def __init__(self, *robots: Robot, seed: int, loss: float, table_loss: float) -> None:
         self.robots, self.now, self.calm = robots, 0.0, False
+        self.invariant = PacketsEnd(robots)
         self._rng, self._loss, self._table_loss = random.Random(seed), loss, table_loss
         self._under_way: deque[tuple[float, Robot, bytes]] = deque()
 
@@ -70,6 +72,7 @@ class Air:
             self._under_way = deque(late)
             for one in self.robots:
                 one.events += one.end.handle_timeout(self.now)
+            self.invariant.step()
 
     def _lost(self, data: bytes) -> bool:
         try:

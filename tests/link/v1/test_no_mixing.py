@@ -16,6 +16,7 @@ from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, write_body
 from tests.link.v1.air import SLOT_S, Robot, registry
+from tests.link.v1.invariants import PacketsEnd
 
 TOPICS = 3
 MESSAGES = 5_000
@@ -70,6 +71,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -
     """In each run both ends have several lives, in which packet numbers pass their half and come round."""
     rng = random.Random(int(loss * 1000))
     one, two = Robot(1, topics(), fixed=False), Robot(2)
+    invariant = PacketsEnd((one, two))
     sent: list[dict[bytes, int]] = [{} for _ in range(TOPICS)]
     latest = [-1] * TOPICS
     now, serial = 0.0, 0
@@ -81,7 +83,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -
     lives = cycle((HALF, ROUND))
 
     def hear(data: bytes) -> None:
-        for event in two.end.receive(AirPacket(data), now):
+        for event in two.receive(data, now):
             if isinstance(event, Delivered):
                 number = sent[event.topic_id].get(event.payload)
                 assert number is not None, f"never sent: {event.payload!r}"
@@ -126,10 +128,11 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -
             hear(late.popleft())
         answer = two.slot(now)
         if answer is not None and not weather.lost():
-            one.end.receive(AirPacket(answer), now)
+            one.receive(answer, now)
         if int(now / SLOT_S) % 8 == 0:
             one.end.handle_timeout(now)
             two.end.handle_timeout(now)
+            invariant.step()
     assert happened["here"] > MESSAGES / 8
     for kind in (
         *("outage", "half", "thinned", "late", "twice"),

@@ -14,6 +14,7 @@ from gr_ros2.mac import Slots
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
 from tests.link.v1.air import SLOT_S, Robot, registry
+from tests.link.v1.invariants import PacketsEnd
 
 STEPS = 8
 """Moments of a slot at which a packet may leave."""
@@ -34,6 +35,7 @@ class Line:
         self.now, self._rng, self._loss = 0.0, random.Random(1), loss
         self._messages = self._steps = 0
         self.said: list[tuple[int, bytes]] = []
+        self.invariant = PacketsEnd(self.robots)
 
     def near(self, one: int) -> list[int]:
         return [other for other in (one - 1, one + 1) if 0 <= other < len(self.robots)]
@@ -54,8 +56,10 @@ class Line:
                     one.receive(heard[0], self.now + SLOT_S, self.now)
             self._steps += 1
             self.now += SLOT_S / STEPS
-            for one in self.robots if self._steps % STEPS == 0 else ():
-                one.events += one.end.handle_timeout(self.now)
+            if self._steps % STEPS == 0:
+                for one in self.robots:
+                    one.events += one.end.handle_timeout(self.now)
+                self.invariant.step()
 
     def _leaving(self) -> Iterator[int]:
         """The robots whose next packet may leave by now."""

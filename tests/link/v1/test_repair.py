@@ -332,3 +332,56 @@ def test_a_repair_that_stands_at_a_later_packet_leaves_out_none_that_is_alive() 
     assert isinstance(repair, Repair)
     assert (repair.number, repair.oldest) == (7, True)
     assert window_numbers(repair.number, repair.mask) == [7, 6, 5, 4, 3]
+
+
+def sent_to(peers: dict[int, int], count: int) -> RepairWindow:
+    """A sender of so many packets to peers of which each may take those up to a number for replays."""
+    sender = window("thrifty", count)
+    for src_id, proven in peers.items():
+        sender.peers.meet(src_id, 0.0)
+        sender.peers.prove(src_id, proven)
+    return sender
+
+
+def test_what_may_be_taken_for_a_replay_comes_back_above_the_proof_also_before_new_messages() -> None:
+    sender = sent_to({2: 60}, 70)
+    sender.peers.sent(70, (Lifetime(in_order=True),), 0.7)
+    sender.peers.report(2, 70, (1 << 64) - 1 ^ 1 << 20, settled=True, loss=0.1, now=9.0)
+    repair = sender.urgent(9.0)
+    assert isinstance(repair, Repair)
+    assert repair.number > 60 and 50 in window_numbers(repair.number, repair.mask)
+
+
+def test_a_report_tells_that_an_earlier_proof_was_taken_than_the_last_one() -> None:
+    sender = sent_to({2: 900}, 1000)
+    sender.peers.report(2, 163, 0, settled=True, loss=0.1, now=20.0)  # it waits for packet 100
+    again = sender.next(20.0)
+    assert isinstance(again, Repair)
+    sender.peers.report(2, 363, 0, settled=False, loss=0.1, now=21.0)
+    again = sender.next(21.0)
+    assert isinstance(again, Sent) and again.number == 363
+
+
+def test_a_peer_that_starts_again_keeps_nothing_back_from_another_one() -> None:
+    sender = sent_to({2: 0, 3: 900}, 1000)
+    seen = set()
+    for slot in range(100):
+        repair = sender.next(20.0 + 10 * slot)
+        assert isinstance(repair, Repair)
+        seen |= set(window_numbers(repair.number, repair.mask))
+    assert seen == set(range(1, 1001))
+
+
+@pytest.mark.parametrize("shares", [False, True])
+def test_a_receiver_is_told_of_what_is_over_between_packets_that_others_lack(shares: bool) -> None:
+    sender = RepairWindow("thrifty", ROOM, shares=shares)
+    for number in range(1, 601):
+        lifetime = Lifetime(in_order=True)
+        sender.sent(number, body(number), b"", (lifetime,), number / 100)
+        if number not in {1, 600}:
+            lifetime.end()
+    sender.peers.meet(2, 7.0)
+    sender.peers.meet(3, 7.0)
+    told = sender.tell(300, 7.0)
+    assert isinstance(told, Repair)
+    assert told.number - told.mask.bit_length() < 300 <= told.number

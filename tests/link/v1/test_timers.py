@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from gr_ros2.link.events import Delivered
 from gr_ros2.settings.config import TopicOptions
 from tests.link.v1.air import SLOT_S, Robot, registry
+from tests.link.v1.invariants import PacketsEnd
 from tests.packets import data_of
 
 _STEPS = st.lists(
@@ -49,7 +50,7 @@ def test_what_is_due_next_is_later(
     topic = TopicOptions(queue=queue, deadline_s=0.2, max_rate=max_rate)  # type: ignore[arg-type]
     topics = registry(a=topic, b=TopicOptions(), c=TopicOptions(durability="transient_local"), d=topic)
     one, two = Robot(1, topics, **options), Robot(2, **options)
-    rng = random.Random(len(steps))
+    rng, invariant = random.Random(len(steps)), PacketsEnd((one, two))
     now = slot = 0.0
     for topic_id, size, pause in [*steps, (-1, 0, 1.5)]:
         if topic_id >= 0:
@@ -67,7 +68,7 @@ def test_what_is_due_next_is_later(
                 if data is not None and rng.random() >= loss:
                     other.receive(data, now)
             for robot in (one, two):
-                robot.end.handle_timeout(now)
+                robot.events += robot.end.handle_timeout(now)
                 out = robot.end.pace.out_of_credit
                 if out or robot.end.next_packet(now) is None:
                     departure = robot.end.next_departure()
@@ -78,6 +79,7 @@ def test_what_is_due_next_is_later(
                 timeout = robot.end.next_timeout()
                 assert timeout is None or timeout > now, "next_timeout"
                 due.append(inf if timeout is None else timeout)
+            invariant.step()
             now = min(due, default=slot)
 
 

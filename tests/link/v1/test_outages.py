@@ -1,0 +1,152 @@
+"""Reliable messages after an outage: robots out of each other's range, one way first, with restarts, with a key and
+without."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.settings.config import TopicOptions
+from tests.link.v1.air import Air, Robot, registry
+
+MODES: tuple[SealMode, ...] = ("none", "encrypt")
+EVERY_S = 0.05
+TOPICS = registry(
+    goal=TopicOptions(reliability="reliable", queue="fifo"),
+    odom=TopicOptions(queue="latest"),
+    path=TopicOptions(reliability="reliable", queue="fifo", qos="bulk"),
+    imu=TopicOptions(queue="deadline", deadline_s=0.2),
+)
+SIZES = (40, 100, 500, 20)
+
+
+class Talk:
+    """Robots of which each says something on every topic in turn, and what was said.
+
+    :ivar cut: pairs of sender and receiver that are out of range
+    """
+
+    def __init__(self, *robots: Robot, loss: float = 0.0, seed: int = 1) -> None:
+        self.air = Air(*robots, seed=seed)
+        self.robots, self.cut = robots, set[tuple[int, int]]()
+        self.said: dict[int, list[bytes]] = {robot.src_id: [] for robot in robots}
+        self._number, air = 0, self.air
+        air.lost = lambda one, two: (one.src_id, two.src_id) in self.cut or air.rng.random() < loss
+
+    def run(self, seconds: float, every_s: float = EVERY_S) -> None:
+        end = self.air.now + seconds
+        while self.air.now < end:
+            for robot in self.robots:
+                if robot.topics:
+                    topic = self._number % 4
+                    text = b"%d %d" % (topic, self._number)
+                    robot.end.messages.submit(topic, text.ljust(SIZES[topic]), self.air.now)
+                    self.said[robot.src_id].append(text)
+            self._number += 1
+            self.air.run(every_s)
+
+    def part(self, *pairs: tuple[int, int]) -> None:
+        self.cut = set(pairs)
+
+    def got(self, receiver: Robot, sender: int, topic: int) -> list[bytes]:
+        return [text.rstrip() for text in receiver.delivered(sender) if text.startswith(b"%d " % topic)]
+
+    def reliable(self, sender: int) -> list[tuple[int, list[bytes]]]:
+        return [(topic, [t for t in self.said[sender] if t.startswith(b"%d " % topic)]) for topic in (0, 2)]
+
+
+def two(mode: SealMode, *, both: bool, **settings: object) -> tuple[Robot, Robot]:
+    one = Robot(1, TOPICS, mode=mode, packet_len=220, fixed=False, **settings)
+    return one, Robot(2, TOPICS if both else None, mode=mode, packet_len=220, fixed=False, **settings)
+
+
+LATER = [
+    pytest.param({}, 0.0, id="both at once"),
+    pytest.param({(1, 2)}, 3.0, id="to the other 3 s later"),
+    pytest.param({(2, 1)}, 3.0, id="back 3 s later"),
+    pytest.param({(2, 1)}, 15.0, id="back 15 s later"),
+]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("both", [False, True], ids=["one sends", "both send"])
+@pytest.mark.parametrize("seconds", [5.0, 12.0, 30.0])
+@pytest.mark.parametrize(("later", "wait"), LATER)
+def test_a_reliable_topic_goes_on_after_an_outage(
+    mode: SealMode, both: bool, seconds: float, later: set[tuple[int, int]], wait: float
+) -> None:
+    one, other = two(mode, both=both)
+    talk = Talk(one, other, loss=0.1)
+    talk.run(5)
+    talk.part((1, 2), (2, 1))
+    talk.run(seconds)
+    talk.part(*later)
+    talk.run(wait)
+    talk.part()
+    talk.run(3)
+    talk.air.run(60)
+    talk.run(1)
+    talk.air.run(5)
+    for sender, receiver in ((one, other), (other, one)) if both else ((one, other),):
+        for topic, said in talk.reliable(sender.src_id):
+            got = talk.got(receiver, sender.src_id, topic)
+            assert got[-5:] == said[-5:]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("restarts", [1, 2])
+@pytest.mark.parametrize("early", [False, True], ids=["both ways", "back later"])
+def test_a_reliable_topic_goes_on_after_a_restart_in_an_outage(mode: SealMode, restarts: int, early: bool) -> None:
+    one, other = two(mode, both=True)
+    talk = Talk(one, other, loss=0.1)
+    talk.run(5)
+    for seconds in (3.0, 12.0):
+        talk.part((1, 2), (2, 1))
+        talk.run(seconds)
+        (one if restarts == 1 else other).start()
+        talk.run(1)
+        talk.part(*{(2, 1)} if early else ())
+        talk.run(5)
+        talk.part()
+        talk.run(3)
+        talk.air.run(60)
+    talk.run(1)
+    talk.air.run(5)
+    for sender, receiver in ((one, other), (other, one)):
+        for topic, said in talk.reliable(sender.src_id):
+            assert talk.got(receiver, sender.src_id, topic)[-5:] == said[-5:]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_reliable_topic_goes_on_one_way_after_an_outage(mode: SealMode) -> None:
+    one, other = two(mode, both=False, hears=False)
+    talk = Talk(one, other, loss=0.1)
+    for seconds in (3.0, 12.0):
+        talk.run(5)
+        talk.part((1, 2))
+        talk.run(seconds)
+        talk.part()
+    talk.run(5)
+    talk.air.run(20)
+    for topic, said in talk.reliable(1):
+        assert talk.got(other, 1, topic)[-5:] == said[-5:]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_robot_that_is_out_of_range_keeps_nothing_back_from_a_third(mode: SealMode) -> None:
+    one, other = two(mode, both=False)
+    third = Robot(3, None, mode=mode, packet_len=220, fixed=False)
+    talk = Talk(one, other, third, loss=0.1)
+    talk.run(5)
+    talk.part((1, 2), (2, 1))
+    talk.run(12)
+    third.start()
+    talk.run(5)
+    talk.part((2, 1))
+    talk.run(3)
+    talk.part()
+    talk.run(5)
+    talk.air.run(30)
+    for topic, said in talk.reliable(1):
+        assert talk.got(other, 1, topic)[-5:] == said[-5:]
+        assert talk.got(third, 1, topic)[-50:] == said[-50:]
