@@ -25,8 +25,10 @@ from gr_ros2.run.scenario import load_scenario
 from gr_ros2.run.simulate import Simulation, offered_by
 from gr_ros2.run.task_run import TaskRun
 
-AIRTIME_S = 1 / 75
-SLOT_S = AIRTIME_S + 0.001
+AIRTIME_S, GUARD_S = 1 / 75, 0.001
+SLOT_S = AIRTIME_S + GUARD_S
+LENGTHS_S = (0.004, 0.02, 0.1, 0.2, 0.4, 1.0)
+"""Airtimes of packets of many radios: those of a packet radio, of a chirp or in a voice channel take the longest."""
 SEEDS = (1, 2, 3)
 MANY_SEEDS = range(1, 13)
 """Where chance decides when groups of robots find common slots."""
@@ -142,6 +144,51 @@ def measured(
         return list(pool.map(_measure, graphs, configs, repeat(until)))
 
 
+class InSlots(NamedTuple):
+    """Figures of one cell whose robots always have something to send, counted in slots.
+
+    :ivar share: of the slots that bring each receiver a packet
+    :ivar first: slots until all are heard, from cold
+    """
+
+    share: float
+    first: float
+
+
+def in_slots(
+    robots: int, airtime_s: float, seed: int, *, guard_s: float = GUARD_S, latency_s: float = 0.01, lead_s: float = 0.0
+) -> InSlots:
+    """One cell of packets of some length, over as many slots as in the other rows."""
+    slot_s, rng = airtime_s + guard_s, random.Random(f"begin {seed}")
+    begins = {number: (rng.uniform(0, 20) * slot_s, math.inf) for number in range(robots)}
+    config = SwarmConfig(airtime_s, latency_s, lead_s, period_s=airtime_s, seed=seed, present=begins)
+
+    def make(number: int, rng: random.Random) -> Slots:
+        return Slots(number, slot_s, rng, period_s=0.0, lead_s=lead_s)
+
+    begin, end = 1400, 5600
+    one = Swarm(make, HearingGraph(fully_meshed(robots), config), config, t0=begin * slot_s, t1=end * slot_s).run()
+    share = one.received / (robots - 1) / (end - begin)
+    return InSlots(share, max(one.first_heard.values()) / slot_s if len(one.first_heard) == robots else math.inf)
+
+
+def lengths() -> list[Row]:
+    """The same in slots at all lengths of packets."""
+    rows = []
+    for robots in (2, 20):
+        frame, shares = robots + 1, []
+        for airtime_s in LENGTHS_S:
+            ran = [in_slots(robots, airtime_s, seed) for seed in SEEDS]
+            shares.append(mean(one.share for one in ran))
+            first = max(one.first for one in ran) / frame
+            what = f"{robots} robots, packets of {1000 * airtime_s:g} ms"
+            rows.append(Row(f"{what}: share of the slots", shares[-1], form="{:.3f}"))
+            rows.append(Row(f"{what}: all heard from cold", first, "frames", "≤", 25, "{:.0f}"))
+        apart = 100 * (max(shares) / min(shares) - 1)
+        rows.append(Row(f"{robots} robots, all lengths: shares differ by", apart, "%", "≤", 5, "{:.1f}"))
+    return rows
+
+
 def cells() -> list[Row]:
     """One cell: messages/s per receiver, mean age, Jain, collisions, and what others carry."""
     rows = []
@@ -170,7 +217,7 @@ def cells() -> list[Row]:
             rows.append(Row(f"{what}: times SOTDMA", rate / others["SOTDMA"], "", "≥", 1, "{:.2f}"))
     ran = [swarm(fully_meshed(10), SwarmConfig(seed=seed, loss=0.05)) for seed in SEEDS]
     rows.append(Row("10 robots, 5 % lost: messages/s", mean(one.rate for one in ran), "", "≥", 50, "{:.1f}"))
-    return rows
+    return rows + lengths()
 
 
 def hidden() -> list[Row]:

@@ -35,6 +35,7 @@ class SwarmConfig:
 
     :param airtime_s: of every packet, s
     :param latency_s: s from the end of a packet to what its receiver does about it
+    :param lead_s: s before it begins at which a packet is composed, as :class:`gr_ros2.mac.Slots` has to know
     :param period_s: s from one message of a robot to the next
     :param loss: share of packets that are lost for other reasons than collisions
     :param relay: robots send on each other's messages by gain
@@ -47,6 +48,7 @@ class SwarmConfig:
 
     airtime_s: float = 1 / 75
     latency_s: float = 0.010
+    lead_s: float = 0.0
     period_s: float = 0.1
     loss: float = 0.0
     relay: bool = False
@@ -161,7 +163,7 @@ class SwarmRobot:
         return number + 1, self._phase + number * self._config.period_s
 
     def _plan(self, now: float, local: float) -> None:
-        due = max(now, (self.access.departure(local) - self._offset) / self._ppm)
+        due = max(now, (self.access.departure(local) - self._offset) / self._ppm - self._config.lead_s)
         if self._jumps:
             due = min(due, max(now, self._jumps[0][0]))
         self.due = due
@@ -177,11 +179,11 @@ class SwarmRobot:
         late, self._late = self._late, []
         for reception in late:
             self._hear(reception)
-        at = self.access.departure(self._local(now))
-        if (at - self._offset) / self._ppm <= now + 1e-9:
+        begin = (self.access.departure(self._local(now)) - self._offset) / self._ppm
+        if begin <= now + self._config.lead_s + 1e-9:
             block = self.access.block(self.traffic.weight)
             if block is not None:
-                start = now + self._rng.uniform(0, self._config.jitter_s)
+                start = max(now, begin) + self._rng.uniform(0, self._config.jitter_s)
                 number, made = self.newest(now)
                 content = self.traffic.compose(number, made, self._local(now))
                 packet = bytes((len(block),)) + block + content

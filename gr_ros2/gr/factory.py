@@ -53,7 +53,6 @@ class EndpointSetup:
     :param mcs_table: the rates of an adaptive rate, see :attr:`gr_ros2.phy.Phy.mcs_table`; () for a fixed rate
     :param access: makes what decides when the robot with an id may send; None from it: whenever there is a credit
     :param relay: whether messages of other robots are sent on
-    :param lead_s: s before its burst begins at which a packet is composed that waits for its time
     :param airtime_share: part of the time that this robot may send, above 0..1
     :param close: lets another process start this robot; nothing is stored afterwards
     """
@@ -70,7 +69,6 @@ class EndpointSetup:
     close: Callable[[], None] = lambda: None
     access: Callable[[int], Access | None] = lambda _: None
     relay: bool = False
-    lead_s: float = 0.0
 
 
 def make_endpoint(
@@ -145,7 +143,6 @@ def make_endpoint(
         observer=observer,
         mcs_table=start.mcs_table,
         access=start.access(robot_of(source, sink)),
-        lead_s=start.lead_s,
     )
 
 

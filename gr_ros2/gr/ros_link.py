@@ -133,8 +133,7 @@ def make_link(
         reports=True,
         half_duplex=half_duplex or shares,
         any_length=any_length,
-        access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=slot_guard_s),
-        lead_s=LEAD_S,
+        access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=slot_guard_s, lead_s=LEAD_S),
         airtime_share=sustained(limits.rule),
     )
     return RosLink(source.registry, source, sink, setup=setup)

@@ -8,9 +8,17 @@ from typing import Any, Protocol
 class Access(Protocol):
     """Medium access of one robot. All times are s of the caller's clock.
 
-    The caller asks for the departure after whatever it has told the engine, waits until then, takes a block, and sends
-    a packet that carries it at once.
+    The caller asks for the departure after whatever it has told the engine, waits until ``lead_s`` before it, takes a
+    block, and hands over a packet that carries it at once.
     """
+
+    @property
+    def lead_s(self) -> float:
+        """s before its departure at which a packet is composed."""
+
+    @property
+    def turn_s(self) -> float:
+        """s from one packet of this robot to its next, as it lately was."""
 
     def departure(self, now: float) -> float:
         """When the next packet may begin."""

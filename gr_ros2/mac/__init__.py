@@ -19,18 +19,21 @@ GUARD_S = 0.001
 """s between two slots in a simulation: what a device keeps that sends at a time (``timing_error_s`` of a front end)."""
 
 
-def access_of(medium: str, airtime_s: float, seed: int, *, guard_s: float = GUARD_S) -> Callable[[int], Access | None]:
+def access_of(
+    medium: str, airtime_s: float, seed: int, *, guard_s: float = GUARD_S, lead_s: float = 0.0
+) -> Callable[[int], Access | None]:
     """What makes the engine of a robot from its id.
 
     :param medium: ``exclusive``, ``slots`` or ``aloha``, see :class:`gr_ros2.settings.config.AnyLink`
     :param airtime_s: of the longest packet
     :param guard_s: silence between two slots, s
+    :param lead_s: s before its burst begins at which a packet is composed
     """
 
     def make(src_id: int) -> Access | None:
         rng = random.Random(f"access {seed} {src_id}")
         if medium == "slots":
-            return Slots(src_id, airtime_s + guard_s, rng, period_s=0.0)
-        return Aloha(src_id, airtime_s, rng, period_s=0.0) if medium == "aloha" else None
+            return Slots(src_id, airtime_s + guard_s, rng, period_s=0.0, lead_s=lead_s)
+        return Aloha(src_id, airtime_s, rng, period_s=0.0, lead_s=lead_s) if medium == "aloha" else None
 
     return make

@@ -15,12 +15,12 @@ from gr_ros2.wire.mac_block import Block
 
 LOAD = 0.5
 """Packets that all robots together start in one airtime."""
-HEARD_S = 20.0
-"""s for which a robot counts: at 100 robots each is heard about every 8 s."""
+HEARD = 1500
+"""Airtimes for which a robot counts: of 100 robots each is heard about every 600."""
 STEP = 0.25
 """Logarithm of the factor by which the interval grows for each robot in whose place nothing is heard."""
-LONGEST_S = 4.0
-"""s, mean interval of a robot that hears nobody."""
+LONGEST = 300
+"""Airtimes, mean interval of a robot that hears nobody."""
 
 
 class Aloha:
@@ -28,25 +28,33 @@ class Aloha:
 
     :param airtime_s: s of the longest packet
     :param period_s: s from one message to the next; a robot sends no more often
+    :param lead_s: s before its departure at which a packet is composed
     """
 
-    def __init__(self, src_id: int, airtime_s: float, rng: random.Random, *, period_s: float = 0.1) -> None:
-        self.src_id = src_id
+    def __init__(
+        self, src_id: int, airtime_s: float, rng: random.Random, *, period_s: float = 0.1, lead_s: float = 0.0
+    ) -> None:
+        self.src_id, self.lead_s = src_id, lead_s
         self._airtime, self._period, self._rng = airtime_s, period_s, rng
         self._heard: dict[int, float] = {}
         self._packets = 0
         self._every = period_s
         self._next: float | None = None
 
+    @property
+    def turn_s(self) -> float:
+        """See :class:`gr_ros2.link.access.Access`."""
+        return max(self._every, self._airtime)
+
     def departure(self, now: float) -> float:
         """See :class:`gr_ros2.link.access.Access`."""
         if self._next is None:
-            robots = sum(at > now - HEARD_S for at in self._heard.values())
+            robots = sum(at > now - HEARD * self._airtime for at in self._heard.values())
             missing = math.exp(-2 * LOAD) - self._packets / robots if robots else 1.0
             least = max(self._period, self._airtime * (1 + robots) / LOAD)
-            self._every = min(max(least, self._every * math.exp(STEP * missing)), max(LONGEST_S, least))
+            self._every = min(max(least, self._every * math.exp(STEP * missing)), max(LONGEST * self._airtime, least))
             self._packets = 0
-            self._next = now + max(self._airtime, self._rng.expovariate(1 / self._every))
+            self._next = now + self.lead_s + max(self._airtime, self._rng.expovariate(1 / self._every))
         return self._next
 
     def block(self, weight: int = 1) -> bytes | None:  # noqa: ARG002

@@ -7,9 +7,9 @@ greater difference means that the other robot belongs to another group, or that 
 - *A robot that did not agree before is ahead* (numbers are compared as on a circle): move to its slots, so that one of
   two groups moves and the other stays.
 - *Two robots that agreed before differ by the same, and nobody has agreed since*: this clock has jumped. Move.
-- *A robot that agreed before is ahead*: its clock has jumped. Move if it has not noticed after ``PATIENCE_S``.
-- *A robot is behind*: if it still is after ``BEHIND_S``, it does not hear this robot. A group whose slots are all in
-  use hears nobody whose packets begin between two of them. Move there, and stay for ``STAYS_S``: told in its own slots
+- *A robot that agreed before is ahead*: its clock has jumped. Move if it has not noticed after ``PATIENCE``.
+- *A robot is behind*: if it still is after ``BEHIND``, it does not hear this robot. A group whose slots are all in
+  use hears nobody whose packets begin between two of them. Move there, and stay for ``STAYS``: told in its own slots
   that there are more robots, the group leaves room, and then hears the one that is ahead. Sooner, or more often, robots
   of a large network move back as fast as others move on.
 
@@ -27,15 +27,15 @@ GAIN = 0.2
 """Share of a difference by which the clock follows. 1 would pass on the jitter of each packet."""
 TOLERANCE = 0.25
 """Slots. Sender and receiver still agree on the number of a slot, whatever the jitter within the guard."""
-PATIENCE_S = 1.5
-"""s for which a robot whose clock has jumped may take to notice: some packets of two others."""
-MEMORY_S = 3.0
-"""s for which a robot that agreed counts as one that agrees."""
-BEHIND_S = 4.0
-"""s that one that is behind may take to follow."""
-STAYS_S = 2.0
-"""s. Clearly less than ``BEHIND_S``: with 3 s for both, the two robots of a link between two groups may change sides in
-turn for a minute (20 at random, held together by one link, are .3 s older)."""
+PATIENCE = 105
+"""Slots for which a robot whose clock has jumped may take to notice: some packets of two others."""
+MEMORY = 210
+"""Slots for which a robot that agreed counts as one that agrees."""
+BEHIND = 280
+"""Slots that one that is behind may take to follow."""
+STAYS = 140
+"""Slots. Clearly less than ``BEHIND``: with 210 for both, the two robots of a link between two groups may change sides
+in turn for 4,000 slots (20 at random, held together by one link, are .3 s older at 14 ms a slot)."""
 
 
 class _Odd(NamedTuple):
@@ -102,7 +102,7 @@ class SlotClock:
         if began < self._stays_until or not self._moves(src_id, error, began, trusted=trusted):
             return None
         if error > 0:
-            self._stays_until = began + STAYS_S
+            self._stays_until = began + STAYS * self.slot_s
         self._zero += error * self.slot_s
         self.jumps += 1
         self._agreed = {src_id: began} if trusted else {}
@@ -111,20 +111,21 @@ class SlotClock:
         return slot
 
     def _agreeing(self, now: float) -> bool:
-        return now - self._agreed_at < MEMORY_S
+        return now - self._agreed_at < MEMORY * self.slot_s
 
     def _moves(self, src_id: int, error: float, now: float, *, trusted: bool) -> bool:
         """Whether to move to the slots of a robot that differs by ``error`` slots: below 0 if it is ahead."""
         if not trusted:
             return not self._agreeing(now) and error < 0
+        memory_s = MEMORY * self.slot_s
         odd = self._odd.get(src_id)
-        if odd is None or now - odd.since > 2 * MEMORY_S or abs(odd.error - error) > 2 * TOLERANCE:
+        if odd is None or now - odd.since > 2 * memory_s or abs(odd.error - error) > 2 * TOLERANCE:
             odd = self._odd[src_id] = _Odd(error, now)
-        if error < 0 and now - self._agreed.get(src_id, float("-inf")) >= MEMORY_S:
+        if error < 0 and now - self._agreed.get(src_id, float("-inf")) >= memory_s:
             return True
         alike = [
             other
             for other, (by, since) in self._odd.items()
             if abs(by - error) <= TOLERANCE and since > self._agreed_at and other in self._agreed
         ]
-        return len(alike) > 1 or now - odd.since > (PATIENCE_S if error < 0 else BEHIND_S)
+        return len(alike) > 1 or now - odd.since > (PATIENCE if error < 0 else BEHIND) * self.slot_s

@@ -42,10 +42,11 @@ from gr_ros2.wire.mac_block import (
     write_block,
 )
 
-LISTEN_S = 0.5
-"""s for which a robot listens before it enters."""
-HEARD_S = 3.0
-"""s for which a robot that was heard counts as heard; longer where robots send less than three times in it."""
+LISTEN = 24
+"""Slots for which a robot listens before it enters. With 12, one of 20 whose clock has jumped by 1 s may collide with
+others 5 s later; with 35, every start takes 11 slots longer, and nothing is better for it."""
+HEARD = 210
+"""Slots for which a robot that was heard counts as heard; more where robots send less than three times in them."""
 CHOICE = 4
 """Free slots among which a robot picks at random where it does so."""
 MIXED = 0.02
@@ -61,9 +62,14 @@ packet is enough: a fourth of the picks in a grid of 5 × 4 at 10 % loss are at 
 KNOWN_LATE = 9
 """Slots that this is at least: a host knows a packet some slots after it began, and composes its own ahead. Without it
 two links on one computer (6 ms a slot) picked at random half of the time, and sent 27 instead of 41 packets/s each."""
-NEWCOMER_S = 2.0
-"""s for which a robot is a newcomer. Without slots for them, 50 robots need 18 s instead of 9 to get in from cold, and
-a robot between two full cells may be heard by nobody for a minute. 1 s takes two seconds longer, 3 s no less."""
+NEWCOMER = 140
+"""Slots for which a robot is a newcomer. Without slots for them, 50 robots need 18 s instead of 9 to get in from cold
+at 14 ms a slot, and a robot between two full cells may be heard by nobody for a minute. 70 slots take two seconds
+longer, 210 no less."""
+LATELY = 70
+"""Slots within which somebody who is there has sent; more where there are many robots."""
+LATE_S = 0.01
+"""s by which a host may be late at most for a packet to be sent all the same, and a slot."""
 EASED = 0.97
 """What v is multiplied by in a free slot. With twice v after an entry in vain, about one robot enters in two slots."""
 _FIRST_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 8.0, 4.0, 64.0, 64.0
@@ -102,11 +108,18 @@ class Slots:
     :param src_id: of this robot
     :param slot_s: s that a slot lasts: the airtime of the longest packet and the guard
     :param period_s: s from one message to the next
+    :param lead_s: s before its slot at which a packet is composed. What is heard from then on comes too late for it
     :ivar reserved: whether the block before had announced the slot of the newest one
     """
 
-    def __init__(self, src_id: int, slot_s: float, rng: random.Random, *, period_s: float = 0.1) -> None:
-        self.src_id = src_id
+    def __init__(
+        self, src_id: int, slot_s: float, rng: random.Random, *, period_s: float = 0.1, lead_s: float = 0.0
+    ) -> None:
+        self.src_id, self.lead_s = src_id, lead_s
+        self._ahead = int(lead_s / slot_s)
+        """Whole slots by which packets are composed ahead."""
+        self._every = 3
+        """Slots from one packet of this robot to the next."""
         self.clock = SlotClock(slot_s)
         self.reserved = False
         self._weight = 1
@@ -138,52 +151,65 @@ class Slots:
 
     def unheard(self, now: float) -> bool:
         """Whether robots are heard, of which none has named this one for so long that none can hear it."""
-        if not self.clock.runs or self._since is None or now < self._since + 3 * HEARD_S:
+        if not self.clock.runs or self._since is None or now < self._since + 3 * HEARD * self.clock.slot_s:
             return False
         slot = self.clock.slot(now)
         return not self._alone(slot) and self._confirmed_at < slot - 2 * self._memory()
 
     # ---- sending
 
+    @property
+    def turn_s(self) -> float:
+        """See :class:`gr_ros2.link.access.Access`."""
+        return self._every * self.clock.slot_s
+
     def departure(self, now: float) -> float:
-        """See :class:`gr_ros2.link.access.Access`. A host that is late by more than half a slot takes the next one."""
+        """See :class:`gr_ros2.link.access.Access`. A host that is too late for a slot takes the next one."""
         if self._since is None:
             self._since = now
+        ready, listened = now + self.lead_s, self._listened
         if not self.clock.runs:
-            if now < self._since + LISTEN_S:
-                return self._since + LISTEN_S
-            self.clock.start(now)
+            if ready < listened:
+                return listened
+            self.clock.start(ready)
         while self._mine:
             begin = self.clock.begin(self._mine[0])
-            if begin >= now - self.clock.slot_s / 2:
+            if begin >= ready - min(self.clock.slot_s, LATE_S):
                 return begin
-            self._mine.pop(0)  # the host was late
-        self._mine.append(self._entry(self.clock.slot(max(now, self._since + LISTEN_S)) + 1))
+            self._mine.pop(0)
+        self._mine.append(self._entry(self.clock.slot(max(ready, listened)) + 1))
         return self.clock.begin(self._mine[0])
+
+    @property
+    def _listened(self) -> float:
+        """s, when it has listened for long enough."""
+        assert self._since is not None
+        return self._since + LISTEN * self.clock.slot_s
 
     def block(self, weight: int = 1) -> bytes | None:
         """See :class:`gr_ros2.link.access.Access`."""
         self._weight = weight
         if not self._mine:  # asked ahead of the end of its silence: nobody is there whose slots it could take
-            assert self._since is not None
-            self.clock.start(self._since + LISTEN_S)
+            self.clock.start(self._listened)
             return None
         slot = self._mine.pop(0)
         self._sweep(slot)
-        alone = self._alone(slot)
+        now = slot - self._ahead
+        alone = self._alone(now)
         if self._entered_at is None:
             if not self._free(slot):
                 return None
             self._entered_at = slot
-        elif not alone and self._confirmed_at < max(self._entered_at, slot - 2 * self._memory()):
+        elif not alone and self._confirmed_at < max(self._answered(slot), now - 2 * self._memory()):
             self._leave()
             self._rate = min(2 * self._rate, _LEAST_RATE)
             return None
         self.reserved = slot in self._announced
         if alone:
             self._rate = min(2 * self._rate, _DEAF_RATE)
-        loads = self._loads(slot)
-        frame = self._frame(slot, loads)
+        loads = self._loads(now)
+        frame = self._frame(now, loads)
+        self._every = max(round(frame / weight), 1)
         kept: list[int] = []
         for mine in self._mine:
             base = kept[-1] if kept else slot
@@ -191,9 +217,14 @@ class Slots:
                 kept.append(mine)
         self._mine = kept
         while len(kept) < 2:
-            kept.append(self._pick(kept[-1] if kept else slot, slot, frame))
+            kept.append(self._pick(kept[-1] if kept else slot, now, frame))
         self._announced, self._sent = tuple(kept), slot
         return write_block(self._content(slot, frame, loads))
+
+    def _answered(self, slot: int) -> int:
+        """The slot since which this robot was to be named, by what is known when a packet is composed for a slot."""
+        assert self._entered_at is not None
+        return self._entered_at if slot > self._entered_at + 2 * self._ahead else _NEVER
 
     def _leave(self) -> None:
         self._mine.clear()
@@ -241,17 +272,17 @@ class Slots:
 
     def _frame(self, now: int, loads: list[int]) -> int:
         """Slots in which every robot around sends as often as its weight says, and newcomers find room."""
-        oldest = now - NEWCOMER_S / self.clock.slot_s
+        oldest = now - NEWCOMER
         newcomers = sum([robot.first >= oldest for robot in self._robots.values()])
         return max(math.ceil(self._period - 1e-9), max(loads) + 1 + newcomers)
 
     def _memory(self) -> int:
         """Slots for which a robot that was heard counts as heard."""
-        return round(max(HEARD_S / self.clock.slot_s, 4 * len(self._robots)))
+        return max(HEARD, 4 * len(self._robots))
 
     def _lately(self) -> int:
         """Slots within which somebody who is there has sent."""
-        return round(max(1.0 / self.clock.slot_s, 3 * len(self._robots)))
+        return max(LATELY, 3 * len(self._robots))
 
     def _alone(self, now: int) -> bool:
         return self._heard_at < now - self._lately()
@@ -262,8 +293,9 @@ class Slots:
         return any(robot.last >= oldest and robot.deaf >= DEAF for robot in self._robots.values())
 
     def _content(self, slot: int, frame: int, loads: list[int]) -> Block:
-        oldest = slot - self._memory()
-        lately = max(oldest, slot - NAMED * frame)
+        now = slot - self._ahead
+        oldest = now - self._memory()
+        lately = max(oldest, now - NAMED * frame)
         fresh = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= lately}
         names = sorted(fresh, key=lambda src_id: fresh[src_id].named)[:2]
         for src_id in names:
@@ -370,7 +402,7 @@ class Slots:
     def _mapped(self, robot: _HeardRobot, expected: int, conflict: tuple[int, int]) -> None:
         slot = robot.last
         at = slot + 1
-        if self._sent < slot - 1 and self._announced and 0 <= self._announced[0] - at < MAP_SLOTS:
+        if self._sent < slot - 1 - self._ahead and self._announced and 0 <= self._announced[0] - at < MAP_SLOTS:
             robot.deaf = 0 if expected >> self._announced[0] - at & 1 else robot.deaf + 1
         skip = at - self._base
         expected = expected << skip if skip > 0 else expected >> -skip

@@ -83,7 +83,6 @@ class RosSide:
             mcs_table=self._phy.mcs_table,
             airtime_share=sustained(self.config.airtime.rule),
             access=self._access if self._sends else lambda _: None,
-            lead_s=LEAD_S + (self._front_end.ahead() or 0.0),
             relay=self.config.relay == "gain",
         )
         both = RosLink(
@@ -115,8 +114,10 @@ class RosSide:
 
     def _access(self, src_id: int) -> Access | None:
         """What decides when it sends. The guard between two robots is what its front end may be late by."""
-        airtime_s, guard_s = self._front_end.airtime(), self._front_end.timing_error_s
-        access = access_of(self.config.medium, airtime_s, secrets.randbits(32), guard_s=guard_s)(src_id)
+        front_end, medium = self._front_end, self.config.medium
+        guard_s, lead_s = front_end.timing_error_s, LEAD_S + (front_end.ahead() or 0.0)
+        make = access_of(medium, front_end.airtime(), secrets.randbits(32), guard_s=guard_s, lead_s=lead_s)
+        access = make(src_id)
         self.slots = access if isinstance(access, Slots) else None
         return access
 

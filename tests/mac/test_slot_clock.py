@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.mac.slot_clock import BEHIND_S, MEMORY_S, PATIENCE_S, STAYS_S, SlotClock
+from gr_ros2.mac.slot_clock import BEHIND, MEMORY, PATIENCE, STAYS, SlotClock
 
 SLOT = 0.015
 
@@ -55,7 +55,7 @@ def test_a_robot_whose_clock_has_jumped_is_given_time_to_notice() -> None:
     made = clock()
     for n in range(10):
         hear(made, 1 + n % 2, n)
-    slots = round(PATIENCE_S / SLOT)
+    slots = PATIENCE
     for n in range(10, 10 + slots - 1, 2):
         assert hear(made, 1, n, -1.0) is None
         assert hear(made, 2, n + 1) == n + 1
@@ -80,13 +80,13 @@ def test_packets_that_are_not_checked_move_nobody_who_hears_others() -> None:
     assert hear(made, 2, 1, -1.0, trusted=False) is None
     assert hear(made, 2, 2, 0.1 * SLOT, trusted=False) == 2
     assert made.begin(0) == before
-    late = 60 + round(MEMORY_S / SLOT)
+    late = 60 + MEMORY
     assert hear(made, 2, late, -0.7, trusted=False) is not None
 
 
 def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:
     made = clock()
-    slots, stays = round(BEHIND_S / SLOT), round(STAYS_S / SLOT)
+    slots, stays = BEHIND, STAYS
     for n in range(0, 2 * slots, 2):
         hear(made, 1, n)
         if hear(made, 2, n + 1, 0.4) is not None:
@@ -94,4 +94,4 @@ def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:
     assert n == pytest.approx(slots, abs=2)
     assert made.jumps == 1
     assert hear(made, 1, n + stays - 9, -0.4) is None, "it would leave before it is heard"
-    assert hear(made, 1, n + round(MEMORY_S / SLOT) + 40, -0.4) is not None
+    assert hear(made, 1, n + MEMORY + 40, -0.4) is not None

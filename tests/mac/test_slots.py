@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fuzz.loop import work
 from gr_ros2.core.errors import EntryBoundsError
-from gr_ros2.mac.slots import CHOICE, HEARD_S, NEWCOMER_S, Slots
+from gr_ros2.mac.slots import CHOICE, HEARD, LISTEN, NEWCOMER, Slots
 from gr_ros2.wire.mac_block import NOBODY, Block, read_block
 
 SLOT = 0.0145
@@ -76,7 +76,7 @@ def test_no_slot_is_taken_that_a_neighbour_has_announced_or_expects_to_receive_i
 
 def test_a_robot_with_weight_sends_as_often_and_says_so() -> None:
     made = robot()
-    later = round(NEWCOMER_S / SLOT) + 1
+    later = NEWCOMER + 1
     for other in range(16):
         hear(made, 10 + other, 70 + other, Block(0, (300, 300), 8, (5, NOBODY)))
         hear(made, 10 + other, 70 + other + later, Block(0, (300, 300), 8, (5, NOBODY)))
@@ -93,7 +93,7 @@ def test_frames_have_a_slot_for_each_newcomer_until_it_is_none_any_more() -> Non
     for other in range(16):
         hear(made, 10 + other, 70 + other, Block(0, (300, 300), 16, (5, NOBODY)))
     assert made._frame(90, made._loads(90)) == 17 + 1 + 16
-    late = 70 + int(NEWCOMER_S / SLOT)
+    late = 70 + NEWCOMER
     assert made._frame(late + 8, made._loads(late + 8)) == 17 + 1 + 8
     assert made._frame(late + 16, made._loads(late + 16)) == 17 + 1
 
@@ -107,7 +107,7 @@ def test_a_robot_that_hears_other_slots_counts_who_has_them_and_picks_at_random_
     assert max(made._loads(70)) == before + 1
     made._confirmed_at = 70
     assert len({made._pick(77, 70, 20) for _ in range(100)}) == CHOICE
-    made._confirmed_at = late = 70 + 2 * round(HEARD_S / SLOT)
+    made._confirmed_at = late = 70 + 2 * HEARD
     made._sweep(late)
     hear(made, 7, late, Block(0, (300, 300), 1, (5, NOBODY)))
     assert made._loads(late)[0] == 2
@@ -209,7 +209,7 @@ def test_a_robot_that_none_of_those_it_hears_names_knows_it(names: bool) -> None
 def test_a_robot_that_asks_ahead_of_the_end_of_its_silence_gets_a_slot_after_it() -> None:
     made = Slots(5, SLOT, random.Random(1))
     at = made.departure(3.0)
-    assert at == pytest.approx(3.5)
+    assert at == pytest.approx(3.0 + LISTEN * SLOT)
     assert made.block() is None
     assert made.departure(at - 0.005) > at
 
@@ -241,7 +241,7 @@ def test_robots_that_left_are_forgotten() -> None:
     begin, _ = send(made, 71 * SLOT)
     for _ in range(60):
         begin, block = send(made, begin + SLOT)
-    assert begin > HEARD_S + 2
+    assert begin > HEARD * SLOT + 2
     assert block.heard == 0
 
 

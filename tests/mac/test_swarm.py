@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from bench.mac import in_slots
 from bench.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 from gr_ros2.link.access import Access
 from gr_ros2.mac import Aloha, Slots
@@ -38,6 +39,26 @@ def test_twenty_robots_in_one_cell_share_it_without_a_collision() -> None:
     assert swarm.age <= 0.26
     assert swarm.jain >= 0.99
     assert swarm.lost("collision", "sending") == 0
+
+
+@pytest.mark.parametrize("robots", [2, 10])
+@pytest.mark.parametrize("airtime_s", [0.004, 0.2, 1.0])
+def test_packets_of_any_length_fill_the_same_share_of_the_slots_after_as_many_frames(
+    robots: int, airtime_s: float
+) -> None:
+    found, usual = in_slots(robots, airtime_s, 1), in_slots(robots, AIRTIME, 1)
+    assert found.share == pytest.approx(usual.share, rel=0.05)
+    assert found.first <= 25 * (robots + 1)
+
+
+@pytest.mark.parametrize("robots", [2, 4])
+@pytest.mark.parametrize("airtime_s", [0.068, 0.204])
+def test_packets_that_are_composed_far_ahead_as_for_a_sound_card_find_their_slots(
+    robots: int, airtime_s: float
+) -> None:
+    found = in_slots(robots, airtime_s, 1, guard_s=0.05, latency_s=0.1, lead_s=0.4)
+    assert found.share >= 0.95 * in_slots(robots, airtime_s, 1, guard_s=0.05).share
+    assert found.first <= 25 * (robots + 1)
 
 
 def test_fifty_robots_that_are_switched_on_at_once_are_all_heard_within_15_seconds() -> None:

@@ -57,7 +57,6 @@ class EndpointV1:
     :param observer: called with every SenderEvent, in order
     :param mcs_table: the rates of an adaptive rate, see :mod:`gr_ros2.link.rate`; () for a fixed rate
     :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
-    :param lead_s: s before its departure at which a packet is composed
     :ivar answers: whether what it receives can change what it sends
     :ivar window: the packets that are worth repairing
     :ivar neighbours: the robots that are heard
@@ -81,9 +80,8 @@ class EndpointV1:
         observer: Callable[[SenderEvent], None] | None = None,
         mcs_table: Sequence[Mcs] = (),
         access: Access | None = None,
-        lead_s: float = 0.0,
     ) -> None:
-        self._access, self._lead = access, lead_s
+        self._access = access
         self.settings = settings = replace(settings, shares=access is not None)
         self.boot = boot
         self.keys = keys = keys if keys is not None else Keys()
@@ -257,7 +255,7 @@ class EndpointV1:
     def _may_begin(self, access: Access, now: float) -> bool:
         """Whether a packet is to be composed now; says when it begins, and takes the block that it carries."""
         begins = access.departure(now)
-        if now < begins - self._lead - _EARLY_S:
+        if now < begins - access.lead_s - _EARLY_S:
             return False
         relaying = self._receiving.relaying
         block = access.block(1 if relaying is None else relaying.gains.weight)
@@ -271,7 +269,7 @@ class EndpointV1:
         if self._access is not None:
             if self._now == -inf:  # a medium may ask before the sending thread has looked for the first time
                 return -inf
-            return max(self._access.departure(self._now) - self._lead, self.pace.slot)
+            return max(self._access.departure(self._now) - self._access.lead_s, self.pace.slot)
         return self._sending.next_departure(self._now)
 
     def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:

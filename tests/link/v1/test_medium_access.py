@@ -26,6 +26,8 @@ def robot(src_id: int, mode: SealMode) -> tuple[Robot, Slots]:
 class Greedy:
     """Announces the next two sends of another robot as its own, and sends in any slot."""
 
+    lead_s, turn_s = 0.0, SLOT
+
     def __init__(self, victim: Slots) -> None:
         self.victim = victim
         self.now = 0.0
