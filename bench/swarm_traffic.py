@@ -89,6 +89,7 @@ class ByGain:
             at, newest = read_control(content, at, len(content))
             assert isinstance(newest, Newest)
             gains.told(src_id, newest)
-        if gains.message(src_id, Stream(message.origin, message.start, message.topic_id), message.number, now):
+        made: float = _stamp.unpack(message.payload)[0]
+        if gains.message(src_id, Stream(message.origin, message.start, message.topic_id), message.number, now, made):
             self._newest[message.origin] = message
-        return message.origin, _stamp.unpack(message.payload)[0]
+        return message.origin, made

@@ -68,8 +68,8 @@ def carry(custody: Custody, data: bytes, src_id: int, now: float) -> None:
     assert write_carried(taker, message) == data
     held = len(custody)
     custody.routes.note(message.origin, src_id, message.hops, now)
-    within(MOST_LINES, partial(custody.take, message, src_id, now))
-    within(MOST_LINES, partial(custody.offer, now))
+    within(MOST_LINES, partial(custody.take, message, src_id, now, made=now))
+    within(MOST_LINES, partial(custody.offer, now, now))
     assert held <= len(custody) <= MOST_HELD
 
 

@@ -13,13 +13,15 @@ With the sum of the squares of all gains over the largest square, how many messa
 known. Each beyond ``EVEN`` adds 1 to the robot's *weight*, by which it shares the channel with others.
 
 Invariants: sans-IO, the caller passes in times; the work for a message heard is bounded by the robots heard, and that
-for a choice by robots times streams; equal calls give equal choices; memory is bounded by ``MOST_STREAMS`` and the ids.
+for a choice by robots times streams; equal calls give equal choices; memory is bounded by the ids and the streams that
+the caller does not drop.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from math import inf
 from typing import NamedTuple
 
 from gr_ros2.wire.control import Newest
@@ -39,7 +41,8 @@ ARRIVALS = 16
 """Numbers of a stream from whose times its period follows."""
 TOLD = 2
 """Streams of which a packet tells the newest number."""
-MOST_STREAMS = 4096
+EXPIRES_S = 15.0
+"""s for which a number refuses lower ones: what was made later than that after it is newer, or the number was false."""
 EVEN = 4
 """Robots of a line or a grid have up to 4 messages of equal worth, one that joins two groups 6. Among robots that all
 have much to relay, weights gain nothing and take the slots out of their order."""
@@ -62,10 +65,11 @@ class Stream(NamedTuple):
 class _State:
     """A stream, and who has what of it."""
 
-    __slots__ = ("arrivals", "has", "newest", "period")
+    __slots__ = ("arrivals", "has", "made", "newest", "period")
 
     def __init__(self) -> None:
         self.newest = -1
+        self.made = -inf
         self.period = FIRST_PERIOD_S
         self.arrivals: deque[tuple[int, float]] = deque(maxlen=ARRIVALS)
         self.has: dict[int, float] = {}
@@ -128,21 +132,21 @@ class Gains:
         robot = self._heard.get(src_id)
         return robot is not None and now - robot.at < HEARD_S and self.src_id in robot.named
 
-    def message(self, via: int, stream: Stream, number: int, now: float) -> bool:
+    def message(self, via: int, stream: Stream, number: int, now: float, made: float | None = None) -> bool:
         """A message was heard.
 
         :param via: the robot whose packet carried it
+        :param made: when it was made, s; now by default
         :return: whether it is newer than what is here
         """
         state = self._state(stream)
-        if state is None:
-            return False
+        new = stream.origin != self.src_id and self._arrived(state, number, now if made is None else made)
         state.has[via] = max(number, state.has.get(via, number))
         robot = self._heard.get(via)
         for name in () if robot is None else robot.named:
             if name in self._heard and name != self.src_id:
                 self._count_as_heard(state, name, number, OTHERS)
-        return stream.origin != self.src_id and self._arrived(state, number, now)
+        return new
 
     def told(self, via: int, newest: Newest) -> None:
         """A robot tells the newest number that it has of a stream. What is not here cannot be relayed to it."""
@@ -155,9 +159,7 @@ class Gains:
 
     def own(self, topic_id: int, start: int, number: int, now: float) -> None:
         """This robot has a new message of its own."""
-        state = self._state(Stream(self.src_id, start, topic_id))
-        if state is not None:
-            self._arrived(state, number, now)
+        self._arrived(self._state(Stream(self.src_id, start, topic_id)), number, now)
 
     def gain(self, stream: Stream, now: float) -> float:
         """By how many s sending its newest message makes the neighbours younger, all together."""
@@ -212,22 +214,30 @@ class Gains:
 
     # ----
 
-    def _state(self, stream: Stream) -> _State | None:
+    def drop(self, stream: Stream) -> None:
+        """Forget a stream."""
+        self._streams.pop(stream, None)
+        self._told.pop((stream.origin, stream.start & 0xFF, stream.topic_id), None)
+
+    def _state(self, stream: Stream) -> _State:
         state = self._streams.get(stream)
-        if state is None and len(self._streams) < MOST_STREAMS:
+        if state is None:
             state = self._streams[stream] = _State()
             self._told[stream.origin, stream.start & 0xFF, stream.topic_id] = state
         return state
 
-    def _arrived(self, state: _State, number: int, now: float) -> bool:
+    def _arrived(self, state: _State, number: int, made: float) -> bool:
         if number <= state.newest:
-            return False
-        state.newest = number
+            if made <= state.made + EXPIRES_S:
+                return False
+            state.arrivals.clear()
+            state.has.clear()
+        state.newest, state.made = number, made
         arrivals = state.arrivals
-        arrivals.append((number, now))
+        arrivals.append((number, made))
         first, since = arrivals[0]
-        if number > first and now > since:
-            state.period = (now - since) / (number - first)
+        if number > first and made > since:
+            state.period = (made - since) / (number - first)
         return True
 
     def _count_as_heard(self, state: _State, robot: int, number: int, share: float) -> None:

@@ -148,7 +148,7 @@ class TopicOptions:
     :param max_age_s: s for which a sealed message of it may have been withheld (with a key and both ways), or it is not
         taken; 0 = any time, auto takes the sink's. A number above 0 at the source has every sink take its own bound
     :param keep_s: s for which its newest message is sent again to robots that lack it, although nothing follows and it
-        is not transient-local: an e-stop, a mode; 0 = as the publishers' durability has it
+        is not transient-local: an e-stop, a mode; 0 = as the publishers' durability has it. Commands are never kept
     :param to: robot for which its messages are, 0..254; other robots do not deliver them; auto = all robots
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)

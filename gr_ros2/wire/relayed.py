@@ -7,17 +7,26 @@ bytes 3..6    number of its packet in which the message began
 byte 7        place of the message among the entries there
 byte 8        topic id in its table; 240 for the table itself, behind 8 bytes of its boot number
 byte 9        C, A, hops      C = 1: coded; A = 1: for one robot; 0..63 robots that have sent it on, this one included
-byte 10       if A: the robot for which it is
+byte 10       age of the message when this packet leaves, see below
+byte 11       if A: the robot for which it is
 then          the message
 ```
 
-A message of topic 242 is *carried*: in front stands one byte more, the robot that is to take it on, and A is 1.
+A message of topic 242 is *carried*: in front stand two bytes more, the robot that is to take it on and the age at which
+the message is of no more use, and A is 1.
 
-Invariants: reading raises nothing but a named WireError; every value has one encoding.
+Ages are floating-point numbers of eight bits in steps of ``AGE_STEP_S``: c < 16 is c steps, and any other c is
+(16 + c mod 16) * 2^(c div 16 - 1) steps. So an age is exact to 10 ms or to 1 part in 16. 255 is an age that is greater
+or unknown, or no limit. An age is rounded up and a limit down, at every hop: nothing seems younger than it is.
+
+Invariants: reading raises nothing but a named WireError; every value has one encoding; no message is written younger
+than it is.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
+from math import inf
 from struct import Struct
 from struct import error as struct_error
 from typing import NamedTuple
@@ -26,10 +35,15 @@ from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
 from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC
 
 MOST_HOPS = 63
-_head = Struct(">BHIBBB")
+AGE_STEP_S = 0.01
+NO_AGE = 255
+"""Code of an age that is greater than all others or unknown, and of no limit."""
+_head = Struct(">BHIBBBB")
 RELAYED_LEN = _head.size
 """Bytes in front of a message for everybody. One for a single robot has one more."""
 _CODED, _ADDRESSED = 0x80, 0x40
+_STEPS = [code if code < 16 else (16 + code % 16) << (code // 16 - 1) for code in range(NO_AGE)]
+"""The ages for which codes stand, in steps."""
 
 
 class Relayed(NamedTuple):
@@ -43,6 +57,8 @@ class Relayed(NamedTuple):
     :param hops: robots that have sent it on, the sender of this packet included
     :param coded: whether the message is coded
     :param dst_id: the robot for which it is, 255 for all
+    :param age: code of its age when it is sent on
+    :param limit: code of the age at which it is of no more use; only carried messages have one
     """
 
     origin: int
@@ -54,14 +70,36 @@ class Relayed(NamedTuple):
     payload: bytes
     coded: bool = False
     dst_id: int = BROADCAST
+    age: int = NO_AGE
+    limit: int = NO_AGE
 
     def describe(self) -> str:
         """The fields in words."""
         to = "" if self.dst_id == BROADCAST else f" to robot {self.dst_id}"
         return (
             f"robot {self.origin}'s (boot ends in {self.start:04x}) topic {self.topic_id}{to}, from its packet "
-            f"{self.number}.{self.place}, hop {self.hops}"
+            f"{self.number}.{self.place}, hop {self.hops}, {_words(self.age)} old"
         )
+
+
+def age_code(age_s: float) -> int:
+    """The code of an age in s; what it stands for is not less."""
+    return bisect_left(_STEPS, age_s / AGE_STEP_S)
+
+
+def limit_code(limit_s: float) -> int:
+    """The code of the age in s at which a message is of no more use, infinite for none; what it stands for is not
+    greater."""
+    return NO_AGE if limit_s == inf else max(bisect_right(_STEPS, limit_s / AGE_STEP_S) - 1, 0)
+
+
+def age_of(code: int) -> float:
+    """The age in s for which a code stands; infinite for ``NO_AGE``."""
+    return inf if code == NO_AGE else _STEPS[code] * AGE_STEP_S
+
+
+def _words(code: int) -> str:
+    return f"more than {age_of(NO_AGE - 1):g} s" if code == NO_AGE else f"{age_of(code):g} s"
 
 
 def write_relayed(message: Relayed) -> bytes:
@@ -69,13 +107,13 @@ def write_relayed(message: Relayed) -> bytes:
 
     :raises EncodeError: a field out of range
     """
-    origin, start, number, place, topic_id, hops, payload, coded, dst_id = message
+    origin, start, number, place, topic_id, hops, payload, coded, dst_id, age, _ = message
     if not 0 <= hops <= MOST_HOPS or topic_id > TABLE_TOPIC or origin == BROADCAST:
         raise EncodeError(f"{message.describe()}: hops are 0..{MOST_HOPS}, topics 0..{TABLE_TOPIC}, robots 0..254")
     addressed = dst_id != BROADCAST
     try:
         flags = coded * _CODED | addressed * _ADDRESSED | hops
-        head = _head.pack(origin, start, number, place, topic_id, flags)
+        head = _head.pack(origin, start, number, place, topic_id, flags, age)
         return head + bytes((dst_id,)) * addressed + payload
     except (struct_error, ValueError) as error:
         raise EncodeError(f"{message.describe()}: a field is out of range ({error})") from error
@@ -89,7 +127,7 @@ def write_carried(taker: int, message: Relayed) -> bytes:
     """
     if not 0 <= taker < BROADCAST or message.dst_id == BROADCAST:
         raise EncodeError(f"{message.describe()}, taken on by robot {taker}: it is for no single robot")
-    return bytes((taker,)) + write_relayed(message)
+    return bytes((taker, message.limit)) + write_relayed(message)
 
 
 def read_carried(data: bytes) -> tuple[int, Relayed]:
@@ -98,10 +136,10 @@ def read_carried(data: bytes) -> tuple[int, Relayed]:
     :raises EntryBoundsError: it is cut off
     :raises EntryKindError: a topic or robot that does not exist, or it is for no single robot
     """
-    message = read_relayed(data[1:])
+    message = read_relayed(data[2:])
     if data[0] == BROADCAST or message.dst_id == BROADCAST:
         raise EntryKindError(f"a carried message to robot {message.dst_id} over robot {data[0]}")
-    return data[0], message
+    return data[0], message._replace(limit=data[1])
 
 
 def read_relayed(data: bytes) -> Relayed:
@@ -112,7 +150,7 @@ def read_relayed(data: bytes) -> Relayed:
     """
     if len(data) < RELAYED_LEN:
         raise EntryBoundsError(f"a relayed message of {len(data)} bytes")
-    origin, start, number, place, topic_id, flags = _head.unpack_from(data)
+    origin, start, number, place, topic_id, flags, age = _head.unpack_from(data)
     at, dst_id = RELAYED_LEN, BROADCAST
     if flags & _ADDRESSED:
         if len(data) == at:
@@ -120,4 +158,5 @@ def read_relayed(data: bytes) -> Relayed:
         dst_id, at = data[at], at + 1
     if topic_id > TABLE_TOPIC or origin == BROADCAST or (flags & _ADDRESSED and dst_id == BROADCAST):
         raise EntryKindError(f"a relayed message of robot {origin}, topic {topic_id}, to robot {dst_id}")
-    return Relayed(origin, start, number, place, topic_id, flags & MOST_HOPS, data[at:], flags & _CODED != 0, dst_id)
+    hops, coded = flags & MOST_HOPS, flags & _CODED != 0
+    return Relayed(origin, start, number, place, topic_id, hops, data[at:], coded, dst_id, age)

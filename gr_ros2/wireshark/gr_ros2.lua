@@ -115,6 +115,8 @@ local f = {
     relayed_topic_id = ProtoField.uint8("gr_ros2.relayed.topic_id", "Topic id"),
     relayed_coded = ProtoField.bool("gr_ros2.relayed.coded", "Coded", 8, nil, 0x80),
     relayed_hops = ProtoField.uint8("gr_ros2.relayed.hops", "Hops", base.DEC, nil, 0x3F),
+    relayed_age = ProtoField.uint8("gr_ros2.relayed.age", "Age when it was sent on, code"),
+    relayed_limit = ProtoField.uint8("gr_ros2.relayed.limit", "Age at which it is of no more use, code"),
     relayed_dst_id = ProtoField.uint8("gr_ros2.relayed.dst_id", "For robot"),
     table_topic_id = ProtoField.uint8("gr_ros2.table.topic_id", "Topic id"),
     table_name = ProtoField.string("gr_ros2.table.name", "Name"),
@@ -328,7 +330,7 @@ end
 
 -- Version 1 -----------------------------------------------------------------------------------------------------------
 
-local TABLE_TOPIC, RELAYED_TOPIC, CARRIED_TOPIC, RELAYED_LEN = 240, 241, 242, 10
+local TABLE_TOPIC, RELAYED_TOPIC, CARRIED_TOPIC, RELAYED_LEN = 240, 241, 242, 11
 local MAX_MESSAGE, MAX_BACK = 0x1000000, 0x1FFFFF
 local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN, PING_LEN, ABOUT_LEN, NEWEST_LEN = 17, 5, 14, 7, 17, 10, 5
 local MAX_SNR = 200 -- 60 dB
@@ -539,11 +541,21 @@ local function show_table(tree, range, rows)
     end
 end
 
+-- The age for which a code stands, in words.
+local function age_of(code)
+    if code == 255 then
+        return " (without limit)"
+    end
+    local steps = code < 16 and code or (16 + code % 16) * 2 ^ (math.floor(code / 16) - 1)
+    return string.format(" (%g s)", steps / 100)
+end
+
 -- Whose message it is that stands in a message of another robot.
 local function dissect_relayed(buffer, entry, id, at, after)
-    if id == CARRIED_TOPIC and after > at then
+    if id == CARRIED_TOPIC and after > at + 1 then
         entry:add(f.relayed_taker, buffer(at, 1))
-        at = at + 1
+        entry:add(f.relayed_limit, buffer(at + 1, 1)):append_text(age_of(buffer(at + 1, 1):uint()))
+        at = at + 2
     end
     if after < at + RELAYED_LEN then
         return
@@ -555,8 +567,9 @@ local function dissect_relayed(buffer, entry, id, at, after)
     entry:add(f.relayed_topic_id, buffer(at + 8, 1))
     entry:add(f.relayed_coded, buffer(at + 9, 1))
     entry:add(f.relayed_hops, buffer(at + 9, 1))
+    entry:add(f.relayed_age, buffer(at + 10, 1)):append_text(age_of(buffer(at + 10, 1):uint()))
     if math.floor(buffer(at + 9, 1):uint() / 64) % 2 == 1 and after > at + RELAYED_LEN then
-        entry:add(f.relayed_dst_id, buffer(at + 10, 1))
+        entry:add(f.relayed_dst_id, buffer(at + RELAYED_LEN, 1))
     end
 end
 

@@ -171,9 +171,9 @@ def check_entries(vector: dict[str, Any], lines: list[str]) -> None:
     lines = [line for line in lines if line not in relayed]
     assert len(relayed) == sum(entry.get("topic_id", 0) > 240 for entry in vector["entries"])
     assert set(relayed) <= {
-        "    relayed: robot 7's (boot ends in cafe) topic 3, from its packet 70000.1, hop 2",
-        "    relayed: robot 7's (boot ends in cafe) topic 3 to robot 9, from its packet 70000.128, hop 2, taken on by "
-        "robot 3",
+        "    relayed: robot 7's (boot ends in cafe) topic 3, from its packet 70000.1, hop 2, 0.05 s old",
+        "    relayed: robot 7's (boot ends in cafe) topic 3 to robot 9, from its packet 70000.128, hop 2, 1 s old, "
+        "taken on by robot 3",
     }
     assert len(lines) == len(vector["entries"])
     for line, entry in zip(lines, vector["entries"], strict=True):

@@ -193,8 +193,9 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
         parts = [entry for entry in entries if "payload" in entry]
         over = [(part["topic_id"], bytes.fromhex(part["payload"])) for part in parts if part["topic_id"] > 240]
         assert numbers("relayed.taker") == [content[0] for topic_id, content in over if topic_id == CARRIED_TOPIC]
-        relayed = [read_relayed(content[topic_id == CARRIED_TOPIC :]) for topic_id, content in over]
-        for field in ("origin", "start", "number", "place", "topic_id", "coded", "hops"):
+        assert numbers("relayed.limit") == [content[1] for topic_id, content in over if topic_id == CARRIED_TOPIC]
+        relayed = [read_relayed(content[2 * (topic_id == CARRIED_TOPIC) :]) for topic_id, content in over]
+        for field in ("origin", "start", "number", "place", "topic_id", "coded", "hops", "age"):
             assert numbers(f"relayed.{field}") == [getattr(message, field) for message in relayed], field
         assert numbers("topic_id") == [entry["topic_id"] for entry in parts]
         assert [one.replace(":", "") for one in values(tree, "gr_ros2.payload")] == [

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.relay.gain import EVEN, HEARD_S, OWN, UNKNOWN_S, Gains, Stream
+from gr_ros2.relay.gain import EVEN, EXPIRES_S, HEARD_S, OWN, UNKNOWN_S, Gains, Stream
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
 
@@ -116,14 +116,16 @@ def test_every_stream_is_told_in_turn() -> None:
 def test_the_choice_is_something_that_is_here(packets: list[tuple[int, int, int, int]]) -> None:
     gains = Gains(1)
     newest: dict[Stream, int] = {}
+    made: dict[Stream, float] = {}
     now = 0.0
     for via, origin, number, later in packets:
         now += later / 10
         stream = Stream(origin, 0, 0)
         gains.neighbour(via, now, [origin], 3)
-        assert gains.message(via, stream, number, now) == (origin != 1 and number > newest.get(stream, -1))
-        if origin != 1:
-            newest[stream] = max(number, newest.get(stream, -1))
+        newer = number > newest.get(stream, -1) or now > made[stream] + EXPIRES_S
+        assert gains.message(via, stream, number, now) == (origin != 1 and newer)
+        if origin != 1 and newer:
+            newest[stream], made[stream] = number, now
         best, gain = gains.best(now)
         assert (best is None) == (gain == 0)
         if best is not None:

@@ -223,11 +223,11 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
 
 def read_relayed(content: bytes) -> dict[str, object]:
     """A message of topic 241."""
-    if len(content) < 10 or (content[9] & 64 and len(content) < 11):
+    if len(content) < 11 or (content[9] & 64 and len(content) < 12):
         raise Refused("entry_bounds")
-    begin = 11 if content[9] & 64 else 10
-    to = content[10] if begin == 11 else 255
-    if content[8] > 240 or content[0] == 255 or (begin == 11 and to == 255):
+    begin = 12 if content[9] & 64 else 11
+    to = content[11] if begin == 12 else 255
+    if content[8] > 240 or content[0] == 255 or (begin == 12 and to == 255):
         raise Refused("entry_kind")
     return {
         "origin": content[0],
@@ -239,15 +239,22 @@ def read_relayed(content: bytes) -> dict[str, object]:
         "payload": content[begin:].hex(),
         "coded": content[9] >= 128,
         "dst_id": to,
+        "age": content[10],
+        "limit": 255,
     }
+
+
+def age_of(code: int) -> float:
+    """Seconds of a code of an age."""
+    return code / 100 if code < 32 else 2 * age_of(code - 16)
 
 
 def read_carried(content: bytes) -> dict[str, object]:
     """A message of topic 242."""
-    message = read_relayed(content[1:])
+    message = read_relayed(content[2:])
     if content[0] == 255 or message["dst_id"] == 255:
         raise Refused("entry_kind")
-    return {"taker": content[0], **message}
+    return {"taker": content[0], **message, "limit": content[1]}
 
 
 def read_medium_access(data: bytes) -> dict[str, object]:

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import EncodeError, WireError
-from gr_ros2.wire.relayed import MOST_HOPS, Relayed, read_carried, read_relayed, write_carried, write_relayed
+from gr_ros2.wire.relayed import (
+    AGE_STEP_S,
+    MOST_HOPS,
+    NO_AGE,
+    Relayed,
+    age_code,
+    age_of,
+    limit_code,
+    read_carried,
+    read_relayed,
+    write_carried,
+    write_relayed,
+)
 
 U8 = st.integers(0, 255)
 ID = st.integers(0, 254)
@@ -22,6 +36,8 @@ MESSAGES = st.builds(
     st.binary(max_size=40),
     st.booleans(),
     U8,
+    U8,
+    st.just(NO_AGE),
 )
 
 
@@ -39,8 +55,9 @@ def test_any_bytes(data: bytes) -> None:
     assert write_relayed(message) == data
 
 
-@given(ID, MESSAGES.filter(lambda message: message.dst_id != 255))
-def test_round_trip_of_carried_messages(taker: int, message: Relayed) -> None:
+@given(ID, MESSAGES.filter(lambda message: message.dst_id != 255), U8)
+def test_round_trip_of_carried_messages(taker: int, message: Relayed, limit: int) -> None:
+    message = message._replace(limit=limit)
     assert read_carried(write_carried(taker, message)) == (taker, message)
 
 
@@ -51,6 +68,14 @@ def test_any_bytes_for_a_carried_message(data: bytes) -> None:
     except WireError:
         return
     assert write_carried(taker, message) == data
+
+
+@given(st.floats(0, 1e6))
+def test_an_age_never_gets_less_and_a_limit_never_more(age: float) -> None:
+    up, down = age_of(age_code(age)), age_of(limit_code(age))
+    assert age <= up + 1e-12 * age and (up <= max(age * (1 + 1 / 16), age + AGE_STEP_S) or age_code(age) == NO_AGE)
+    assert min(age, 4915.2) * (1 - 1 / 16) - AGE_STEP_S <= down <= age * (1 + 1e-12)
+    assert age_of(age_code(inf)) == age_of(limit_code(inf)) == inf
 
 
 @pytest.mark.parametrize(("taker", "dst_id"), [(255, 9), (-1, 9), (3, 255)])
@@ -69,5 +94,5 @@ def test_fields_out_of_range(change: dict[str, int]) -> None:
 
 
 def test_it_says_whose_message_it_is() -> None:
-    said = Relayed(7, 0xCAFE, 70_000, 1, 3, 2, b"", dst_id=9).describe()
-    assert said == "robot 7's (boot ends in cafe) topic 3 to robot 9, from its packet 70000.1, hop 2"
+    said = Relayed(7, 0xCAFE, 70_000, 1, 3, 2, b"", dst_id=9, age=age_code(0.05)).describe()
+    assert said == "robot 7's (boot ends in cafe) topic 3 to robot 9, from its packet 70000.1, hop 2, 0.05 s old"

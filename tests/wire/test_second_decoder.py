@@ -21,7 +21,7 @@ from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.mac_block import read_block
-from gr_ros2.wire.relayed import read_carried, read_relayed, write_carried, write_relayed
+from gr_ros2.wire.relayed import age_code, age_of, limit_code, read_carried, read_relayed, write_carried, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 from tests.link.v1.air import KEY, Air, Robot, registry
 from tests.wire import second_decoder as second
@@ -89,6 +89,16 @@ def test_messages_of_other_robots(case: dict[str, Any]) -> None:
 def test_messages_of_other_robots_to_refuse(case: dict[str, Any]) -> None:
     data = bytes.fromhex(case["hex"])
     assert refusals(read_relayed, second.read_relayed, data) == (case["error"], case["error"])
+
+
+def test_ages_are_rounded_up_and_limits_down() -> None:
+    cases = VECTORS["ages"]
+    assert cases["codes"] == [pytest.approx(second.age_of(code)) for code in range(255)]
+    assert cases["codes"] == [age_of(code) for code in range(255)]
+    for age, code in cases["ages"]:
+        assert age_code(age) == code == next((c for c in range(255) if second.age_of(c) >= age - 1e-9), 255)
+    for age, code in cases["limits"]:
+        assert limit_code(age) == code == max(c for c in range(255) if second.age_of(c) <= age + 1e-9)
 
 
 @named("carried")

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 from typing import NamedTuple
 
 from gr_ros2.link.fates import Fate
@@ -24,12 +25,13 @@ from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopics
 from gr_ros2.relay.gain import Gains
+from gr_ros2.relay.rooms import Rooms
 from gr_ros2.relay.routes import STALE_S, Routes
-from gr_ros2.wire.relayed import MOST_HOPS, Relayed, write_carried
+from gr_ros2.wire.relayed import MOST_HOPS, Relayed, age_code, limit_code, write_carried
 from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC
 
 MOST_HELD = 1024
-"""Messages held; with more of other robots, the oldest of these are lost."""
+"""Messages of other robots that are held; with more, the oldest from the robot that handed over most are lost."""
 WAITING = 8
 """Messages that wait in a queue of carried ones. Own ones beyond wait in the queue of their topic, by its rules."""
 _FIRST_PLACE = 128
@@ -50,6 +52,8 @@ class _Held:
 
     :param came: the robot from which it came; the own one at its origin
     :param at: when it came, s
+    :param made: when it was made, s
+    :param until: when it is of no more use, s
     :param own: at its origin: the message as it was submitted
     :param taker: the robot to which it is handed
     :param out: the message that hands it on; None while no way is known
@@ -60,6 +64,8 @@ class _Held:
     message: Relayed
     came: int
     at: float
+    made: float
+    until: float
     own: Message | None
     long: bool
     taker: int = -1
@@ -82,7 +88,7 @@ class Custody:
     :param peers: the robots that report
     :param gains: knows who hears whom
     :param room: bytes of the longest body
-    :param most: bytes of messages that may be held
+    :param most: bytes of messages of others that may be held
     :param dropped: counts what is lost
     :param drop: called with own messages that are too late
     :ivar routes: over whom other robots are reached
@@ -104,7 +110,8 @@ class Custody:
         self.routes = Routes()
         self._src_id, self._boot = own
         self._topics, self._packets, self._peers, self._gains = topics, packets, peers, gains
-        self._room, self._most, self._dropped, self._drop = room, most, dropped, drop
+        self._room, self._dropped, self._drop = room, dropped, drop
+        self._rooms: Rooms[_Name] = Rooms(MOST_HELD, most)
         self._held: dict[_Name, _Held] = {}
         self._bytes = self._named = 0
 
@@ -118,26 +125,28 @@ class Custody:
 
     # ---- what comes
 
-    def take(self, message: Relayed, came: int, now: float) -> None:
-        """Take a message on that another robot hands over."""
+    def take(self, message: Relayed, came: int, now: float, *, made: float, until: float = inf) -> None:
+        """Take a message on that another robot hands over.
+
+        :param made: when it was made, s
+        :param until: when it is of no more use, s
+        """
         name = _Name(message.origin, message.start, message.topic_id, message.number, message.place)
         if name in self._held:
             self._dropped["relayed_before"] += 1
         elif message.hops >= MOST_HOPS:
             self._dropped["too_many_hops"] += 1
         else:
-            self._hold(name, _Held(message, came, now, None, self._is_long(message)))
+            self._hold(name, _Held(message, came, now, made, until, None, self._is_long(message)))
 
     def _hold(self, name: _Name, held: _Held) -> None:
         held.long = held.long or any(other.long and other.stream == held.stream for other in self._held.values())
         self._held[name] = held
         self._bytes += len(held.message.payload)
-        while len(self._held) > MOST_HELD or self._bytes > self._most:
-            oldest = next((name for name, held in self._held.items() if held.own is None), None)
-            if oldest is None:
-                break
-            self._dropped["custody_full"] += 1
-            self._forget(oldest)
+        if held.own is None:
+            for lost in self._rooms.put(name, held.came, len(held.message.payload)):
+                self._dropped["custody_full"] += 1
+                self._forget(lost)
 
     def _is_long(self, message: Relayed) -> bool:
         return len(write_carried(0, message)) > self._room
@@ -169,22 +178,32 @@ class Custody:
         self._named += 1
         start, of, to = self._boot & 0xFFFF, message.topic_id, message.dst_id
         relayed = Relayed(self._src_id, start, number, place, of, 0, message.payload, message.coded, to)
+        relayed = relayed._replace(limit=limit_code(message.expires - message.submitted))
         name = _Name(self._src_id, start, of, number, place)
-        self._hold(name, _Held(relayed, self._src_id, now, message, self._is_long(relayed)))
+        made, until, long = message.submitted, message.expires, self._is_long(relayed)
+        self._hold(name, _Held(relayed, self._src_id, now, made, until, message, long))
 
     # ---- what leaves
 
-    def offer(self, now: float) -> None:
-        """Put messages into the queues of what leaves next, as far as there is a way for them."""
+    def offer(self, now: float, leaves: float) -> None:
+        """Put messages into the queues of what leaves next, as far as there is a way for them.
+
+        :param leaves: when the packet leaves, s
+        """
         self._gather(now)
         for name, held in list(self._held.items()):
-            leaves = held.last >= 0 or (held.out is not None and held.out.started)
-            if held.own is not None and not leaves and now >= held.own.expires:
-                if not held.low:
-                    self._drop([Dropped(held.own, Fate.STALE, "it waited too long for its way to another robot")])
+            left = held.last >= 0 or (held.out is not None and held.out.started)
+            if now >= held.until:
+                if held.own is None:
+                    self._dropped["too_old"] += 1
+                elif not held.low and held.last < 0:
+                    fate = Fate.ABANDONED if left else Fate.STALE
+                    self._drop([Dropped(held.own, fate, "it waited too long for its way to another robot")])
                 self._forget(name)
             elif held.out is None:
                 self._hand_on(name, held, now)
+            if not left and held.out is not None:
+                held.out.payload = self._written(held, leaves)
 
     def _hand_on(self, name: _Name, held: _Held, now: float) -> None:
         topic_id = LONG_CARRIED if held.long else CARRIED_TOPIC
@@ -193,14 +212,20 @@ class Custody:
         if taker is None or len(queue) >= WAITING:
             return
         held.taker = taker
-        payload = write_carried(taker, message._replace(hops=message.hops + (own is None)))
+        payload = self._written(held, now)
         if own is None:
             held.out = Message(-1, topic_id, payload, 0, held.at, repeat=True)
         else:
             key = Key(self._boot, name.number, name.place)
             held.out = Message(own.serial, topic_id, payload, own.qos, own.submitted, own.weight)
             held.out.repeat, held.out.carried = own.repeat or held.low > 0, (name.topic_id, key)
+        held.out.expires = held.until
         queue.append(held.out)
+
+    def _written(self, held: _Held, leaves: float) -> bytes:
+        """A message as it leaves at a time, s."""
+        hops, age = held.message.hops + (held.own is None), age_code(leaves - held.made)
+        return write_carried(held.taker, held.message._replace(hops=hops, age=age))
 
     def _way(self, robot: int, came: int, at: float, now: float) -> int | None:
         """To whom a message is handed: not back to whom it came from, unless that is long ago."""
@@ -249,5 +274,6 @@ class Custody:
 
     def _forget(self, name: _Name) -> None:
         held = self._held.pop(name)
+        self._rooms.drop(name)
         self._bytes -= len(held.message.payload)
         self._take_back(held)

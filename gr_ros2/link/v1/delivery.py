@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from math import inf
 from zlib import crc32
 
 from gr_ros2.link.fates import Fate
@@ -23,6 +24,10 @@ _REACHED = 256
 """Arrivals remembered, from which the age of a command follows."""
 _OVER = 256
 """Messages over other robots that are remembered, because the origin's own packets may bring them too."""
+_NEVER = (-1, -1)
+EXPIRES_S = 15.0
+"""s for which a number that came over others refuses lower ones: what was made later than that after it is newer, or
+the number was false. Ages of messages are right to less than that."""
 MAX_AGE_S = 15.0
 """Default of ``max_age_s``. How long ago a packet was sealed is known to the time from one hello to the echo of the
 next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
@@ -48,10 +53,36 @@ class DeliveryRules:
         """Numbers that the robot's packets have reached, and when, s."""
         self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
         """Messages that came over other robots, by topic id and order: they may come again."""
+        self._made: dict[int, float] = {}
+        """When the newest message of a topic was made, s, where it came over others."""
+        self._direct: dict[int, tuple[int, int]] = {}
+        """The newest message of a topic that its maker's own packets brought."""
 
     def reached(self, number: int, now: float) -> None:
         """The robot's packets have reached a number, s."""
         self._reached.append((number, now))
+
+    def made(self, ready: Ready, now: float) -> float:
+        """When a message of this robot was made at the latest, s: before a packet arrived that left after it. One that
+        had to be repaired may have left right after the packet before it."""
+        before, after = now, now
+        for reached, at in reversed(self._reached):
+            before = at
+            if reached < ready.order[0]:
+                break
+            after = at
+        return before if ready.repaired else after
+
+    def sealed(self, ready: Ready) -> float:
+        """Time in s after which a message of this robot was sealed; infinite where that needs no proof."""
+        return inf if self.sealed_after is None else self.sealed_after(ready.order[0])
+
+    def overrule(self, number: int) -> None:
+        """Forget the messages with greater numbers that came over others."""
+        for topic_id in [topic_id for topic_id, order in self.newest.items() if order[0] > number]:
+            over = (order for of, order in self._over if of == topic_id and order[0] <= number)
+            self.newest[topic_id] = max(self._direct.get(topic_id, _NEVER), max(over, default=_NEVER))
+            self._made.pop(topic_id, None)
 
     def came_over(self, ready: Ready) -> None:
         """A message has come over another robot."""
@@ -60,6 +91,7 @@ class DeliveryRules:
     def adopt(self, far: DeliveryRules) -> None:
         """Go on from what has come over other robots."""
         self.newest.update(far.newest)
+        self._made.update(far._made)
         self._over.extend(far._over)
 
     def lacks(self, mark: tuple[int, int], number: int) -> bool:
@@ -75,18 +107,24 @@ class DeliveryRules:
         """Why a message is not delivered; None for one that is, or that is here already."""
         if not self.is_for_us(topic) and self._own != NOBODY:
             return Fate.NOT_FOR_US
-        if self._old(ready.order[0], topic, now):
+        withheld_s, deadline_s = self._limits(topic)
+        oldest = self.sealed(ready) if ready.over is None else min(ready.sealed, ready.made)
+        if now - oldest > withheld_s:
             return Fate.NOT_FRESH
-        if topic.fresh and self._late(ready.order[0], topic, now):
+        if now - ready.made > min(deadline_s, ready.limit_s):
             return Fate.LATE
-        passed = ready.order <= self.newest.get(ready.topic_id, (-1, -1))
-        return passed_over(topic) if passed and (ready.topic_id, ready.order) not in self._over else None
+        return passed_over(topic) if self._passed(ready) and (ready.topic_id, ready.order) not in self._over else None
 
     def takes(self, ready: Ready, topic: AnnouncedTopic) -> bool:
         """Note a message that nothing refuses; returns whether it is new."""
-        if ready.order <= self.newest.get(ready.topic_id, (-1, -1)):
+        if self._passed(ready):
             return False
         self.newest[ready.topic_id] = ready.order
+        if ready.over is None:
+            self._direct[ready.topic_id] = ready.order
+            self._made.pop(ready.topic_id, None)
+        else:
+            self._made[ready.topic_id] = ready.made
         if topic.latched:
             mark, marks = crc32(ready.payload), self.marks.get(ready.topic_id, ())
             if mark in marks:
@@ -94,24 +132,27 @@ class DeliveryRules:
             self.marks[ready.topic_id] = (*marks, mark)[-max(topic.depth, 1) :]
         return True
 
-    def _old(self, number: int, topic: AnnouncedTopic, now: float) -> bool:
-        """Whether a message may be older than its topic allows, because nothing proves that it is not."""
-        if self.sealed_after is None:
-            return False
-        most = self._max_ages.get(topic.name.lstrip("/"), self._max_age_s) if self._max_ages else self._max_age_s
-        if most == AUTO:
-            most = MAX_AGE_S if topic.fresh else 0.0
-        return 0 < most < now - self.sealed_after(number)
+    def limit_s(self, topic: AnnouncedTopic) -> float:
+        """Age in s at which a message of a topic that came over others is of no more use."""
+        return min(self._limits(topic))
 
-    def _late(self, number: int, topic: AnnouncedTopic, now: float) -> bool:
-        """Whether a command has been under way for longer than it is good for: at least since a packet arrived that
-        left after it."""
+    def _limits(self, topic: AnnouncedTopic) -> tuple[float, float]:
+        """s for which a message of a topic may have been withheld, and s for which it may have been under way; infinite
+        for any time."""
         name = topic.name.lstrip("/")
-        deadline = self._deadlines.get(name, 0.0)
-        if name not in self._deadlines and is_command(name, topic.type_name, self._commands):
-            deadline = COMMAND_DEADLINE_S
-        since = next((at for reached, at in self._reached if reached >= number), now)
-        return 0 < deadline < now - since
+        withheld_s = self._max_ages.get(name, self._max_age_s)
+        if withheld_s == AUTO:
+            withheld_s = MAX_AGE_S if topic.fresh else 0.0
+        deadline_s = self._deadlines.get(name, 0.0) if topic.fresh else 0.0
+        if topic.fresh and name not in self._deadlines and is_command(name, topic.type_name, self._commands):
+            deadline_s = COMMAND_DEADLINE_S
+        return withheld_s or inf, deadline_s or inf
+
+    def _passed(self, ready: Ready) -> bool:
+        """Whether a later message of its topic was delivered."""
+        if ready.order > self.newest.get(ready.topic_id, _NEVER):
+            return False
+        return ready.over is None or ready.made <= self._made.get(ready.topic_id, inf) + EXPIRES_S
 
 
 def passed_over(topic: AnnouncedTopic) -> Fate:

@@ -92,6 +92,7 @@ class Inbox:
     :ivar announced: its topics
     :ivar order: which of its messages wait for an earlier one
     :ivar deliveries: which of them are delivered
+    :ivar began: when the packet that is processed began to arrive, s
     """
 
     def __init__(
@@ -129,6 +130,7 @@ class Inbox:
         )
         self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
         self._now = 0.0
+        self.began = inf
 
     @property
     def newest(self) -> int:
@@ -247,7 +249,7 @@ class Inbox:
         if number <= newest:
             return
         gone = number - newest - here
-        self.deliveries.reached(number, now)
+        self.deliveries.reached(number, min(self.began, now))
         if gone:
             met = newest >= self._first  # what came before the first packet that was heard is not lost
             self._stats.missed[self.src_id] += gone * met
@@ -292,6 +294,7 @@ class Inbox:
 
     def _arrived(self, ready: Ready) -> None:
         """A message is complete."""
+        ready.made = self.deliveries.made(ready, self._now)
         if ready.topic_id > TABLE_TOPIC:
             if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
                 self.order.wait(ready)
@@ -327,6 +330,7 @@ class Inbox:
         if self._relaying is None:
             self._stats.dropped["relayed"] += 1
             return
+        ready.sealed = self.deliveries.sealed(ready)
         self._relaying.receive(self.src_id, ready, self._now)
 
     def relayed(self, ready: Ready, now: float) -> None:
@@ -339,6 +343,11 @@ class Inbox:
             self.deliveries.came_over(ready)
             self._known(ready)
         self._settle()
+
+    def overrule(self, number: int) -> None:
+        """The robot itself has reached this number: what came over others with a greater one was false."""
+        self.deliveries.overrule(number)
+        self._give_up(self.order.beyond(number), Fate.DAMAGED)
 
     def adopt(self, far: Inbox) -> None:
         """Go on from what has come of this start over other robots."""

@@ -62,7 +62,9 @@ class KeptMessages:
     def keep(self, topic: SentTopic, message: Message) -> None:
         """Keep a new message of a topic that keeps some."""
         kept = self._kept.setdefault(message.topic_id, deque(maxlen=max(topic.kept_depth, 1)))
-        until = inf if topic.latched else message.submitted + topic.topic.options.keep_s
+        until = message.submitted + min(
+            inf if topic.latched else topic.topic.options.keep_s, topic.queue.deadline_s or inf, message.lifespan_s
+        )
         kept.append(_Kept(message.serial, message.payload, message.coded, crc32(message.payload), until=until))
 
     def tabulate(self, rows: Sequence[AnnouncedTopic]) -> bool:

@@ -41,6 +41,9 @@ class Ready:
     :param hops: robots that have sent it on
     :param over: the last of them; None where it came from the robot that made it
     :param carried: it was handed on to this robot
+    :param made: when it was made, s, as far as that is known: not later
+    :param sealed: time in s after which its last packet was sealed, where that has to be proven and it came over others
+    :param limit_s: age in s at which it is of no more use
     """
 
     topic_id: int
@@ -52,6 +55,9 @@ class Ready:
     hops: int = 0
     over: int | None = None
     carried: bool = False
+    made: float = inf
+    sealed: float = inf
+    limit_s: float = inf
 
 
 class Order:
@@ -169,6 +175,15 @@ class Order:
         held = self._gaps[0][0] + self._hold_s if self._gaps and not self.told else inf
         soonest = min(held, self._over_at + self._give_up_s)
         return None if soonest == inf else soonest
+
+    def beyond(self, number: int) -> list[Ready]:
+        """Give up messages that wait, came over others, and began in a later packet than this one."""
+        given_up: list[Ready] = []
+        for line in self._waiting.values():
+            given_up += [ready for ready in line if ready.over is not None and ready.order[0] > number]
+            line[:] = [ready for ready in line if ready.over is None or ready.order[0] <= number]
+        self.held -= sum(len(ready.payload) + _COST for ready in given_up)
+        return given_up
 
     def without(self, topic_ids: Collection[int]) -> list[Ready]:
         """Give up the messages that wait, except those of these topics."""

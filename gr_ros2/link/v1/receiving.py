@@ -92,9 +92,10 @@ class ReceivingSide:
         self.neighbours = Neighbours(
             own, settings, keys, heard=heard, save=save, inbox=self._inbox, dropped=self.stats.dropped
         )
-        self.relaying = Relaying(settings.src_id, self.neighbours, self._outcomes) if settings.relay else None
-        if self.relaying is not None:
-            self.relaying.tell(lambda src_id, boot: self._inbox(src_id, boot, 0, settings.packet_len))
+        self.relaying: Relaying | None = None
+        if settings.relay:
+            self.relaying = Relaying(settings.src_id, self.neighbours, self._outcomes, settings.max_source_bytes)
+            self.relaying.tell(lambda src_id, boot: self._inbox(src_id, boot, 0, settings.packet_len, far=True))
         self._now = -inf
         self._sender: Neighbour | None = None
         """The sender of the packet that is processed."""
@@ -213,6 +214,9 @@ class ReceivingSide:
         if opened.met:
             self._meet(opened, now)
         self._sender, inbox = neighbour, neighbour.inbox
+        inbox.began = now if self._access is None or arrival.at is None else arrival.at
+        if self.relaying is not None and opened.new:
+            self.relaying.reached(neighbour, number)
         mask, clear, repair_id = 0, False, NOT_A_REPAIR
         if repair is not None:
             mask, clear, repair_id = repair.mask, repair.clear, repair.repair_id
@@ -311,7 +315,7 @@ class ReceivingSide:
         if self._rate is not None:
             self._rate.forget(src_id)
 
-    def _inbox(self, src_id: int, boot: int, first: int, room: int) -> Inbox:
+    def _inbox(self, src_id: int, boot: int, first: int, room: int, *, far: bool = False) -> Inbox:
         inbox = Inbox(
             src_id,
             boot,
@@ -323,10 +327,11 @@ class ReceivingSide:
             outcomes=self._outcomes,
             control=self._entry,
             relaying=self.relaying,
-            give_up_s=self._give_up_s,
+            give_up_s=0.0 if far else self._give_up_s,  # who is not heard repairs nothing
         )
-        far = None if self.relaying is None else self.relaying.far.get(src_id)
-        if far is not None and far.boot == boot:
-            inbox.adopt(far)
+        known = None if self.relaying is None else self.relaying.far.get(src_id)
+        if known is not None and known.boot == boot and self.relaying is not None:
+            inbox.adopt(known)
+            self.relaying.ahead.add(src_id)
         inbox.reports.tells_snr = self._rate is not None
         return inbox

@@ -7,8 +7,15 @@ under the number that the origin has reached, again every ``TABLE_S``.
 Messages of reliable topics for one robot, and calls, are carried to it (``custody``); of all others the newest of each
 topic is relayed.
 
-Invariants: a message is delivered once, whether it comes directly or over others; memory is bounded by ``MOST_FAR``
-robots and the topics that they announce.
+A message has an age, which grows at every robot. Where its table is known, a robot sends nothing on that is older than
+its topic allows. All that a start of a robot has said is forgotten ``FORGET_S`` after it was last there.
+
+*Trust.* Which start a robot is in and its table come from it alone as long as it is heard. A number that came over
+others counts until the robot itself says less, or until a much later message has a lower one; a start of a robot that
+is not heard counts until nothing of it has come for ``STALE_S``.
+
+Invariants: a message is delivered once, whether it comes directly or over others; what is sent on is bounded by
+``MOST_STREAMS`` and ``max_source_bytes``, and of the neighbours that brought it, the one with most of it loses first.
 """
 
 from __future__ import annotations
@@ -16,34 +23,65 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 from math import inf
+from typing import NamedTuple
 
 from gr_ros2.core.errors import WireError
 from gr_ros2.link.endpoint import HeardRobot
 from gr_ros2.link.events import Gone, Met
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.message import Message
-from gr_ros2.link.v1.neighbours import Neighbours
+from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sent_topics import SentTopic
 from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.relay.rooms import Rooms
 from gr_ros2.relay.routes import STALE_S
 from gr_ros2.settings.registry import CALLS_TYPE
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import NOBODY, Block
-from gr_ros2.wire.relayed import MOST_HOPS, RELAYED_LEN, Relayed, read_carried, read_relayed, write_relayed
+from gr_ros2.wire.relayed import (
+    MOST_HOPS,
+    NO_AGE,
+    RELAYED_LEN,
+    Relayed,
+    age_code,
+    age_of,
+    read_carried,
+    read_relayed,
+    write_relayed,
+)
 from gr_ros2.wire.table import write_table
 from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
 
 TABLE_S = 5.0
 """s after which the table of a robot that is heard is worth sending on again: some may have come since."""
-MOST_FAR = 64
-"""Robots that are known over others only."""
+MOST_STREAMS = 4096
+"""Topics of other robots of which a message is kept to be sent on."""
+FORGET_S = 60.0
+"""s after which nothing of a robot is sent on any more: its table comes every ``TABLE_S`` from who hears it."""
+FAR_S = 600.0
+"""s after which a robot that is known over others only is forgotten, and with it what has come of it."""
 MOST_EARLY = 16
-"""Messages carried to this robot that wait for the table of their origin."""
+"""Messages carried to this robot that wait for the table of their origin, of each neighbour."""
 _BOOT_LEN = 8
+_LONG_S = 2 * age_of(NO_AGE - 1)
+"""s that are taken for an age that is unknown."""
+
+
+class _ToPass(NamedTuple):
+    """A message to be sent on.
+
+    :param made: when it was made, s
+    :param until: when it is of no more use, s
+    """
+
+    message: Relayed
+    made: float
+    until: float
 
 
 class Relaying:
@@ -52,24 +90,33 @@ class Relaying:
     :param src_id: of this robot
     :param neighbours: the robots that are heard
     :param outcomes: takes what comes of it
+    :param most: bytes of messages that are kept to be sent on, and of tables of far robots
     :ivar hops: over how many robots the newest message of each robot came; 0 for directly
     """
 
-    def __init__(self, src_id: int, neighbours: Neighbours, outcomes: Outcomes) -> None:
+    def __init__(self, src_id: int, neighbours: Neighbours, outcomes: Outcomes, most: int) -> None:
         self.src_id = src_id
         self.hops: dict[int, int] = {}
         self.relayed: Counter[tuple[int, int]] = Counter()
         """Messages sent on, by origin and topic id."""
         self.far: dict[int, Inbox] = {}
+        """Robots that are or were known over others only."""
         self.gains = Gains(src_id)
         self.custody: Custody
         self._here: dict[int, tuple[int, float]] = {}
         """Robots that are reached over others: boot number, and when something of them last came, s."""
         self._neighbours, self._outcomes, self._dropped = neighbours, outcomes, outcomes.stats.dropped
-        self._newest: dict[Stream, Relayed] = {}
+        self._newest: dict[Stream, _ToPass] = {}
+        self._rooms: Rooms[Stream] = Rooms(MOST_STREAMS, most)
+        self._far_rooms: Rooms[int] = Rooms(BROADCAST, most)
+        self._there: dict[int, float] = {}
+        """When a robot was there last, s."""
+        self._swept = 0.0
+        self.ahead: set[int] = set()
+        """Robots of which a message came over others with a number that they have not reached themselves."""
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
-        self._early = deque[tuple[Relayed, int]](maxlen=MOST_EARLY)
+        self._early: dict[int, deque[tuple[Relayed, Ready]]] = {}
         self._chosen: Stream | None = None
         self.found: Callable[[int, float], None] = lambda _, __: None
         """Called with a robot that is reached over others for the first time."""
@@ -93,8 +140,19 @@ class Relaying:
         boot, table, at = self._tables.get(src_id, (0, b"", now))
         if neighbour is not None and not neighbour.hello.digest and boot != neighbour.boot:
             boot, table, at = neighbour.boot, write_table(()), -inf  # others learn that it is there, and where
+        self._there[src_id] = now
         if table and neighbour is not None and now - at > TABLE_S:
             self._table(src_id, boot, table, neighbour.inbox.newest, now)
+        if now > self._swept + TABLE_S:
+            self._sweep(now)
+
+    def reached(self, neighbour: Neighbour, number: int) -> None:
+        """A robot itself has reached this number: whoever has said more was wrong."""
+        src_id = neighbour.src_id
+        if src_id in self.ahead and number >= neighbour.inbox.newest:
+            self.ahead.discard(src_id)
+            neighbour.inbox.overrule(number)
+            self._drop_of(src_id, lambda stream: self._newest[stream].message.number > number)
 
     def newest(self, src_id: int, newest: Newest) -> None:
         """A robot tells the newest message that it has of a topic."""
@@ -111,7 +169,8 @@ class Relaying:
         if self._carried(src_id, ready.topic_id):
             return
         message = Relayed(src_id, boot & 0xFFFF, number, place, ready.topic_id, 0, ready.payload, ready.coded)
-        self._take(src_id, message, now)
+        if now <= (until := ready.made + self._limit_s(message)):
+            self._take(src_id, _ToPass(message, ready.made, until), now)
 
     def receive(self, via: int, ready: Ready, now: float) -> None:
         """A message of another robot has come over one that is heard."""
@@ -124,52 +183,75 @@ class Relaying:
         except WireError as error:
             self._dropped[error.kind] += 1
             return
-        if message.origin != self.src_id:
-            self.custody.routes.note(message.origin, via, message.hops, now)
-        if taker != BROADCAST:
-            if message.dst_id != self.src_id:
-                if taker == self.src_id:
-                    self.custody.take(message, via, now)
-                return
-        elif not self._known(message):
-            self._dropped["unknown_origin"] += 1  # It is not taken, so whoever has it does not learn that it is here.
+        origin, start = message.origin, message.start
+        neighbour = self._neighbours.all.get(origin)
+        heard = neighbour is not None and not neighbour.gone
+        if (message.hops == 0) != (origin == via) or (heard and neighbour and neighbour.boot & 0xFFFF != start):
+            self._dropped["false_origin"] += 1
             return
-        elif not self._take(via, message, now):
+        if origin == self.src_id:
             self._dropped["relayed_before"] += 1
             return
-        self.hops[message.origin] = message.hops
+        self.custody.routes.note(origin, via, message.hops, now)
+        age_s, limit_s = age_of(message.age), age_of(message.limit)
+        made = max(ready.made - age_s, now - _LONG_S)
+        kept = _ToPass(message, made, made + min(limit_s, self._limit_s(message)))
+        if now > kept.until:
+            self._dropped["too_old"] += 1
+            return
+        if taker != BROADCAST and message.dst_id != self.src_id:
+            if taker == self.src_id:
+                self.custody.take(message, via, now, made=made, until=kept.until)
+            return
+        if message.topic_id == TABLE_TOPIC and not self._starts(
+            message, via, now, heard=heard, carried=taker < BROADCAST
+        ):
+            return
+        inbox = self._inbox(origin, start)
+        if taker == BROADCAST:
+            if inbox is None or (message.topic_id != TABLE_TOPIC and inbox.announced.topic_of(message) is None):
+                self._dropped["unknown_origin"] += 1  # not taken: who has it must not learn that it is here
+                return
+            if not self._take(via, kept, now):
+                self._dropped["relayed_before"] += 1
+                return
+        self.hops[origin] = message.hops
         if message.dst_id not in (BROADCAST, self.src_id):
             return
-        if message.topic_id == TABLE_TOPIC:
-            self._announced(message, via, now)
-        elif (inbox := self._inbox(message.origin, message.start)) is not None:
-            self._delivered(inbox, message, via, now, carried=taker != BROADCAST)
-        else:  # Whoever has handed it on has forgotten it by now. It waits until the table of its origin is here.
-            self._dropped["unknown_origin"] += len(self._early) == MOST_EARLY
-            self._early.append((message, via))
+        order, topic_id = (message.number, message.place), message.topic_id
+        sealed = ready.sealed - age_s if ready.sealed < inf else inf
+        payload = message.payload[_BOOT_LEN * (topic_id == TABLE_TOPIC) :]
+        of = Ready(topic_id, order, payload, -1, message.coded, False, message.hops, via, taker != BROADCAST)
+        of.made, of.sealed, of.limit_s = made, sealed, limit_s
+        if inbox is None:  # Whoever has handed it on has forgotten it by now. It waits for the table of its origin.
+            early = self._early.setdefault(via, deque(maxlen=MOST_EARLY))
+            self._dropped["unknown_origin"] += len(early) == MOST_EARLY
+            early.append((message, of))
+            return
+        self._delivered(inbox, of, now)
+        if topic_id == TABLE_TOPIC:
+            self._deliver_early(inbox, now)
 
-    def _delivered(self, inbox: Inbox, message: Relayed, via: int, now: float, *, carried: bool = False) -> None:
-        order = message.number, message.place
-        ready = Ready(message.topic_id, order, message.payload, -1, message.coded, False, message.hops, via, carried)
-        self._reached(inbox, now)
+    def _delivered(self, inbox: Inbox, ready: Ready, now: float) -> None:
+        neighbour = self._neighbours.all.get(inbox.src_id)
+        if neighbour is not None and ready.order[0] > neighbour.inbox.newest:
+            self.ahead.add(inbox.src_id)
+        self._reached(inbox, ready.made, now)
         inbox.relayed(ready, now)
 
-    def _known(self, message: Relayed) -> bool:
-        """Whether a table of topics says what a message is."""
-        if message.topic_id == TABLE_TOPIC or message.origin == self.src_id:
-            return True
-        inbox = self._inbox(message.origin, message.start)
-        return inbox is not None and inbox.announced.topic_of(message) is not None
-
-    def _reached(self, inbox: Inbox, now: float) -> None:
+    def _reached(self, inbox: Inbox, made: float, now: float) -> None:
         """Something of a robot came over others."""
+        self._there[inbox.src_id] = max(self._there.get(inbox.src_id, -inf), made)
+        boot, at = self._here.get(inbox.src_id, (-1, -inf))
+        at = max(made, at if boot == inbox.boot else -inf)
+        if now >= at + STALE_S:
+            return  # it was there when that was made, which is too long ago
         neighbour = self._neighbours.all.get(inbox.src_id)
         known = neighbour is not None and not neighbour.gone
         if neighbour is not None:
             neighbour.timeout = None
-        met = not known and self._here.get(inbox.src_id, (-1, 0.0))[0] != inbox.boot
-        self._here[inbox.src_id] = inbox.boot, now
-        if met:
+        self._here[inbox.src_id] = inbox.boot, at
+        if boot != inbox.boot and not known:
             self._outcomes.events.append(Met(inbox.src_id, inbox.boot, hears=False))
 
     def reaches(self, src_id: int, boot: int, now: float) -> bool:
@@ -214,42 +296,100 @@ class Relaying:
         topic = None if neighbour is None else neighbour.inbox.announced.topics.get(topic_id)
         return topic is not None and topic.reliable and (topic.dst_id != BROADCAST or topic.type_name == CALLS_TYPE)
 
-    def _take(self, via: int, message: Relayed, now: float) -> bool:
+    def _take(self, via: int, kept: _ToPass, now: float) -> bool:
+        """Keep a message to be sent on; returns whether it is newer than what is here."""
+        message = kept.message
         stream = Stream(message.origin, message.start, message.topic_id)
-        new = self.gains.message(via, stream, message.number, now)
-        if new:
-            self._newest[stream] = message
-        return new
+        if not self.gains.message(via, stream, message.number, now, kept.made):
+            return False
+        self._newest[stream] = kept
+        for lost in self._rooms.put(stream, via, len(message.payload)):
+            self._dropped["relay_full"] += 1
+            self._drop(lost)
+        return True
+
+    def _drop(self, stream: Stream) -> None:
+        """Send nothing of a stream on."""
+        self._newest.pop(stream, None)
+        self._rooms.drop(stream)
+        self.gains.drop(stream)
+        if stream == self._chosen:
+            self._chosen = None
+
+    def _limit_s(self, message: Relayed) -> float:
+        """Age in s at which a message is of no more use, as far as its table is known."""
+        inbox = self._inbox(message.origin, message.start)
+        topic = None if inbox is None else inbox.announced.topics.get(message.topic_id)
+        return inf if inbox is None or topic is None else inbox.deliveries.limit_s(topic)
+
+    def _sweep(self, now: float) -> None:
+        """Forget what is too long ago."""
+        self._swept = now
+        for origin, at in list(self._there.items()):
+            if now > at + FORGET_S:
+                self._drop_of(origin, lambda _: True)
+            if now > at + FAR_S:
+                del self._there[origin]
+                self._forget(origin, Fate.GIVEN_UP)
+        for src_id in [src_id for src_id in self._tables if src_id not in self._neighbours.all]:
+            del self._tables[src_id]
+        for via, early in list(self._early.items()):
+            while early and now > early[0][1].made + FORGET_S:
+                self._dropped["unknown_origin"] += 1
+                early.popleft()
+            if not early:
+                del self._early[via]
+
+    def _forget(self, origin: int, reason: Fate) -> None:
+        """A start of a robot that was known over others is over."""
+        self._far_rooms.drop(origin)
+        if (inbox := self.far.pop(origin, None)) is not None:
+            inbox.close(reason)
 
     def _table(self, src_id: int, boot: int, table: bytes, number: int, now: float) -> None:
         self._tables[src_id] = boot, table, now
         payload = boot.to_bytes(_BOOT_LEN, "big") + table
-        self._take(src_id, Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload), now)
+        self._drop_of(src_id, lambda stream: stream.start != boot & 0xFFFF)
+        self._take(src_id, _ToPass(Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload), now, inf), now)
 
-    def _announced(self, message: Relayed, via: int, now: float) -> None:
-        """The table of a far robot."""
-        boot = int.from_bytes(message.payload[:_BOOT_LEN], "big")
-        if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start:
+    def _drop_of(self, origin: int, over: Callable[[Stream], bool]) -> None:
+        """Send nothing on of these streams of a robot."""
+        for stream in [stream for stream in self._newest if stream.origin == origin and over(stream)]:
+            self._drop(stream)
+
+    def _starts(self, message: Relayed, via: int, now: float, *, heard: bool, carried: bool) -> bool:
+        """Look at the table of a robot; returns whether it is that of its start, as far as this is known."""
+        origin, boot = message.origin, int.from_bytes(message.payload[:_BOOT_LEN], "big")
+        if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start or carried:
             self._dropped["bad_table"] += 1
-            return
-        inbox = self._inbox(message.origin, message.start)
-        if inbox is None:
-            known = self.far.get(message.origin)
-            if known is not None and known.boot > boot:
+            return False
+        if heard:
+            self._dropped["relayed_before"] += 1
+            return False
+        known = self.far.get(origin)
+        if self._inbox(origin, message.start) is None:
+            if known is not None and known.boot > boot and self.reaches(origin, known.boot, now):
                 self._dropped["old_start"] += 1
-                return
-            if known is None and len(self.far) >= MOST_FAR:
+                return False
+            self._forget(origin, Fate.SENDER_RESTARTED)
+            self._drop_of(origin, lambda _: True)
+            known = self.far[origin] = self._make_inbox(origin, boot)
+            self.found(origin, now)
+        if known is not None:
+            for lost in self._far_rooms.put(origin, via, len(message.payload)):
                 self._dropped["max_sources"] += 1
-                return
-            inbox = self.far[message.origin] = self._make_inbox(message.origin, boot)
-            self.found(message.origin, now)
-        self._delivered(inbox, message._replace(payload=message.payload[_BOOT_LEN:]), via, now)
-        for early in [early for early in self._early if early[0].origin == message.origin]:
-            self._early.remove(early)
-            if early[0].start == message.start:
-                self._delivered(inbox, *early, now, carried=True)
-            else:
-                self._dropped["unknown_origin"] += 1
+                self._forget(lost, Fate.MEMORY)
+        return True
+
+    def _deliver_early(self, inbox: Inbox, now: float) -> None:
+        """Deliver what waited for the table of a robot."""
+        for early in self._early.values():
+            for message, waiting in [item for item in early if item[0].origin == inbox.src_id]:
+                early.remove((message, waiting))
+                if message.start == inbox.boot & 0xFFFF:
+                    self._delivered(inbox, waiting, now)
+                else:
+                    self._dropped["unknown_origin"] += 1
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
         """Where messages of a start of a robot come together, directly or over others."""
@@ -261,29 +401,33 @@ class Relaying:
 
     # ---- what leaves
 
-    def offer(self, topic: SentTopic, now: float) -> None:
+    def offer(self, topic: SentTopic, now: float, leaves: float) -> None:
         """Let the message that is worth most compete for the next packet, unless one is leaving.
 
         Its value is ``g^2 / c`` as for own messages, with g the gain per neighbour. What every neighbour is likely to
         have goes after all others: there is always some such message, and long ones would wait for their turns.
 
         :param topic: the queue of relayed messages
+        :param leaves: when the packet leaves, s
         """
-        if topic.queue and topic.queue[0].started:
+        if topic.queue and topic.queue[0].started and now <= topic.queue[0].expires:
             return
         topic.queue.clear()
+        for stream in [stream for stream, kept in self._newest.items() if now > kept.until]:
+            self._dropped["too_old"] += self.gains.lacks(stream, now)
+            self._drop(stream)
         self._chosen, gain = self.gains.best(now, self._cost)
         if self._chosen is None:
             return
-        message = self._newest[self._chosen]
-        payload = write_relayed(message._replace(hops=min(message.hops + 1, MOST_HOPS)))
+        message, made, until = self._newest[self._chosen]
+        hops = min(message.hops + 1, MOST_HOPS)
+        payload = write_relayed(message._replace(hops=hops, age=age_code(leaves - made)))
         topic.newest = now - gain / max(self.gains.neighbours(now), 1)
         qos = QOS_DEFAULT if self.gains.lacks(self._chosen, now) else QOS_BULK
-        topic.queue.append(Message(-1, RELAYED_TOPIC, payload, qos, now, repeat=True))
+        topic.queue.append(Message(-1, RELAYED_TOPIC, payload, qos, now, expires=until, repeat=True))
 
     def _cost(self, stream: Stream) -> float:
-        message = self._newest.get(stream)
-        return inf if message is None else RELAYED_LEN + len(message.payload)
+        return RELAYED_LEN + len(self._newest[stream].message.payload)
 
     def left(self, now: float) -> None:
         """The message that was offered has left whole."""

@@ -101,8 +101,9 @@ class SendingSide:
             return first
         room = self._writer.room
         if self._relaying is not None and messages.relayed is not None:
-            self._relaying.offer(messages.relayed, now)
-            self._relaying.custody.offer(now)
+            leaves = now if self._writer.leave_at is None else max(now, self._writer.leave_at)
+            self._relaying.offer(messages.relayed, now, leaves)
+            self._relaying.custody.offer(now, leaves)
             room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
         filling = packing.fill(self._window.packets.newest + 1, room - reports.reserved, now)
         if filling is not None:

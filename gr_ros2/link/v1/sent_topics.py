@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
 from gr_ros2.link.v1.lifetime import Lifetimes
@@ -48,13 +49,14 @@ class SentTopic:
     dst_id: int = field(init=False)
 
     def __post_init__(self) -> None:
+        self._check(self.topic.options)
         to = self.topic.options.to
         self.dst_id = BROADCAST if to == AUTO else to
 
     @property
     def kept(self) -> bool:
-        """Whether its newest messages are kept for robots that lack them."""
-        return self.latched or self.topic.options.keep_s > 0
+        """Whether its newest messages are kept for robots that lack them; commands never are."""
+        return not self.command and (self.latched or self.topic.options.keep_s > 0)
 
     @property
     def is_stream(self) -> bool:
@@ -88,10 +90,18 @@ class SentTopic:
 
     def change(self, options: TopicOptions) -> None:
         """Use other options from now on, for the same robot."""
+        self._check(options)
         self.topic = replace(self.topic, options=options)
         self.qos, self.weight = qos_class(options, command=self.command), options.weight
         self.queue.limit(options.max_rate)
         self.follow(self.publishers)
+
+    def _check(self, options: TopicOptions) -> None:
+        if self.command and options.keep_s:
+            raise ConfigError(
+                f"topic {self.topic.name}: keep_s = {options.keep_s:g}, but commands come in time or not at all, and "
+                "none is kept for robots that come later: leave keep_s out, or take the topic out of commands"
+            )
 
     def announced(self, codec: str) -> AnnouncedTopic:
         """Its row in the table.

@@ -1,0 +1,199 @@
+"""Nothing acts late over hops: what has to be fresh counts from its origin, whoever has kept it."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.events import Delivered, ReceiverEvent
+from gr_ros2.link.queues import PublisherQos
+from gr_ros2.link.v1.relaying import FORGET_S, Relaying
+from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.settings.commands import COMMAND_DEADLINE_S
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
+from tests.link.v1.air import SLOT_S, Robot, registry
+from tests.link.v1.test_commands import TWIST
+from tests.link.v1.test_custody import custody_of, line_of, named
+from tests.link.v1.test_relaying import Line, robot
+
+MODES: tuple[SealMode, ...] = ("none", "encrypt")
+COMMANDS = Registry([Topic(0, "cmd_vel", TWIST)])
+
+
+def relaying_of(one: Robot) -> Relaying:
+    assert one.end._receiving.relaying is not None
+    return one.end._receiving.relaying
+
+
+def absent(line: Line, *robots: int) -> None:
+    """These robots neither hear nor are heard."""
+    line.near = lambda one: [  # type: ignore[method-assign]
+        other
+        for other in (one - 1, one + 1)
+        if 0 <= other < len(line.robots) and not {line.robots[one].src_id, line.robots[other].src_id} & set(robots)
+    ]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("off_s", [2.0, 3600.0])
+def test_the_last_command_of_a_robot_that_is_off_is_not_handed_to_one_that_comes(mode: SealMode, off_s: float) -> None:
+    line = Line(robot(1, mode, COMMANDS), *(robot(src_id, mode) for src_id in (2, 3)))
+    absent(line, 3)
+    line.run(10)
+    assert line.robots[1].delivered(1)
+    absent(line, 1, 3)
+    line.run(min(off_s, 15.0))
+    line.now += max(off_s - 15.0, 0.0)
+    line._messages = int(line.now / 0.3)
+    absent(line, 1)
+    line.run(30)
+    assert line.robots[2].delivered(2)
+    assert not line.robots[2].delivered(1)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("away_s", [5.0, 3600.0])
+def test_goals_with_a_deadline_that_a_relay_holds_are_over_after_it(mode: SealMode, away_s: float) -> None:
+    rows = named(3, queue="deadline", deadline_s=2.0)
+    line = line_of(robot(1, mode, rows), *(robot(src_id, mode) for src_id in (2, 3)), loss=0.0)
+    last = line.robots[-1]
+    absent(line, 3)
+    for n in range(5):
+        line.robots[0].end.messages.submit(1, b"goal %d" % n, line.now)
+    line.run(1)
+    assert len(custody_of(line.robots[1])) == 5
+    line.run(4)
+    line.now += away_s - 5.0
+    line._messages = int(line.now / 0.3)
+    absent(line)
+    line.run(30)
+    assert not any(payload.startswith(b"goal") for payload in last.delivered(1))
+    assert line.robots[1].end.received.dropped["too_old"] == 5
+    line.robots[0].end.messages.submit(1, b"now", line.now)
+    line.run(2)
+    assert b"now" in last.delivered(1)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_commands_over_hops_count_from_their_origin(mode: SealMode, loss: float) -> None:
+    line = Line(robot(1, mode, COMMANDS), *(robot(src_id, mode) for src_id in (2, 3, 4)), loss=loss)
+    ages: dict[int, list[float]] = {one.src_id: [] for one in line.robots}
+    given: dict[bytes, float] = {}
+    submit = line.robots[0].end.messages.submit
+
+    def submitted(topic_id: int, payload: bytes, now: float) -> None:
+        given[payload] = now
+        submit(topic_id, payload, now)
+
+    line.robots[0].end.messages.submit = submitted  # type: ignore[assignment,method-assign]
+    for one in line.robots:
+
+        def received(data: bytes, now: float, began: float | None = None, one: Robot = one) -> list[ReceiverEvent]:
+            events = Robot.receive(one, data, now, began)
+            ages[one.src_id] += [now - given[e.payload] for e in events if isinstance(e, Delivered) and e.src_id == 1]
+            return events
+
+        one.receive = received  # type: ignore[method-assign]
+    line.run(60)
+    assert len(ages[2]) > 100
+    assert len(ages[3]) > 20
+    # What a direct packet has waited for at its origin is not known to who hears it: at most one deadline more.
+    assert max(ages[2]) <= 2 * COMMAND_DEADLINE_S
+    assert max(ages[3] + ages[4]) <= 2 * COMMAND_DEADLINE_S + 2 * SLOT_S
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_call_that_a_relay_holds_is_over_after_its_deadline(mode: SealMode) -> None:
+    rows = Registry([Topic(0, "odom", "std_msgs/msg/String"), Topic(1, "calls", CALLS_TYPE)])
+    line = line_of(robot(1, mode, rows), *(robot(src_id, mode) for src_id in (2, 3)), loss=0.0)
+    line.robots[0].end.messages.follow(1, PublisherQos(lifespan_s=60.0))
+    line.run(6)
+    absent(line, 3)
+    line.robots[0].end.messages.submit(1, b"call", line.now, 3.0, 3)
+    line.run(1)
+    assert len(custody_of(line.robots[1])) == 1
+    line.run(5)
+    absent(line)
+    line.run(20)
+    assert b"call" not in line.robots[2].delivered(1)
+    assert line.robots[1].end.received.dropped["too_old"] == 1
+
+
+@pytest.mark.parametrize(("limit_s", "comes"), [(1.0, False), (60.0, True), (0.0, True)])
+def test_max_age_s_of_a_receiver_counts_from_the_origin(limit_s: float, comes: bool) -> None:
+    rows = named(3)
+    line = line_of(robot(1, topics=rows), robot(2), robot(3, max_ages={"goal": limit_s} if limit_s else {}), loss=0.0)
+    absent(line, 3)
+    line.robots[0].end.messages.submit(1, b"goal", line.now)
+    line.run(5)
+    absent(line)
+    line.run(20)
+    assert (b"goal" in line.robots[2].delivered(1)) == comes
+    assert comes or line.robots[2].end.received.dropped["too_old"]
+
+
+def test_nothing_of_a_robot_is_sent_on_long_after_it_was_there() -> None:
+    line = Line(*(robot(src_id) for src_id in (1, 2, 3)))
+    line.run(10)
+    assert any(stream.origin == 1 for stream in relaying_of(line.robots[1])._newest)
+    absent(line, 1)
+    line.run(FORGET_S + 20)
+    assert not any(stream.origin == 1 for one in line.robots[1:] for stream in relaying_of(one)._newest)
+
+
+def test_commands_are_not_kept_for_late_robots() -> None:
+    latched = Registry([Topic(0, "cmd_vel", TWIST, TopicOptions(durability="transient_local"))])
+    end = robot(1, topics=latched).end
+    end.messages.submit(0, b"go", 0.0)
+    assert not end.messages.kept.marks(100.0)
+    assert not end.messages.sent[0].announced("").latched
+    with pytest.raises(ConfigError, match="leave keep_s out"):
+        robot(1, topics=Registry([Topic(0, "cmd_vel", TWIST, TopicOptions(keep_s=5.0))]))
+    with pytest.raises(ConfigError, match="leave keep_s out"):
+        robot(1, topics=COMMANDS).end.messages.change(0, TopicOptions(keep_s=5.0))
+
+
+def test_a_kept_message_is_not_sent_again_after_its_deadline() -> None:
+    rows = registry(map=TopicOptions(durability="transient_local", queue="deadline", deadline_s=2.0))
+    one, later = Robot(1, rows), 1.5
+    one.end.messages.submit(0, b"map", 0.0)
+    for slot in range(5):
+        one.slot(slot * SLOT_S)
+    assert one.end.messages.kept.marks(later)
+    assert not one.end.messages.kept.marks(2.5)
+
+
+def test_ages_in_a_mesh_are_never_less_than_the_truth() -> None:
+    """Random outages and losses: what is known of when a message was made is not later than it was submitted, but for
+    the time in a queue of the origin and the slot in which a packet came again as it was."""
+    line = Line(*(robot(src_id, "encrypt") for src_id in range(1, 6)), loss=0.2)
+    given: dict[bytes, float] = {}
+    seen: list[float] = []
+    rng = random.Random(3)
+    for one in line.robots:
+        submit = one.end.messages.submit
+
+        def submitted(topic_id: int, payload: bytes, now: float, submit: Any = submit) -> None:
+            given[payload] = now
+            submit(topic_id, payload, now)
+
+        one.end.messages.submit = submitted  # type: ignore[assignment,method-assign]
+        relaying = relaying_of(one)
+        keep = relaying._take
+
+        def taken(via: int, kept: Any, now: float, keep: Any = keep) -> bool:
+            if kept.message.payload in given:
+                seen.append(kept.made - given[kept.message.payload])
+            return bool(keep(via, kept, now))
+
+        relaying._take = taken  # type: ignore[method-assign]
+    for _ in range(20):
+        absent(line, *(src_id for src_id in range(1, 6) if rng.random() < 0.2))
+        line.run(3)
+    assert len(seen) > 500
+    assert max(seen) < 1.0

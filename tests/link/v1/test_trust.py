@@ -1,0 +1,183 @@
+"""Robots that say false things of others: an insider that has the key, and anybody where there is none."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.link.events import Delivered
+from gr_ros2.link.v1.message import Message
+from gr_ros2.link.v1.order import Ready
+from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.relay.routes import STALE_S
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.wire.relayed import Relayed, write_relayed
+from gr_ros2.wire.table import AnnouncedTopic, write_table
+from gr_ros2.wire.v1 import RELAYED_TOPIC, TABLE_TOPIC
+from tests.link.v1.air import Robot
+from tests.link.v1.test_ages import MODES, absent, relaying_of
+from tests.link.v1.test_relaying import Line, robot
+
+LAST_NUMBER, LAST_BOOT = 2**32 - 1, 2**64 - 1
+ROW = AnnouncedTopic(0, "odom", "std_msgs/msg/String", 1, False, False, 1, "", False, 255)
+
+
+def says(insider: Robot, false: Relayed, now: float) -> None:
+    """This robot sends a message on that nobody has made."""
+    relaying = relaying_of(insider)
+    offer = relaying.offer
+
+    def once(topic, *_):  # type: ignore[no-untyped-def]
+        if not topic.queue:
+            relaying.offer, relaying._chosen = offer, None  # type: ignore[method-assign]
+            topic.queue.append(Message(-1, RELAYED_TOPIC, write_relayed(false), 1, now, repeat=True))
+
+    relaying.offer = once  # type: ignore[method-assign,assignment]
+
+
+def number(false: int, start: int) -> Relayed:
+    return Relayed(1, start & 0xFFFF, false, 0, 0, 1, b"false", age=0)
+
+
+def table(origin: int, boot: int, at: int, *rows: AnnouncedTopic) -> Relayed:
+    payload = boot.to_bytes(8, "big") + write_table(rows)
+    return Relayed(origin, boot & 0xFFFF, at, 0, TABLE_TOPIC, 1, payload, age=0)
+
+
+def count(one: Robot, line: Line, seconds: float) -> int:
+    """Messages of robot 1 that come out in so many s."""
+    before = len(one.delivered(1))
+    line.run(seconds)
+    return len(one.delivered(1)) - before
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("reliable", [False, True])
+def test_a_false_number_does_not_silence_a_robot_that_is_heard(mode: SealMode, reliable: bool) -> None:
+    topics = Registry(
+        [Topic(0, "odom", "std_msgs/msg/String", TopicOptions() if reliable else TopicOptions(queue="latest"))]
+    )
+    line = Line(*(robot(src_id, mode, topics) for src_id in (1, 2, 3)))
+    line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
+    line.run(10)
+    for later in (0, 1, 100, LAST_NUMBER // 2, LAST_NUMBER):
+        newest = line.robots[0].end.window.packets.newest
+        says(line.robots[1], number(min(newest + later, LAST_NUMBER), line.robots[0].boot), line.now)
+        assert count(line.robots[2], line, 6) >= 15
+    got = line.robots[2].delivered(1)
+    true = [payload for payload in got if payload != b"false"]
+    assert len(true) == len(set(true))
+    assert true == [payload for src_id, payload in line.said if src_id == 1 and payload in true], "in their order"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_false_number_silences_a_robot_over_hops_for_a_while_only(mode: SealMode) -> None:
+    line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3, 4)))
+    line.run(15)
+    says(line.robots[3], number(LAST_NUMBER, line.robots[0].boot), line.now)
+    line.run(STALE_S + 10)
+    assert b"false" in line.robots[2].delivered(1)
+    assert count(line.robots[2], line, 10) > 10
+    assert count(line.robots[1], line, 10) > 20
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_false_number_of_a_robot_over_hops_does_not_count_when_it_is_heard(mode: SealMode) -> None:
+    line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3, 4)))
+    line.run(15)
+    says(line.robots[3], number(LAST_NUMBER, line.robots[0].boot), line.now)
+    line.run(3)
+    line.near = lambda one: [other for other in range(4) if other != one]  # type: ignore[method-assign]
+    line.run(5)
+    assert count(line.robots[2], line, 10) > 20
+    assert count(line.robots[3], line, 10) > 20
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_false_start_ends_a_robot_for_a_while_only(mode: SealMode) -> None:
+    line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3, 4)))
+    line.run(15)
+    says(line.robots[3], table(1, LAST_BOOT, 0), line.now)
+    line.run(1)
+    assert relaying_of(line.robots[2]).far[1].boot == LAST_BOOT
+    line.run(STALE_S + 10)
+    assert count(line.robots[2], line, 10) > 10
+    assert count(line.robots[1], line, 10) > 20
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_false_table_of_a_robot_that_is_heard_changes_nothing(mode: SealMode) -> None:
+    line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3)))
+    line.run(10)
+    two, known = line.robots[1], line.robots[1].end.topics_of(1)
+    boot = line.robots[0].boot
+    for false in (table(1, boot, LAST_NUMBER), table(1, boot, 5, ROW), table(1, LAST_BOOT, 5)):
+        says(line.robots[2], false, line.now)
+        assert count(two, line, 6) >= 15
+        assert two.end.topics_of(1) == known
+    assert two.end.received.dropped["false_origin"]
+
+
+def test_a_robot_that_starts_again_takes_the_place_of_its_earlier_start_over_hops() -> None:
+    line = Line(*(robot(src_id) for src_id in (1, 2, 3)))
+    line.run(10)
+    for _ in range(3):
+        line.robots[0].start()
+        line.run(10)
+        assert count(line.robots[2], line, 5) > 5
+    streams = relaying_of(line.robots[2])._newest
+    assert {stream.start for stream in streams if stream.origin == 1} == {line.robots[0].boot}
+
+
+def heard_over(one: Robot, via: int, said: Relayed, now: float) -> None:
+    order = (said.number, 0)
+    relaying_of(one).receive(via, Ready(RELAYED_TOPIC, order, write_relayed(said), 0, False, False, made=now), now)
+
+
+def test_any_number_of_robots_is_known_over_one_neighbour() -> None:
+    line = Line(robot(2), robot(3))
+    line.run(5)
+    one = line.robots[1]
+    for origin in range(10, 250):
+        heard_over(one, 2, table(origin, 1000, 1, ROW), line.now)
+        heard_over(one, 2, Relayed(origin, 1000, 2, 0, 0, 1, b"odom", age=0), line.now)
+    line.run(1)
+    assert {event.src_id for event in one.events if isinstance(event, Delivered)} >= set(range(10, 250))
+    assert len([known for known in one.end.peers(line.now) if known.hops]) == 240
+
+
+def test_twenty_robots_with_ten_topics_start_twenty_times_and_are_still_relayed() -> None:
+    line = Line(robot(2), robot(3), robot(4))
+    absent(line, 4)
+    line.run(5)
+    one, rows = line.robots[1], [ROW._replace(topic_id=n, name=f"odom{n}") for n in range(10)]
+    for start in range(1, 21):
+        for origin in range(10, 30):
+            heard_over(one, 2, table(origin, start, 1, *rows), line.now)
+            for topic_id in range(10):
+                heard_over(one, 2, Relayed(origin, start, 2, topic_id, topic_id, 1, b"odom", age=0), line.now)
+        line.run(0.1)
+    streams = relaying_of(one)._newest
+    assert {(stream.origin, stream.start, stream.topic_id) for stream in streams if stream.topic_id < TABLE_TOPIC} >= {
+        (origin, 20, topic_id) for origin in range(10, 30) for topic_id in range(10)
+    }
+    assert len(streams) < 20 * 11 + 20
+    absent(line)
+    line.run(20)
+    got = {(e.src_id, e.topic_id) for e in line.robots[2].events if isinstance(e, Delivered) and e.src_id >= 10}
+    assert len(got) > 100
+
+
+def test_who_brings_much_takes_no_room_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gr_ros2.link.v1.relaying.MOST_STREAMS", 20)
+    line = Line(robot(1), robot(2), robot(3))
+    line.run(10)
+    one = line.robots[1]
+    rows = [ROW._replace(topic_id=n, name=f"odom{n}") for n in range(100)]
+    heard_over(one, 3, table(9, 1, 1, *rows), line.now)
+    for topic_id in range(100):
+        heard_over(one, 3, Relayed(9, 1, 2, topic_id, topic_id, 1, b"odom", age=0), line.now)
+    relaying = relaying_of(one)
+    assert len(relaying._newest) <= 20
+    assert {stream.topic_id for stream in relaying._newest if stream.origin == 1} == {0, TABLE_TOPIC}
+    assert one.end.received.dropped["relay_full"] > 80
