@@ -12,7 +12,7 @@ Counters, where NAME is the name of the service on the graph of this end:
 - of calls made here: ``called:NAME``, and each of them in one of ``answered:NAME``, ``timed_out:NAME`` (no reply by the
   deadline), ``server_gone:NAME`` (the far server, or its robot's link, has ended) and ``too_many:NAME`` (``MAX_CALLS``
   were waiting: the oldest without a deadline is given up, or where there is none the new one); or it waits. ``late``
-  counts replies to calls that no longer wait.
+  counts replies to calls that no longer wait, and requests that come after their deadline.
 - of calls of other robots: ``served:NAME``, and each of them in one of ``replied:NAME``, ``unanswered:NAME`` (the
   server here did not reply by the deadline), ``caller_gone:NAME`` (the caller's link has started again) and
   ``refused:NAME`` (``MAX_CALLS`` of that robot were waiting: as above); or it waits.
@@ -183,12 +183,13 @@ class Calls:
     # ---- frames
 
     def receive(
-        self, sender: tuple[int, int], data: bytes, offers: Mapping[int, Offer], now: float
+        self, sender: tuple[int, int], data: bytes, offers: Mapping[int, Offer], now: float, age_s: float = 0.0
     ) -> Request | Answer | None:
         """Take the bytes of a frame.
 
         :param sender: id of the robot that sent it, and the start of that robot
         :param offers: the services of this robot whose server is there, by id
+        :param age_s: s for which it has been under way: a call counts from its caller
         :return: what it asks for; None for a frame that is dropped, and counted
         """
         self.expire(now)
@@ -200,7 +201,7 @@ class Calls:
             return self._dropped("not_for_us")
         if frame.dst_boot != self._boot:
             return self._dropped("other_start")
-        return self._request(sender, frame, offers, now) if frame.is_request else self._answer(sender, frame)
+        return self._request(sender, frame, offers, now, age_s) if frame.is_request else self._answer(sender, frame)
 
     def started(self, robot: int, boot: int) -> None:
         """Note that a robot has started. Its earlier starts neither answer nor wait for an answer."""
@@ -221,7 +222,7 @@ class Calls:
         return len(self._made), len(self._served)
 
     def _request(
-        self, sender: tuple[int, int], frame: CallFrame, offers: Mapping[int, Offer], now: float
+        self, sender: tuple[int, int], frame: CallFrame, offers: Mapping[int, Offer], now: float, age_s: float
     ) -> Request | Answer | None:
         robot, boot = sender
         newest, last = self._last.get(robot, (-1, 0))
@@ -231,13 +232,15 @@ class Calls:
         offer = offers.get(frame.service_id)
         if offer is None:
             return self._dropped("no_server")
+        expires = now - age_s + min(frame.deadline_s or inf, offer.deadline_s or inf)
+        if now >= expires:
+            return self._dropped("late")
         name = offer.name
         self.counters[f"served:{name}"] += 1
         waiting = [ticket for ticket, call in self._served.items() if call.robot == robot]
         if len(waiting) >= MAX_CALLS and not self._room(self._served, waiting, "refused"):
             return self._dropped(f"refused:{name}")
         self._ticket += 1
-        expires = now + min(frame.deadline_s or inf, offer.deadline_s or inf)
         self._served[self._ticket] = _Served(name, robot, boot, frame.number, expires)
         return Request(self._ticket, frame.service_id, frame.payload)
 

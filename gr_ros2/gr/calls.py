@@ -239,7 +239,7 @@ class LiveCalls:
     def _receive(self, event: Delivered) -> None:
         with self._lock:
             sender = event.src_id, self._robots[event.src_id].boot
-            found = self._engine.receive(sender, event.payload, self._offered, self._clock())
+            found = self._engine.receive(sender, event.payload, self._offered, self._clock(), event.age_s)
         try:
             if isinstance(found, Request):
                 self._clients[found.service_id].call(found.ticket, found.payload)

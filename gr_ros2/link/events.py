@@ -78,7 +78,7 @@ class Rejected(NamedTuple):
 class Delivered(NamedTuple):
     """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: at least one of its
     packets was lost at first and recovered later; ``hops``: robots that have sent it on, and ``over``: the last of
-    them, None where there were none."""
+    them, None where there were none; ``age_s``: s for which it has been under way at least."""
 
     src_id: int
     topic_id: int
@@ -88,6 +88,7 @@ class Delivered(NamedTuple):
     repaired: bool = False
     hops: int = 0
     over: int | None = None
+    age_s: float = 0.0
 
 
 class Lost(NamedTuple):

@@ -73,6 +73,17 @@ def test_a_late_reply_reaches_nobody() -> None:
     assert one.counters["late"] == one.counters["timed_out:/rx_robot_2/add"] == 1
 
 
+def test_a_call_counts_from_its_caller() -> None:
+    one, two = pair()
+    late = call(one, deadline_s=5.0)
+    assert two.receive(CALLER, late, OFFERS, 6.0, age_s=6.0) is None
+    assert two.counters["late"] == 1
+    found = two.receive(CALLER, call(one, deadline_s=5.0), OFFERS, 7.0, age_s=3.0)
+    assert isinstance(found, Request)
+    two.expire(9.1)
+    assert two.waiting == (0, 0)
+
+
 def test_a_call_without_a_deadline_waits() -> None:
     one, two = pair()
     sent = one.call(FAR, 0, b"", deadline_s=1e6, now=0.0)

@@ -249,7 +249,7 @@ class Inbox:
         if number <= newest:
             return
         gone = number - newest - here
-        self.deliveries.reached(number, min(self.began, now))
+        self.deliveries.reached(number, self.began)
         if gone:
             met = newest >= self._first  # what came before the first packet that was heard is not lost
             self._stats.missed[self.src_id] += gone * met
@@ -294,7 +294,7 @@ class Inbox:
 
     def _arrived(self, ready: Ready) -> None:
         """A message is complete."""
-        ready.made = self.deliveries.made(ready, self._now)
+        ready.made = min(self.deliveries.made(ready, self._now), self.began)
         if ready.topic_id > TABLE_TOPIC:
             if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
                 self.order.wait(ready)
@@ -376,7 +376,17 @@ class Inbox:
         qos = ready.qos if ready.qos >= 0 else topic.qos
         key = Key(self.boot, ready.order[0], ready.order[1])
         self._outcomes.delivered(
-            Delivered(self.src_id, ready.topic_id, payload, qos, key, ready.repaired, ready.hops, ready.over)
+            Delivered(
+                self.src_id,
+                ready.topic_id,
+                payload,
+                qos,
+                key,
+                ready.repaired,
+                ready.hops,
+                ready.over,
+                self._now - ready.made,
+            )
         )
 
     def _table(self, payload: bytes) -> None:

@@ -51,6 +51,8 @@ from gr_ros2.wire.v1 import (
 _HALF = 1 << 15
 _EARLY = 64
 """Number of packets kept per robot that cannot be opened yet."""
+_EARLY_S = 30.0
+"""s for which they are kept: hellos come more often, and where none came for so long, nobody waits for them."""
 _CHANGE_S = 1.0
 """s after which another start of a robot that does not seal is taken: forged hellos silence it for half of the time at
 most, and a robot that restarts is met soon."""
@@ -167,15 +169,15 @@ class Neighbours:
         self.own_hellos = OwnHellos(own[0])
         self._make_inbox = inbox
         self.all: dict[int, Neighbour] = {}
-        self._early: dict[int, deque[bytes]] = {}
+        self._early: dict[int, deque[tuple[float, bytes]]] = {}
         self._met_at: dict[int, float] = {}
         """When the present start of each robot was heard for the first time."""
         self._ended: dict[tuple[int, int], int] = {}
         """By id and boot number of a start that was replaced: the first packet of it that was not heard."""
 
-    def early(self, src_id: int) -> list[bytes]:
-        """Packets of a robot that could not be opened before; they are returned once."""
-        return list(self._early.pop(src_id, ()))
+    def early(self, src_id: int, now: float) -> list[tuple[float, bytes]]:
+        """Packets of a robot that could not be opened before, and when they came, s; they are returned once."""
+        return [(at, data) for at, data in self._early.pop(src_id, ()) if now <= at + _EARLY_S]
 
     def silent(self, now: float, after: float) -> list[Neighbour]:
         """Robots not heard for so many s. Their state is kept until another robot needs the room."""
@@ -199,7 +201,7 @@ class Neighbours:
             start += repair.size
         neighbour = self.all.get(header.src_id)
         if neighbour is None:
-            self._keep(header.src_id, data)
+            self._keep(header.src_id, data, now)
             self.dropped["early"] += 1
             return None
         number = neighbour.number(header.number)
@@ -207,12 +209,12 @@ class Neighbours:
         try:
             body = neighbour.trailer.open(data[:start], data[start:], number, repair_id)
         except (CrcError, TagError):
-            self._keep(header.src_id, data)
+            self._keep(header.src_id, data, now)
             raise
         control = repair is not None and not repair.mask
         if not control and neighbour.proves:
             if neighbour.proofs.proven is None:
-                self._keep(header.src_id, data)
+                self._keep(header.src_id, data, now)
                 self.dropped["early"] += 1
                 return None
             if number <= neighbour.proofs.proven:
@@ -379,10 +381,10 @@ class Neighbours:
             raise SourcesError(f"robot {src_id}: {len(self.all)} others are heard; raise max_sources")
         return self.all.pop(quiet.src_id)
 
-    def _keep(self, src_id: int, data: bytes) -> None:
+    def _keep(self, src_id: int, data: bytes, now: float) -> None:
         if src_id not in self._early and len(self._early) >= self._settings.max_sources:
             del self._early[next(iter(self._early))]
-        self._early.setdefault(src_id, deque(maxlen=_EARLY)).append(data)
+        self._early.setdefault(src_id, deque(maxlen=_EARLY)).append((now, data))
 
     def _counts_on_store(self, hello: Hello) -> bool:
         """Whether only the stored packet number keeps replays of a robot out."""

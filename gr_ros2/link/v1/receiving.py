@@ -107,7 +107,8 @@ class ReceivingSide:
     def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         """Take one packet; the events it causes, in order."""
         self._now = now
-        self._receive(arrival, now)
+        began = now if self._access is None or arrival.at is None else min(arrival.at, now)
+        self._receive(arrival, now, began)
         return self._outcomes.take()
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
@@ -152,7 +153,8 @@ class ReceivingSide:
         self.stats.lost[event.src_id, event.topic_id, Fate.PUBLISH_FAILED.value] += 1
         return Lost(event.src_id, event.topic_id, Fate.PUBLISH_FAILED, event.key)
 
-    def _receive(self, arrival: AirPacket, now: float) -> None:
+    def _receive(self, arrival: AirPacket, now: float, began: float) -> None:
+        """Take a packet that began to arrive at a time, s."""
         try:
             header = read_header(arrival.data, self._settings.packet_len)
             opened = self._open(arrival.data, header, now)
@@ -166,14 +168,15 @@ class ReceivingSide:
                 return
             if arrival.snr_db is not None and opened.new:
                 opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
+            opened.neighbour.inbox.began = began
             proved = self._use(arrival, opened, now)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
             self._outcomes.events.append(Rejected(arrival.data, error))
             return
         if opened.met or proved:
-            for early in self.neighbours.early(opened.neighbour.src_id):
-                self._receive(AirPacket(early), now)
+            for at, early in self.neighbours.early(opened.neighbour.src_id, now):
+                self._receive(AirPacket(early), now, at)
 
     def _note_slot(self, access: Access, header: Header, arrival: AirPacket, now: float, *, trusted: bool) -> None:
         """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
@@ -214,7 +217,6 @@ class ReceivingSide:
         if opened.met:
             self._meet(opened, now)
         self._sender, inbox = neighbour, neighbour.inbox
-        inbox.began = now if self._access is None or arrival.at is None else arrival.at
         if self.relaying is not None and opened.new:
             self.relaying.reached(neighbour, number)
         mask, clear, repair_id = 0, False, NOT_A_REPAIR

@@ -124,6 +124,23 @@ def test_a_call_that_a_relay_holds_is_over_after_its_deadline(mode: SealMode) ->
     assert line.robots[1].end.received.dropped["too_old"] == 1
 
 
+@pytest.mark.parametrize(("after_s", "comes"), [(0.1, {b"go", b"text"}), (5.0, {b"text"}), (3600.0, set())])
+def test_what_waited_for_a_hello_counts_from_when_it_came(after_s: float, comes: set[bytes]) -> None:
+    rows = Registry([Topic(0, "cmd_vel", TWIST), Topic(1, "text", "std_msgs/msg/String")])
+    sender, receiver = Robot(1, rows, packet_len=128), Robot(2, packet_len=128)
+    sender.end.messages.submit(0, b"go", 0.0)
+    sender.end.messages.submit(1, b"text", 0.0)
+    packets = [data for n in range(6) if (data := sender.slot(n * SLOT_S)) is not None]
+    hellos = [data for data in packets if Robot(3, packet_len=128).receive(data, 0.0)]
+    assert 0 < len(hellos) < len(packets)
+    for data in packets:
+        if data not in hellos:
+            receiver.receive(data, 0.1)
+    for data in hellos:
+        receiver.receive(data, 0.1 + after_s)
+    assert set(receiver.delivered()) == comes
+
+
 @pytest.mark.parametrize(("limit_s", "comes"), [(1.0, False), (60.0, True), (0.0, True)])
 def test_max_age_s_of_a_receiver_counts_from_the_origin(limit_s: float, comes: bool) -> None:
     rows = named(3)
