@@ -154,11 +154,12 @@ class ControlSocket:
     def _reply_to(self, line: bytes) -> Mapping[str, Any]:
         try:
             query = parse(line)
+        except ValueError as error:
+            return {"error": f"not understood ({error}); a question is one line of JSON, an object"}
+        try:
             return {"name": self._name, **(self._answer(query) if query else {})}
         except GrRos2Error as error:
             return {"error": str(error)}
-        except (ValueError, LookupError, TypeError, ArithmeticError):
-            return {"error": "not understood"}
         except Exception as error:  # noqa: BLE001 - whatever error one client causes, the next one gets an answer
             return {"error": f"{type(error).__name__}: {error}"}
 

@@ -9,14 +9,17 @@ import webbrowser
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from rich.console import Console
 
 from gr_ros2.cli.control_socket import ControlSocket, receive, request, running_programs
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import BackendMissingError, ConfigError, RunError
+from gr_ros2.settings.config import STRICT, build
 
 if TYPE_CHECKING:
     from gr_ros2.dashboard.server import Dashboard
@@ -34,6 +37,14 @@ dashboard_option = click.option(
     metavar="[ADDRESS:]PORT",
     help=f"Show it live on a web page, at {ADDRESS}:{PORT} unless told otherwise (write --dashboard=PORT).",
 )
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class _Place:
+    """Where a page is asked for."""
+
+    address: str
+    port: Annotated[int, Field(ge=0, le=65535)]
 
 
 @contextmanager
@@ -69,8 +80,12 @@ def audience(
             return urls[0]
 
         def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
-            known = {key: answers[key](value) for key, value in asked.items() if key in answers}
-            return known or {"url": serve(str(asked["address"]), int(asked["port"]))}
+            if set(asked) & {"address", "port"}:
+                place = build(_Place, asked, "dashboard")
+                return {"url": serve(place.address, place.port)}
+            if strange := sorted(set(asked) - set(answers)):
+                raise ConfigError(f"{', '.join(strange)}: no question here; known are {', '.join(sorted(answers))}")
+            return {key: answers[key](value) for key, value in asked.items()}
 
         if where is not None:
             console.print(f"live at {serve(*parse_place(where))}", soft_wrap=True)

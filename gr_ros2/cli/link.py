@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from pydantic.dataclasses import dataclass
 from rich.console import Console
 from rich.live import Live
 
@@ -31,7 +32,7 @@ from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.radio import FRONT_ENDS, PRESETS
 from gr_ros2.radio.config import LinkConfig, link_from, load_link
 from gr_ros2.radio.one_line import FLAGS, one_line
-from gr_ros2.settings.config import DEFAULT_MIDDLEWARE
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, STRICT, RobotId, build
 from gr_ros2.settings.files import portable_registry, settled
 from gr_ros2.settings.yaml_text import yaml_text
 from gr_ros2.wire import BROADCAST
@@ -129,7 +130,6 @@ def link(
         raise click.UsageError("--against needs --check")
     # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
-        from gr_ros2.radio.live_settings import LiveSettings
         from gr_ros2.radio.robot_link import RobotLink
         from gr_ros2.run.observers import RunObservers
 
@@ -146,12 +146,7 @@ def link(
             signal.signal(number, lambda *_, on=on: _switch(running, on))
         try:
             running.start()
-            live = LiveSettings(running.source, running.sink)
-            answers |= {
-                STATUS: lambda _: {**running.stats(), "findings": running.findings()},
-                PING: lambda asks: running.ping(int(asks["robot"]), anew=bool(asks["anew"])),
-                SET: lambda asks: [live.change(name, value) for name, value in asks],
-            }
+            answers |= _answers(running)
             run_observers.run_started(_live(running))
             _show(console, running, duration)
         except KeyboardInterrupt:
@@ -162,6 +157,37 @@ def link(
         for line in running.incomplete():
             console.print(line, soft_wrap=True)
         return FAILED if running.incomplete() else 0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class _Asked:
+    """Which robot is asked, and whether earlier questions are forgotten."""
+
+    robot: RobotId
+    anew: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class _Changes:
+    """Settings to change, each a name and a value."""
+
+    changes: list[tuple[str, Any]]
+
+
+def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
+    """What clients may ask a running link, by the names of :mod:`gr_ros2.cli.status`."""
+    from gr_ros2.radio.live_settings import LiveSettings
+
+    live = LiveSettings(running.source, running.sink)
+
+    def ping(asks: Any) -> dict[str, Any]:
+        asked = build(_Asked, asks, PING)
+        return running.ping(asked.robot, anew=asked.anew)
+
+    def change(asks: Any) -> list[str]:
+        return [live.change(name, value) for name, value in build(_Changes, {"changes": asks}, SET).changes]
+
+    return {STATUS: lambda _: {**running.stats(), "findings": running.findings()}, PING: ping, SET: change}
 
 
 def _switch(running: RobotLink, on: bool) -> None:

@@ -271,7 +271,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def _reconfigure(self, **changes: Any) -> None:
         with self._lock:
             config = replaced(self.config, **changes)
-            self._end.reconfigure(**changes)
+            self._end.reconfigure(**{name: getattr(config, name) for name in changes})  # as validated
             self.config = config
             self._work.notify_all()
             self._room.notify_all()

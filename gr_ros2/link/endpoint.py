@@ -226,6 +226,7 @@ class Questions(Protocol):
         """Ask a robot as soon as a packet may leave; returns what has come of all questions to it so far.
 
         :param anew: forget the earlier ones
+        :raises ConfigError: for a number that no robot has
         """
 
 

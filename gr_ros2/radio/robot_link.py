@@ -275,7 +275,7 @@ class RobotLink(Flowgraph):
         """Ask another robot, which answers at once; returns what has come of all questions to it so far.
 
         :param anew: forget the earlier ones
-        :raises ConfigError: with version 0
+        :raises ConfigError: with version 0, or for a number that no robot has
         """
         return {**ping(self.end, robot, self._clock(), anew=anew), **self.source.rate()}
 

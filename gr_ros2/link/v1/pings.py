@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any
 
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.control import ABOUT_LEN, HELD_STEP_S, PING_LEN, About, Ping, reportable
 
 ANSWER_S, ASK_S = 0.05, 0.1
@@ -160,7 +162,12 @@ class Pings:
 
     def ask(self, robot: int, now: float, *, wants_about: bool = False) -> RoundTrips:
         """Ask a robot as soon as a packet may leave, unless it was asked less than ``ASK_S`` ago; returns what has come
-        of all questions to it."""
+        of all questions to it.
+
+        :raises ConfigError: for a number that no robot has
+        """
+        if not 0 <= robot < BROADCAST:
+            raise ConfigError(f"robot = {robot}: who can be asked is 0 to {BROADCAST - 1}")
         trips = self.asked.setdefault(robot, RoundTrips())
         if now >= trips.not_before:
             trips.not_before = now + ASK_S
