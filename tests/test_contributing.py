@@ -1,4 +1,4 @@
-"""The worked examples of CONTRIBUTING.md: installed from the page as a package, and held to the contracts."""
+"""The worked examples of docs/how-to/extend.md: installed from the page as a package, and held to the contracts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from tests.packages import REPOSITORY, install, run
 
-PAGE = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs/how-to/extend.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"^### [^\n]*`(\w+)\.py`\n.*?^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
 DIFFS = re.findall(r"^```diff\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 ASK = """
