@@ -12,7 +12,7 @@ from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sent_topics import SentTopics
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.wire.control import Newest
-from gr_ros2.wire.relayed import Relayed, read_carried, read_relayed, write_carried, write_relayed
+from gr_ros2.wire.relayed import Receipt, Relayed, read_carried, read_relayed, write_carried, write_relayed
 
 MOST_LINES = 12_000
 """Lines of Python for a message heard, and for a choice among 40 streams for 40 neighbours."""
@@ -36,6 +36,7 @@ def relay(data: bytes) -> None:
         most=10_000,
         dropped=Counter(),
         drop=lambda _: None,
+        ended=lambda *_: None,
     )
     for start in range(0, min(len(data), 40 * _STEP), _STEP):
         src_id, later, *names = (data[start : start + 4] + bytes(4))[:4]
@@ -69,6 +70,7 @@ def carry(custody: Custody, data: bytes, src_id: int, now: float) -> None:
     held = len(custody)
     custody.routes.note(message.origin, src_id, message.hops, now)
     within(MOST_LINES, partial(custody.take, message, src_id, now, made=now))
+    within(MOST_LINES, partial(custody.receipt, message.origin, Receipt(message.start, message.topic_id, 0, 0)))
     within(MOST_LINES, partial(custody.offer, now, now))
     assert held <= len(custody) <= MOST_HELD
 
@@ -80,10 +82,10 @@ def corpus() -> list[bytes]:
         message = write_relayed(Relayed(n % 7, 1, n, 0, 0, n % 4, b"odom"))
         heard += bytes((2 + n % 3, 64, 1, 3, n, 0)) + message
     carried = b"".join(
-        bytes((2 + n % 3, 64, 1, 3, n)) + write_carried(1, Relayed(n % 7, 1, n, 128, 0, n % 4, b"go", dst_id=9))
+        bytes((2 + n % 3, 64, 1, 3, n)) + write_carried(1, Relayed(n % 7, 1, n, 128, 0, n % 4, b"", dst_id=9))
         for n in range(40)
     )
-    return [b"", heard[:_STEP], heard, b"".join(carried[at : at + 19] + b"!" for at in range(0, len(carried), 19))]
+    return [b"", heard[:_STEP], heard, carried]
 
 
 if __name__ == "__main__":

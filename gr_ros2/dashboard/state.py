@@ -171,7 +171,7 @@ class DashboardState:
                 topic = self._topic((src_id, event.topic_id))
                 topic.sent += event.count
                 topic.ended[Fate.LOST_ON_GRAPH.value] += event.count
-            else:
+            elif isinstance(event, Refused):
                 self._refused(source, src_id, event)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:

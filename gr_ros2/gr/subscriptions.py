@@ -121,6 +121,8 @@ class Subscriptions:
                 "submitted": sum(stats.submitted[topic_id] for topic_id in ids[topic.name]),
                 Fate.LOST_ON_GRAPH.value: sum(stats.missed[topic_id] for topic_id in ids[topic.name]),
                 "sent": sum(stats.sent[topic_id] for topic_id in ids[topic.name]),
+                "arrived": sum(stats.ended[topic_id, True] for topic_id in ids[topic.name]),
+                "unconfirmed": sum(stats.ended[topic_id, False] for topic_id in ids[topic.name]),
                 "queued": sum(queued[topic_id] for topic_id in ids[topic.name]),
                 "queue": self._messages.queue(now[topic.topic_id])[0],
                 "queue_depth": self._messages.depth(now[topic.topic_id]),

@@ -173,6 +173,19 @@ class Missed(NamedTuple):
     count: int  # type: ignore[assignment]
 
 
+class Ended(NamedTuple):
+    """What is known of a message for one robot that was sent where messages are relayed.
+
+    ``arrived``: that robot has told that it has the message. Otherwise it has told nothing, and the message is of no
+    more use: it is kept no longer. What became of it is known there only.
+    """
+
+    serial: int
+    topic_id: int
+    dst_id: int
+    arrived: bool
+
+
 class SentEntry(NamedTuple):
     """One entry of a packet that left: fragment ``index`` of message ``serial``.
 
@@ -220,4 +233,4 @@ class SentPacket(NamedTuple):
         return PacketId(*self[2:6])
 
 
-SenderEvent = Accepted | Refused | Missed | SentPacket
+SenderEvent = Accepted | Refused | Missed | Ended | SentPacket

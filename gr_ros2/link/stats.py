@@ -14,13 +14,15 @@ class SenderStats:
     """Counters of the sending half.
 
     ``refused`` is keyed by (topic_id, reason); ``missed`` are messages that the ROS graph lost before ``submit``;
-    ``air`` counts packets by their use (:data:`gr_ros2.link.events.AirKind`).
+    ``ended`` counts messages for one robot by (topic_id, whether that robot has told that it has them), where messages
+    are relayed; ``air`` counts packets by their use (:data:`gr_ros2.link.events.AirKind`).
     """
 
     submitted: Counter[int] = field(default_factory=Counter)
     refused: Counter[tuple[int, str]] = field(default_factory=Counter)
     sent: Counter[int] = field(default_factory=Counter)
     missed: Counter[int] = field(default_factory=Counter)
+    ended: Counter[tuple[int, bool]] = field(default_factory=Counter)
     air: Counter[str] = field(default_factory=Counter)
     repeats: int = 0
     packets: int = 0

@@ -143,7 +143,7 @@ class Ledger:
                 topic = self._topic(src_id, event.topic_id)
                 topic.sent += event.count
                 topic.fates[Fate.LOST_ON_GRAPH.value] += event.count
-            else:
+            elif isinstance(event, Refused):
                 self._refused(source, event)
 
     def packet_received(self, identity: PacketId) -> int | None:

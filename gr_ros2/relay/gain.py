@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
+from gr_ros2.wire.v1 import TABLE_TOPIC
 
 HEARD_S = 3.0
 """s for which a robot that was heard counts as a neighbour."""
@@ -252,11 +253,12 @@ class Gains:
 
     def _gain(self, stream: Stream, state: _State, neighbours: Iterable[int]) -> float:
         newest, origin, has = state.newest, stream.origin, state.has
+        table = stream.topic_id == TABLE_TOPIC  # who hears a robot has its table from it
         if newest < 0:
             return 0.0
         behind = 0.0
         for robot in neighbours:
-            if robot != origin:
+            if robot != origin and not (table and origin in self._heard[robot].named):
                 before = has.get(robot)
                 if before is None:
                     behind += UNKNOWN_S / state.period

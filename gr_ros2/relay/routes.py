@@ -1,7 +1,8 @@
 """Over which robot a message comes nearer to another one.
 
 Every message of another robot says how many have sent it on, so whoever carries it stands so far from its origin. A
-robot hands a message for that origin to the one that stands nearest and hears it.
+robot hands a message for that origin to the one that stands nearest and hears it. One to which messages were handed
+that did not arrive comes last.
 
 Invariants: sans-IO, the caller passes in times; memory is bounded by the ids.
 """
@@ -13,6 +14,9 @@ from collections.abc import Callable
 STALE_S = 15.0
 """s for which a distance counts: tables are relayed every 5 s at least, and two may be lost."""
 
+DOUBT_S = 300.0
+"""s for which a robot over which messages did not arrive comes after all others."""
+
 
 class Routes:
     """The distances of the robots that are heard from all others."""
@@ -21,6 +25,8 @@ class Routes:
         self._ways: dict[int, dict[int, tuple[int, float]]] = {}
         """By robot, and by the one that is heard: how many stand between them, this one included, and when that was
         last so, s."""
+        self._doubted: dict[tuple[int, int], float] = {}
+        """Until when a robot counts as no good way to another one, by this one and by it, s."""
 
     def note(self, robot: int, via: int, hops: int, now: float) -> None:
         """A message of a robot has come over another one.
@@ -32,14 +38,26 @@ class Routes:
         if hops <= before or now > at + STALE_S:  # a detour says nothing about the shortest way
             ways[via] = hops, now
 
+    def doubt(self, robot: int, via: int, now: float) -> None:
+        """What was handed to ``via`` for ``robot`` has not arrived."""
+        self._doubted[robot, via] = now + DOUBT_S
+
+    def trust(self, robot: int, via: int) -> None:
+        """What was handed to ``via`` for ``robot`` has arrived."""
+        self._doubted.pop((robot, via), None)
+
     def over(self, robot: int, now: float, usable: Callable[[int], bool]) -> int | None:
         """The robot to which a message for ``robot`` is to be handed; None if no way is known.
 
         :param usable: whether a robot may be taken
         """
         ways = self._ways.get(robot, {}).items()
-        open_ways = [(hops, via) for via, (hops, at) in ways if now <= at + STALE_S and usable(via)]
-        return min(open_ways)[1] if open_ways else None
+        open_ways = [
+            (now < self._doubted.get((robot, via), now), hops, via)
+            for via, (hops, at) in ways
+            if now <= at + STALE_S and usable(via)
+        ]
+        return min(open_ways)[2] if open_ways else None
 
     def hops(self, robot: int, now: float) -> int | None:
         """Robots between this one and another; 0 if it is heard, None if nothing is known."""

@@ -12,8 +12,17 @@ byte 11       if A: the robot for which it is
 then          the message
 ```
 
-A message of topic 242 is *carried*: in front stand two bytes more, the robot that is to take it on and the age at which
-the message is of no more use, and A is 1.
+A message of topic 242 is *carried*: A is 1, and in front stand three bytes more: the robot that is to take it on; the
+age at which the message is of no more use; and how many messages of its topic before it, with the places before its
+own, its origin still keeps (0..127). One of topic 240 is a receipt: it says what has come of the messages of the robot
+for which it is, in entries of 8 bytes.
+
+```text
+bytes 0, 1    the low 16 bits of the boot number of the robot for which the receipt is
+byte 2        topic id in the table of that robot
+bytes 3..6    number, and
+byte 7        place of the newest message of this topic that has come with all before it
+```
 
 Ages are floating-point numbers of eight bits in steps of ``AGE_STEP_S``: c < 16 is c steps, and any other c is
 (16 + c mod 16) * 2^(c div 16 - 1) steps. So an age is exact to 10 ms or to 1 part in 16. 255 is an age that is greater
@@ -26,6 +35,7 @@ than it is.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Iterable
 from math import inf
 from struct import Struct
 from struct import error as struct_error
@@ -38,7 +48,11 @@ MOST_HOPS = 63
 AGE_STEP_S = 0.01
 NO_AGE = 255
 """Code of an age that is greater than all others or unknown, and of no limit."""
-_head = Struct(">BHIBBBB")
+FIRST_PLACE, PLACES = 128, 128
+"""Messages that their origin hands on have places that no entry has, one after the other, and again from the first."""
+RECEIPT_TOPIC = TABLE_TOPIC
+"""Topic id of receipts: a table of topics is not carried."""
+_head, _receipt = Struct(">BHIBBBB"), Struct(">HBIB")
 RELAYED_LEN = _head.size
 """Bytes in front of a message for everybody. One for a single robot has one more."""
 _CODED, _ADDRESSED = 0x80, 0x40
@@ -59,6 +73,7 @@ class Relayed(NamedTuple):
     :param dst_id: the robot for which it is, 255 for all
     :param age: code of its age when it is sent on
     :param limit: code of the age at which it is of no more use; only carried messages have one
+    :param waits: where it is carried: messages of its topic before it that its origin keeps
     """
 
     origin: int
@@ -72,6 +87,7 @@ class Relayed(NamedTuple):
     dst_id: int = BROADCAST
     age: int = NO_AGE
     limit: int = NO_AGE
+    waits: int = 0
 
     def describe(self) -> str:
         """The fields in words."""
@@ -107,7 +123,7 @@ def write_relayed(message: Relayed) -> bytes:
 
     :raises EncodeError: a field out of range
     """
-    origin, start, number, place, topic_id, hops, payload, coded, dst_id, age, _ = message
+    origin, start, number, place, topic_id, hops, payload, coded, dst_id, age, *_ = message
     if not 0 <= hops <= MOST_HOPS or topic_id > TABLE_TOPIC or origin == BROADCAST:
         raise EncodeError(f"{message.describe()}: hops are 0..{MOST_HOPS}, topics 0..{TABLE_TOPIC}, robots 0..254")
     addressed = dst_id != BROADCAST
@@ -127,7 +143,9 @@ def write_carried(taker: int, message: Relayed) -> bytes:
     """
     if not 0 <= taker < BROADCAST or message.dst_id == BROADCAST:
         raise EncodeError(f"{message.describe()}, taken on by robot {taker}: it is for no single robot")
-    return bytes((taker, message.limit)) + write_relayed(message)
+    if not 0 <= message.waits < PLACES:
+        raise EncodeError(f"{message.describe()}: {message.waits} messages before it; at most {PLACES - 1}")
+    return bytes((taker, message.limit, message.waits)) + write_relayed(message)
 
 
 def read_carried(data: bytes) -> tuple[int, Relayed]:
@@ -136,10 +154,39 @@ def read_carried(data: bytes) -> tuple[int, Relayed]:
     :raises EntryBoundsError: it is cut off
     :raises EntryKindError: a topic or robot that does not exist, or it is for no single robot
     """
-    message = read_relayed(data[2:])
-    if data[0] == BROADCAST or message.dst_id == BROADCAST:
+    message = read_relayed(data[3:])
+    if data[0] == BROADCAST or data[2] >= PLACES or message.dst_id == BROADCAST:
         raise EntryKindError(f"a carried message to robot {message.dst_id} over robot {data[0]}")
-    return data[0], message._replace(limit=data[1])
+    return data[0], message._replace(limit=data[1], waits=data[2])
+
+
+class Receipt(NamedTuple):
+    """What has come of the messages of one topic that were carried to one robot.
+
+    :param start: the low 16 bits of the boot number of the robot that made them
+    :param topic_id: in its table
+    :param number: number and ``place`` of the newest message that has come with all before it
+    """
+
+    start: int
+    topic_id: int
+    number: int
+    place: int
+
+
+def write_receipts(receipts: Iterable[Receipt]) -> bytes:
+    """The payload of a receipt."""
+    return b"".join(_receipt.pack(*receipt) for receipt in receipts)
+
+
+def read_receipts(payload: bytes) -> list[Receipt]:
+    """The entries of a receipt.
+
+    :raises EntryBoundsError: it is cut off
+    """
+    if len(payload) % _receipt.size:
+        raise EntryBoundsError(f"a receipt of {len(payload)} bytes, which are no entries of {_receipt.size}")
+    return [Receipt(*entry) for entry in _receipt.iter_unpack(payload)]
 
 
 def read_relayed(data: bytes) -> Relayed:

@@ -117,6 +117,7 @@ local f = {
     relayed_hops = ProtoField.uint8("gr_ros2.relayed.hops", "Hops", base.DEC, nil, 0x3F),
     relayed_age = ProtoField.uint8("gr_ros2.relayed.age", "Age when it was sent on, code"),
     relayed_limit = ProtoField.uint8("gr_ros2.relayed.limit", "Age at which it is of no more use, code"),
+    relayed_waits = ProtoField.uint8("gr_ros2.relayed.waits", "Messages before it that its origin keeps"),
     relayed_dst_id = ProtoField.uint8("gr_ros2.relayed.dst_id", "For robot"),
     table_topic_id = ProtoField.uint8("gr_ros2.table.topic_id", "Topic id"),
     table_name = ProtoField.string("gr_ros2.table.name", "Name"),
@@ -552,10 +553,11 @@ end
 
 -- Whose message it is that stands in a message of another robot.
 local function dissect_relayed(buffer, entry, id, at, after)
-    if id == CARRIED_TOPIC and after > at + 1 then
+    if id == CARRIED_TOPIC and after > at + 2 then
         entry:add(f.relayed_taker, buffer(at, 1))
         entry:add(f.relayed_limit, buffer(at + 1, 1)):append_text(age_of(buffer(at + 1, 1):uint()))
-        at = at + 2
+        entry:add(f.relayed_waits, buffer(at + 2, 1))
+        at = at + 3
     end
     if after < at + RELAYED_LEN then
         return

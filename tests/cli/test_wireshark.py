@@ -194,7 +194,8 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
         over = [(part["topic_id"], bytes.fromhex(part["payload"])) for part in parts if part["topic_id"] > 240]
         assert numbers("relayed.taker") == [content[0] for topic_id, content in over if topic_id == CARRIED_TOPIC]
         assert numbers("relayed.limit") == [content[1] for topic_id, content in over if topic_id == CARRIED_TOPIC]
-        relayed = [read_relayed(content[2 * (topic_id == CARRIED_TOPIC) :]) for topic_id, content in over]
+        assert numbers("relayed.waits") == [content[2] for topic_id, content in over if topic_id == CARRIED_TOPIC]
+        relayed = [read_relayed(content[3 * (topic_id == CARRIED_TOPIC) :]) for topic_id, content in over]
         for field in ("origin", "start", "number", "place", "topic_id", "coded", "hops", "age"):
             assert numbers(f"relayed.{field}") == [getattr(message, field) for message in relayed], field
         assert numbers("topic_id") == [entry["topic_id"] for entry in parts]

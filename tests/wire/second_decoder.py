@@ -241,6 +241,7 @@ def read_relayed(content: bytes) -> dict[str, object]:
         "dst_id": to,
         "age": content[10],
         "limit": 255,
+        "waits": 0,
     }
 
 
@@ -251,10 +252,26 @@ def age_of(code: int) -> float:
 
 def read_carried(content: bytes) -> dict[str, object]:
     """A message of topic 242."""
-    message = read_relayed(content[2:])
-    if content[0] == 255 or message["dst_id"] == 255:
+    message = read_relayed(content[3:])
+    if content[0] == 255 or message["dst_id"] == 255 or content[2] > 127:
         raise Refused("entry_kind")
-    return {"taker": content[0], **message, "limit": content[1]}
+    return {"taker": content[0], **message, "limit": content[1], "waits": content[2]}
+
+
+def read_receipts(payload: bytes) -> list[dict[str, object]]:
+    """The message of a carried one of topic 240."""
+    if len(payload) % 8:
+        raise Refused("entry_bounds")
+    entries = [payload[at : at + 8] for at in range(0, len(payload), 8)]
+    return [
+        {
+            "start": int.from_bytes(entry[:2], "big"),
+            "topic_id": entry[2],
+            "number": int.from_bytes(entry[3:7], "big"),
+            "place": entry[7],
+        }
+        for entry in entries
+    ]
 
 
 def read_medium_access(data: bytes) -> dict[str, object]:

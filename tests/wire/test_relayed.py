@@ -38,6 +38,7 @@ MESSAGES = st.builds(
     U8,
     U8,
     st.just(NO_AGE),
+    st.just(0),
 )
 
 
@@ -55,9 +56,9 @@ def test_any_bytes(data: bytes) -> None:
     assert write_relayed(message) == data
 
 
-@given(ID, MESSAGES.filter(lambda message: message.dst_id != 255), U8)
-def test_round_trip_of_carried_messages(taker: int, message: Relayed, limit: int) -> None:
-    message = message._replace(limit=limit)
+@given(ID, MESSAGES.filter(lambda message: message.dst_id != 255), U8, st.integers(0, 127))
+def test_round_trip_of_carried_messages(taker: int, message: Relayed, limit: int, waits: int) -> None:
+    message = message._replace(limit=limit, waits=waits)
     assert read_carried(write_carried(taker, message)) == (taker, message)
 
 

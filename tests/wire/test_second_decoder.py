@@ -21,7 +21,17 @@ from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.mac_block import read_block
-from gr_ros2.wire.relayed import age_code, age_of, limit_code, read_carried, read_relayed, write_carried, write_relayed
+from gr_ros2.wire.relayed import (
+    age_code,
+    age_of,
+    limit_code,
+    read_carried,
+    read_receipts,
+    read_relayed,
+    write_carried,
+    write_receipts,
+    write_relayed,
+)
 from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 from tests.link.v1.air import KEY, Air, Robot, registry
 from tests.wire import second_decoder as second
@@ -115,6 +125,15 @@ def test_carried_messages(case: dict[str, Any]) -> None:
 def test_carried_messages_to_refuse(case: dict[str, Any]) -> None:
     data = bytes.fromhex(case["hex"])
     assert refusals(read_carried, second.read_carried, data) == (case["error"], case["error"])
+
+
+@named("receipts")
+def test_receipts(case: dict[str, Any]) -> None:
+    data = bytes.fromhex(case["hex"])
+    ours = read_receipts(data)
+    assert write_receipts(ours) == data
+    assert [receipt._asdict() for receipt in ours] == second.read_receipts(data) == case["receipts"]
+    assert refusals(read_receipts, second.read_receipts, data + b"\0") == ("entry_bounds", "entry_bounds")
 
 
 def test_kept_messages() -> None:

@@ -139,6 +139,7 @@ class EndpointV1:
                 most=settings.max_source_bytes,
                 dropped=self.received.dropped,
                 drop=messages.drop,
+                ended=messages.ended,
             )
             messages.relayed_left, relaying.found = relaying.left, messages.found
         self._receiving.tell(self._sending, messages, window, rate)

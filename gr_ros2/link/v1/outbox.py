@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.endpoint import check_live_options
-from gr_ros2.link.events import Accepted, Missed, Refused
+from gr_ros2.link.events import Accepted, Ended, Missed, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import OVERLOAD_S, OVERLOADED, Dropped, PublisherQos
@@ -33,7 +33,7 @@ from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOPIC
 
-Observer = Callable[[Accepted | Refused | Missed], None]
+Observer = Callable[[Accepted | Refused | Missed | Ended], None]
 
 
 class Owner(Protocol):
@@ -277,13 +277,19 @@ class Outbox:
         if message.topic_id == RELAYED_TOPIC:
             self.relayed_left(now)
         elif self.custody is not None and message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):
-            self.custody.left(message)
+            self.custody.left(message, now)
 
     def found(self, robot: int, now: float) -> None:
         """A robot is reached over others for the first time: what is kept for it is sent. It cannot ask."""
         for topic in self.sent.named():
             if topic.dst_id == robot and topic.kept:
                 self.kept.ask(topic.topic.topic_id, now)
+
+    def ended(self, message: Message, arrived: bool) -> None:
+        """A message for one robot has come there, or is kept no longer without that being known."""
+        self.stats.ended[message.topic_id, arrived] += 1
+        if self._observer is not None:
+            self._observer(Ended(message.serial, message.topic_id, message.dst_id, arrived))
 
     def drop(self, dropped: list[Dropped[Message]]) -> None:
         """These messages are not sent, or not again."""

@@ -94,7 +94,7 @@ class ReceivingSide:
         )
         self.relaying: Relaying | None = None
         if settings.relay:
-            self.relaying = Relaying(settings.src_id, self.neighbours, self._outcomes, settings.max_source_bytes)
+            self.relaying = Relaying(settings.src_id, self.neighbours, self._outcomes, most=settings.max_source_bytes)
             self.relaying.tell(lambda src_id, boot: self._inbox(src_id, boot, 0, settings.packet_len, far=True))
         self._now = -inf
         self._sender: Neighbour | None = None
@@ -302,7 +302,7 @@ class ReceivingSide:
         self._window.peers.report(sender, number, report.arrived, settled=report.settled, loss=loss, now=now)
         self._sending.repairs.reported()
         if self.relaying is not None:
-            self.relaying.custody.reported(sender)
+            self.relaying.custody.reported(sender, now)
         self._messages.reported = True
         if self._rate is not None and report.snr_db is not None:
             self._rate.report(sender, report.snr_db, loss, now)

@@ -20,7 +20,7 @@ Invariants: a message is delivered once, whether it comes directly or over other
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from math import inf
 from typing import NamedTuple
@@ -36,21 +36,25 @@ from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sent_topics import SentTopic
+from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.rooms import Rooms
 from gr_ros2.relay.routes import STALE_S
 from gr_ros2.settings.registry import CALLS_TYPE
-from gr_ros2.wire import QOS_BULK, QOS_DEFAULT
+from gr_ros2.wire import QOS_DEFAULT
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import NOBODY, Block
 from gr_ros2.wire.relayed import (
     MOST_HOPS,
     NO_AGE,
+    RECEIPT_TOPIC,
     RELAYED_LEN,
+    Receipt,
     Relayed,
     age_code,
     age_of,
     read_carried,
+    read_receipts,
     read_relayed,
     write_relayed,
 )
@@ -65,8 +69,6 @@ FORGET_S = 60.0
 """s after which nothing of a robot is sent on any more: its table comes every ``TABLE_S`` from who hears it."""
 FAR_S = 600.0
 """s after which a robot that is known over others only is forgotten, and with it what has come of it."""
-MOST_EARLY = 16
-"""Messages carried to this robot that wait for the table of their origin, of each neighbour."""
 _BOOT_LEN = 8
 _LONG_S = 2 * age_of(NO_AGE - 1)
 """s that are taken for an age that is unknown."""
@@ -90,11 +92,11 @@ class Relaying:
     :param src_id: of this robot
     :param neighbours: the robots that are heard
     :param outcomes: takes what comes of it
-    :param most: bytes of messages that are kept to be sent on, and of tables of far robots
+    :param most: bytes of messages that are kept to be sent on, of those carried here that wait, and of far tables
     :ivar hops: over how many robots the newest message of each robot came; 0 for directly
     """
 
-    def __init__(self, src_id: int, neighbours: Neighbours, outcomes: Outcomes, most: int) -> None:
+    def __init__(self, src_id: int, neighbours: Neighbours, outcomes: Outcomes, *, most: int) -> None:
         self.src_id = src_id
         self.hops: dict[int, int] = {}
         self.relayed: Counter[tuple[int, int]] = Counter()
@@ -116,7 +118,7 @@ class Relaying:
         """Robots of which a message came over others with a number that they have not reached themselves."""
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
-        self._early: dict[int, deque[tuple[Relayed, Ready]]] = {}
+        self._carried_here = Sequences[Ready](most)
         self._chosen: Stream | None = None
         self.found: Callable[[int, float], None] = lambda _, __: None
         """Called with a robot that is reached over others for the first time."""
@@ -199,38 +201,63 @@ class Relaying:
         if now > kept.until:
             self._dropped["too_old"] += 1
             return
-        if taker != BROADCAST and message.dst_id != self.src_id:
-            if taker == self.src_id:
-                self.custody.take(message, via, now, made=made, until=kept.until)
+        order, table = (message.number, message.place), message.topic_id == TABLE_TOPIC
+        payload = message.payload[_BOOT_LEN * table :]
+        of = Ready(message.topic_id, order, payload, -1, message.coded, False, message.hops, via, taker != BROADCAST)
+        of.made, of.sealed, of.limit_s = made, ready.sealed - age_s if ready.sealed < inf else inf, limit_s
+        if taker != BROADCAST:
+            self._handed(taker, via, kept, of, now)
             return
-        if message.topic_id == TABLE_TOPIC and not self._starts(
-            message, via, now, heard=heard, carried=taker < BROADCAST
-        ):
+        if table and not self._starts(message, via, now, heard=heard):
             return
         inbox = self._inbox(origin, start)
-        if taker == BROADCAST:
-            if inbox is None or (message.topic_id != TABLE_TOPIC and inbox.announced.topic_of(message) is None):
-                self._dropped["unknown_origin"] += 1  # not taken: who has it must not learn that it is here
-                return
-            if not self._take(via, kept, now):
-                self._dropped["relayed_before"] += 1
-                return
+        if inbox is None or (not table and inbox.announced.topic_of(message) is None):
+            self._dropped["unknown_origin"] += 1  # not taken: who has it must not learn that it is here
+            return
+        if not self._take(via, kept, now):
+            self._dropped["relayed_before"] += 1
+            return
         self.hops[origin] = message.hops
-        if message.dst_id not in (BROADCAST, self.src_id):
+        if message.dst_id in (BROADCAST, self.src_id):
+            self._delivered(inbox, of, now)
+            if table:
+                self._due(inbox, now, receipts=True)
+
+    def _handed(self, taker: int, via: int, kept: _ToPass, ready: Ready, now: float) -> None:
+        """A message was heard that is carried to one robot."""
+        message = kept.message
+        if message.dst_id != self.src_id:
+            if taker == self.src_id:
+                self.custody.take(message, via, now, made=kept.made, until=kept.until)
             return
-        order, topic_id = (message.number, message.place), message.topic_id
-        sealed = ready.sealed - age_s if ready.sealed < inf else inf
-        payload = message.payload[_BOOT_LEN * (topic_id == TABLE_TOPIC) :]
-        of = Ready(topic_id, order, payload, -1, message.coded, False, message.hops, via, taker != BROADCAST)
-        of.made, of.sealed, of.limit_s = made, sealed, limit_s
-        if inbox is None:  # Whoever has handed it on has forgotten it by now. It waits for the table of its origin.
-            early = self._early.setdefault(via, deque(maxlen=MOST_EARLY))
-            self._dropped["unknown_origin"] += len(early) == MOST_EARLY
-            early.append((message, of))
+        if message.topic_id == RECEIPT_TOPIC:
+            try:
+                self.custody.told(message.origin, read_receipts(message.payload), now)
+            except WireError as error:
+                self._dropped[error.kind] += 1
             return
-        self._delivered(inbox, of, now)
-        if topic_id == TABLE_TOPIC:
-            self._deliver_early(inbox, now)
+        self.hops[message.origin] = message.hops
+        new = self._carried_here.take(message, ready)
+        if not new:
+            self._dropped["custody_full" if new is None else "relayed_before"] += 1
+        reported = taker == self.src_id and not message.hops  # its origin learns from a report that it is here
+        if (inbox := self._inbox(message.origin, message.start)) is not None:
+            self._due(inbox, now, receipts=not reported)
+        if not new and not reported:
+            self._confirm(message.origin, message.start, message.topic_id)
+
+    def _due(self, inbox: Inbox, now: float, *, receipts: bool) -> None:
+        """Deliver what was carried here of a robot, as far as its turn has come."""
+        for ready in self._carried_here.due(inbox.src_id, inbox.boot & 0xFFFF):
+            self._delivered(inbox, ready, now)
+            if receipts:
+                self._confirm(inbox.src_id, inbox.boot & 0xFFFF, ready.topic_id)
+
+    def _confirm(self, origin: int, start: int, topic_id: int) -> None:
+        """Tell a robot what has come of one of its topics."""
+        newest = self._carried_here.newest(Stream(origin, start, topic_id))
+        if newest is not None:
+            self.custody.receipt(origin, Receipt(start, topic_id, *newest))
 
     def _delivered(self, inbox: Inbox, ready: Ready, now: float) -> None:
         neighbour = self._neighbours.all.get(inbox.src_id)
@@ -333,12 +360,6 @@ class Relaying:
                 self._forget(origin, Fate.GIVEN_UP)
         for src_id in [src_id for src_id in self._tables if src_id not in self._neighbours.all]:
             del self._tables[src_id]
-        for via, early in list(self._early.items()):
-            while early and now > early[0][1].made + FORGET_S:
-                self._dropped["unknown_origin"] += 1
-                early.popleft()
-            if not early:
-                del self._early[via]
 
     def _forget(self, origin: int, reason: Fate) -> None:
         """A start of a robot that was known over others is over."""
@@ -357,10 +378,10 @@ class Relaying:
         for stream in [stream for stream in self._newest if stream.origin == origin and over(stream)]:
             self._drop(stream)
 
-    def _starts(self, message: Relayed, via: int, now: float, *, heard: bool, carried: bool) -> bool:
+    def _starts(self, message: Relayed, via: int, now: float, *, heard: bool) -> bool:
         """Look at the table of a robot; returns whether it is that of its start, as far as this is known."""
         origin, boot = message.origin, int.from_bytes(message.payload[:_BOOT_LEN], "big")
-        if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start or carried:
+        if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start:
             self._dropped["bad_table"] += 1
             return False
         if heard:
@@ -381,16 +402,6 @@ class Relaying:
                 self._forget(lost, Fate.MEMORY)
         return True
 
-    def _deliver_early(self, inbox: Inbox, now: float) -> None:
-        """Deliver what waited for the table of a robot."""
-        for early in self._early.values():
-            for message, waiting in [item for item in early if item[0].origin == inbox.src_id]:
-                early.remove((message, waiting))
-                if message.start == inbox.boot & 0xFFFF:
-                    self._delivered(inbox, waiting, now)
-                else:
-                    self._dropped["unknown_origin"] += 1
-
     def _inbox(self, origin: int, start: int) -> Inbox | None:
         """Where messages of a start of a robot come together, directly or over others."""
         neighbour = self._neighbours.all.get(origin)
@@ -405,7 +416,7 @@ class Relaying:
         """Let the message that is worth most compete for the next packet, unless one is leaving.
 
         Its value is ``g^2 / c`` as for own messages, with g the gain per neighbour. What every neighbour is likely to
-        have goes after all others: there is always some such message, and long ones would wait for their turns.
+        have is not sent: repairs would wait for it, and it would have to be repaired.
 
         :param topic: the queue of relayed messages
         :param leaves: when the packet leaves, s
@@ -416,17 +427,18 @@ class Relaying:
         for stream in [stream for stream, kept in self._newest.items() if now > kept.until]:
             self._dropped["too_old"] += self.gains.lacks(stream, now)
             self._drop(stream)
-        self._chosen, gain = self.gains.best(now, self._cost)
+        self._chosen, gain = self.gains.best(now, lambda stream: self._cost(stream, now))
         if self._chosen is None:
             return
         message, made, until = self._newest[self._chosen]
         hops = min(message.hops + 1, MOST_HOPS)
         payload = write_relayed(message._replace(hops=hops, age=age_code(leaves - made)))
         topic.newest = now - gain / max(self.gains.neighbours(now), 1)
-        qos = QOS_DEFAULT if self.gains.lacks(self._chosen, now) else QOS_BULK
-        topic.queue.append(Message(-1, RELAYED_TOPIC, payload, qos, now, expires=until, repeat=True))
+        topic.queue.append(Message(-1, RELAYED_TOPIC, payload, QOS_DEFAULT, now, expires=until, repeat=True))
 
-    def _cost(self, stream: Stream) -> float:
+    def _cost(self, stream: Stream, now: float) -> float:
+        if stream not in self._newest or not self.gains.lacks(stream, now):
+            return inf
         return RELAYED_LEN + len(self._newest[stream].message.payload)
 
     def left(self, now: float) -> None:

@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.link.events import Gone, Met
+from gr_ros2.link.events import Ended, Gone, Met
 from gr_ros2.link.v1 import custody
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
+from gr_ros2.wire.relayed import Relayed
 from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_relaying import Line, robot
 
@@ -155,3 +156,67 @@ def test_a_message_with_a_deadline_is_not_handed_on_after_it() -> None:
     line.run(15)
     assert not len(custody_of(line.robots[0]))
     assert line.robots[0].end.sent.refused[1, "stale"]
+
+
+def told(one: Robot) -> list[bool]:
+    """Of each own message that has ended, whether it has come."""
+    return [event.arrived for event in one.events if isinstance(event, Ended)]
+
+
+@pytest.mark.parametrize("fails", [2, 3])
+def test_what_a_robot_took_on_and_lost_when_it_started_again_comes_all_the_same(fails: int) -> None:
+    """It took 24 goals on while it did not hear the next one; robot 3 is not heard by robot 1."""
+    line = line_of(robot(1, "encrypt", named()), *(robot(src_id, "encrypt") for src_id in (2, 3, LAST)))
+    first, last, forgets = line.robots[0], line.robots[-1], line.robots[fails - 1]
+    near = line.near
+    line.near = lambda one: [other for other in near(one) if {one, other} != {fails - 1, fails}]  # type: ignore[method-assign]
+    goals = [b"goal %d" % n for n in range(24)]
+    for goal in goals:
+        first.end.messages.submit(1, goal, line.now)
+        line.run(0.5)
+    until(line, 30, lambda: len(custody_of(forgets)) == 24)
+    forgets.start()
+    line.near = near  # type: ignore[method-assign]
+    until(line, 120, lambda: len(told(first)) == 24)
+    assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
+    assert told(first) == [True] * 24
+    until(line, 30, lambda: not any(len(custody_of(one)) for one in line.robots))
+
+
+def test_a_robot_that_claims_to_be_near_keeps_nothing_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1 hears 2 and 3. 3 hears 4, and 2 only says so: it confirms what it takes, and sends nothing on."""
+    line = Line(robot(1, topics=named()), *(robot(src_id) for src_id in (2, 3, LAST)), loss=0.1)
+    heard = {0: [1, 2], 1: [0], 2: [0, 3], 3: [2]}
+    line.near = lambda one: heard[one]  # type: ignore[method-assign]
+    line.run(15)
+    first, liar, last = line.robots[0], line.robots[1], line.robots[-1]
+    taken: list[Relayed] = []
+    monkeypatch.setattr(custody_of(liar), "take", lambda message, *_, **__: taken.append(message))
+    goals = [b"goal %d" % n for n in range(10)]
+    for goal in goals:
+        custody_of(first).routes.note(LAST, liar.src_id, 1, line.now)
+        first.end.messages.submit(1, goal, line.now)
+        line.run(1)
+    until(line, 120, lambda: len(told(first)) == 10)
+    assert len(taken) >= 10
+    assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
+    assert told(first) == [True] * 10
+
+
+@pytest.mark.parametrize("hops", [1, 2])
+def test_the_end_of_a_message_is_told_also_if_it_is_of_no_more_use(hops: int) -> None:
+    """The robot for which it is is heard, or over another one."""
+    rows = named(hops + 1, queue="deadline", deadline_s=8.0)
+    line = line_of(robot(1, topics=rows), *(robot(src_id) for src_id in range(2, hops + 2)), loss=0.0)
+    first = line.robots[0]
+    first.end.messages.submit(1, b"goal", line.now)
+    until(line, 10, lambda: told(first) == [True])
+    assert first.end.sent.ended == {(1, True): 1}
+    line.near = lambda one: [other for other in (one - 1, one + 1) if 0 <= other < hops and one < hops]  # type: ignore[method-assign]
+    first.end.messages.submit(1, b"too late", line.now)
+    line.run(12)
+    assert told(first) == [True, False]
+    line.near = Line.near.__get__(line)  # type: ignore[method-assign]
+    first.end.messages.submit(1, b"goal again", line.now)
+    until(line, 60, lambda: told(first) == [True, False, True])
+    until(line, 60, lambda: b"goal again" in line.robots[-1].delivered(1))

@@ -26,15 +26,15 @@ class Cell(Line):
         return [other for other in range(len(self.robots)) if other != one and not self.apart(one, other)]
 
 
-def cell(mode: SealMode, loss: float) -> Cell:
-    met = Cell(*(robot(src_id, mode, TOPICS) for src_id in (1, 2, 3)), loss=loss)
+def cell(mode: SealMode, loss: float, *, relay: bool = True) -> Cell:
+    met = Cell(*(robot(src_id, mode, TOPICS, relay=relay) for src_id in (1, 2, 3)), loss=loss)
     met.run(5)
     return met
 
 
-def talk(cell: Cell, count: int) -> list[bytes]:
+def talk(cell: Cell, count: int, after: int = 0) -> list[bytes]:
     """Every robot publishes so many goals."""
-    goals = [b"goal %d" % n for n in range(count)]
+    goals = [b"goal %d" % n for n in range(after, after + count)]
     for goal in goals:
         for one in cell.robots:
             one.end.messages.submit(1, goal, cell.now)
@@ -53,21 +53,48 @@ def whole(cell: Cell, goals: list[bytes]) -> bool:
 
 @pytest.mark.parametrize("mode", ["none", "encrypt"])
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.2, 0.3])
-def test_a_relayed_message_does_not_overtake_what_repair_brings(loss: float, mode: SealMode) -> None:
+def test_a_relayed_message_neither_overtakes_nor_delays_what_repair_brings(loss: float, mode: SealMode) -> None:
     everybody = cell(mode, loss)
     goals = talk(everybody, 150)
-    everybody.run(20)
+    everybody.run(6)
     assert whole(everybody, goals)
-    assert any(one.end.received.dropped["relayed_before"] for one in everybody.robots), "messages were relayed"
 
 
-def test_eight_seconds_out_of_reach_cost_nothing() -> None:
-    """A third robot hears both meanwhile."""
-    everybody = cell("encrypt", 0.1)
-    everybody.apart = lambda one, other: 10 <= everybody.now < 18 and {one, other} == {0, 2}
+def one_way_first(now: float, one: int, other: int) -> bool:
+    """Robot 3 is heard by others again 3 s before it hears them."""
+    return (one == 2 and 10 <= now < 17) or (other == 2 and 10 <= now < 14)
+
+
+PATTERNS: dict[str, Callable[[float, int, int], bool]] = {
+    "from all": lambda now, one, other: 10 <= now < 17 and 2 in (one, other),  # it enters the slots anew after 2 s
+    "from one, whom a third robot hears": lambda now, one, other: 10 <= now < 18 and {one, other} == {0, 2},
+    "one way first": one_way_first,
+    "again and again": lambda now, one, other: now % 5 < 2 and one != int(now / 5) % 3 != other,
+}
+
+
+@pytest.mark.parametrize("relay", [False, True])
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_some_seconds_out_of_reach_cost_nothing(pattern: str, relay: bool) -> None:
+    everybody = cell("encrypt", 0.1, relay=relay)
+    everybody.apart = lambda one, other: PATTERNS[pattern](everybody.now, one, other)
     goals = talk(everybody, 80)
+    everybody.apart = lambda _, __: False
     everybody.run(30)
     assert whole(everybody, goals)
+
+
+def test_a_robot_that_starts_again_takes_nothing_from_the_others() -> None:
+    everybody = cell("encrypt", 0.2)
+    first, other, again = everybody.robots
+    goals = talk(everybody, 30)
+    again.start()
+    later = talk(everybody, 40, after=30)
+    everybody.run(10)
+    assert came(first, 2) == came(other, 1) == goals + later
+    of_its_new_start = [goal for goal in came(again, 1) if goal in later]
+    assert of_its_new_start == later[-len(of_its_new_start) :] and len(of_its_new_start) >= 30
+    assert came(first, 3)[-40:] == later == came(other, 3)[-40:]
 
 
 def test_a_robot_that_stays_out_of_reach_is_heard_over_others() -> None:

@@ -36,6 +36,7 @@ class Line:
         self._messages = self._steps = 0
         self.said: list[tuple[int, bytes]] = []
         self.invariant = PacketsEnd(self.robots)
+        self.invariant = PacketsEnd(self.robots)
 
     def near(self, one: int) -> list[int]:
         return [other for other in (one - 1, one + 1) if 0 <= other < len(self.robots)]
@@ -59,6 +60,8 @@ class Line:
             if self._steps % STEPS == 0:
                 for one in self.robots:
                     one.events += one.end.handle_timeout(self.now)
+            if self._steps % STEPS == 0:
+                self.invariant.step()
                 self.invariant.step()
 
     def _leaving(self) -> Iterator[int]:
@@ -95,6 +98,17 @@ def test_a_message_comes_out_once_at_who_hears_it_both_ways() -> None:
     for one in line.robots:
         keys = [(event.src_id, event.key) for event in one.events if isinstance(event, Delivered)]
         assert len(keys) == len(set(keys)) > 60
+
+
+def test_where_all_hear_all_next_to_nothing_is_relayed() -> None:
+    """Neither their messages nor their tables: otherwise repairs would wait for them."""
+    line = Line(*(robot(src_id) for src_id in range(1, 4)))
+    line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
+    line.run(10)
+    relayed = [one.end._receiving.relaying for one in line.robots]
+    before = sum(one.relayed.total() for one in relayed if one is not None)
+    line.run(20)
+    assert sum(one.relayed.total() for one in relayed if one is not None) - before < 20
 
 
 def test_without_the_key_nobody_relays_or_is_relayed() -> None:

@@ -1,0 +1,99 @@
+"""The messages that are carried to this robot, in the order in which their origins made them.
+
+The messages of a topic have consecutive places, and each says how many before it its origin still keeps. So it waits
+for these, and for no others: their origin hands them on until it is told that they have come.
+
+Invariants: a message is given out once, and none after a later one of its topic; memory is bounded by ``most`` bytes
+and ``MOST_STREAMS`` topics.
+"""
+
+from __future__ import annotations
+
+from typing import Generic, TypeVar
+
+from gr_ros2.relay.gain import Stream
+from gr_ros2.wire.relayed import PLACES, Relayed
+
+MOST_STREAMS = 1024
+"""Topics of which it is known what has come; of others, everything counts as new."""
+_COST = 250
+"""Bytes that a message which waits takes beside its payload."""
+T = TypeVar("T")
+
+
+class _Sequence(Generic[T]):
+    """The messages of one topic of one start of one robot, by places that are counted on.
+
+    :ivar next: that of the next message
+    :ivar floor: the origin keeps no message before it any more
+    :ivar newest: number and place of the last message that was given out
+    """
+
+    __slots__ = ("floor", "newest", "next", "waiting")
+
+    def __init__(self, place: int) -> None:
+        self.next = self.floor = place
+        self.newest = (-1, -1)
+        self.waiting: dict[int, tuple[Relayed, T]] = {}
+
+    def take_out(self) -> tuple[Relayed, T] | None:
+        """The next message; None if it is not here."""
+        first = min(self.waiting, default=None)
+        if first is None or first > max(self.next, self.floor):
+            return None
+        message, item = self.waiting.pop(first)
+        self.next, self.newest = first + 1, (message.number, message.place)
+        return message, item
+
+
+class Sequences(Generic[T]):
+    """See the module.
+
+    :param most: bytes of messages that may wait
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most, self._bytes = most, 0
+        self._all: dict[Stream, _Sequence[T]] = {}
+
+    def take(self, message: Relayed, item: T) -> bool | None:
+        """Keep a message until its turn.
+
+        :param item: what is given out with it
+        :return: whether it is new; None if there is no room for it
+        """
+        stream = Stream(message.origin, message.start, message.topic_id)
+        sequence = self._all.pop(stream, None)
+        if sequence is None:
+            sequence = _Sequence(message.place - message.waits)
+        self._all[stream] = sequence
+        if len(self._all) > MOST_STREAMS:
+            self._drop(next(iter(self._all)))
+        if (message.number, message.place) <= sequence.newest:
+            return False
+        place = sequence.next + (message.place - sequence.next) % PLACES
+        sequence.floor = max(sequence.floor, place - message.waits)
+        if place in sequence.waiting:
+            return False
+        if self._bytes + len(message.payload) + _COST > self._most and place > max(sequence.next, sequence.floor):
+            return None
+        self._bytes += len(message.payload) + _COST
+        sequence.waiting[place] = message, item
+        return True
+
+    def due(self, origin: int, start: int) -> list[T]:
+        """The messages of a start of a robot whose turn has come."""
+        found = []
+        for stream, sequence in self._all.items():
+            while stream[:2] == (origin, start) and (out := sequence.take_out()) is not None:
+                self._bytes -= len(out[0].payload) + _COST
+                found.append(out[1])
+        return found
+
+    def newest(self, stream: Stream) -> tuple[int, int] | None:
+        """Number and place of the last message of a topic that was given out."""
+        sequence = self._all.get(stream)
+        return None if sequence is None or sequence.newest[0] < 0 else sequence.newest
+
+    def _drop(self, stream: Stream) -> None:
+        self._bytes -= sum(len(message.payload) + _COST for message, _ in self._all.pop(stream).waiting.values())
