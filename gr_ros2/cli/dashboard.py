@@ -77,6 +77,12 @@ def audience(
                 dashboard = dashboards.enter_context(_make(address, port))
                 seen.invite(dashboard)
                 urls.append(dashboard.url)
+                if dashboard.exposed:
+                    _log.warning(
+                        "%s: everybody on the network can open this page, change the channel and switch sending off; "
+                        "leave the address out to serve it on this machine only",
+                        dashboard.url,
+                    )
             return urls[0]
 
         def answer(asked: Mapping[str, Any]) -> dict[str, Any]:

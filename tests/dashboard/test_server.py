@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 import threading
 from http.client import HTTPConnection
 from urllib.request import urlopen
@@ -11,11 +12,12 @@ from urllib.request import urlopen
 import pytest
 
 pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
-pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from bokeh.document import Document
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.dashboard import server
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.server import Dashboard
 from gr_ros2.dashboard.state import DashboardState
@@ -64,9 +66,34 @@ def test_a_taken_port_is_named() -> None:
 
 def test_every_interface_only_where_asked() -> None:
     with Dashboard("0.0.0.0", port=0) as dashboard:
-        assert dashboard.url == f"http://127.0.0.1:{dashboard.port}/"
+        here, *_ = server._own_addresses()
+        assert dashboard.url == f"http://{here}:{dashboard.port}/"
         assert get(dashboard.url)
+        assert f"{here}:{dashboard.port}" in dashboard._origins()
     assert Dashboard("::1", 80).url == "http://[::1]:80/"
+
+
+def test_the_addresses_of_this_machine_are_those_that_linux_names() -> None:
+    told = subprocess.run(["ip", "-4", "-o", "addr"], capture_output=True, text=True, check=True).stdout
+    named = set(re.findall(r"inet ([0-9.]+)", told))
+    found = server._own_addresses()
+    assert set(found) <= named
+    assert found[0].startswith("127.") == all(address.startswith("127.") for address in named)
+
+
+@pytest.mark.parametrize(
+    ("address", "exposed"),
+    [
+        ("127.0.0.1", False),
+        ("::1", False),
+        ("localhost", False),
+        ("0.0.0.0", True),
+        ("::", True),
+        ("robot.local", True),
+    ],
+)
+def test_it_knows_whether_others_can_open_it(address: str, exposed: bool) -> None:
+    assert Dashboard(address, 80).exposed is exposed
 
 
 def test_it_goes_and_leaves_no_thread() -> None:
