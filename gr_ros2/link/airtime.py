@@ -2,14 +2,14 @@
 
 Invariants: a packet starts at the latest of its arrival, the time it asks for, and the end of the packet before; a
 packet leaves when its airtime is over, or ``ahead`` before it begins, never earlier; idle time is not saved up; a
-credit is granted no earlier than ``lead`` before the channel is free of all queued and all promised packets (a
-promised packet is an unused credit, counted as a longest packet), and only while there are fewer than ``OUTSTANDING``
-of them. The lead can follow what the source was measured to need (:class:`ComposingTime`). There is no IO and no
-clock: ``now`` is seconds, monotonic. With a limit (:mod:`gr_ros2.link.airtime_limit`)
-a credit is granted only when the limit lets a longest packet begin, and a packet that comes without one and would
-have to wait for the limit is refused. While sending is switched off, nothing passes and no credit is granted. With
-``listens``, one packet at a time is queued or promised, and it waits until nobody else sends. While the device is not
-``ready``, packets wait too.
+credit is granted no earlier than ``lead`` and ``ahead`` before the channel is free of all queued and all promised
+packets (a promised packet is an unused credit, counted as a longest packet), and only while there are fewer than
+``OUTSTANDING`` of them. The lead can follow what the source was measured to need (:class:`ComposingTime`). There is no
+IO and no clock: ``now`` is seconds, monotonic. With a limit (:mod:`gr_ros2.link.airtime_limit`) a credit is granted
+only when the limit lets a longest packet begin, and a packet that comes without one and would have to wait for the
+limit is refused. While sending is switched off, nothing passes and no credit is granted. With ``listens``, one packet
+at a time is queued or promised, and it waits until nobody else sends. While the device is not ``ready``, packets wait
+too.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ class AirtimeClock(Generic[T]):
         """When ``due`` or ``grants`` next has something, None if only an arrival can change that."""
         times = [self._queue[0][0]] if self._queue else []
         granted = self._next_grant(now)
-        if granted is not None and (self._free > now or self.limit is not None):
+        if granted is not None and (self._free > now + self._taken_ahead or self.limit is not None):
             times.append(max(now, granted))
         return min(times) if times else None
 
@@ -249,7 +249,12 @@ class AirtimeClock(Generic[T]):
 
     @property
     def _grant_lead(self) -> float:
-        return self._lead if self._composing is None else self._composing.longest
+        lead = self._lead if self._composing is None else self._composing.longest
+        return lead + self._taken_ahead
+
+    @property
+    def _taken_ahead(self) -> float:
+        return self._ahead or 0.0
 
     def _promised_until(self, now: float) -> float:
-        return max(now, self._free) + self._unused * self._airtime
+        return max(now + self._taken_ahead, self._free) + self._unused * self._airtime

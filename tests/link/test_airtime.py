@@ -63,6 +63,23 @@ def test_one_credit_at_the_start_and_the_next_just_before_the_air_is_free() -> N
     assert clock.grants(5.2) == 0
 
 
+def test_a_device_that_takes_packets_long_ahead_gets_them_one_after_the_other() -> None:
+    clock = AirtimeClock[str](0.1, lead=0.005, ahead=0.4)
+    now, begins = 0.0, [0.4]
+    clock.grants(now)
+    clock.offer("first", now, leave_at=0.4)
+    while len(begins) < 10:
+        at = clock.next_timeout(now)
+        assert at is not None
+        now = max(now, at)
+        clock.due(now)
+        if clock.grants(now):
+            begin = clock.offer("next", now + 0.004, leave_at=begins[-1] + 0.1)
+            assert begin is not None and begin >= now + 0.004 + 0.4, "it comes in time"
+            begins.append(begin)
+    assert begins == pytest.approx([0.4 + 0.1 * number for number in range(10)])
+
+
 def test_at_most_two_packets_are_here_or_promised_however_short_they_are() -> None:
     clock: AirtimeClock[str] = AirtimeClock(0.001, lead=0.005)
     assert clock.grants(0.0) == 2
