@@ -25,6 +25,7 @@ import numpy as np
 from bench.rows import Row
 from gr_ros2.link import rate as engine
 from gr_ros2.link.rate import Mcs, RateController
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.medium.fading import RayleighFading
 
@@ -81,7 +82,7 @@ def run(snr: Snr, link: Link, seed: int) -> float:
     rate.meet(2)
     decoder: Any = SimpleNamespace(newest=-1, bodies=())
     order: Any = SimpleNamespace(wanted=0, told=False, held=0)
-    reporter = Reporter((1, 1), decoder, order, half_duplex=link.half_duplex)
+    reporter = Reporter((1, 1), decoder, order, Settings(2, half_duplex=link.half_duplex))
     under_way: deque[tuple[float, float, float]] = deque()
     free = 0.0
 

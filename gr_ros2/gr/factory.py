@@ -51,6 +51,7 @@ class EndpointSetup:
     :param half_duplex: whether sending and receiving share the airtime
     :param any_length: whether the PHY carries shorter packets in less time, see :attr:`gr_ros2.phy.Phy.any_length`
     :param mcs_table: the rates of an adaptive rate, see :attr:`gr_ros2.phy.Phy.mcs_table`; () for a fixed rate
+    :param airtime_s: of the longest packet, s; 0 = not known
     :param access: makes what decides when the robot with an id may send; None from it: whenever there is a credit
     :param relay: whether messages of other robots are sent on
     :param airtime_share: part of the time that this robot may send, above 0..1
@@ -66,6 +67,7 @@ class EndpointSetup:
     any_length: bool = False
     mcs_table: Sequence[Mcs] = ()
     airtime_share: float = 1.0
+    airtime_s: float = 0.0
     close: Callable[[], None] = lambda: None
     access: Callable[[int], Access | None] = lambda _: None
     relay: bool = False
@@ -126,6 +128,7 @@ def make_endpoint(
             half_duplex=start.half_duplex,
             fixed=not start.any_length,
             airtime_share=start.airtime_share,
+            airtime_s=start.airtime_s,
             relay=start.relay,
         ),
         boot=start.boot,

@@ -135,6 +135,7 @@ def make_link(
         any_length=any_length,
         access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=slot_guard_s, lead_s=LEAD_S),
         airtime_share=sustained(limits.rule),
+        airtime_s=airtime_s,
     )
     return RosLink(source.registry, source, sink, setup=setup)
 

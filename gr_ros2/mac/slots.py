@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections import deque
 
 from gr_ros2.mac.slot_clock import SlotClock
 from gr_ros2.wire.mac_block import (
@@ -62,10 +63,10 @@ packet is enough: a fourth of the picks in a grid of 5 × 4 at 10 % loss are at 
 KNOWN_LATE = 9
 """Slots that this is at least: a host knows a packet some slots after it began, and composes its own ahead. Without it
 two links on one computer (6 ms a slot) picked at random half of the time, and sent 27 instead of 41 packets/s each."""
-NEWCOMER = 140
-"""Slots for which a robot is a newcomer. Without slots for them, 50 robots need 18 s instead of 9 to get in from cold
-at 14 ms a slot, and a robot between two full cells may be heard by nobody for a minute. 70 slots take two seconds
-longer, 210 no less."""
+NEWCOMER, NEWCOMER_FRAMES = 140, 8
+"""Slots for which a robot is a newcomer; in a small cell so many frames, as they are without newcomers. Without slots
+for them, 50 robots need 18 s instead of 9 to get in from cold at 14 ms a slot, and a robot between two full cells may
+be heard by nobody for a minute. 70 slots take two seconds longer, 210 no less."""
 LATELY = 70
 """Slots within which somebody who is there has sent; more where there are many robots."""
 LATE_S = 0.01
@@ -116,7 +117,7 @@ class Slots:
         self, src_id: int, slot_s: float, rng: random.Random, *, period_s: float = 0.1, lead_s: float = 0.0
     ) -> None:
         self.src_id, self.lead_s = src_id, lead_s
-        self._ahead = int(lead_s / slot_s)
+        self._ahead = math.ceil(lead_s / slot_s)
         """Whole slots by which packets are composed ahead."""
         self._every = 3
         """Slots from one packet of this robot to the next."""
@@ -127,8 +128,8 @@ class Slots:
         self._period = period_s / slot_s
         self._mine: list[int] = []
         self._announced: tuple[int, ...] = ()
-        self._sent = _NEVER
-        """The slot of the newest packet."""
+        self._said: deque[tuple[int, tuple[int, ...]]] = deque(maxlen=1 + self._ahead)
+        """The slots of the newest packets, and what they announced."""
         self._taken: dict[int, int] = {}
         """Slot -> the robot that has announced it."""
         self._expected = 0
@@ -218,7 +219,8 @@ class Slots:
         self._mine = kept
         while len(kept) < 2:
             kept.append(self._pick(kept[-1] if kept else slot, now, frame))
-        self._announced, self._sent = tuple(kept), slot
+        self._announced = tuple(kept)
+        self._said.append((slot, self._announced))
         return write_block(self._content(slot, frame, loads))
 
     def _answered(self, slot: int) -> int:
@@ -272,9 +274,10 @@ class Slots:
 
     def _frame(self, now: int, loads: list[int]) -> int:
         """Slots in which every robot around sends as often as its weight says, and newcomers find room."""
-        oldest = now - NEWCOMER
+        known = max(loads) + 1
+        oldest = now - min(NEWCOMER, NEWCOMER_FRAMES * known)
         newcomers = sum([robot.first >= oldest for robot in self._robots.values()])
-        return max(math.ceil(self._period - 1e-9), max(loads) + 1 + newcomers)
+        return max(math.ceil(self._period - 1e-9), known + newcomers)
 
     def _memory(self) -> int:
         """Slots for which a robot that was heard counts as heard."""
@@ -295,7 +298,7 @@ class Slots:
     def _content(self, slot: int, frame: int, loads: list[int]) -> Block:
         now = slot - self._ahead
         oldest = now - self._memory()
-        lately = max(oldest, now - NAMED * frame)
+        lately = max(oldest, now - max(NAMED * frame, KNOWN_LATE))
         fresh = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= lately}
         names = sorted(fresh, key=lambda src_id: fresh[src_id].named)[:2]
         for src_id in names:
@@ -402,8 +405,10 @@ class Slots:
     def _mapped(self, robot: _HeardRobot, expected: int, conflict: tuple[int, int]) -> None:
         slot = robot.last
         at = slot + 1
-        if self._sent < slot - 1 - self._ahead and self._announced and 0 <= self._announced[0] - at < MAP_SLOTS:
-            robot.deaf = 0 if expected >> self._announced[0] - at & 1 else robot.deaf + 1
+        known = next((ahead for sent, ahead in reversed(self._said) if sent < slot - 1 - self._ahead), ())
+        mine = next((mine for mine in known if mine >= at), slot)
+        if 0 <= mine - at < MAP_SLOTS:
+            robot.deaf = 0 if expected >> mine - at & 1 else robot.deaf + 1
         skip = at - self._base
         expected = expected << skip if skip > 0 else expected >> -skip
         for mine in self._mine:

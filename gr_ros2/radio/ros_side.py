@@ -81,6 +81,7 @@ class RosSide:
             half_duplex=self.shares or getattr(self._front_end.options, "half_duplex", False),
             any_length=self._phy.any_length,
             mcs_table=self._phy.mcs_table,
+            airtime_s=self._front_end.airtime(),
             airtime_share=sustained(self.config.airtime.rule),
             access=self._access if self._sends else lambda _: None,
             relay=self.config.relay == "gain",

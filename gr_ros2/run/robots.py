@@ -36,6 +36,7 @@ def start_of_run(scenario: Scenario, phy: Phy) -> EndpointSetup:
         mcs_table=phy.mcs_table,
         access=access_of(scenario.medium, phy.airtime(), scenario.seed),
         relay=scenario.relay == "gain",
+        airtime_s=phy.airtime(),
         airtime_share=sustained(scenario.airtime.rule),
     )
 

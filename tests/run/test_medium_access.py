@@ -37,6 +37,13 @@ def test_two_robots_both_ways_lose_nothing_in_slots_and_most_of_it_otherwise() -
     assert sum(at_once.values()) <= 0.65 * sum(counts.values())
 
 
+@pytest.mark.parametrize("sample_rate", [24_000, 8_000])
+def test_packets_of_200_ms_share_a_channel_as_shorter_ones_do(sample_rate: int) -> None:
+    two = ("robots=2", "sim.robots=2", "sim.odom_rate=1", f"phy.sample_rate={sample_rate}")
+    counts, _ = delivered("team", *two, duration_s=60)
+    assert min(counts.values()) >= 58
+
+
 def test_four_robots_share_a_channel() -> None:
     counts, run = delivered("team", duration_s=10)
     assert min(counts.values()) >= 0.99 * 3 * 100

@@ -46,7 +46,7 @@ class DeliveryRules:
         self.marks = marks
         self.sealed_after: Callable[[int], float] | None = None
         self.newest: dict[int, tuple[int, int]] = {}
-        self._own = settings.src_id
+        self._own, self._settings = settings.src_id, settings
         self._max_age_s, self._max_ages = settings.max_age_s, settings.max_ages
         self._commands, self._deadlines = settings.commands, settings.deadlines
         self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
@@ -142,7 +142,7 @@ class DeliveryRules:
         name = topic.name.lstrip("/")
         withheld_s = self._max_ages.get(name, self._max_age_s)
         if withheld_s == AUTO:
-            withheld_s = MAX_AGE_S if topic.fresh else 0.0
+            withheld_s = MAX_AGE_S * self._settings.slower if topic.fresh else 0.0
         deadline_s = self._deadlines.get(name, 0.0) if topic.fresh else 0.0
         if topic.fresh and name not in self._deadlines and is_command(name, topic.type_name, self._commands):
             deadline_s = COMMAND_DEADLINE_S

@@ -44,6 +44,10 @@ _EARLY_S = 1e-6
 """s before its time at which a packet may begin: times are not exact to the last bit."""
 
 
+def _shared(settings: Settings, access: Access) -> Settings:
+    return replace(settings, shares=True, turn_s=lambda: access.turn_s)
+
+
 class EndpointV1:
     """Both directions of one robot.
 
@@ -82,7 +86,7 @@ class EndpointV1:
         access: Access | None = None,
     ) -> None:
         self._access = access
-        self.settings = settings = replace(settings, shares=access is not None)
+        self.settings = settings = settings if access is None else _shared(settings, access)
         self.boot = boot
         self.keys = keys = keys if keys is not None else Keys()
         self.mcs_table = tuple(mcs_table)
@@ -97,6 +101,7 @@ class EndpointV1:
             settings.expected_loss,
             shares=settings.shares,
             proves=keys.sealed and settings.hears and settings.idle_is_free,
+            slower=settings.slower,
         )
         self.messages = messages = Outbox(topics, settings, self, boot=boot, room=room, codec=codec, observer=observer)
         self.sent = messages.stats

@@ -5,7 +5,7 @@ Invariant: this module holds values only; every default suits a radio of some kB
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from gr_ros2.core.errors import ConfigError
@@ -15,6 +15,9 @@ from gr_ros2.settings.config import NOBODY, SinkConfig, SourceConfig, robot_of
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, REPAIR_HEADER_LEN, TAG_LEN
 
+TURN_S = 1 / 3
+"""s from one packet of a robot to its next up to which the times that rules wait for packets hold as they are written:
+some packets of others, whatever their airtime. Twenty robots in one cell at 75 packets/s have a turn so often."""
 MIN_PACKET_LEN = HEADER_LEN + REPAIR_HEADER_LEN + TAG_LEN + 26
 
 
@@ -43,8 +46,8 @@ class Settings:
     :param queue_depth: messages that may wait per topic; 0 = no limit
     :param commands: types and names of topics whose messages come in time or not at all
     :param deadlines: s by topic, without leading slash, after which a received command is not delivered any more
-    :param airtime_share: part of the time that this robot may send, above 0..1; what it says about itself comes more
-        rarely by this factor, and so may what it hears
+    :param airtime_share: part of the time that this robot may send, above 0..1
+    :param turn_s: tells s from one packet of this robot to its next, where it always has one; 0 = not known
     :param beacon_s: s without hearing any robot after which one hello leaves every so many s, and nothing else; 0 = off
     """
 
@@ -69,6 +72,7 @@ class Settings:
     commands: tuple[str, ...] = COMMAND_TYPES
     deadlines: Mapping[str, float] = field(default_factory=dict)
     airtime_share: float = 1.0
+    turn_s: Callable[[], float] = field(default=lambda: 0.0, compare=False)
     beacon_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -81,6 +85,12 @@ class Settings:
                 f"beacon_s = {self.beacon_s:g}: this end never hears anybody, so it would fall silent for ever; set 0, "
                 "or run a link both ways"
             )
+
+    @property
+    def slower(self) -> float:
+        """By how much longer than written rules wait for packets of others, and by how much more rarely a robot speaks
+        of itself: turns come less often on a slow channel, on one that many share, and with a limit of airtime."""
+        return max(1.0, self.turn_s() / TURN_S) / self.airtime_share
 
     @property
     def idle_is_free(self) -> bool:
@@ -96,6 +106,7 @@ def settings_of(
     half_duplex: bool = False,
     fixed: bool = True,
     airtime_share: float = 1.0,
+    airtime_s: float = 0.0,
     relay: bool = False,
 ) -> Settings:
     """The settings of an end, made from those of its blocks.
@@ -103,6 +114,7 @@ def settings_of(
     :param hears: whether it receives and can report
     :param fixed: whether every packet must be as long as the longest
     :param airtime_share: see :class:`Settings`
+    :param airtime_s: of the longest packet, s; 0 = not known
     :param relay: likewise
     :raises ConfigError: neither block names the robot, although it would send something
     """
@@ -137,5 +149,6 @@ def settings_of(
             if options.deadline_s != AUTO
         },
         airtime_share=airtime_share,
+        turn_s=lambda: airtime_s,
         beacon_s=send.beacon_s,
     )

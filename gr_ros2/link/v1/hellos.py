@@ -3,7 +3,8 @@
 Hellos are sent at the start, several in the first second because any of them may be lost; whenever the table of topics
 changes; at once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about
 50 bytes/s, every two where nothing is lost, or less and less often while nobody is heard. While messages wait, hellos
-are delayed: by half a second, or by two seconds if receivers report.
+are delayed: by half a second, or by two seconds if receivers report. On a slow channel all of it takes longer
+(``Settings.slower``).
 
 Invariant: a hello names a kept message only after the receivers had time to get it when it was first sent.
 """
@@ -70,9 +71,6 @@ class Hellos:
         self._messages, self._window, self._neighbours = messages, window, neighbours
         self._boot = boot
         self._capabilities = settings.hears * CAN_HEAR | encrypts * ENCRYPTS
-        self._rarer = 1 / settings.airtime_share
-        """By how much longer all times between hellos are than on a channel without a limit."""
-        self._period = min(max(OFTEN_S, settings.packet_len / HELLO_BYTES_S), SELDOM_S) * self._rarer
         self._pause = self._period
         """s to the next hello."""
         self._starting: deque[float] = deque()
@@ -85,7 +83,7 @@ class Hellos:
 
     def start(self, now: float) -> None:
         """The first packet may be sent now."""
-        self._starting = deque(now + after * self._rarer for after in STARTING_S)
+        self._starting = deque(now + after * self._settings.slower for after in STARTING_S)
         self.due = self._starting.popleft()
 
     @property
@@ -95,7 +93,7 @@ class Hellos:
 
     def met(self, now: float) -> None:
         """A start of a robot is heard for the first time: send it hellos, several because any of them may be lost."""
-        self._starting = deque(now + after * self._rarer for after in STARTING_S[1:])
+        self._starting = deque(now + after * self._settings.slower for after in STARTING_S[1:])
         self._eager = EAGER
         self.answer(now)
 
@@ -120,12 +118,17 @@ class Hellos:
             return late >= 0
         if self._starting:
             return late >= latency * LATENCY_S
-        return late > (SELDOM_S if heard else OFTEN_S / 2) * self._rarer + latency * LATENCY_S
+        return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
 
     @property
     def lone(self) -> bool:
         """Whether no robot is heard, though one could be."""
         return self._settings.hears and all(neighbour.gone for neighbour in self._neighbours.all.values())
+
+    @property
+    def _period(self) -> float:
+        """s from one hello to the next."""
+        return min(max(OFTEN_S, self._settings.packet_len / HELLO_BYTES_S), SELDOM_S) * self._settings.slower
 
     @property
     def _calm(self) -> bool:
@@ -152,7 +155,7 @@ class Hellos:
             return apart
         free = room - HELLO_LEN
         lone = self.lone and not self._starting
-        period = SELDOM_S * self._rarer if self._calm else self._period
+        period = SELDOM_S * self._settings.slower if self._calm else self._period
         self._pause = min(2 * self._pause, max(LONE_S, self._period)) if lone else period
         marks, heard = self._messages.kept.marks(now), neighbours.heard(window.packets.newest)
         proofs, self._heard = _in_turn(heard, self._heard, max(free // HEARD_LEN - bool(marks), 1))
@@ -174,7 +177,7 @@ class Hellos:
         if not wants or not self._eager:
             return due
         self._eager -= 1
-        return min(due, now + EAGER_S * self._rarer)
+        return min(due, now + EAGER_S * self._settings.slower)
 
 
 def _in_turn(items: Sequence[_T], turn: int, most: int) -> tuple[list[_T], int]:

@@ -122,11 +122,11 @@ class Inbox:
         self._first = first
         self.order = Order(self.decoder, first, settings.hold_s, most=bounds.ordered, room=room, give_up_s=give_up_s)
         self._reassembly = Reassembly(bounds.fragments)
-        of, share = (src_id, boot), settings.airtime_share
+        of = src_id, boot
         self.reports: Reporter = (
-            SharedReporter(of, self.decoder, self.order, self._reassembly, airtime_share=share)
+            SharedReporter(of, self.decoder, self.order, self._reassembly, settings)
             if settings.shares
-            else Reporter(of, self.decoder, self.order, half_duplex=settings.half_duplex, airtime_share=share)
+            else Reporter(of, self.decoder, self.order, settings)
         )
         self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
         self._now = 0.0

@@ -14,6 +14,7 @@ from math import inf
 from zlib import crc32
 
 from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
 from gr_ros2.wire import QOS_BULK
@@ -26,7 +27,8 @@ SETTLING_S = 1.0
 """s after which a latched message is named in hellos: a receiver that lacks it then has lost it, not just not received
 it yet."""
 STARTING_S = 2.0
-"""s from the start during which the table is repaired even if no receiver reports."""
+"""s from the start during which the table is repaired even if no receiver reports; any other kept message is for so
+long beyond the time that it waited."""
 
 
 @dataclass(slots=True, eq=False)
@@ -52,10 +54,16 @@ class KeptMessages:
     """
 
     def __init__(
-        self, topics: SentTopics, room: int, stats: SenderStats, admit: Callable[[SentTopic, Message], None]
+        self,
+        topics: SentTopics,
+        room: int,
+        settings: Settings,
+        stats: SenderStats,
+        admit: Callable[[SentTopic, Message], None],
     ) -> None:
         self.digest = 0
-        self._topics, self._room, self._stats, self._admit = topics, room, stats, admit
+        self._topics, self._room, self._settings = topics, room, settings
+        self._stats, self._admit = stats, admit
         self._kept: dict[int, deque[_Kept]] = {}
         self._starting_until = inf
 
@@ -82,7 +90,7 @@ class KeptMessages:
 
     def ask(self, topic_id: int, now: float) -> None:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already."""
-        self._starting_until = min(self._starting_until, now + STARTING_S)
+        self._starting_until = min(self._starting_until, now + STARTING_S * self._settings.slower)
         topic = self._topics.get(topic_id)
         if topic is None or any(message.repeat for message in topic.queue):
             return
@@ -128,9 +136,10 @@ class KeptMessages:
             return
         for kept in self._kept[message.topic_id]:
             if kept.payload is message.payload and kept.named == inf:
-                kept.named = now + SETTLING_S
+                kept.named = now + SETTLING_S * self._settings.slower
         if not reported:
             # Later the table is sent again, and is small; at the start, nothing can be delivered without it.
             lifetime, waited = message.lifetime, now - message.submitted
+            again = STARTING_S * self._settings.slower
             table = message.topic_id == TABLE_TOPIC
-            lifetime.expires = self._starting_until if table else min(lifetime.expires, now + 2 * waited + 2.0)
+            lifetime.expires = self._starting_until if table else min(lifetime.expires, now + 2 * waited + again)

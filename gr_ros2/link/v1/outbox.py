@@ -92,7 +92,7 @@ class Outbox:
         self._observer = observer
         self._serial = 0
         self.sent = SentTopics(codec, settings.commands)
-        self.kept = KeptMessages(self.sent, room, self.stats, self._admit)
+        self.kept = KeptMessages(self.sent, room, settings, self.stats, self._admit)
         self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)
         self.relayed: SentTopic | None = None
         """The queue of messages of other robots, where they are relayed."""

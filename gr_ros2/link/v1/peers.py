@@ -95,6 +95,7 @@ class Peers:
     :param packets: the packets that they confirm
     :param unreported: what holds while there are none
     :param shared: on a channel that others share
+    :param slower: see ``Settings``
     :ivar all: the peers, by robot id
     :ivar loss: share of packets that the peer with the most losses loses, as far as it is known or expected
     :ivar proven: some peer may take packets up to this number for replays
@@ -105,8 +106,11 @@ class Peers:
         sent
     """
 
-    def __init__(self, packets: SentPackets, unreported: Unreported, shared: SharedRepairs | None = None) -> None:
+    def __init__(
+        self, packets: SentPackets, unreported: Unreported, shared: SharedRepairs | None = None, *, slower: float = 1.0
+    ) -> None:
         self.all: dict[int, Peer] = {}
+        self._interval = _INTERVAL_S * slower
         self.loss = unreported.loss
         self.proven = 0
         self.in_vain = False
@@ -150,7 +154,7 @@ class Peers:
         peer = self.all.get(src_id)
         if peer is None:
             free = next(bit for bit in range(256) if not self._packets.everybody >> bit & 1)
-            peer = self.all[src_id] = Peer(1 << free, now)
+            peer = self.all[src_id] = Peer(1 << free, now, interval=self._interval)
             self._packets.everybody |= peer.bit
             self._note()
         return peer

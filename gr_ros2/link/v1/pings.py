@@ -1,8 +1,8 @@
 """Round trips: a robot asks another one, which answers at once; and what each end tells of itself.
 
-Invariants: one answer waits per robot at most, and one leaves every ``ANSWER_S`` at most, so that questions take a
-bounded share of the air; of each robot asked, the newest ``KEPT`` round trips are kept; there is no clock here, so the
-caller passes in the time, and the difference to the clock of the wall.
+Invariants: one answer waits per robot at most, and one leaves every ``ANSWER_S`` and in every other packet at most, so
+that questions take a bounded share of the air; of each robot asked, the newest ``KEPT`` round trips are kept; there is
+no clock here, so the caller passes in the time, and the difference to the clock of the wall.
 """
 
 from __future__ import annotations
@@ -133,13 +133,15 @@ class Pings:
     """The questions and answers of one robot.
 
     :param about: what this end is, to be told to those who ask; None tells nothing
+    :param turn_s: tells s from one packet of this robot to its next; 0 = not known
     :ivar wall_s: clock of the wall minus ``now``, s; 0 = unknown
     :ivar snr_db: returns the SNR of the newest packets of all robots, for PHYs that do not tell it packet by packet
     :ivar asked: what came of the questions, by robot
     """
 
-    def __init__(self, about: About | None = None) -> None:
+    def __init__(self, about: About | None = None, turn_s: Callable[[], float] = lambda: 0.0) -> None:
         self.about = about
+        self._turn_s = turn_s
         self.wall_s = 0.0
         self.snr_db: Callable[[], float | None] = lambda: None
         self.asked: dict[int, RoundTrips] = {}
@@ -170,7 +172,7 @@ class Pings:
             raise ConfigError(f"robot = {robot}: who can be asked is 0 to {BROADCAST - 1}")
         trips = self.asked.setdefault(robot, RoundTrips())
         if now >= trips.not_before:
-            trips.not_before = now + ASK_S
+            trips.not_before = now + self._rest(ASK_S)
             self._to_ask[robot] = wants_about
             self.due = -inf
         return trips
@@ -187,7 +189,7 @@ class Pings:
             return [self.asked[robot].ask(robot, self._clock_us(now), now, wants_about=wants_about)]
         if not self._to_answer or now < self._not_before:
             return []
-        self._not_before = now + ANSWER_S
+        self._not_before = now + self._rest(ANSWER_S)
         robot = next(iter(self._to_answer))
         question = self._to_answer.pop(robot)
         self._plan()
@@ -215,6 +217,10 @@ class Pings:
             self.due = min(self.due, self._not_before)
         elif src_id in self.asked:
             self.asked[src_id].answer(entry, self.wall_s, now)
+
+    def _rest(self, seconds: float) -> float:
+        """s between two of them: every other packet is for messages."""
+        return max(seconds, 2 * self._turn_s())
 
     def _plan(self) -> None:
         """Something of what waited leaves."""

@@ -84,7 +84,6 @@ class ReceivingSide:
         self._settings = settings
         self._boot = boot
         self._sealed = keys.sealed
-        self._give_up_s = GIVE_UP_S / settings.airtime_share
         self._decoder_for = decoder_for
         self._marks: dict[int, dict[int, tuple[int, ...]]] = {}
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
@@ -138,6 +137,10 @@ class ReceivingSide:
             times.append(at)
         soonest = min(times, default=inf)
         return None if soonest == inf else soonest
+
+    @property
+    def _give_up_s(self) -> float:
+        return GIVE_UP_S * self._settings.slower
 
     def _timeout(self, neighbour: Neighbour) -> float:
         waits = neighbour.inbox.next_timeout()

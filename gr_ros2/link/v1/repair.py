@@ -39,7 +39,7 @@ class RepairWindow:
     :param room: bytes of the longest body
     :param expected_loss: share of packets lost, used until a report arrives
     :param shares: whether others send on the same channel
-    :param proves: see :class:`Unreported`
+    :param proves, slower: see :class:`Unreported`
     :ivar packets: what has left and may be repaired
     :ivar peers: what reports tell of them
     :ivar thrift: when a report is overdue
@@ -54,12 +54,13 @@ class RepairWindow:
         *,
         shares: bool = False,
         proves: bool = False,
+        slower: float = 1.0,
     ) -> None:
         self.mode = mode
         self.packets = SentPackets(span)
-        self._unreported = Unreported(expected_loss, proves=proves)
+        self._unreported = Unreported(expected_loss, proves=proves, slower=slower)
         self._shared = SharedRepairs(self.packets) if shares else None
-        self.peers = Peers(self.packets, self._unreported, self._shared)
+        self.peers = Peers(self.packets, self._unreported, self._shared, slower=slower)
         self.thrift = Thrift(self.packets, self.peers)
         self._combining = Combining(self.packets, room)
 

@@ -30,7 +30,7 @@ class RepairSlots:
     def __init__(
         self, settings: Settings, pace: Pace, window: RepairWindow, *, writer: PacketWriter, hold: Hold
     ) -> None:
-        self._setting = settings.repair
+        self._settings = settings
         self._pace, self._window, self._writer, self._hold = pace, window, writer, hold
         self.waits_until = -inf
         self._calm_since = -inf
@@ -41,7 +41,7 @@ class RepairSlots:
     @property
     def mode(self) -> RepairMode:
         """What idle slots carry."""
-        mode, reported = self._setting, bool(self._window.peers.all)
+        mode, reported = self._settings.repair, bool(self._window.peers.all)
         if not self._pace.known:  # nothing limits how many packets leave: repair only what reports call for
             return "thrifty" if mode != "off" and reported else "off"
         if mode != AUTO:
@@ -58,7 +58,7 @@ class RepairSlots:
         again = self._window.urgent(now)
         if again is not None:
             return self._writer.repair(again, now)
-        over = self._window.peers.over(now, PATIENCE_S)
+        over = self._window.peers.over(now, PATIENCE_S * self._settings.slower)
         return self._tell(over, now) if over >= 0 else None
 
     def spare(self, now: float) -> SentPacket | None:

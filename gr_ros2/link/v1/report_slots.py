@@ -37,10 +37,10 @@ class ReportSlots:
     """
 
     def __init__(self, settings: Settings, neighbours: Iterable[Neighbour], writer: PacketWriter) -> None:
-        self.requests = Requests(neighbours, hears=settings.hears)
+        self.requests = Requests(neighbours, settings)
         self._neighbours = neighbours if settings.hears else ()
         self._writer = writer
-        self._packet_len, self._shares = settings.packet_len, settings.shares
+        self._settings, self._packet_len, self._shares = settings, settings.packet_len, settings.shares
         self._allowed = 0.0
         """Bytes of reports that may leave on a shared channel."""
         self._mask_len = MASK_LEN if settings.repair != "off" else 0
@@ -57,7 +57,8 @@ class ReportSlots:
                 due.append(report)
         if self._shares:
             self._allowed = min(self._allowed + REPORTS * self._packet_len, AT_ONCE * REPORT_LEN)
-            due.sort(key=lambda r: (not r.lacks and now < r.reported_at + WAITS_S, r.reported_at))
+            long_ago = now - WAITS_S * self._settings.slower
+            due.sort(key=lambda r: (not r.lacks and r.reported_at > long_ago, r.reported_at))
             del due[int(self._allowed / REPORT_LEN) :]
             size = sum(report.size for report in due)
             self._allowed -= size

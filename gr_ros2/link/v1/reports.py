@@ -18,6 +18,7 @@ from __future__ import annotations
 from math import inf
 
 from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Order
 from gr_ros2.link.v1.peers import MAP, PROMPT
 from gr_ros2.link.v1.reassembly import Reassembly
@@ -56,8 +57,7 @@ class Reporter:
     :param sender: id and boot number of the robot
     :param decoder: knows which packets are here
     :param order: knows which packets are waited for
-    :param half_duplex: whether reports take airtime from the other end
-    :param airtime_share: part of the time that this robot may send, above 0..1
+    :param settings: of this robot
     :ivar unreported: packets since the last report
     :ivar loss: recent share of lost packets
     :ivar confirms: whether something has arrived that the sender repairs until it is confirmed
@@ -70,9 +70,7 @@ class Reporter:
         sender: tuple[int, int],
         decoder: RepairDecoder,
         order: Order,
-        *,
-        half_duplex: bool,
-        airtime_share: float = 1.0,
+        settings: Settings,
     ) -> None:
         self.unreported = 0
         self.loss = 0.0
@@ -81,9 +79,9 @@ class Reporter:
         self.tells_snr = True
         self._sender = sender
         self._decoder, self._order = decoder, order
-        self._half_duplex = half_duplex
-        self._scarce = airtime_share < 1
-        self._shortest = _PAUSE_S / airtime_share
+        self._settings = settings
+        self._rare = settings.half_duplex or settings.shares or settings.airtime_share < 1
+        """Whether reports take airtime from others, or from what this robot may send."""
         self._arrived = 0
         """Source packets that have arrived."""
         self._unspent = 1.0
@@ -91,8 +89,8 @@ class Reporter:
         self._missed = False
         """Whether a packet went missing since the last report."""
         self.reported_at = 0.0
-        self._pause = self._shortest
-        """s after which the next report is due."""
+        self._slowly = 1.0
+        """By how much longer than ``_PAUSE_S`` the next report is put off, because nothing is lost."""
         self._old_turn = False
 
     def arrived(self, *, late: bool) -> None:
@@ -124,14 +122,18 @@ class Reporter:
     def due(self, now: float) -> float:
         """When the next report is due, s; infinite if there is nothing to report."""
         if not self.unreported:
-            return self.reported_at + max(_AGAIN_S, self._shortest) if self._order.told and self._order.held else inf
-        half = self._half_duplex or self._scarce
-        every = _EVERY * (4 if half else 1)
-        most = min(every * self._pause / self._shortest, max(every, MAP // 2))
-        prompt = (self._missed or (self.tells_snr and self.snr.changed)) and not half and self._unspent >= 1
+            again = max(_AGAIN_S, self._after(_PAUSE_S))
+            return self.reported_at + again if self._order.told and self._order.held else inf
+        every = _EVERY * (4 if self._rare else 1)
+        most = min(every * self._slowly, max(every, MAP // 2))
+        prompt = (self._missed or (self.tells_snr and self.snr.changed)) and not self._rare and self._unspent >= 1
         if prompt or self.unreported >= most:
             return now
-        return self.reported_at + self._pause
+        return self.reported_at + self._after(_PAUSE_S * self._slowly)
+
+    def _after(self, seconds: float) -> float:
+        """s that are as many packets of others on a slow channel."""
+        return seconds * self._settings.slower
 
     @property
     def lacks(self) -> bool:
@@ -141,7 +143,7 @@ class Reporter:
     @property
     def helps(self) -> bool:
         """Whether to send a report early, in a slot that nothing else needs, so that losses are noticed sooner."""
-        free = self._unspent >= 1 and not self._half_duplex and not self._scarce
+        free = self._unspent >= 1 and not self._rare
         return free and self.unreported > 0 and self.loss >= PROMPT
 
     @property
@@ -152,7 +154,7 @@ class Reporter:
     def make(self, now: float) -> Report:
         """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
         calm = not self._missed and self.loss < CALM and self._arrived > MAP
-        self._pause = min(self._pause * _SLOWER, max(_CALM_S, self._shortest)) if calm else self._shortest
+        self._slowly = min(self._slowly * _SLOWER, max(_CALM_S / self._after(_PAUSE_S), 1.0)) if calm else 1.0
         self.unreported = 0
         self._missed = False
         self._unspent = max(self._unspent - 1, 0.0)
@@ -188,10 +190,9 @@ class SharedReporter(Reporter):
         decoder: RepairDecoder,
         order: Order,
         reassembly: Reassembly,
-        *,
-        airtime_share: float = 1.0,
+        settings: Settings,
     ) -> None:
-        super().__init__(sender, decoder, order, half_duplex=True, airtime_share=airtime_share)
+        super().__init__(sender, decoder, order, settings)
         self._reassembly = reassembly
 
     @property
@@ -202,9 +203,9 @@ class SharedReporter(Reporter):
 
     def due(self, now: float) -> float:
         if self._order.told and self.lacks:
-            return now if self.unreported else self.reported_at + CONFIRM_S
+            return now if self.unreported else self.reported_at + self._after(CONFIRM_S)
         wanted = (self._order.told and self.confirms) or (self.tells_snr and self.snr.changed)
-        return self.reported_at + CONFIRM_S if wanted and self.unreported else inf
+        return self.reported_at + self._after(CONFIRM_S) if wanted and self.unreported else inf
 
     def make(self, now: float) -> Report:
         self.confirms = False

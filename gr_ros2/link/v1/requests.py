@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from math import inf
 
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
 from gr_ros2.wire.control import Ask
 from gr_ros2.wire.v1 import TABLE_TOPIC
@@ -20,15 +21,14 @@ CHECK_S = 0.02
 class Requests:
     """The requests of one robot.
 
-    :param hears: whether other robots can be heard
     :ivar lacking: whether they keep messages that this one lacked when it last looked
     :ivar check_at: when it looks next, s; infinite for never
     """
 
-    def __init__(self, neighbours: Iterable[Neighbour], *, hears: bool) -> None:
+    def __init__(self, neighbours: Iterable[Neighbour], settings: Settings) -> None:
         self.lacking = False
-        self._neighbours = neighbours
-        self.check_at = -inf if hears else inf
+        self._neighbours, self._settings = neighbours, settings
+        self.check_at = -inf if settings.hears else inf
 
     def entries(self, room: int, now: float) -> list[Ask]:
         """Requests, as many as ``room`` bytes hold."""
@@ -48,5 +48,5 @@ class Requests:
             if wanted and room >= ASK_LEN + len(wanted):
                 room -= ASK_LEN + len(wanted)
                 found.append(Ask(neighbour.src_id, wanted))
-                asked.update(dict.fromkeys(wanted, now + ASK_S))
+                asked.update(dict.fromkeys(wanted, now + ASK_S * self._settings.slower))
         return found

@@ -62,7 +62,7 @@ class SendingSide:
         self.pace = Pace(settings.packet_rate)
         self._slowness = Slowness(self.pace)
         self.hellos = hellos
-        self.pings = Pings()
+        self.pings = Pings(turn_s=settings.turn_s)
         self.repairs = RepairSlots(settings, self.pace, window, writer=writer, hold=hold)
         self.reports = ReportSlots(settings, neighbours.all.values(), writer)
         self.urged = False

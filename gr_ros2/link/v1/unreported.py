@@ -28,11 +28,13 @@ class Unreported:
     """The repairs of one sender that no report calls for.
 
     :param loss: share of packets that are expected to be lost
+    :param slower: see ``Settings``
     :param proves: whether others take packets only after a proof, and idle slots take airtime from nobody
     """
 
-    def __init__(self, loss: float, *, proves: bool = False) -> None:
+    def __init__(self, loss: float, *, proves: bool = False, slower: float = 1.0) -> None:
         self.loss = loss
+        self._meeting_s = MEETING_S * slower
         self._silent_from = inf if proves else -inf
         """When packets may be over, s; inf until the first one leaves."""
         self._owed = 0.0
@@ -64,7 +66,7 @@ class Unreported:
         """These packets were combined, and nobody reports: those that were combined often enough are over."""
         if now < self._silent_from:
             if self._silent_from == inf:
-                self._silent_from = now + MEETING_S
+                self._silent_from = now + self._meeting_s
             return
         share = 1 / self._enough(len(packets))
         for record in packets:

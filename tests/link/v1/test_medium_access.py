@@ -8,6 +8,7 @@ from math import inf
 
 import pytest
 
+from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.v1.sealing import Keys, SealMode
 from gr_ros2.mac import Slots
 from gr_ros2.wire.mac_block import Block, read_block, write_block
@@ -115,3 +116,37 @@ def test_a_robot_without_the_key_takes_slots_from_nobody_for_longer_than_it_send
     for (at, data), (after, _) in pairwise(sent[2:]):
         ahead = read_block(read_header(data, 64).block)[0].ahead[0]
         assert after == pytest.approx(at + ahead * SLOT, abs=SLOT / 2), "each announced send takes place"
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+@pytest.mark.parametrize("airtime_s", [0.068, 0.204])
+def test_messages_cross_where_packets_are_handed_over_long_ahead_as_to_a_sound_card(
+    airtime_s: float, mode: SealMode
+) -> None:
+    ahead_s, heard_after_s, seconds = 0.4, 0.1, 60
+    robots, gates = [], []
+    for src_id in (1, 2):
+        access = Slots(src_id, airtime_s + 0.05, random.Random(src_id), period_s=0.0, lead_s=LEAD_S + ahead_s)
+        robots.append(Robot(src_id, registry(), mode=mode, access=access))
+        gates.append(AirtimeClock[bytes](airtime_s, ahead=ahead_s))
+    air: list[tuple[float, int, bytes]] = []
+    sent = late = 0
+    for step in range(round((seconds + 15) / LEAD_S)):
+        now = step * LEAD_S
+        for robot, gate in zip(robots, gates, strict=True):
+            if not step % round(1 / LEAD_S) and now < seconds:
+                robot.end.messages.submit(0, b"%d %d" % (robot.src_id, step), now)
+                sent += 1
+            gate.due(now)
+            robot.end.pace.credit(gate.grants(now))
+            if (packet := robot.end.next_packet(now)) is not None:
+                begin = gate.offer(packet.data, now, leave_at=packet.leave_at)
+                assert begin is not None
+                late += begin < now + ahead_s - 1e-6
+                air.append((max(begin, now + ahead_s), robot.src_id, packet.data))
+        for began, src_id, data in [one for one in air if now - LEAD_S < one[0] + airtime_s + heard_after_s <= now]:
+            if not any(other != src_id and abs(at - began) < airtime_s for at, other, _ in air):
+                robots[2 - src_id].receive(data, now, began)
+        air = [one for one in air if one[0] > now - 2]
+    assert sum(len(robot.delivered()) for robot in robots) == sent == 2 * seconds
+    assert late == 0

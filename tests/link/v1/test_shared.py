@@ -11,6 +11,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from bench import reliable
 from gr_ros2.link.v1.combining import Repair
 from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.order import Order
 from gr_ros2.link.v1.reassembly import Reassembly
@@ -26,7 +27,7 @@ def reporter() -> tuple[SharedReporter, RepairDecoder, Reassembly]:
     reassembly = Reassembly(10_000)
     order = Order(decoder, 1, 1.0, most=10_000, room=ROOM)
     order.told = True
-    return SharedReporter((1, 1), decoder, order, reassembly), decoder, reassembly
+    return SharedReporter((1, 1), decoder, order, reassembly, Settings(2, shares=True)), decoder, reassembly
 
 
 def test_packets_that_nobody_repairs_are_not_reported() -> None:
