@@ -42,6 +42,15 @@ COMPILE = [
 VARIANTS = {"_baseline": []} | ({"_avx2": ["-mavx2", "-mfma"]} if MACHINE in ("x86_64", "AMD64") else {})
 """Libraries of compiled kernels: for every processor of the architecture (64-bit ARM has NEON), and for newer ones."""
 
+LABORATORY = [
+    "jinja2>=3.1,<4",
+    "matplotlib>=3.9,<4",
+    "plotext>=5.3,<6",
+    "pyarrow>=17,<26; python_version < '3.13'",  # 26 needs numpy 2
+    "pyarrow>=17; python_version >= '3.13'",
+]
+"""What experiments and their reports need, and a robot's link does not."""
+
 (version,) = re.findall(r'^__version__ = "(.+)"$', Path("gr_ros2/__init__.py").read_text(encoding="utf-8"), re.M)
 
 
@@ -138,15 +147,10 @@ setup(
         "cryptography>=41",
         # PyPI has neither a wheel of it for Linux on ARM nor the C sources to make one from.
         f"{CYCLONEDDS}; python_version < '3.14' and (sys_platform != 'linux' or platform_machine == 'x86_64')",
-        "jinja2>=3.1,<4",
-        "matplotlib>=3.9,<4",
         # That of the distribution's GNU Radio: Debian's and Ubuntu's was built for numpy 2 from Python 3.13 on.
         "numpy>=1.21.5,<2; python_version < '3.13'",
         "numpy>=2,<3; python_version >= '3.13'",
         "packaging>=22",
-        "pyarrow>=17,<26; python_version < '3.13'",  # 26 needs numpy 2
-        "pyarrow>=17; python_version >= '3.13'",
-        "plotext>=5.3,<6",
         "pydantic>=2.10,<3",
         "pyyaml>=6,<7",
         "rich>=14",
@@ -154,8 +158,9 @@ setup(
         "rosbags>=0.11,<0.12",
     ],
     extras_require={
-        "dashboard": ["bokeh>=3.8,<4"],
-        "sweep": ["distributed>=2024.8"],
+        "dashboard": ["bokeh>=3.8,<4", "jinja2>=3.1,<4"],
+        "lab": LABORATORY,
+        "sweep": [*LABORATORY, "distributed>=2024.8"],
         "zenoh": ["eclipse-zenoh>=1.10,<2"],
     },
     entry_points={"console_scripts": ["gr-ros2 = gr_ros2.cli.__main__:main"]},

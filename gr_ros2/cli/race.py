@@ -11,11 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import OrAuto
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.race.race_settings import RaceSettings
-from gr_ros2.race.results import notes, race_grid, write_race
-from gr_ros2.race.runner import run_race
 from gr_ros2.report.table import as_table
-from gr_ros2.settings.config import build
 
 _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
 _TEAM = {"packet_len": 96, "loss": (0.05,), "load": (2.0, 4.0)}
@@ -41,6 +37,12 @@ def race(
     short: bool, out: Path | None, loss: str | None, load: str | None, peers: str | None, **options: object
 ) -> None:
     """Carry one recording by gr-ros2, Cyclone DDS and Zenoh over the same radio, and compare. Needs root."""
+    # A race loads figures, tables of files and ROS's types, for which its help does not wait.
+    from gr_ros2.race.race_settings import RaceSettings
+    from gr_ros2.race.results import notes, race_grid, write_race
+    from gr_ros2.race.runner import run_race
+    from gr_ros2.settings.config import build
+
     given = {
         "loss": None if loss is None else _shares("loss", loss),
         "load": None if load is None else _shares("load", load),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import click
 
-from gr_ros2.run.scenario import builtin_scenarios
+from gr_ros2.settings.config import read_yaml
+from gr_ros2.settings.files import BUILTIN_DIR
 
 
 @click.command()
 def scenarios() -> None:
     """List the built-in scenarios, one line each."""
-    found = list(builtin_scenarios())
-    width = max(len(scenario.name) for scenario in found)
-    for scenario in found:
-        print(f"{scenario.name:{width}}  {scenario.description}")
+    found = {path.stem: str(read_yaml(path)["description"]) for path in BUILTIN_DIR.glob("*.yaml")}
+    width = max(map(len, found))
+    for name, description in sorted(found.items()):
+        print(f"{name:{width}}  {description}")

@@ -9,12 +9,3 @@ imageio and loguru.
 Invariant: no input or output, except in ``publisher``. Time is simulated, and every random number comes from a seeded
 generator.
 """
-
-from __future__ import annotations
-
-from gr_ros2.sim.fleet import Fleet, SimMessage
-from gr_ros2.sim.publisher import SimPublisher
-from gr_ros2.sim.sim_settings import SimSettings
-from gr_ros2.sim.world import World
-
-__all__ = ["Fleet", "SimMessage", "SimPublisher", "SimSettings", "World"]

@@ -13,9 +13,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import build
-from gr_ros2.sim import Fleet, SimMessage, SimSettings
+from gr_ros2.sim.fleet import Fleet, SimMessage
 from gr_ros2.sim.motion import ACCELERATION, MAX_TURN, RADIUS, TURN_ACCELERATION
 from gr_ros2.sim.sensors import GRAVITY, TYPES
+from gr_ros2.sim.sim_settings import SimSettings
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 DURATION = 10

@@ -10,7 +10,9 @@ import pytest
 
 from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware.base import Middleware, Publisher, Qos, Subscription, TopicInfo
-from gr_ros2.sim import Fleet, SimPublisher, SimSettings
+from gr_ros2.sim.fleet import Fleet
+from gr_ros2.sim.publisher import SimPublisher
+from gr_ros2.sim.sim_settings import SimSettings
 from tests.waiting import PATIENCE_S, wait_for
 
 

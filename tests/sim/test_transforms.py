@@ -9,7 +9,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.sim import Fleet, SimSettings
+from gr_ros2.sim.fleet import Fleet
+from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.sim.transforms import TF_TYPE, TransformPublisher
 from tests.domains import domain
 from tests.waiting import wait_for
