@@ -28,7 +28,7 @@ def mac(data: bytes) -> None:
             block, _ = read_block(data, start + 3)
         except EntryBoundsError:
             break
-        within(MOST_LINES, partial(robot.hear, src_id, block, now, trusted=trusted % 2 > 0))
+        within(MOST_LINES, partial(robot.hear, src_id, block, now, trusted=trusted % 3 > 1, checked=trusted % 3 > 0))
         due = robot.departure(now)
         if due <= now + _SLOT_S:
             sent = robot.block()

@@ -30,10 +30,11 @@ class Access(Protocol):
         :param weight: packets to send while others send one, 1 to 16: more where there is much to relay
         """
 
-    def hear(self, src_id: int, block: Any, began: float, *, trusted: bool = True) -> None:
+    def hear(self, src_id: int, block: Any, began: float, *, trusted: bool = True, checked: bool = False) -> None:
         """A packet of a robot was received.
 
         :param block: as read, None where packets carry none
         :param began: when its burst began
-        :param trusted: its trailer has been checked
+        :param trusted: its trailer has been checked, and it is no recording as far as its sender can prove that
+        :param checked: its trailer has been checked, and its sender may prove soon that it is no recording
         """

@@ -62,7 +62,15 @@ class Aloha:
         self._next = None
         return b""
 
-    def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:  # noqa: ARG002
+    def hear(
+        self,
+        src_id: int,
+        block: Block | None,  # noqa: ARG002
+        began: float,
+        *,
+        trusted: bool = True,
+        checked: bool = False,  # noqa: ARG002
+    ) -> None:
         """See :class:`gr_ros2.link.access.Access`."""
         if trusted and src_id != self.src_id:
             self._heard[src_id] = began

@@ -56,6 +56,8 @@ class SlotClock:
         self.slot_s = slot_s
         self.jumps = 0
         self._zero: float | None = None
+        self._doubtful = False
+        """Whether only packets that were not checked have said where the slots are."""
         self._agreed: dict[int, float] = {}
         self._agreed_at = float("-inf")
         self._odd: dict[int, _Odd] = {}
@@ -81,42 +83,51 @@ class SlotClock:
         assert self._zero is not None
         return int((now - self._zero) // self.slot_s)
 
-    def heard(self, src_id: int, number: int, began: float, *, trusted: bool) -> int | None:
+    def heard(self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool = False) -> int | None:
         """Follow a packet of slot ``number`` mod 256 whose burst began at ``began`` s.
 
-        :param trusted: its trailer has been checked. Other packets move nobody who hears a robot that agrees
+        :param trusted: it is no recording. Other packets move nobody who hears a robot that agrees
+        :param checked: its trailer has been checked. A packet of which nothing is known only starts a clock that
+            stands, which the first one that was checked moves
         :return: its slot as this clock counts, None where it does not agree
         """
+        checked = checked or trusted
         if self._zero is None:
             self._zero = began - number * self.slot_s
+            self._doubtful = not checked
         exact = (began - self._zero) / self.slot_s
         error = (exact - number + SLOT_NUMBERS / 2) % SLOT_NUMBERS - SLOT_NUMBERS / 2
         slot = round(exact - error)
         if -TOLERANCE <= error <= TOLERANCE:
-            if trusted or not self._agreeing(began):
+            self._doubtful = self._doubtful and not checked
+            if trusted or (checked and not self.agreeing(began)):
                 self._zero += GAIN * error * self.slot_s
             if trusted:
                 self._agreed[src_id] = self._agreed_at = began
                 self._odd.pop(src_id, None)
             return slot
-        if began < self._stays_until or not self._moves(src_id, error, began, trusted=trusted):
+        if not checked or began < self._stays_until:
             return None
-        if error > 0:
+        if not self._doubtful and not self._moves(src_id, error, began, trusted=trusted):
+            return None
+        if error > 0 and not self._doubtful:
             self._stays_until = began + STAYS * self.slot_s
         self._zero += error * self.slot_s
         self.jumps += 1
         self._agreed = {src_id: began} if trusted else {}
         self._agreed_at = began if trusted else float("-inf")
         self._odd.clear()
+        self._doubtful = False
         return slot
 
-    def _agreeing(self, now: float) -> bool:
+    def agreeing(self, now: float) -> bool:
+        """Whether a robot that is trusted has been heard lately, and agrees."""
         return now - self._agreed_at < MEMORY * self.slot_s
 
     def _moves(self, src_id: int, error: float, now: float, *, trusted: bool) -> bool:
         """Whether to move to the slots of a robot that differs by ``error`` slots: below 0 if it is ahead."""
         if not trusted:
-            return not self._agreeing(now) and error < 0
+            return not self.agreeing(now) and error < 0
         memory_s = MEMORY * self.slot_s
         odd = self._odd.get(src_id)
         if odd is None or now - odd.since > 2 * memory_s or abs(odd.error - error) > 2 * TOLERANCE:

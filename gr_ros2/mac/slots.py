@@ -21,9 +21,12 @@ robot whose next slot three maps in a row of a neighbour lack, or that nobody na
 the first free slots. So does a robot that hears nobody, and one that hears robots with other slots: a packet that
 always falls between the same two slots of a group is never heard there.
 
-Invariants: sans-IO, the caller passes in times of its own clock, and the generator; what arrives with bytes that were
-not checked keeps its sender's announced slots free and does nothing else; the work for a packet heard is bounded by the
-slots it names and, when clocks differ, the robots heard; equal calls give equal slots.
+*Who is not trusted.* A packet that may be a recording keeps its sender's announced slots free; its sender counts as one
+robot and is named, so that it gets in, and may name this one. Of a packet that could not be checked only the announced
+slots count, and nothing at all once a robot is heard that is trusted.
+
+Invariants: sans-IO, the caller passes in times of its own clock, and the generator; the work for a packet heard is
+bounded by the slots it names and, when clocks differ, the robots heard; equal calls give equal slots.
 """
 
 from __future__ import annotations
@@ -194,7 +197,7 @@ class Slots:
             self.clock.start(self._listened)
             return None
         slot = self._mine.pop(0)
-        self._sweep(slot)
+        self._sweep(slot - 1)  # who has announced this slot is still needed
         now = slot - self._ahead
         alone = self._alone(now)
         if self._entered_at is None:
@@ -332,17 +335,38 @@ class Slots:
 
     # ---- what is heard
 
-    def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:
+    def hear(
+        self, src_id: int, block: Block | None, began: float, *, trusted: bool = True, checked: bool = False
+    ) -> None:
         """See :class:`gr_ros2.link.access.Access`. Who says nothing about slots cannot be avoided."""
-        slot = None if block is None else self._placed(src_id, block.slot, began, trusted=trusted)
-        if block is None or slot is None or src_id == self.src_id:
+        if block is None or src_id == self.src_id or not (trusted or checked or not self.clock.agreeing(began)):
+            return
+        slot = self._placed(src_id, block.slot, began, trusted=trusted, checked=checked)
+        if slot is None:
             return
         first, second = block.ahead
         ahead = (slot + first, slot + first + second) if first and second else (slot + first,) if first else ()
         if not trusted:
             for at in ahead:
                 self._taken.setdefault(at, src_id)
+            if not checked:
+                return
+        robot = self._present(src_id, slot, ahead)
+        if not trusted:
+            self._named(tuple([name for name in block.names if name == self.src_id]), slot)
             return
+        robot.heard, robot.weight = block.heard, block.weight
+        for at in ahead:
+            if self._taken.setdefault(at, src_id) != src_id or at in self._mine:
+                self._claim(at, src_id)
+        self._named(block.names, slot)
+        if block.expected is None:
+            robot.deaf = 0 if self.src_id in block.names else DEAF
+        else:
+            self._mapped(robot, block.expected, block.conflict)
+
+    def _present(self, src_id: int, slot: int, ahead: tuple[int, ...]) -> _HeardRobot:
+        """A robot sends in a slot, and has announced others."""
         robot = self._robots.get(src_id)
         if robot is None:
             robot = self._robots[src_id] = _HeardRobot(slot)
@@ -356,20 +380,13 @@ class Slots:
             for known in (self._taken, self._conflicts):
                 if at not in ahead and known.get(at) == src_id:
                     del known[at]
-        robot.last, robot.ahead, robot.heard, robot.weight = slot, ahead, block.heard, block.weight
-        for at in ahead:
-            if self._taken.setdefault(at, src_id) != src_id or at in self._mine:
-                self._claim(at, src_id)
-        self._named(block.names, slot)
-        if block.expected is None:
-            robot.deaf = 0 if self.src_id in block.names else DEAF
-        else:
-            self._mapped(robot, block.expected, block.conflict)
+        robot.last, robot.ahead = slot, ahead
+        return robot
 
-    def _placed(self, src_id: int, number: int, began: float, *, trusted: bool) -> int | None:
+    def _placed(self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool) -> int | None:
         """The slot of a packet; None where its sender has other slots."""
         jumps = self.clock.jumps
-        slot = self.clock.heard(src_id, number, began, trusted=trusted)
+        slot = self.clock.heard(src_id, number, began, trusted=trusted, checked=checked)
         if self.clock.jumps > jumps:
             assert slot is not None
             self._elsewhere = dict.fromkeys(self._robots, began)
@@ -391,7 +408,7 @@ class Slots:
             else:
                 self._conflicts[slot] = src_id
 
-    def _named(self, names: tuple[int, int], slot: int) -> None:
+    def _named(self, names: tuple[int, ...], slot: int) -> None:
         for name in names:
             other = self._robots.get(name)
             if name == self.src_id:

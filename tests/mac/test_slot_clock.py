@@ -17,9 +17,11 @@ def clock(now: float = 100.0) -> SlotClock:
     return made
 
 
-def hear(of: SlotClock, src_id: int, slot: int, shift: float = 0.0, *, trusted: bool = True) -> int | None:
+def hear(
+    of: SlotClock, src_id: int, slot: int, shift: float = 0.0, *, trusted: bool = True, checked: bool = True
+) -> int | None:
     """A packet in this slot of the clock, which begins ``shift`` s late."""
-    return of.heard(src_id, slot % 256, of.begin(slot) + shift, trusted=trusted)
+    return of.heard(src_id, slot % 256, of.begin(slot) + shift, trusted=trusted, checked=checked)
 
 
 def test_the_first_packet_heard_decides_where_the_slots_are() -> None:
@@ -73,7 +75,7 @@ def test_a_clock_that_has_jumped_itself_goes_back_to_the_others() -> None:
     assert hear(made, 3, 12) == 12
 
 
-def test_packets_that_are_not_checked_move_nobody_who_hears_others() -> None:
+def test_packets_that_are_not_trusted_move_nobody_who_hears_others() -> None:
     made = clock()
     hear(made, 1, 0)
     before = made.begin(0)
@@ -82,6 +84,17 @@ def test_packets_that_are_not_checked_move_nobody_who_hears_others() -> None:
     assert made.begin(0) == before
     late = 60 + MEMORY
     assert hear(made, 2, late, -0.7, trusted=False) is not None
+
+
+def test_what_was_not_checked_starts_a_clock_and_moves_none() -> None:
+    made = SlotClock(SLOT)
+    assert made.heard(2, 7, 50.0, trusted=False) == 7
+    assert made.heard(3, 9, 50.0 + 4.3 * SLOT, trusted=False) is None
+    assert made.heard(3, 7, 50.0 + 0.1 * SLOT, trusted=False) == 7
+    assert made.begin(7) == 50.0
+    assert made.heard(4, 99, 50.0 + 7.6 * SLOT, trusted=False, checked=True) is not None, "it knows better"
+    assert made.begin(99) % SLOT == pytest.approx((50.0 + 7.6 * SLOT) % SLOT)
+    assert hear(made, 5, 110, 0.4, trusted=False) is None, "once only"
 
 
 def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:

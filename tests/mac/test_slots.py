@@ -33,8 +33,8 @@ def send(of: Slots, now: float, weight: int = 1) -> tuple[float, Block]:
     raise AssertionError("it never sends")
 
 
-def hear(of: Slots, src_id: int, slot: int, block: Block, *, trusted: bool = True) -> None:
-    of.hear(src_id, block._replace(slot=slot % 256), of.clock.begin(slot), trusted=trusted)
+def hear(of: Slots, src_id: int, slot: int, block: Block, *, trusted: bool = True, checked: bool = False) -> None:
+    of.hear(src_id, block._replace(slot=slot % 256), of.clock.begin(slot), trusted=trusted, checked=checked)
 
 
 def test_a_robot_keeps_what_it_announces() -> None:
@@ -221,6 +221,43 @@ def test_a_host_that_was_late_sends_in_a_later_slot() -> None:
     assert at >= begin + 1.0 - SLOT / 2
 
 
+def test_a_slot_that_somebody_has_announced_is_not_entered_however_long_ago_this_robot_has_sent() -> None:
+    made = robot(5)
+    hear(made, 1, 60, Block(0, (200, 200), 1, (NOBODY, NOBODY)))
+    made._mine, made._since = [260], 0.0
+    made._rate = 1.0
+    assert made.departure(made.clock.begin(259)) == made.clock.begin(260)
+    assert made.block() is None
+
+
+def test_once_a_trusted_robot_is_heard_what_was_not_checked_says_nothing() -> None:
+    made = robot(5)
+    hear(made, 1, 60, Block(0, (40, 40), 1, (5, NOBODY)))
+    before = dict(made._taken), dict(made._robots), made._expected, made.clock.begin(0)
+    for at in range(61, 90):
+        hear(made, 100 + at, at, Block(0, (10, 10), 60, (5, 9), 0xFFFFFF, (4, 5)), trusted=False)
+        made.hear(100, Block(7, (3, 3)), at * SLOT + 0.4 * SLOT, trusted=False)
+    assert (dict(made._taken), dict(made._robots), made._expected, made.clock.begin(0)) == before
+    assert made.clock.jumps == 0
+
+
+def test_what_may_be_a_recording_keeps_its_slots_free_and_its_sender_is_named() -> None:
+    made = robot(5)
+    hear(made, 1, 60, Block(0, (300, 300), 1, (5, NOBODY)))
+    begin, block = send(made, 61 * SLOT)
+    slot = made.clock.slot(begin + SLOT / 2)
+    claim = Block(0, (block.ahead[0] - 1, 40), 60, (5, 9), 0xFFFFFFF, (block.ahead[0] - 1, 5), weight=8)
+    hear(made, 2, slot + 1, claim, trusted=False, checked=True)
+    assert not made._free(slot + block.ahead[0] + 40)
+    assert not made._expected
+    at, after = send(made, begin + SLOT / 2)
+    assert made.clock.slot(at + SLOT / 2) == slot + block.ahead[0], "it stays"
+    assert 2 in after.names
+    assert after.heard == 2, "it is one robot, whatever it says"
+    made.hear(2, Block(99, (3, 3)), at + 5.4 * SLOT, trusted=False, checked=True)
+    assert made.clock.jumps == 0
+
+
 def test_packets_that_are_not_checked_keep_their_slots_free_and_do_nothing_else() -> None:
     made = robot(5)
     begin, block = send(made, 1.0)
@@ -248,12 +285,12 @@ def test_robots_that_left_are_forgotten() -> None:
 @settings(max_examples=40)
 @given(
     st.lists(
-        st.tuples(st.integers(0, 254), st.floats(0, 20), st.binary(min_size=12, max_size=12), st.booleans()),
+        st.tuples(st.integers(0, 254), st.floats(0, 20), st.binary(min_size=12, max_size=12), st.integers(0, 2)),
         max_size=60,
     )
 )
 def test_whatever_is_heard_it_sends_in_slots_and_the_work_is_bounded(
-    heard: list[tuple[int, float, bytes, bool]],
+    heard: list[tuple[int, float, bytes, int]],
 ) -> None:
     made = robot(5)
     now = 1.0
@@ -262,7 +299,7 @@ def test_whatever_is_heard_it_sends_in_slots_and_the_work_is_bounded(
             block = read_block(data)[0]
         except EntryBoundsError:
             continue
-        lines, _ = work(partial(made.hear, src_id, block, at, trusted=trusted))
+        lines, _ = work(partial(made.hear, src_id, block, at, trusted=trusted > 1, checked=trusted > 0))
         assert lines < 600
         now = made.departure(now)
         sent = made.block()

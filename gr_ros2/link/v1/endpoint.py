@@ -220,7 +220,7 @@ class EndpointV1:
                 len(neighbour.inbox.announced.topics),
             )
             for neighbour in self.neighbours.all.values()
-            if neighbour.src_id not in over
+            if neighbour.src_id not in over and neighbour.proven
         ]
 
     def knows(self, src_id: int) -> bool:
@@ -235,7 +235,7 @@ class EndpointV1:
     def _inbox(self, src_id: int) -> Inbox | None:
         """What has come of a robot, directly or over others."""
         neighbour, relaying = self.neighbours.all.get(src_id), self._receiving.relaying
-        if neighbour is not None:
+        if neighbour is not None and neighbour.proven:
             return neighbour.inbox
         return None if relaying is None else relaying.far.get(src_id)
 

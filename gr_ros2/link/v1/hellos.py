@@ -122,8 +122,8 @@ class Hellos:
 
     @property
     def lone(self) -> bool:
-        """Whether no robot is heard, though one could be."""
-        return self._settings.hears and all(neighbour.gone for neighbour in self._neighbours.all.values())
+        """Whether nothing of any robot comes, though it could."""
+        return self._settings.hears and all(neighbour.silent for neighbour in self._neighbours.all.values())
 
     @property
     def _period(self) -> float:
@@ -135,7 +135,7 @@ class Hellos:
         """Whether a robot is heard, and nothing is lost either way."""
         losses = [
             self._window.peers.loss,
-            *(neighbour.inbox.reports.loss for neighbour in self._neighbours.all.values()),
+            *(neighbour.inbox.reports.loss for neighbour in self._neighbours.all.values() if neighbour.proven),
         ]
         return len(losses) > 1 and max(losses) < CALM
 

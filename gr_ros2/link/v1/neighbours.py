@@ -5,7 +5,9 @@ kept until then.
 
 *Replays.* Where packets are sealed and two robots hear each other, a packet of messages is used only if it was sealed
 after this robot started, which the other robot proves (``proofs``). Packets that arrive before the first proof are kept
-until then. Of a robot that can prove nothing, a number is stored below which nothing is accepted (``replays``).
+until then. Control packets are opened for the proofs in them, and are trusted only as packets of messages are: before
+its first proof a robot is not heard. Of a robot that can prove nothing, a number is stored below which nothing is
+accepted (``replays``).
 
 An older start of a robot is accepted only with a proof; where packets are not sealed, any other start is accepted a
 second after the last one. A robot whose boot number is stored was heard before this robot restarted, so its packets
@@ -18,7 +20,7 @@ where packets are sealed, nothing is given out that was sealed before this start
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import inf
 
@@ -60,6 +62,9 @@ _STARTS = 256
 """Starts that have ended of which is known how far they were heard."""
 _NUMBERS_KEPT = 512
 """Packet numbers, counted back from the newest, for which it is known which repair ids were used."""
+_HANDSHAKE = 8
+"""Packets of each robot that is heard, after which one that has proven nothing is taken for a recording: its hello, the
+answers of the others, and its answer to these."""
 _MOST = 1 << 48
 """Number of packets that a start of a robot can have."""
 
@@ -80,8 +85,10 @@ class Neighbour:
     proofs: Proofs
     proves: bool
     """Whether it can prove when it sealed a packet: it hears this robot, and packets are sealed."""
-    gone: bool = False
-    """Whether it has been silent for long."""
+    appeared_at: int = 0
+    """How many packets had been opened when it appeared."""
+    silent: bool = False
+    """Whether nothing of it has come for long."""
     repair_ids: dict[int, int] = field(default_factory=dict)
     """Repair ids of packets that carried entries, as bits, by packet number."""
     asked: dict[int, float] = field(default_factory=dict)
@@ -91,6 +98,16 @@ class Neighbour:
     timeout: float | None = None
     """When something of it is to be given up, s; infinite for never, None while nobody has looked since its newest
     packet. Only what it sends can bring this forward."""
+
+    @property
+    def proven(self) -> bool:
+        """Whether anything shows that it is not a recording: a proof, where it can prove something."""
+        return not self.proves or self.proofs.proven is not None
+
+    @property
+    def gone(self) -> bool:
+        """Whether it does not count as heard: it has been silent for long, or has proven nothing yet."""
+        return self.silent or not self.proven
 
     def number(self, low: int) -> int:
         """The full packet number for its low 16 bits: the one nearest to the newest."""
@@ -119,8 +136,10 @@ class Neighbour:
 class Opened:
     """A packet whose trailer was checked.
 
-    ``met``: it is of a start that was not known before, or of a robot that was taken for gone; ``replaced``: the robot
-    start that is now forgotten, if any; ``new``: whether it was not here before.
+    ``kept``: it can be used after a proof only, and was kept until then;
+    ``appeared``: it is of a start that was not known before, or of a robot that was silent for long; ``met``: its
+    sender counts as heard from now on; ``trusted``: it was sealed after this start of this robot, as far as its sender
+    can prove that; ``replaced``: the robot start that is now forgotten, if any; ``new``: it was not here before.
     """
 
     neighbour: Neighbour
@@ -129,7 +148,10 @@ class Opened:
     repair: RepairHeader | None
     body: bytes
     entries: list[EntryV1] | None = None
+    kept: bool = False
+    appeared: bool = False
     met: bool = False
+    trusted: bool = True
     replaced: Neighbour | None = None
     new: bool = True
 
@@ -170,6 +192,8 @@ class Neighbours:
         self._make_inbox = inbox
         self.all: dict[int, Neighbour] = {}
         self._early: dict[int, deque[tuple[float, bytes]]] = {}
+        self._packets = self._met_first = 0
+        """Packets that were opened; so many of them when a robot was met and no other one was heard."""
         self._met_at: dict[int, float] = {}
         """When the present start of each robot was heard for the first time."""
         self._ended: dict[tuple[int, int], int] = {}
@@ -180,16 +204,18 @@ class Neighbours:
         return [(at, data) for at, data in self._early.pop(src_id, ()) if now <= at + _EARLY_S]
 
     def silent(self, now: float, after: float) -> list[Neighbour]:
-        """Robots not heard for so many s. Their state is kept until another robot needs the room."""
-        silent = [neighbour for neighbour in self.all.values() if neighbour.heard + after <= now and not neighbour.gone]
+        """Robots that do not count as heard any more after so many s of silence. Their state is kept until another
+        robot needs the room."""
+        silent = [n for n in self.all.values() if n.heard + after <= now and not n.silent]
+        heard = [neighbour for neighbour in silent if neighbour.proven]
         for neighbour in silent:
-            neighbour.gone = True
-        return silent
+            neighbour.silent = True
+        return heard
 
     def open(self, data: bytes, header: Header, now: float) -> Opened | None:
         """Open a packet.
 
-        :return: None if it is kept until a hello or a proof comes, or dropped because it is not proven
+        :return: None if it is kept until a hello comes, or dropped because it is not proven
         :raises WireError: the packet cannot be opened, or must not be
         """
         start, end = header.size, len(data) - self._trailer_len
@@ -216,38 +242,64 @@ class Neighbours:
             if neighbour.proofs.proven is None:
                 self._keep(header.src_id, data, now)
                 self.dropped["early"] += 1
-                return None
+                self._packets += 1
+                return Opened(neighbour, header, number, repair, b"", kept=True, trusted=False)
             if number <= neighbour.proofs.proven:
                 self.dropped["unproven"] += 1
                 return None
         new = neighbour.new(number, repair_id)
         if control and not new:
             raise ReplayedError(f"repair id {repair_id} at packet {number} of robot {header.src_id} was here before")
-        met = new and self._heard(neighbour, number, now)
-        return Opened(neighbour, header, number, repair, body, met=met, new=new)
+        entries = read_body(body, header.room(self._settings.packet_len)) if control else None
+        return self._opened(Opened(neighbour, header, number, repair, body, entries, new=new), now)
+
+    def _opened(self, opened: Opened, now: float) -> Opened:
+        """Take the proofs in a packet that was opened, and note what it says about its sender."""
+        neighbour, number, repair = opened.neighbour, opened.number, opened.repair
+        proofs, gone = neighbour.proofs, neighbour.gone or opened.appeared
+        self._packets += 1
+        alone = gone and self.alone
+        if opened.entries is not None and repair is not None:
+            for since, at in self.own_hellos.proofs(number, opened.entries, proofs.not_before):
+                proofs.take(since, at, (number, repair.repair_id))
+            opened.trusted = not neighbour.proves or proofs.covers(number, repair.repair_id)
+        if opened.new and (opened.trusted or not neighbour.proven):
+            opened.appeared = opened.appeared or neighbour.silent
+            neighbour.heard, neighbour.silent = now, False
+            if self._stores and not neighbour.proves:
+                self.floors.guard(neighbour.floor, number, now)
+        if opened.appeared:
+            neighbour.appeared_at = self._packets
+        opened.met = gone and not neighbour.gone
+        if opened.met and alone:
+            self._met_first = self._packets
+        return opened
 
     def _proves(self, hello: Hello) -> bool:
         return self._provable and hello.capabilities & CAN_HEAR != 0
 
+    def proves_soon(self, neighbour: Neighbour) -> bool:
+        """Whether a robot has appeared so lately that its first proof may still be under way."""
+        if neighbour.proven or self.alone:
+            return not neighbour.proven
+        return self._packets - max(neighbour.appeared_at, self._met_first) <= _HANDSHAKE * len(self.all)
+
+    @property
+    def alone(self) -> bool:
+        """Whether no robot counts as heard."""
+        return all(neighbour.gone for neighbour in self.all.values())
+
     @property
     def unproven(self) -> bool:
         """Whether a robot is heard whose messages cannot be taken before it has proven that it hears this start."""
-        return any(n.proofs.proven is None and not n.gone and n.proves for n in self.all.values())
-
-    def proved(self, neighbour: Neighbour, number: int, entries: Sequence[EntryV1]) -> bool:
-        """Take the proofs among the entries of a control packet; returns whether they are the first of its sender."""
-        proofs = neighbour.proofs
-        before = proofs.proven
-        for since, at in self.own_hellos.proofs(number, entries, proofs.not_before):
-            proofs.take(since, at)
-        return before is None and proofs.proven is not None
+        return any(not n.proven and not n.silent for n in self.all.values())
 
     def heard(self, newest: int) -> list[Heard]:
         """What proves to other robots that they were heard.
 
         :param newest: number of this robot's newest source packet
         """
-        echoes = [(n.src_id, *n.echo) for n in self.all.values() if n.echo and n.proves and not n.gone]
+        echoes = [(n.src_id, *n.echo) for n in self.all.values() if n.echo and n.proves and not n.silent]
         return [Heard(src_id, echo, since & 0xFFFF) for src_id, echo, since in echoes if newest - since < 1 << 16]
 
     def since(self, src_id: int) -> int:
@@ -299,13 +351,13 @@ class Neighbours:
         if neighbour is not None and neighbour.boot == hello.boot:
             neighbour.trailer.open(clear, rest, number, repair.repair_id, plain=True)
             jumps = not sealed and abs(number - neighbour.inbox.newest) > _HALF
-            if not (jumps and neighbour.gone):
+            if not (jumps and neighbour.silent):
                 if jumps or not neighbour.new(number, repair.repair_id):
                     raise ReplayedError(f"a hello of robot {src_id} at packet {number} was here before, or cannot be")
                 if number >= neighbour.hello_number:
                     neighbour.hello, neighbour.hello_number = hello, number
                     neighbour.proves = self._proves(hello)
-                return Opened(neighbour, header, number, repair, b"", entries, self._heard(neighbour, number, now))
+                return self._opened(Opened(neighbour, header, number, repair, b"", entries), now)
         boot, floor = self.floors.of(src_id)
         before = self._met_at.get(src_id, -inf)
         proven = sealed and self.own_hellos.proofs(number, entries, before)
@@ -349,7 +401,8 @@ class Neighbours:
         met.new(number, repair.repair_id)
         self.all[src_id] = met
         self.floors.store(met.floor, max(first, number + 1) if stores else 0, now)
-        return Opened(met, header, number, repair, b"", entries, True, neighbour)
+        opened = Opened(met, header, number, repair, b"", entries, appeared=True, replaced=neighbour)
+        return self._opened(opened, now)
 
     def _trailer(self, src_id: int, hello: Hello, clear: bytes, rest: bytes, place: tuple[int, int]) -> Trailer:
         encrypt = hello.capabilities & ENCRYPTS != 0
@@ -364,19 +417,11 @@ class Neighbours:
                 failed = error
         raise failed
 
-    def _heard(self, neighbour: Neighbour, number: int, now: float) -> bool:
-        """A new packet of a known robot arrived; returns whether the robot was taken for gone."""
-        neighbour.heard = now
-        back, neighbour.gone = neighbour.gone, False
-        if self._stores and not neighbour.proves:
-            self.floors.guard(neighbour.floor, number, now)
-        return back
-
     def _room_for(self, src_id: int) -> Neighbour | None:
         """The robot whose state is dropped to make room for another one, if there is no more room."""
         if len(self.all) < self._settings.max_sources:
             return None
-        quiet = min(self.all.values(), key=lambda neighbour: neighbour.heard)
+        quiet = min(self.all.values(), key=lambda neighbour: (not neighbour.gone, neighbour.heard))
         if not quiet.gone:
             raise SourcesError(f"robot {src_id}: {len(self.all)} others are heard; raise max_sources")
         return self.all.pop(quiet.src_id)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from math import inf
 
 from gr_ros2.wire.control import ECHO_LEN, Heard
-from gr_ros2.wire.v1 import EntryV1
+from gr_ros2.wire.v1 import REPAIR_IDS, EntryV1
 
 _ECHOES = 64
 """Hellos of this robot that can be echoed, and proofs kept of each other robot."""
@@ -57,14 +57,28 @@ class Proofs:
     def __init__(self, not_before: float) -> None:
         self.not_before = not_before
         self.proven: int | None = None
+        self._place = -1, 0
+        """Number and repair id of the packet that proves this; of several at one number, those of the newest."""
         self._newest: deque[tuple[int, float]] = deque(maxlen=_ECHOES)
         """(number, time in s): packets above this number were sealed after this time."""
 
-    def take(self, number: int, at: float) -> None:
-        """Packets above a number were sealed after a time, s."""
+    def take(self, number: int, at: float, place: tuple[int, int]) -> None:
+        """Packets above a number were sealed after a time, s.
+
+        :param place: number and repair id of the packet that says so
+        """
+        if self.proven is None or number < self.proven or place[0] == self._place[0]:
+            self._place = place
         self.proven = number if self.proven is None else min(self.proven, number)
         if not self._newest or (number >= self._newest[-1][0] and at > self._newest[-1][1]):
             self._newest.append((number, at))
+
+    def covers(self, number: int, repair_id: int) -> bool:
+        """Whether a control packet was sealed after this robot started: above that number, or at it, where the proof
+        itself stands there, not before the proof. Repair ids go up, and begin again at 0 after the last one."""
+        if self.proven is None or number > self.proven:
+            return self.proven is not None
+        return number == self._place[0] and (repair_id - self._place[1]) % REPAIR_IDS < REPAIR_IDS // 2
 
     def sealed_after(self, number: int) -> float:
         """Time in s after which a packet was sealed; -inf if nothing proves it."""

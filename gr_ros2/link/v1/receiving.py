@@ -144,7 +144,7 @@ class ReceivingSide:
 
     def _timeout(self, neighbour: Neighbour) -> float:
         waits = neighbour.inbox.next_timeout()
-        gone = inf if neighbour.gone else neighbour.heard + self._give_up_s
+        gone = inf if neighbour.silent else neighbour.heard + self._give_up_s
         neighbour.timeout = gone if waits is None else min(waits, gone)
         return neighbour.timeout
 
@@ -162,31 +162,33 @@ class ReceivingSide:
             header = read_header(arrival.data, self._settings.packet_len)
             opened = self._open(arrival.data, header, now)
             if self._access is not None and (opened is None or opened.new):  # what was here says nothing about now
-                self._note_slot(self._access, header, arrival, now, trusted=opened is not None)
-            if opened is None:
+                self._note_slot(self._access, header, arrival, now, opened)
+            if opened is None or opened.kept:
                 return
             opened.neighbour.timeout = None
             if self._access is not None and not self._for_us(header):
                 self.stats.dropped["not_for_us"] += 1
                 return
-            if arrival.snr_db is not None and opened.new:
+            if arrival.snr_db is not None and opened.new and opened.trusted:
                 opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
             opened.neighbour.inbox.began = began
-            proved = self._use(arrival, opened, now)
+            self._use(arrival, opened, now)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
             self._outcomes.events.append(Rejected(arrival.data, error))
             return
-        if opened.met or proved:
+        if opened.met:
             for at, early in self.neighbours.early(opened.neighbour.src_id, now):
                 self._receive(AirPacket(early), now, at)
 
-    def _note_slot(self, access: Access, header: Header, arrival: AirPacket, now: float, *, trusted: bool) -> None:
+    def _note_slot(self, access: Access, header: Header, arrival: AirPacket, now: float, opened: Opened | None) -> None:
         """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
         if arrival.at is None or header.src_id == self._settings.src_id:
             return
         block = read_block(header.block)[0] if header.block else None
-        access.hear(header.src_id, block, arrival.at, trusted=trusted)
+        trusted = opened is not None and opened.trusted
+        checked = opened is not None and (trusted or self.neighbours.proves_soon(opened.neighbour))
+        access.hear(header.src_id, block, arrival.at, trusted=trusted, checked=checked)
         if self.relaying is not None and trusted:
             self.relaying.heard(header.src_id, block, now)
 
@@ -209,18 +211,21 @@ class ReceivingSide:
         own = self._settings.src_id
         return header.dst_id in (BROADCAST, own) or own == NOBODY
 
-    def _use(self, arrival: AirPacket, opened: Opened, now: float) -> bool:
-        """Take an opened packet; returns whether packets that were kept until a proof can be taken now."""
+    def _use(self, arrival: AirPacket, opened: Opened, now: float) -> None:
+        """Take an opened packet."""
         self.stats.packets += 1
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
         sending = self._sending
-        sending.heard_at = now
-        sending.repairs.waits_until = -inf
+        if opened.trusted or opened.appeared:
+            sending.heard_at = now
+            sending.repairs.waits_until = -inf
         sending.urged = sending.urged or (repair is not None and not repair.mask) or sending.reports.requests.lacking
+        if opened.appeared:
+            self._appear(opened, now)
         if opened.met:
-            self._meet(opened, now)
+            self._meet(neighbour, now)
         self._sender, inbox = neighbour, neighbour.inbox
-        if self.relaying is not None and opened.new:
+        if self.relaying is not None and opened.new and opened.trusted:
             self.relaying.reached(neighbour, number)
         mask, clear, repair_id = 0, False, NOT_A_REPAIR
         if repair is not None:
@@ -239,47 +244,58 @@ class ReceivingSide:
         elif mask:
             inbox.repair(number, mask, repair_id, opened.body, oldest=repair.oldest, now=now, new=opened.new)
         else:
-            return self._control(arrival, opened, repair, entries, now)
-        return False
+            self._control(arrival, opened, repair, entries, now)
 
     def _control(
         self, arrival: AirPacket, opened: Opened, repair: RepairHeader, entries: Sequence[EntryV1], now: float
-    ) -> bool:
-        """Take a packet of entries that are not messages; returns the same as ``_use``."""
+    ) -> None:
+        """Take a packet of entries that are not messages. One that is not trusted moves nothing but the proofs."""
         neighbour, number, sending = opened.neighbour, opened.number, self._sending
         inbox = neighbour.inbox
         if repair.clear:
             neighbour.echo = arrival.data[-ECHO_LEN:], self._window.packets.newest
             if neighbour.hello.capabilities & WANTS_PROOF:
                 sending.hellos.answer(now)
-        proved = self.neighbours.proved(neighbour, number, entries)
-        if proved:
-            assert neighbour.proofs.proven is not None
-            inbox.order.repaired_from(neighbour.proofs.proven - REACH)
+        if not opened.trusted:
+            if not repair.clear:
+                self.stats.dropped["unproven"] += 1
+            return
         for entry in entries:
             if isinstance(entry, Hello):
-                inbox.order.told = self._settings.hears and entry.capabilities & REPORTED != 0
+                self._greeted(neighbour)
             elif isinstance(entry, (Ask, Report, Newest)):
                 self._entry(entry)
             elif isinstance(entry, (Ping, About)):
                 sending.pings.receive(neighbour.src_id, self._settings.src_id, entry, now)
         inbox.heard(number, now, over=repair.oldest)
-        return proved
 
-    def _meet(self, opened: Opened, now: float) -> None:
-        """A robot is heard for the first time, or is heard again."""
-        neighbour = opened.neighbour
+    def _appear(self, opened: Opened, now: float) -> None:
+        """Something of a robot comes for the first time, or again: it is answered, so that it can prove that it hears
+        this start."""
         if opened.replaced is not None:
             opened.replaced.inbox.close(Fate.SENDER_RESTARTED)
-        self._forget(neighbour.src_id)
+        self._forget(opened.neighbour.src_id)
+        self._sending.met(now)
+
+    def _meet(self, neighbour: Neighbour, now: float) -> None:
+        """A robot is heard for the first time, or is heard again."""
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
             self._window.peers.meet(neighbour.src_id, now)
+            if neighbour.proves:
+                self._window.peers.prove(neighbour.src_id, self.neighbours.since(neighbour.src_id))
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)
             self._messages.reported = True
-        self._sending.met(now)
         self._outcomes.events.append(Met(neighbour.src_id, neighbour.boot, hears))
+        self._greeted(neighbour)
+        if neighbour.proofs.proven is not None:
+            neighbour.inbox.order.repaired_from(neighbour.proofs.proven - REACH)
+
+    def _greeted(self, neighbour: Neighbour) -> None:
+        """The newest hello of a robot that is heard."""
+        told = self._settings.hears and neighbour.hello.capabilities & REPORTED != 0
+        neighbour.inbox.order.told = told
 
     def _entry(self, entry: Control) -> None:
         """Handle an entry that is not a message, from the sender of the packet that is processed."""

@@ -37,7 +37,7 @@ class Requests:
             return found
         self.check_at = now + CHECK_S
         self.lacking = False
-        for neighbour in self._neighbours:
+        for neighbour in [neighbour for neighbour in self._neighbours if neighbour.proven]:
             hello, inbox, asked = neighbour.hello, neighbour.inbox, neighbour.asked
             marks = list(hello.marks)
             if hello.digest and hello.digest != inbox.announced.digest:

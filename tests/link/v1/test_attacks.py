@@ -10,7 +10,7 @@ import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import AirPacket
-from gr_ros2.link.events import Delivered, Gone, Rejected
+from gr_ros2.link.events import Delivered, Gone, Met, Rejected
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Seal, SealMode, subkey
@@ -353,6 +353,29 @@ def test_a_recorded_packet_is_no_sign_of_life(mode: SealMode) -> None:
         snr_db.append(known.inbox.reports.snr.snr_db)
     assert any(isinstance(event, Gone) for event in two.events)
     assert snr_db[-1] is None
+
+
+@pytest.mark.parametrize("mode", SEALED)
+def test_recordings_make_a_robot_that_starts_again_meet_nobody(mode: SealMode) -> None:
+    """The other robot is dead: its packets can prove nothing to this start."""
+    one, two, air = pair(mode)
+    recorded = of(air, one)
+    two.start()
+    two.events.clear()
+    air.robots = [two]
+    for number in range(600):
+        if number % 2 == 0:
+            two.receive(recorded[number // 2 % len(recorded)], air.now)
+        air.run(0.05)
+        assert not two.end.peers(air.now)
+        assert not two.end.window.peers
+        assert not two.end.knows(1)
+    assert not [event for event in two.events if isinstance(event, (Met, Gone, Delivered))]
+    assert two.end.received.dropped["unproven"] > 0
+    air.robots = [one, two]
+    one.start()
+    check_alive(one, two, air)
+    assert any(isinstance(event, Met) for event in two.events)
 
 
 def test_equal_ids_are_told_to_both_and_share_no_key() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from itertools import pairwise
 from math import inf
 
@@ -12,11 +13,13 @@ from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.v1.sealing import Keys, SealMode
 from gr_ros2.mac import Slots
 from gr_ros2.wire.mac_block import Block, read_block, write_block
-from gr_ros2.wire.v1 import read_header
+from gr_ros2.wire.v1 import QOS_REPAIR, Header, read_header, read_repair_header, write_header
 from tests.link.v1.air import Robot, registry
 
 AIRTIME = 0.010
 SLOT = 0.011
+SHORT = 0.0006
+"""s that the shortest packet lasts."""
 
 
 def robot(src_id: int, mode: SealMode) -> tuple[Robot, Slots]:
@@ -43,18 +46,35 @@ class Greedy:
         ahead = max(first - slot, 1), max(second - first, 1)
         return write_block(Block(slot % 256, ahead, 40, (1, 2), 0xFFFFFFF, (ahead[0], self.victim.src_id)))
 
-    def hear(self, src_id: int, block: Block | None, began: float, *, trusted: bool = True) -> None:
+    def hear(
+        self, src_id: int, block: Block | None, began: float, *, trusted: bool = True, checked: bool = False
+    ) -> None:
         pass
 
 
-def talk(robots: list[Robot], begin: float, seconds: float) -> list[tuple[float, Robot, bytes]]:
-    """Let robots send, each once it may; what overlaps is lost."""
+Junk = Callable[[float], list[bytes]]
+
+
+def talk(
+    robots: list[Robot], begin: float, seconds: float, *, every: float = inf, junk: Junk = lambda _: []
+) -> list[tuple[float, Robot, bytes]]:
+    """Let robots send, each once it may; what overlaps is lost.
+
+    :param junk: what an outsider sends every so many s, if it overlaps nothing: short packets, several in a slot
+    """
     sent: list[tuple[float, Robot, bytes]] = []
-    busy, now = begin, begin
+    busy, now, due = begin, begin, begin + every
     for one in robots:
         one.end.handle_timeout(begin)
     while now < begin + seconds:
         now, at = min((max(now, r.end.next_departure(credited=True) or now), n) for n, r in enumerate(robots))
+        if due + AIRTIME < now:
+            for number, other_data in enumerate(junk(due) if due >= busy else ()):
+                for other in robots:
+                    other.receive(other_data, due + AIRTIME, due + number * SHORT)
+            due += every
+            now = due - every + AIRTIME
+            continue
         data = robots[at].slot(now)
         if data is None:
             continue
@@ -150,3 +170,60 @@ def test_messages_cross_where_packets_are_handed_over_long_ahead_as_to_a_sound_c
         air = [one for one in air if one[0] > now - 2]
     assert sum(len(robot.delivered()) for robot in robots) == sent == 2 * seconds
     assert late == 0
+
+
+def team(size: int) -> tuple[list[Robot], list[Slots]]:
+    """Robots with a key that have met."""
+    made = [robot(src_id, "encrypt") for src_id in range(1, size + 1)]
+    robots, accesses = [one for one, _ in made], [access for _, access in made]
+    talk(robots, 0.0, 8.0)
+    return robots, accesses
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_what_nobody_can_check_takes_no_more_than_its_own_slots(size: int) -> None:
+    """An outsider takes 4 % of the air: short packets of robots that nobody knows, each of which wants two slots."""
+    rates = {}
+    for attacked in (False, True):
+        robots, accesses = team(size)
+        rng = random.Random(2)
+
+        def junk(now: float, rng: random.Random = rng, of: Slots = accesses[0]) -> list[bytes]:
+            slot = of.clock.slot(now + SLOT / 2)
+            blocks = [Block(slot % 256, (rng.randrange(2, 60), rng.randrange(2, 60))) for _ in range(4)]
+            heads = [
+                Header(0, True, rng.randrange(100, 200), rng.randrange(1 << 16), block=write_block(b)) for b in blocks
+            ]
+            return [write_header(head) + rng.randbytes(12) for head in heads]
+
+        sent = talk(robots, 8.0, 6.0, every=5 * SLOT if attacked else inf, junk=junk)
+        rates[attacked] = len(sent)
+        assert all(access.clock.jumps == 0 for access in accesses)
+    assert rates[True] > 0.9 * rates[False]
+
+
+def is_hello(data: bytes) -> bool:
+    header = read_header(data, 64)
+    return header.qos == QOS_REPAIR and read_repair_header(data, header.size, 56).clear
+
+
+def test_recordings_of_a_robot_that_is_dead_neither_slow_others_nor_move_their_clocks() -> None:
+    robots, _ = team(4)
+    recorded = [data for _, sender, data in talk(robots, 8.0, 90.0) if sender is robots[3] and is_hello(data)]
+    assert len(recorded) > 30
+    rates = {}
+    for attacked in (False, True):
+        alive = robots[:3]
+        for one in alive:
+            one.access = Slots(one.src_id, SLOT, random.Random(one.src_id))
+            one.start()
+        talk(alive, 100.0, 8.0)
+        queue = iter(recorded)
+        every = 1.5 if attacked else inf
+        sent = talk(alive, 108.0, 40.0, every=every, junk=lambda _, queue=queue: [next(queue)])  # type: ignore[misc]
+        rates[attacked] = sum(sender is alive[0] for at, sender, _ in sent if at > 118.0)
+        for one in alive:
+            assert isinstance(one.access, Slots)
+            assert one.access.clock.jumps == 0
+            assert {peer.robot for peer in one.end.peers(148.0)} == {1, 2, 3} - {one.src_id}
+    assert rates[True] > 0.9 * rates[False]
