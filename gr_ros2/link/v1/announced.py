@@ -43,6 +43,11 @@ class AnnouncedTopics:
         self._bytes = 0
         self._most = most
 
+    @property
+    def held(self) -> int:
+        """Bytes of the messages that wait for a table."""
+        return self._bytes
+
     def topic_of(self, ready: Ready | Relayed) -> AnnouncedTopic | None:
         """The topic of a message; None if the message has to wait for a table."""
         topic = self.topics.get(ready.topic_id)

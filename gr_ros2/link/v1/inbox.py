@@ -46,7 +46,8 @@ class Bounds(NamedTuple):
     :param span: packets remembered
     :param equations: equations held; together they take up to a half
     :param fragments: bytes of incomplete messages
-    :param ordered: bytes of messages that may wait for an earlier one; above it, they wait no longer
+    :param ordered: bytes of messages that may wait for an earlier one, whatever else is kept; above it, they wait no
+        longer, unless what the others leave of the memory has room for them
     :param unknown: bytes of messages that may wait for the table of topics
     """
 
@@ -63,7 +64,7 @@ class Bounds(NamedTuple):
         equations = max(min(MOST_EQUATIONS, packets // 4 // (room + _EQUATION_COST)), MAP)
         rest = packets - equations * (room + _EQUATION_COST)
         span = max(min(SPAN, rest // (room + _PACKET_COST)), MAP)
-        return cls(span, equations, most // 4, most, most // 4)
+        return cls(span, equations, most // 4, most // 8, most // 8)
 
 
 class Passing(Protocol):
@@ -120,7 +121,15 @@ class Inbox:
         self.decoder.begin(first)
         self.decoder.newest = first - 1
         self._first = first
-        self.order = Order(self.decoder, first, settings.hold_s, most=bounds.ordered, room=room, give_up_s=give_up_s)
+        self._most = settings.max_source_bytes
+        self.order = Order(
+            self.decoder,
+            first,
+            settings.hold_s,
+            fits=lambda held: held <= bounds.ordered or held + self._others() <= self._most,
+            room=room,
+            give_up_s=give_up_s,
+        )
         self._reassembly = Reassembly(bounds.fragments)
         of = src_id, boot
         self.reports: Reporter = (
@@ -141,6 +150,12 @@ class Inbox:
     def held(self) -> int:
         """Bytes of incomplete messages, bookkeeping included."""
         return self._reassembly.held
+
+    def _others(self) -> int:
+        """Bytes of all that is kept beside the messages that wait for an earlier one, at most."""
+        packets, equations = len(self.decoder.bodies), self.decoder.equations
+        coded = packets * (self._room + _PACKET_COST) + equations * (self._room + _EQUATION_COST)
+        return coded + self._reassembly.held + self.announced.held
 
     def source(self, number: int, body: bytes, entries: Sequence[EntryV1], qos: int, now: float) -> None:
         """Take a source packet.

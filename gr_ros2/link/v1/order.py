@@ -15,7 +15,7 @@ Invariants: messages of one topic come out in the order in which they began; the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from math import inf
 
@@ -66,7 +66,7 @@ class Order:
     :param decoder: knows which packets are here
     :param first: packets before this number are neither waited for nor needed
     :param hold_s: s that a message waits for an earlier one whose sender gets no reports
-    :param most: bytes of messages that may wait
+    :param fits: whether messages of so many bytes may wait
     :param room: bytes of the longest body
     :param give_up_s: s of silence after which a sender is regarded as gone
     :ivar contents: which topics missing packets can have carried
@@ -77,7 +77,14 @@ class Order:
     """
 
     def __init__(
-        self, decoder: RepairDecoder, first: int, hold_s: float, *, most: int, room: int, give_up_s: float = inf
+        self,
+        decoder: RepairDecoder,
+        first: int,
+        hold_s: float,
+        *,
+        fits: Callable[[int], bool],
+        room: int,
+        give_up_s: float = inf,
     ) -> None:
         self.told = False
         self.low = self.wanted = first
@@ -89,7 +96,7 @@ class Order:
         self._hold_s, self._give_up_s = hold_s, give_up_s
         self._over_at = inf
         """When another robot brought a message for the first time since the sender was heard, s."""
-        self._most = most
+        self._fits = fits
         self._dead = first
         """The sender does not repair packets before this number any more."""
         self._void: set[int] = set()
@@ -142,7 +149,7 @@ class Order:
         low = max(self.low, dead if dead <= newest else newest + 1)
         while gaps and gaps[0][2] < floor:
             gaps.popleft()
-        waits = self.held <= self._most and now < self._over_at + self._give_up_s
+        waits = self._fits(self.held) and now < self._over_at + self._give_up_s
         if not waits:
             low = newest + 1
         elif gaps and not self.told:

@@ -119,6 +119,30 @@ def test_memory_is_counted_as_it_is_used(packet_len: int) -> None:
     assert used < 1.1 * most
 
 
+def test_all_that_is_kept_of_one_robot_shares_its_memory() -> None:
+    """Packets, incomplete messages, and messages that wait for a packet that never comes, together."""
+    most, packet_len = 1_000_000, 1000
+    one, two = Robot(1, registry(), packet_len=packet_len), Robot(2, packet_len=packet_len, max_source_bytes=most)
+    air = Air(one, two)
+    air.run(2.0)
+    trailer, room = keys("none").own(1, one.boot), v1.body_room(packet_len)
+    whole, begun = Part(2, b"reliable" * 8, 0, 0, True), [Part(n, b"odom", 0, 0, False) for n in (0, 1)]
+
+    def packet(number: int) -> bytes:
+        body = v1.write_body([*begun, *[whole] * 11], room).ljust(packet_len - 8, b"\0")
+        return trailer.close(v1.write_header(Header(0, False, 1, number)), body, number, NOT_A_REPAIR)
+
+    after_a_gap = one.end.window.packets.newest + 2
+    packets = [packet(number) for number in range(after_a_gap, after_a_gap + 1000)]
+    tracemalloc.start()
+    before, used = tracemalloc.get_traced_memory()[0], 0
+    for number, data in enumerate(packets):
+        two.end.receive(AirPacket(data), air.now + number * 1e-3)
+        used = max(used, tracemalloc.get_traced_memory()[0] - before)
+    tracemalloc.stop()
+    assert 0.5 * most < used < 1.1 * most
+
+
 @pytest.mark.parametrize("mode", ["none", "encrypt"])
 def test_a_report_costs_no_more_the_more_was_sent(mode: SealMode) -> None:
     one, two = Robot(1, registry(), mode=mode), Robot(2, registry(), mode=mode)
