@@ -26,6 +26,8 @@ from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, seconds_of, whole_and_
 from gr_ros2.phy.threads import KeepsThreadState
 
 _LENGTH = pmt.intern(LENGTH_TAG)
+_PLACES = 256
+"""Blanked places that are remembered for a block behind, which is some buffers late at most."""
 _REMEMBERED = 64
 """Number of bursts whose times are kept. A receiver is never that many bursts behind."""
 
@@ -229,6 +231,14 @@ class Blanker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._clock = clock
         self.blanked = 0
         """Number of samples set to zero."""
+        self._passed = 0
+        self._places: deque[tuple[int, int]] = deque(maxlen=_PLACES)
+        """First of the samples set to zero, and the one behind the last, counted from the start."""
+
+    def blanked_in(self, first: int, end: int) -> list[tuple[int, int]]:
+        """Where samples were set to zero, of the newest ones from ``first`` to before ``end``, counted from the
+        start. Any thread may ask."""
+        return [(low, high) for low, high in tuple(self._places) if low < end and first < high]
 
     def work(self, input_items: list[Samples], output_items: list[Samples]) -> int:
         out = output_items[0]
@@ -238,6 +248,12 @@ class Blanker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             # Rounded outwards: a sample that overlaps a burst only in part is blanked too.
             low = max(0, floor((begin - first) * self._sample_rate))
             high = min(len(out), ceil((end + self._after - first) * self._sample_rate))
-            out[low:high] = 0
-            self.blanked += max(0, high - low)
+            if low < high:
+                out[low:high] = 0
+                self.blanked += high - low
+                place = self._passed + low
+                if self._places and self._places[-1][1] == place:
+                    place, _ = self._places.pop()
+                self._places.append((place, self._passed + high))
+        self._passed += len(out)
         return len(out)

@@ -106,7 +106,8 @@ class DeviceFrontEnd(FrontEnd):
         self._blanker: Blanker | None = None
         if chosen.half_duplex and self.transmits:
             self._blanker = Blanker(self._shaper.sent, chosen.turnaround_s, phy.sample_rate)
-        self._gaps, self._energy = GapCounter(), EnergyCounter(phy.sample_rate)
+        blanked_in = None if self._blanker is None else self._blanker.blanked_in
+        self._gaps, self._energy = GapCounter(), EnergyCounter(phy.sample_rate, blanked_in)
         self._given, self._taken = Watch(), Watch()
         self._transmitting: Any = None
         self._receiving: Any = None

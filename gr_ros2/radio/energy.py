@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -19,20 +21,32 @@ DOUBLES_S = 5.0
 late. A carrier 20 dB above the noise counts as a signal for 23 s and then as noise: whoever listens before sending does
 not fall silent for ever."""
 
+_SILENCE = 2 * STANDS_OUT
+"""Samples that are all zero are silence, so many times below the weakest power that came. Twice as much would still
+be a signal; noise that begins after zeros, as a driver may give at its start, counts as one for ``DOUBLES_S`` only."""
+
 
 class EnergyCounter(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
     """Takes received samples.
 
     :param sample_rate: samples/s
+    :param blanked_in: returns where samples were set to zero from one sample to before another, counted from the start;
+        these are neither noise nor silence. None: nowhere
     :ivar bursts: how often the power rose above the noise
     """
 
-    def __init__(self, sample_rate: float) -> None:
+    def __init__(
+        self, sample_rate: float, blanked_in: Callable[[int, int], Sequence[tuple[int, int]]] | None = None
+    ) -> None:
         super().__init__("gr_ros2_energy_counter", [np.complex64], None)
         self.set_output_multiple(_CHUNK)
         self.bursts = 0
         self._rise = 2 ** (_CHUNK / (sample_rate * DOUBLES_S))
-        self._noise = 0.0
+        self._blanked_in = blanked_in
+        self._noise = self._weakest = inf
+        """Power of the noise, and the least power of a chunk that is not zero; infinite while it is not known."""
+        self._silent = False
+        """Whether zeros came before anything else."""
         self._above = False
 
     def is_above(self) -> bool:
@@ -45,13 +59,23 @@ class EnergyCounter(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             return len(input_items[0])
         parts = input_items[0][:whole].view(np.float32).reshape(-1, 2 * _CHUNK)
         power = np.einsum("ij,ij->i", parts, parts)
-        blanked = ~input_items[0][:whole].reshape(-1, _CHUNK).all(axis=1)  # zeros are not noise
-        power = power[np.isfinite(power) & ~blanked]
+        heard = np.isfinite(power)
+        if self._blanked_in is not None:
+            first = self.nitems_read(0)
+            for low, high in self._blanked_in(first, first + whole):
+                heard[max(low - first, 0) // _CHUNK : (high - first - 1) // _CHUNK + 1] = False
+        power = power[heard]
+        before, known = self._noise, self._weakest < inf
+        self._weakest = min(self._weakest, power[power > 0].min(initial=inf))
+        silence = self._weakest / _SILENCE
+        if self._silent and not known:
+            before = silence
+        self._silent |= not power.all()
+        power = np.where(power > 0, power, silence)
         steps = self._rise ** np.arange(1, len(power) + 1)
         # The lowest power so far, each one grown since: noise[n] = min(power[k] * rise^(n - k), k <= n).
-        before = self._noise if self._noise else float("inf")
         noise = steps * np.minimum.accumulate(np.minimum(power / steps, before))
-        above = power > STANDS_OUT * noise
+        above = power > STANDS_OUT * noise  # False while nothing but zeros came
         if len(power):
             self.bursts += int(np.count_nonzero(above[1:] & ~above[:-1])) + bool(above[0] and not self._above)
             self._above, self._noise = bool(above[-1]), float(noise[-1])

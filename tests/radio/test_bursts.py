@@ -120,3 +120,7 @@ def test_what_came_while_we_sent_is_blanked(sent: list[tuple[float, float]], sil
     assert set(silent) <= set(deaf)
     assert len(set(deaf) - set(silent)) <= 2 * len(sent)
     assert blanker.blanked == len(deaf)
+    assert [n for low, high in blanker.blanked_in(0, 1000) for n in range(low, high)] == deaf.tolist()
+    blanker.work([np.ones(1000, np.complex64)], [out])  # of the same time, so blanked at the same places of the next
+    places = [n for low, high in blanker.blanked_in(0, 2000) for n in range(low, high)]
+    assert places == [*deaf.tolist(), *(1000 + deaf).tolist()]

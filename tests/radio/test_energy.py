@@ -7,15 +7,17 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from collections.abc import Sequence
+
 from gnuradio import blocks, gr
 from numpy.typing import NDArray
 
 from gr_ros2.radio.energy import EnergyCounter
 
 
-def counted(samples: NDArray[np.complex64]) -> int:
+def counted(samples: NDArray[np.complex64], blanked: Sequence[tuple[int, int]] = ()) -> int:
     """How many signals a flowgraph counts in them."""
-    graph, counter = gr.top_block(), EnergyCounter(1e6)
+    graph, counter = gr.top_block(), EnergyCounter(1e6, lambda first, end: blanked)  # noqa: ARG005
     graph.connect(blocks.vector_source_c(samples), counter)
     graph.run()
     return counter.bursts
@@ -43,7 +45,31 @@ def test_bursts_are_counted(snr_db: float) -> None:
 def test_what_was_blanked_is_no_noise() -> None:
     samples = noise(200_000, 1e-6)
     samples[50_100:60_000] = 0
-    assert counted(samples) == 0
+    assert counted(samples, [(50_100, 60_000)]) == 0
+
+
+def listened(samples: NDArray[np.complex64], sample_rate: float = 1e6) -> EnergyCounter:
+    graph, counter = gr.top_block(), EnergyCounter(sample_rate)
+    graph.connect(blocks.vector_source_c(samples), counter)
+    graph.run()
+    return counter
+
+
+@pytest.mark.parametrize("power", [1e-12, 1e-3, 1.0])
+def test_silence_of_exact_zeros_is_a_level_above_which_others_are_heard(power: float) -> None:
+    samples = np.zeros(1_000_000, np.complex64)
+    for at in range(100_000, 1_000_000, 100_000):
+        samples[at : at + 20_000] = noise(20_000, power, at)
+        assert listened(samples[: at + 10_000]).is_above()
+        assert not listened(samples[: at + 30_000]).is_above()
+    assert counted(samples) == 9
+
+
+def test_noise_that_begins_after_zeros_is_noise_after_a_while() -> None:
+    """A driver may give zeros at its start: who listens before sending would be silent for ever."""
+    samples = np.concatenate([np.zeros(20_000, np.complex64), noise(200_000, 1e-6)])
+    assert listened(samples[:30_000], 2e4).is_above()
+    assert not listened(samples, 2e4).is_above()
 
 
 def test_silence_and_samples_that_are_no_numbers_do_no_harm() -> None:
