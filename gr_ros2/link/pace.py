@@ -15,7 +15,8 @@ from gr_ros2.settings.fields import AUTO, Auto
 _INTERVALS = 15
 """Number of packet intervals whose median estimates the interval of credits."""
 _ENOUGH, _RECENT_S = 3, 10.0
-"""Intervals that must have been measured within so many seconds before a message is dropped because of them. With one,
+"""Intervals that must have been measured within so many seconds, or ``_INTERVALS`` of them where these are longer,
+before a message is dropped because of them. With one,
 the pause of a busy computer stopped the commands of a link for good: what was dropped measured nothing better."""
 
 
@@ -98,7 +99,8 @@ class Pace:
 
     def sure_interval(self, now: float) -> float:
         """The same, but 0 where it was measured too seldom, or too long ago, to drop a message because of it."""
-        return self.interval if self._rate or self._measured[0] > now - _RECENT_S else 0.0
+        recent_s = max(_RECENT_S, _INTERVALS * self._median)
+        return self.interval if self._rate or self._measured[0] > now - recent_s else 0.0
 
     def free(self, now: float) -> float:
         """When the air is free of all packets that have left, as far as it can be estimated; not before ``now``."""

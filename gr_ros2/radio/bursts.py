@@ -190,7 +190,7 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
                 at = leave_at - self._layout.lead / self._sample_rate - self.clock_offset()
                 self.add_item_tag(0, self.nitems_written(0) + made, TX_TIME, whole_and_rest(at))
             made += total
-            self._note(total)
+            self._note(total, None if self.clock_offset is None else leave_at)
         return made
 
     def _within_scale(self, samples: Samples) -> Samples:
@@ -200,10 +200,12 @@ class BurstShaper(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
             samples[beyond] /= np.abs(samples[beyond])
         return samples
 
-    def _note(self, total: int) -> None:
-        """Store when a burst is on the air: now, or directly after the one before it."""
+    def _note(self, total: int, leave_at: float | None) -> None:
+        """Store when a burst is on the air: now, when it has to leave, or directly after the one before it."""
         with self._lock:
             begin = max(self._clock(), self._sending[-1][1] if self._sending else float("-inf"))
+            if leave_at is not None:
+                begin = max(begin, leave_at - self._layout.lead / self._sample_rate)
             self._sending.append((begin, begin + total / self._sample_rate))
 
 

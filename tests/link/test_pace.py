@@ -83,6 +83,17 @@ def test_messages_are_dropped_for_an_interval_only_if_it_was_measured_lately_and
     assert Pace(4.0).sure_interval(60.0) == 0.25
 
 
+def test_long_packets_are_measured_for_as_many_packets_as_short_ones() -> None:
+    pace = Pace(AUTO)
+    pace.use_credit()
+    pace.credit()
+    for at in (0.0, 5.0, 10.0, 15.0, 20.0):
+        assert pace.may_leave(at)
+        pace.left(at, waiting=True)
+        pace.credit()
+    assert pace.sure_interval(21.0) == pytest.approx(5.0)
+
+
 def test_the_air_is_free_when_all_that_left_is_over() -> None:
     pace = Pace(AUTO)
     pace.use_credit()

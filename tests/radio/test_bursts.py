@@ -15,6 +15,7 @@ from gnuradio import blocks, gr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gr_ros2.phy.stream_times import TX_TIME, whole_and_rest
 from gr_ros2.radio.bursts import LENGTH_TAG, Blanker, BurstLayout, BurstShaper
 
 SIZES = st.integers(0, 5000)
@@ -89,6 +90,16 @@ def test_nothing_goes_beyond_full_scale() -> None:
     out, _ = through(shaper, [0.4, 1j, 3 + 3j, -0.5])
     assert np.allclose(out, [0.8, 1j, (1 + 1j) / np.sqrt(2), -1])
     assert shaper.clipped == 2
+
+
+def test_a_burst_that_is_handed_over_ahead_is_on_the_air_at_its_time() -> None:
+    shaper = BurstShaper(BurstLayout(1000), 1.0, 1e3, clock=lambda: 5.0, tagged=True)
+    shaper.clock_offset = lambda: 0.0
+    values = (pmt.intern(LENGTH_TAG), pmt.from_long(1000)), (TX_TIME, whole_and_rest(5.4))
+    tags = [gr.tag_utils.python_to_tag((0, key, value, pmt.intern("x"))) for key, value in values]
+    through(shaper, [1j] * 1000, tags)
+    assert shaper.sent(5.0, 5.3) == []
+    assert shaper.sent(5.5, 5.6) == [(pytest.approx(5.4), pytest.approx(6.4))]
 
 
 def test_bursts_follow_each_other_on_the_air() -> None:
