@@ -142,6 +142,11 @@ class Inbox:
         self.began = inf
 
     @property
+    def room(self) -> int:
+        """Bytes of the longest body."""
+        return self._room
+
+    @property
     def newest(self) -> int:
         """The newest packet number seen."""
         return self.decoder.newest

@@ -2,7 +2,8 @@
 
 A robot that lacks one asks for it; hellos name them. While no robot reports, they are repeated.
 
-Invariant: a message is named in hellos only after the receivers had time to get it when it was first sent.
+Invariants: a message is named in hellos only after the receivers had time to get it when it was first sent; however
+many ask, and whoever they are, each message takes a bounded share of the time.
 """
 
 from __future__ import annotations
@@ -26,6 +27,10 @@ TABLE_FIRST = 2
 SETTLING_S = 1.0
 """s after which a latched message is named in hellos: a receiver that lacks it then has lost it, not just not received
 it yet."""
+ANSWERS, PAUSE, PAUSE_S = 3, 9, 1.0
+"""A message is sent again for robots that ask once in a pause, and up to ``ANSWERS`` times at once after a time without
+need. A pause is ``PAUSE`` times the time that the message took to leave, and ``PAUSE_S`` s at least. So those who join
+one after the other are answered at once, and forged requests take a tenth of the time at most in the long run."""
 STARTING_S = 2.0
 """s from the start during which the table is repaired even if no receiver reports; any other kept message is for so
 long beyond the time that it waited."""
@@ -65,6 +70,10 @@ class KeptMessages:
         self._topics, self._room, self._settings = topics, room, settings
         self._stats, self._admit = stats, admit
         self._kept: dict[int, deque[_Kept]] = {}
+        self._answers: dict[int, tuple[float, float]] = {}
+        """How often messages of each topic may be sent again because somebody asks, at a time in s."""
+        self._took: dict[int, float] = {}
+        """How long the newest of them took to leave, s."""
         self._starting_until = inf
 
     def keep(self, topic: SentTopic, message: Message) -> None:
@@ -88,12 +97,26 @@ class KeptMessages:
         """Keep none of the messages of a topic so far."""
         self._kept.pop(topic_id, None)
 
-    def ask(self, topic_id: int, now: float) -> None:
-        """Send the kept message of a topic again because a robot lacks it, unless it is waiting already."""
+    def asked(self, topic_id: int, now: float) -> bool:
+        """A robot asks for the kept message of a topic; returns whether that is not too often."""
+        if topic_id not in self._kept:
+            return True
+        pause = max(PAUSE_S * self._settings.slower, PAUSE * self._took.get(topic_id, 0.0))
+        left, at = self._answers.get(topic_id, (ANSWERS, now))
+        left = min(left + (now - at) / pause, ANSWERS)
+        if left >= 1:
+            left -= self.ask(topic_id, now)
+            self._answers[topic_id] = left, now
+            return True
+        return False
+
+    def ask(self, topic_id: int, now: float) -> bool:
+        """Send the kept message of a topic again because a robot lacks it, unless it is waiting already; returns
+        whether it is sent."""
         self._starting_until = min(self._starting_until, now + STARTING_S * self._settings.slower)
         topic = self._topics.get(topic_id)
         if topic is None or any(message.repeat for message in topic.queue):
-            return
+            return False
         for kept in self._kept.get(topic_id, ()):
             if now > kept.until:
                 continue
@@ -109,6 +132,7 @@ class KeptMessages:
                 again.dst_id = topic.dst_id
                 self._admit(topic, again)
             self._stats.repeats += 1
+        return True
 
     def announce(self, now: float) -> None:
         """Send all kept messages, for robots that cannot ask."""
@@ -134,6 +158,8 @@ class KeptMessages:
         """
         if message.topic_id not in self._kept:
             return
+        if message.repeat:
+            self._took[message.topic_id] = now - message.submitted
         for kept in self._kept[message.topic_id]:
             if kept.payload is message.payload and kept.named == inf:
                 kept.named = now + SETTLING_S * self._settings.slower

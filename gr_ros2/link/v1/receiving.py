@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
 
-from gr_ros2.core.errors import EntryKindError, NoKeyError, NotSealedError, WireError
+from gr_ros2.core.errors import EntryKindError, LengthError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.access import Access
 from gr_ros2.link.events import (
     AirPacket,
@@ -171,7 +171,10 @@ class ReceivingSide:
                 return
             if arrival.snr_db is not None and opened.new and opened.trusted:
                 opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
-            opened.neighbour.inbox.began = began
+            inbox, room = opened.neighbour.inbox, header.room(self._settings.packet_len)
+            if opened.entries is None and room != inbox.room:  # it could not be combined with others
+                raise LengthError(f"bodies of {room} bytes, where those of this start have {inbox.room}")
+            inbox.began = began
             self._use(arrival, opened, now)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
@@ -306,8 +309,9 @@ class ReceivingSide:
             if self.relaying is not None:
                 self.relaying.newest(self._sender.src_id, entry)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
-            for topic_id in entry.topic_ids:
-                self._messages.kept.ask(topic_id, self._now)
+            for topic_id in dict.fromkeys(entry.topic_ids):
+                if not self._messages.kept.asked(topic_id, self._now):
+                    self.stats.dropped["asked_too_often"] += 1
 
     def _reported(self, sender: int, report: Report) -> None:
         """A robot says which packets it has."""

@@ -16,8 +16,17 @@ from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Seal, SealMode, subkey
 from gr_ros2.link.v1.unreported import MEETING_S
 from gr_ros2.settings.config import TopicOptions
-from gr_ros2.wire.control import Report
-from gr_ros2.wire.v1 import Header, Part, RepairHeader, body_room, write_body, write_header, write_repair_header
+from gr_ros2.wire.control import Ask, Report
+from gr_ros2.wire.v1 import (
+    QOS_REPAIR,
+    Header,
+    Part,
+    RepairHeader,
+    body_room,
+    write_body,
+    write_header,
+    write_repair_header,
+)
 from tests.link.v1.air import KEY, Air, Robot, registry
 
 SEALED: list[SealMode] = ["authenticate", "encrypt"]
@@ -376,6 +385,26 @@ def test_recordings_make_a_robot_that_starts_again_meet_nobody(mode: SealMode) -
     one.start()
     check_alive(one, two, air)
     assert any(isinstance(event, Met) for event in two.events)
+
+
+def test_forged_requests_take_a_share_of_the_air() -> None:
+    """Anybody may ask where no key is set. 20 kB are a third of what this robot can send in the time."""
+    topics = registry(map=TopicOptions(qos="bulk", durability="transient_local"))
+    one, forger = Robot(1, topics, packet_len=220), Robot(2, registry(), packet_len=220, hears=False)
+    air = Air(one, forger)
+    one.end.messages.submit(0, bytes(range(256)) * 80, air.now)
+    air.run(10.0)
+    sent, begin = len(of(air, one)), air.now
+    while air.now < begin + 60.0:
+        ask = forger.end._sending._writer.control([Ask(1, b"\x00\x00\xf0")], "hello", air.now)
+        one.receive(ask.data, air.now)
+        air.run(0.1)
+    assert one.end.received.dropped["asked_too_often"] > 0
+    parts = [data for data in of(air, one)[sent:] if data[0] & 3 != QOS_REPAIR]
+    assert 4 * 20_000 < sum(map(len, parts)) < 0.3 * 60 * 75 * 220, "with what is repeated of itself"
+    late = Robot(3, packet_len=220)
+    air.robots = [one, late]
+    assert air.run(60.0, lambda: bool(late.delivered())) < 30.0, "who needs it gets it all the same"
 
 
 def test_equal_ids_are_told_to_both_and_share_no_key() -> None:

@@ -15,8 +15,17 @@ from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, SealMode
 from gr_ros2.wire import v1
-from gr_ros2.wire.control import Hello
-from gr_ros2.wire.v1 import Header, PacketV1, Part, RepairHeader
+from gr_ros2.wire.control import CAN_HEAR, Hello
+from gr_ros2.wire.v1 import (
+    BROADCAST,
+    QOS_REPAIR,
+    EntryV1,
+    Header,
+    PacketV1,
+    Part,
+    RepairHeader,
+    encode,
+)
 from tests.link.v1.air import Air, Robot, keys, registry
 
 MOST_LINES = 5_000
@@ -153,3 +162,21 @@ def test_a_report_costs_no_more_the_more_was_sent(mode: SealMode) -> None:
         window.sent(number, b"", b"", (), 1.0)
     lines = [work(lambda: window.peers.report(2, 19_990, 0, settled=True, loss=0.1, now=air.now))[0] for _ in range(2)]
     assert lines[1] < MOST_LINES
+
+
+def forged(boot: int, number: int, *entries: EntryV1, to: int = BROADCAST, **repair: int | bool) -> bytes:
+    """A packet of robot 1, as anybody can make it where no key is set."""
+    header = Header(QOS_REPAIR if repair else 0, False, 1, number, to, to != BROADCAST)
+    fields = RepairHeader(**repair) if repair else None  # type: ignore[arg-type]
+    combined = b"\xff" * header.room(64) if repair.get("mask") else b""
+    return encode(PacketV1(header, entries, fields, combined), 64, boot)
+
+
+def test_a_packet_whose_bodies_have_another_length_than_those_of_its_start_is_refused() -> None:
+    two = Robot(2, registry())
+    two.receive(forged(5, 0, Hello(5, 0, CAN_HEAR, 0), to=2, repair_id=0, clear=True), 0.0)
+    two.receive(forged(5, 3, repair_id=1, mask=3), 0.1)
+    two.receive(forged(5, 4, Part(0, b"too long")), 0.1)
+    assert two.end.received.rejected["length"] == 2
+    two.receive(forged(5, 4, Part(0, b"not too long"), to=2), 0.2)
+    assert two.end.neighbours.all[1].inbox.newest == 4
