@@ -106,7 +106,7 @@ class _Seen:
             value = values[slot.index]
             if slot.kind == STRING and 0 < len(value) <= LONG_TEXT and value[-1] == 0:
                 if numbered(value):
-                    continue  # the codec composes names of numbered robots itself itself itself itself itself
+                    continue  # the codec composes names of numbered robots itself
                 try:
                     self.words[value[:-1].decode()] += 1
                 except UnicodeDecodeError:
