@@ -59,7 +59,13 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
     for peer in peers:
         table.add_row(
             str(peer["robot"]),
-            "silent" if peer["silent"] else f"over {peer['over']}, hop {peer['hops']}" if peer["hops"] else "heard",
+            "two robots"
+            if peer["doubled"]
+            else "silent"
+            if peer["silent"]
+            else f"over {peer['over']}, hop {peer['hops']}"
+            if peer["hops"]
+            else "heard",
             _seconds(peer["heard_s"]),
             "" if peer["snr_db"] is None else f"{peer['snr_db']:.1f} dB",
             f"{peer['lost']} ({peer['loss']:.1%} lately)",

@@ -142,6 +142,7 @@ class LinkHealth:
         """
         limits, found, now = self._config, {}, self._snapshots[-1].now
         far = {peer["robot"]: peer for peer in stats["peers"] if peer["hops"]}
+        doubled = {peer["robot"] for peer in stats["peers"] if peer["doubled"]}
         ages = [*stats["sink"]["silence_s"].items(), *((robot, peer["heard_s"]) for robot, peer in far.items())]
         for src_id, age in ages:
             self._reached[src_id] = max(self._reached.get(src_id, now - age), now - age)
@@ -157,6 +158,9 @@ class LinkHealth:
                 state.level, state.problems = Level.WARN, ["degraded"]
             else:
                 state.problems = ["up"]
+            if src_id in doubled:
+                state.level = max(state.level, Level.WARN)
+                state.problems.append("two robots have this number")
             found[src_id] = state
         return found
 

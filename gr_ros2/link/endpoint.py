@@ -190,6 +190,7 @@ class HeardRobot:
     :param topics: number of topics and services that it has announced
     :param hops: robots that have sent its newest message on; 0 where it is heard itself
     :param over: where it is not heard: the neighbour over which it is reached, None if no way is known
+    :param doubled: two robots send under its number, or a recording of an earlier start is on the air
     """
 
     robot: int
@@ -203,6 +204,7 @@ class HeardRobot:
     topics: int
     hops: int = 0
     over: int | None = None
+    doubled: bool = False
 
 
 class Questions(Protocol):

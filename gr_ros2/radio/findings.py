@@ -118,6 +118,19 @@ def same_id(robot: int, stats: Mapping[str, Any]) -> str | None:
     return f"another robot sends as robot {robot}, which is this one; give one of them another robot_id"
 
 
+def doubled(heard: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One line for each robot that is heard or reached over others, and is two.
+
+    :param heard: the robots, as :func:`peers` returns them
+    """
+    return [
+        f"two robots send as robot {peer['robot']}, and what comes out mixes both: give one of them another robot_id "
+        "(or a recording of an earlier start of it is on the air)"
+        for peer in heard
+        if peer["doubled"]
+    ]
+
+
 def unheard(robot: int, heard: Sequence[int]) -> str:
     """One line for a robot that hears others, of which none hears it."""
     named = ", ".join(str(other) for other in heard)

@@ -25,7 +25,7 @@ from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
-from gr_ros2.radio.findings import about, introduce, outrun, peers, ping, same_id, unheard
+from gr_ros2.radio.findings import about, doubled, introduce, outrun, peers, ping, same_id, unheard
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.limits import open_limit
 from gr_ros2.radio.permission import permitted
@@ -288,7 +288,8 @@ class RobotLink(Flowgraph):
     def findings(self) -> list[str]:
         """What a person should know about this link and its surroundings: one line each, mostly none."""
         now, own = self._clock(), self.config.ros_source.src_id()
-        robots = [peer["robot"] for peer in peers(self.end, now)]
+        heard = peers(self.end, now)
+        robots = [peer["robot"] for peer in heard]
         here, there = self.source.middleware, self.sink.middleware
         names = {info.topic for graph in {here, there} for info in graph.discover() if info.publishers}
         services = here.discover_services() if isinstance(here, ServiceGraph) else ()
@@ -298,6 +299,7 @@ class RobotLink(Flowgraph):
             shortcut([*names, *services], own, robots),
             foreign(names, sink["topics"]),
             same_id(own, {"sink": sink}),
+            *doubled(heard),
             full if self._ros.shares else None,
         ]
         with self.end.lock:

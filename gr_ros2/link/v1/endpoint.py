@@ -218,9 +218,10 @@ class EndpointV1:
                 neighbour.inbox.reports.loss,
                 self.received.missed[neighbour.src_id],
                 len(neighbour.inbox.announced.topics),
+                doubled=self.neighbours.doubled(neighbour.src_id, now),
             )
             for neighbour in self.neighbours.all.values()
-            if neighbour.src_id not in over and neighbour.proven
+            if neighbour.src_id not in over and (neighbour.proven or self.neighbours.doubled(neighbour.src_id, now))
         ]
 
     def knows(self, src_id: int) -> bool:

@@ -65,6 +65,8 @@ _NUMBERS_KEPT = 512
 _HANDSHAKE = 8
 """Packets of each robot that is heard, after which one that has proven nothing is taken for a recording: its hello, the
 answers of the others, and its answer to these."""
+_DOUBLED_S = 60.0
+"""s for which a robot is said to be two after both were last there."""
 _MOST = 1 << 48
 """Number of packets that a start of a robot can have."""
 
@@ -198,6 +200,10 @@ class Neighbours:
         """When the present start of each robot was heard for the first time."""
         self._ended: dict[tuple[int, int], int] = {}
         """By id and boot number of a start that was replaced: the first packet of it that was not heard."""
+        self._far_at: dict[int, float] = {}
+        """The same of robots that are reached over others."""
+        self._doubled: dict[int, float] = {}
+        """When a start of a robot sent something although another one had begun, s."""
 
     def early(self, src_id: int, now: float) -> list[tuple[float, bytes]]:
         """Packets of a robot that could not be opened before, and when they came, s; they are returned once."""
@@ -294,6 +300,23 @@ class Neighbours:
         """Whether a robot is heard whose messages cannot be taken before it has proven that it hears this start."""
         return any(not n.proven and not n.silent for n in self.all.values())
 
+    def sent_by_another_start(self, src_id: int, at: float, now: float) -> None:
+        """Note that a start of a robot that is not the present one has sent something.
+
+        :param at: when, s. What was sent before the present start was met says nothing
+        """
+        if at > max(self._met_at.get(src_id, -inf), self._far_at.get(src_id, -inf)):
+            self._doubled[src_id] = now
+
+    def met_over_others(self, src_id: int, now: float) -> None:
+        """Note that the present start of a robot was met, which is not heard itself."""
+        self._far_at[src_id] = now
+
+    def doubled(self, src_id: int, now: float) -> bool:
+        """Whether two robots send under this number: both were there lately, in turns. A robot that restarts never
+        comes back as it was before."""
+        return now < self._doubled.get(src_id, -inf) + _DOUBLED_S
+
     def heard(self, newest: int) -> list[Heard]:
         """What proves to other robots that they were heard.
 
@@ -365,6 +388,10 @@ class Neighbours:
         if not sealed:
             refused = neighbour is not None and now < before + _CHANGE_S
         if refused:
+            if number >= self._ended.get((src_id, hello.boot), _MOST):
+                # No recording of what was heard: the robot of that start goes on, or what it sent then comes only now.
+                self._trailer(src_id, hello, clear, rest, (number, repair.repair_id))
+                self.sent_by_another_start(src_id, now, now)
             newest = boot if neighbour is None else neighbour.boot
             raise ReplayedError(f"start {hello.boot:016x} of robot {src_id}, after start {newest:016x} was heard")
         trailer = self._trailer(src_id, hello, clear, rest, (number, repair.repair_id))
@@ -380,7 +407,9 @@ class Neighbours:
             self._ended[neighbour.src_id, neighbour.boot] = neighbour.inbox.newest + 1
             if len(self._ended) > _STARTS:
                 del self._ended[next(iter(self._ended))]
-        first = max(first, self._ended.pop((src_id, hello.boot), 0))
+        if (ended := self._ended.pop((src_id, hello.boot), None)) is not None:
+            first = max(first, ended)
+            self.sent_by_another_start(src_id, now, now)
         room = header.room(self._settings.packet_len)
         inbox, proofs = self._make_inbox(src_id, hello.boot, first, room), Proofs(before)
         met = Neighbour(

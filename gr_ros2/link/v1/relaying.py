@@ -188,15 +188,18 @@ class Relaying:
         origin, start = message.origin, message.start
         neighbour = self._neighbours.all.get(origin)
         heard = neighbour is not None and not neighbour.gone
-        if (message.hops == 0) != (origin == via) or (heard and neighbour and neighbour.boot & 0xFFFF != start):
+        age_s, limit_s = age_of(message.age), age_of(message.limit)
+        made = max(ready.made - age_s, now - _LONG_S)
+        another = heard and neighbour is not None and neighbour.boot & 0xFFFF != start
+        if (message.hops == 0) != (origin == via) or another:
             self._dropped["false_origin"] += 1
+            if another:
+                self._neighbours.sent_by_another_start(origin, made, now)
             return
         if origin == self.src_id:
             self._dropped["relayed_before"] += 1
             return
         self.custody.routes.note(origin, via, message.hops, now)
-        age_s, limit_s = age_of(message.age), age_of(message.limit)
-        made = max(ready.made - age_s, now - _LONG_S)
         kept = _ToPass(message, made, made + min(limit_s, self._limit_s(message)))
         if now > kept.until:
             self._dropped["too_old"] += 1
@@ -208,7 +211,7 @@ class Relaying:
         if taker != BROADCAST:
             self._handed(taker, via, kept, of, now)
             return
-        if table and not self._starts(message, via, now, heard=heard):
+        if table and not self._starts(message, via, now, made, heard=heard):
             return
         inbox = self._inbox(origin, start)
         if inbox is None or (not table and inbox.announced.topic_of(message) is None):
@@ -297,7 +300,8 @@ class Relaying:
             if inbox is not None and (neighbour is None or neighbour.gone):
                 hops, over = self.hops.get(src_id, 0), self.custody.routes.over(src_id, now, lambda _: True)
                 topics = len(inbox.announced.topics)
-                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, 0, topics, hops, over))
+                two = self._neighbours.doubled(src_id, now)
+                found.append(HeardRobot(src_id, now - at, False, boot, sealed, None, 0.0, 0, topics, hops, over, two))
         return found
 
     def handle_timeout(self, now: float) -> None:
@@ -378,7 +382,7 @@ class Relaying:
         for stream in [stream for stream in self._newest if stream.origin == origin and over(stream)]:
             self._drop(stream)
 
-    def _starts(self, message: Relayed, via: int, now: float, *, heard: bool) -> bool:
+    def _starts(self, message: Relayed, via: int, now: float, made: float, *, heard: bool) -> bool:
         """Look at the table of a robot; returns whether it is that of its start, as far as this is known."""
         origin, boot = message.origin, int.from_bytes(message.payload[:_BOOT_LEN], "big")
         if len(message.payload) <= _BOOT_LEN or boot & 0xFFFF != message.start:
@@ -391,10 +395,12 @@ class Relaying:
         if self._inbox(origin, message.start) is None:
             if known is not None and known.boot > boot and self.reaches(origin, known.boot, now):
                 self._dropped["old_start"] += 1
+                self._neighbours.sent_by_another_start(origin, made, now)
                 return False
             self._forget(origin, Fate.SENDER_RESTARTED)
             self._drop_of(origin, lambda _: True)
             known = self.far[origin] = self._make_inbox(origin, boot)
+            self._neighbours.met_over_others(origin, now)
             self.found(origin, now)
         if known is not None:
             for lost in self._far_rooms.put(origin, via, len(message.payload)):

@@ -36,7 +36,6 @@ class Line:
         self._messages = self._steps = 0
         self.said: list[tuple[int, bytes]] = []
         self.invariant = PacketsEnd(self.robots)
-        self.invariant = PacketsEnd(self.robots)
 
     def near(self, one: int) -> list[int]:
         return [other for other in (one - 1, one + 1) if 0 <= other < len(self.robots)]
@@ -60,8 +59,6 @@ class Line:
             if self._steps % STEPS == 0:
                 for one in self.robots:
                     one.events += one.end.handle_timeout(self.now)
-            if self._steps % STEPS == 0:
-                self.invariant.step()
                 self.invariant.step()
 
     def _leaving(self) -> Iterator[int]:
