@@ -15,9 +15,10 @@ from rich.table import Table
 
 from gr_ros2.cli.params import SCENARIO, set_option
 from gr_ros2.link.fates import ARRIVED, Fate
+from gr_ros2.middleware.bag_files import is_bag
 from gr_ros2.run.scenario import Scenario, load_scenario
 from gr_ros2.study.forecast import Advice, Cut, Effect, Forecast, Planner
-from gr_ros2.study.traffic import is_bag, link_values, of_recording, recorded_graph
+from gr_ros2.study.traffic import link_values, of_recording, recorded_graph
 
 _WIDTH = 110
 _ADVICE = 3

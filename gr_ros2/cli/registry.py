@@ -18,7 +18,7 @@ from rich.table import Table
 
 from gr_ros2.cli.params import Completed, OrAuto
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.core.names import INFRASTRUCTURE, checked_namespace, topic_fault
+from gr_ros2.core.names import INFRASTRUCTURE, checked_namespace, first, topic_fault
 from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.bag_files import bag_contents
@@ -125,7 +125,7 @@ def from_bag(*, bag: Path, namespace: str, topics: str, out: Path | None) -> Non
     Its QoS columns are what the publishers offered when the bag was recorded.
     """
     contents = bag_contents(bag)
-    found = [topic.info for topic in contents.topics.values()]
+    found = [topic.info for topic in contents.some().values()]
     _write(registry_csv(found, namespace, _names(topics), bag), {**contents.left_out, **unfit(found)}, out)
     for line in contents.differences:
         print(line, file=sys.stderr)
@@ -191,7 +191,7 @@ def registry_csv(
         and (name := row.name.removeprefix(prefix)) not in published
     }
     names = [name.lstrip("/").removeprefix(prefix[1:]) for name in wanted] or [*published, *offered]
-    seen = f"published below {prefix} are {', '.join(published) or 'no topics'}"
+    seen = f"published below {prefix} are {', '.join(first(published)) or 'no topics'}"
     for name in names:
         if why := reasons.get(f"{prefix}{name}"):
             raise ConfigError(f"topic {name!r} cannot be registered: {why}")
@@ -234,8 +234,8 @@ def _names(text: str) -> list[str]:
 
 def _write(text: str, left_out: Mapping[str, str], out: Path | None) -> None:
     """Write a registry to its file or to the terminal. Topics that are left out are reported on stderr."""
-    for topic, why in left_out.items():
-        click.echo(f"gr-ros2: {topic} is left out: {why}", err=True)
+    for line in first(f"{topic} is left out: {why}" for topic, why in left_out.items()):
+        click.echo(f"gr-ros2: {line}", err=True)
     if out is None:
         print(text, end="")
         return

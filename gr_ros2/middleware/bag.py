@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.core.names import first
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.adapt import offered
 from gr_ros2.middleware.bag_files import BagContents, BagMessage, bag_contents, bag_definitions, bag_topics, read_bag
@@ -151,7 +152,7 @@ class BagMiddleware(Middleware):
         self._contents.check(topic, type_name)
         topics = self._contents.topics
         if topic not in topics:
-            _log.warning("bag %s: has no topic %s; it has %s", self.path, topic, ", ".join(topics) or "none")
+            _log.warning("bag %s: has no topic %s; it has %s", self.path, topic, ", ".join(first(topics)) or "none")
         subscription = BagSubscription(topic, callback, topics[topic].info.publishers if topic in topics else ())
         with self._starting:
             if self._thread is not None:

@@ -1,21 +1,24 @@
 """The content of a ROS 2 bag, MCAP or sqlite3: a folder with metadata.yaml, or a bare storage file.
 
-Invariants: reading changes nothing, and every fault of a file is a BagError in one line that names the file. The
-content of a bag is taken from its files; metadata.yaml says which files there are, and what was expected in them. A
-topic is given completely, under its absolute name and with one type and definition, or it is left out with the reason;
-messages are counted, and fewer messages than in the file's own index are an error.
+Invariants: reading changes nothing, and every fault of a file is one line that names the file. The content of a bag is
+taken from its files; metadata.yaml says which files there are, and what was expected in them. Neither metadata.yaml,
+nor a file, nor a topic that cannot be read hinders the rest: what is missing is a remark. A BagError says that nothing
+can be read. A topic is given completely, under its absolute name and with one type and definition, or it is left out
+with the reason; messages are counted, and fewer messages than in the file's own index are an error.
 """
 
 from __future__ import annotations
 
 import logging
 import re
+import shutil
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from rosbags.interfaces import (
@@ -29,11 +32,13 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.interfaces import Qos as Profile
-from rosbags.rosbag2 import Reader, metadata
-from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2 import metadata
+from rosbags.rosbag2.reader import zstd  # type: ignore[attr-defined]
 from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.core.guard import one_line
 from gr_ros2.core.names import first
 from gr_ros2.middleware.bag_mcap import McapStorage
 from gr_ros2.middleware.bag_sqlite import SqliteStorage
@@ -44,6 +49,20 @@ from gr_ros2.settings.registry import normalize_type
 
 _CDR = "cdr"
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
+_METADATA = "metadata.yaml"
+_STORAGES: Mapping[bytes, type[McapStorage | SqliteStorage]] = {b"\x89MCAP0": McapStorage, b"SQLite": SqliteStorage}
+"""By how a file begins."""
+_ZSTD = b"\x28\xb5\x2f\xfd"
+_NO_TIME = {"sec": 0, "nsec": 0}
+_PROFILE = {
+    **dict.fromkeys(("history", "reliability", "durability", "liveliness"), "system_default"),
+    **dict.fromkeys(("deadline", "lifespan", "liveliness_lease_duration"), _NO_TIME),
+    "depth": 0,
+    "avoid_ros_namespace_conventions": False,
+}
+"""What a QoS profile says where it says nothing."""
+_UNREADABLE = -1
+"""Depth that stands for a text that is no profile."""
 _MESSAGE_TYPE = re.compile(r"\w+/msg/\w+")
 
 _log = logging.getLogger(__name__)
@@ -83,7 +102,8 @@ class BagContents:
 
     :param topics: by absolute name, in its order
     :param left_out: why a topic is left out, by absolute name
-    :param differences: one line for each topic whose message counts in metadata.yaml and in the files differ
+    :param differences: one line for each topic whose message counts in metadata.yaml and in the files differ, for each
+        file that is missing or incomplete, and for each QoS that cannot be read
     """
 
     path: Path
@@ -102,6 +122,15 @@ class BagContents:
         """The definitions that are ``.msg`` texts, by type name."""
         found = {topic.info.type_name: topic.definition for topic in self.topics.values()}
         return {name: text.data for name, text in found.items() if text.format is MessageDefinitionFormat.MSG}
+
+    def some(self) -> Mapping[str, RecordedTopic]:
+        """The topics, of which there are some.
+
+        :raises ConfigError: there is none
+        """
+        if not self.topics:
+            raise ConfigError("; ".join([f"bag {self.path}: has no topics that a link can carry", *self.remarks]))
+        return self.topics
 
     def check(self, topic: str, type_name: str) -> None:
         """Check that messages of a topic have that type; a topic that is not in the bag passes.
@@ -134,49 +163,152 @@ class _QosTexts(YAML):
     """
 
     def load(self, stream: Any) -> Any:
-        """What a text contains; rosbags does not change it."""
+        """The profiles of a text; rosbags does not change them."""
         return _loaded(stream)
 
 
 @lru_cache(maxsize=256)
-def _loaded(text: str) -> Any:
-    return YAML(typ="safe").load(text)
+def _loaded(text: str) -> list[dict[str, Any]]:
+    try:
+        profiles = YAML(typ="safe").load(text)
+    except YAMLError:
+        profiles = None
+    return [_profile(one) for one in (profiles if isinstance(profiles, list) else [profiles])]
+
+
+def _profile(one: Any) -> dict[str, Any]:
+    """A profile with all that rosbags requires; one with ``_UNREADABLE`` for what is no profile."""
+    return _filled(one, _PROFILE) if isinstance(one, dict) else {**_PROFILE, "depth": _UNREADABLE}
+
+
+def _filled(value: Any, default: dict[str, Any]) -> dict[str, Any]:
+    """What a profile, or a time in it, says; the default for what is missing or of another kind."""
+    filled = {}
+    for key, plain in default.items():
+        said = value.get(key) if isinstance(value, dict) else None
+        fits = isinstance(said, type(plain)) or (isinstance(plain, str) and isinstance(said, int))
+        filled[key] = _filled(said, plain) if isinstance(plain, dict) else said if fits else plain
+    return filled
 
 
 metadata.YAML = _QosTexts  # type: ignore[attr-defined]
 
 
-class _Folder(DirectoryReader):
-    """rosbags' reader of a folder, but without its requirement that the topics equal those of metadata.yaml."""
+class _Bag:
+    """The opened files of a bag.
 
-    STORAGE_PLUGINS = {"mcap": McapStorage, "sqlite3": SqliteStorage}  # noqa: RUF012
+    :param path: folder or file
+    :param stack: closes the files
+    :ivar expected: the topics that metadata.yaml names, and how many messages it counts of each
+    :ivar remarks: what cannot be read, one line each
+    :raises BagError: there is nothing to read
+    """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        self._stack = stack
         self.expected: list[Connection] = []
-        """The topics of metadata.yaml."""
-
-    def open(self) -> None:
-        super().open()
-        self.expected = self.connections
-        self.connections = [connection for storage in self.storages for connection in storage.connections]
-
-
-class _Bag(Reader):
-    """rosbags' reader, with storages that read the content of a file instead of trusting its index or metadata.yaml."""
-
-    STORAGE_PLUGINS = {"dir": _Folder, ".mcap": McapStorage, ".db3": SqliteStorage}  # noqa: RUF012
-
-    @property
-    def files(self) -> Sequence[McapStorage | SqliteStorage]:
-        """The opened files."""
-        files = self.storage.storages if isinstance(self.storage, _Folder) else [self.storage]
-        return [file for file in files if isinstance(file, McapStorage | SqliteStorage)]
+        self.message_count = 0
+        self.remarks: list[str] = []
+        self.files: list[McapStorage | SqliteStorage] = []
+        for file in self._listed(path) if path.is_dir() else [path]:
+            try:
+                self.files.append(self._open(file))
+            except Exception as error:
+                if file == path:
+                    raise
+                self.remarks.append(f"{file.name} cannot be read ({one_line(error)})")
+        if not self.files:
+            raise BagError("; ".join([f"bag {path}: has no .mcap or .db3 file that can be read", *self.remarks]))
+        self.remarks += [f"{Path(str(file.path)).name} {file.broken}" for file in self.files if file.broken]
 
     @property
-    def expected(self) -> list[Connection]:
-        """The topics of metadata.yaml, empty for a bare file."""
-        return self.storage.expected if isinstance(self.storage, _Folder) else []
+    def connections(self) -> list[Connection]:
+        """The topics of the files."""
+        return [connection for file in self.files for connection in file.connections]
+
+    def messages(self, connections: Sequence[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
+        """The messages of topics, each with its stamp in ns."""
+        for file in self.files:
+            if chosen := [connection for connection in connections if connection.owner is file]:
+                for connection, stamp_ns, payload in file.messages(chosen):
+                    # The first byte of CDR is 0.
+                    compressed = payload[: len(_ZSTD)] == _ZSTD
+                    yield connection, stamp_ns, zstd.decompress(payload) if compressed else payload
+
+    def _listed(self, path: Path) -> list[Path]:
+        """The files of a folder: those of metadata.yaml, or all where it cannot be used."""
+        names: list[str] = []
+        try:
+            names = self._described(
+                YAML(typ="safe").load((path / _METADATA).read_text())["rosbag2_bagfile_information"]
+            )
+        except FileNotFoundError:
+            self.remarks.append(f"there is no {_METADATA}, as after a crash: all files of the folder count")
+        except Exception as error:  # noqa: BLE001 - it may contain anything
+            self.remarks.append(f"{_METADATA} cannot be used ({one_line(error)}): all files of the folder count")
+        missing = [name for name in names if not (path / name).exists()]
+        self.remarks += [f"{name} is missing" for name in first(missing)]
+        found = [path / name for name in names if name not in missing]
+        return found or _files(path)
+
+    def _described(self, information: Mapping[str, Any]) -> list[str]:
+        """Take what metadata.yaml expects; returns the names of its files."""
+        expected = [
+            Connection(
+                number,
+                topic["name"],
+                topic["type"],
+                _NO_DEFINITION,
+                topic.get("type_description_hash", ""),
+                row["message_count"],
+                ConnectionExtRosbag2(topic["serialization_format"], _profiles(topic.get("offered_qos_profiles"))),
+                self,
+            )
+            for number, row in enumerate(information["topics_with_message_count"])
+            for topic in [row["topic_metadata"]]
+        ]
+        names = [PurePath(name).name for name in information["relative_file_paths"]]
+        self.expected, self.message_count = expected, information["message_count"]
+        return names
+
+    def _open(self, path: Path) -> McapStorage | SqliteStorage:
+        with path.open("rb") as file:
+            begins = file.read(16)
+        if begins.startswith(_ZSTD):
+            plain = Path(self._stack.enter_context(TemporaryDirectory(prefix="gr-ros2-"))) / path.stem
+            with zstd.open(path, "rb") as packed, plain.open("wb") as unpacked:
+                shutil.copyfileobj(packed, unpacked)
+            return self._open(plain)
+        if begins.startswith(b"#ROSBAG"):
+            raise BagError(
+                f"bag {path}: is of ROS 1; make one of ROS 2 of it: rosbags-convert --src {path} --dst {path.stem}"
+            )
+        for magic, storage in _STORAGES.items():
+            if begins.startswith(magic):
+                opened = storage(path)
+                opened.open()
+                self._stack.callback(opened.close)
+                return opened
+        raise BagError(f"bag {path}: is neither an MCAP nor a sqlite3 file, also not in zstd")
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of a folder that may be of a bag; the tenth comes after the second."""
+    found = [file for file in folder.iterdir() if {".mcap", ".db3"} & {file.suffix, Path(file.stem).suffix}]
+    found = [file for file in found if not file.name.endswith(("-wal", "-shm", "-journal"))]
+    return sorted(found, key=lambda file: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", file.name)])
+
+
+def is_bag(path: Path) -> bool:
+    """Whether this is by its name a recording: a bag folder, or a file of one."""
+    if path.is_dir():
+        return (path / _METADATA).is_file() or bool(_files(path))
+    return path.suffix in (".mcap", ".db3", ".zstd", ".bag")
+
+
+def _profiles(said: Any) -> list[Profile]:
+    """The QoS in metadata.yaml: a text, or since version 9 a list."""
+    return metadata.parse_qos([_profile(one) for one in said] if isinstance(said, list) else said)  # type: ignore[misc]
 
 
 @contextmanager
@@ -184,14 +316,8 @@ def _opened(path: Path) -> Iterator[_Bag]:
     with explained(path, "read"):
         if not path.exists():
             raise BagError(f"bag {path}: there is no such file or folder")
-        if path.is_dir() and not (path / "metadata.yaml").exists():
-            files = sorted(file.name for file in path.iterdir() if file.suffix in _Bag.STORAGE_PLUGINS)
-            raise BagError(
-                f"bag {path}: has no metadata.yaml, as after a crash; name a file of it ({', '.join(files) or 'none'}) "
-                "or have it made by ros2 bag reindex"
-            )
-        with _Bag(path) as bag:
-            yield bag
+        with ExitStack() as stack:
+            yield _Bag(path, stack)
 
 
 def read_bag(path: str | Path, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
@@ -260,6 +386,9 @@ def _contents(path: Path, bag: _Bag) -> BagContents:
                 definitions.setdefault(_kind(connection), (name, connection.msgdef))
     unfit = {name: _unfit(name, named[name], definitions) for name in sorted(named)}
     topics = {name: _recorded(name, named[name], definitions, bag) for name, why in unfit.items() if not why}
+    for name in topics:
+        if any(profile.depth < 0 for c in named[name] for profile in _ext(c).offered_qos_profiles):
+            bag.remarks.append(f"the QoS of {name} cannot be read: reliable, volatile and 10 are taken instead")
     left_out = {name: why for name, why in unfit.items() if why}
     return BagContents(path, topics, left_out, tuple(_differences(path, bag)))
 
@@ -314,6 +443,7 @@ def _recorded(
         [profile for c in file.connections if c.topic == one.topic for profile in _ext(c).offered_qos_profiles]
         for file in bag.files
     ) or [profile for c in connections for profile in _ext(c).offered_qos_profiles]
+    profiles = [profile for profile in profiles if profile.depth >= 0]
     offers = tuple(_offered(profile) for profile in profiles) or (Qos("reliable", "volatile", 10),)
     return RecordedTopic(
         TopicInfo(name, kind, offers),
@@ -338,6 +468,7 @@ def _united(files: Iterable[Sequence[Profile]]) -> list[Profile]:
 
 
 def _differences(path: Path, bag: _Bag) -> Iterator[str]:
+    yield from (f"{path}: {remark}" for remark in bag.remarks)
     found, expected = _counts(bag.connections), _counts(bag.expected)
     if bag.expected:
         for topic in sorted({*found, *expected}):

@@ -1,21 +1,43 @@
-"""MCAP files of ROS 2 bags: written with both times of a message, and read even if the index is incomplete.
+"""MCAP files of ROS 2 bags: written with both times of a message and the hash of its type, and read without an index.
 
 Invariants: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags
-alone writes the first one into both. A message that is missing in the index is read too; a schema in a language that
-ROS does not use is ignored.
+alone writes the first one into both. A message that is missing in the index is read too, and so are all complete
+records of a file that was never closed. A schema in a language that ROS does not use is ignored, and so is the profile.
 """
 
 from __future__ import annotations
 
 import os
+import struct
+from collections.abc import Collection, Generator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.rosbag2.storage_mcap import McapReader, McapWriter, Schema
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.storage_mcap import (
+    ChunkInfo,
+    McapReader,
+    McapWriter,
+    Schema,
+    read_string,
+    write_channel,
+    write_string,
+)
 
 _LANGUAGES = frozenset({"ros2msg", "ros2idl", "omgidl"})
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER = b"\x02" + (20).to_bytes(8, "little")
+_END_LEN = len(_FOOTER) + 20 + len(_MAGIC)
+_RECORD_LEN = 1 + 8
+"""Bytes of a record before its content: opcode, length."""
+_CHUNK = 0x06
+_STAMPS = 1 << 64
+"""Number of stamps."""
+_DIGEST = "topic_type_hash"
+"""Name of the RIHS01 hash of a topic's type, as rosbag2 writes it since Iron."""
 _PUBLISH_TIME_AT = 1 + 8 + 2 + 4 + 8
 """Bytes of a message record before its publish_time: opcode, length, channel, sequence, log_time."""
 
@@ -28,17 +50,95 @@ class _Schemas(dict[int, Schema]):
 
 
 class McapStorage(McapReader):
-    """rosbags' reader, extended to files whose chunks have no message index, which rosbags would skip."""
+    """rosbags' reader, extended to files without an index or without an end, and to stamps before 1970.
+
+    :ivar broken: what is missing at the end of a file whose writer never closed it, '' where nothing is
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self.schemas = _Schemas()
+        self.broken = ""
 
-    def open(self) -> None:
-        """Open and read the index."""
-        super().open()
-        if any(not chunk.message_index_offsets for chunk in self.chunks):
-            self.chunks.clear()  # without a list of chunks rosbags reads the whole file
+    def _open(self) -> None:
+        """Read the index, or the whole file where it has none that lists all messages."""
+        assert self.bio is not None
+        size = self.bio.seek(0, os.SEEK_END)
+        self.bio.seek(max(size - _END_LEN, 0))
+        end = self.bio.read()
+        closed = end.startswith(_FOOTER) and end.endswith(_MAGIC)
+        self.data_start, self.data_end = len(_MAGIC), size - _END_LEN if closed else size
+        summary = int.from_bytes(end[len(_FOOTER) :][:8], "little") if closed else 0
+        if summary:
+            self.data_end = summary
+            self.read_index()
+        if not all(chunk.message_index_offsets for chunk in self.chunks) or not self.statistics:
+            self._find_chunks()
+            if not closed:
+                self.broken = f"has no end, as after a crash: {size - self.data_end} bytes of it cannot be read"
+        if not self.statistics or not self.schemas:
+            self.meta_scan()
+        if self.broken and not self.connections:
+            raise ReaderError(self.broken)
+        assert self.statistics is not None
+        counts = self.statistics.channel_message_counts
+        self.connections = [
+            c._replace(msgcount=counts.get(c.id, 0), digest=_digest(self.channels[c.id].metadata))
+            for c in self.connections
+        ]
+        self.metadata = self.metadata._replace(message_count=self.statistics.message_count)
+        # rosbags reads a chunk only if it counts a message of the topic in it.
+        for chunk in self.chunks:
+            if not chunk.message_index_offsets:
+                chunk.channel_count.update(dict.fromkeys(self.channels, 1))
+
+    def _find_chunks(self) -> None:
+        """List the chunks, and find where the last complete record ends."""
+        assert self.bio is not None
+        self.chunks.clear()
+        at = self.data_start
+        while at + _RECORD_LEN <= self.data_end:
+            self.bio.seek(at)
+            kind, length = struct.unpack("<BQ", self.bio.read(_RECORD_LEN))
+            if not kind or at + _RECORD_LEN + length > self.data_end:
+                break
+            if kind == _CHUNK:
+                first, last, size, _ = struct.unpack("<QQQI", self.bio.read(28))
+                compression = read_string(self.bio)
+                (packed,) = struct.unpack("<Q", self.bio.read(8))
+                self.chunks.append(
+                    ChunkInfo(first, last, at, _RECORD_LEN + length, {}, 0, compression, packed, size, {})
+                )
+            at += _RECORD_LEN + length
+        self.data_end = at
+
+    def messages(
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,  # noqa: ARG002 - a bag is read from its beginning to its end
+        stop: int | None = None,  # noqa: ARG002
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """The messages in the order of their stamps; those of a file without chunks are sorted in memory if needed."""
+        if self.chunks:
+            found = super().messages(connections, 0, _STAMPS)
+        else:
+            found = self.messages_scan(connections, 0, _STAMPS)
+            stamps = [stamp for _, stamp, _ in self.messages_scan(connections, 0, _STAMPS)]
+            if stamps != sorted(stamps):
+                found = (message for message in sorted(found, key=lambda message: message[1]))
+        for connection, stamp, payload in found:
+            # rosbag2 writes its signed stamps as unsigned numbers.
+            yield connection, stamp - _STAMPS if stamp >= _STAMPS >> 1 else stamp, payload
+
+
+def _digest(settings: bytes) -> str:
+    """The RIHS01 hash among the settings of a channel, '' where there is none."""
+    stream = BytesIO(settings)
+    while stream.tell() < len(settings):
+        key, value = read_string(stream), read_string(stream)
+        if key == _DIGEST:
+            return value
+    return ""
 
 
 class TwoTimes(McapWriter):
@@ -49,6 +149,18 @@ class TwoTimes(McapWriter):
         self.sent_ns: int | None = None
         """When the next message was sent, ns since 1970; None = when it was received."""
         self._sent: list[tuple[int, int]] = []
+
+    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
+        """See rosbags; with the hash of the type, as rosbag2 writes it."""
+        at = self.chunk.bio.tell()
+        super().add_connection(connection, offered_qos_profiles)
+        settings = BytesIO(self.channels[-1].metadata)
+        settings.seek(0, os.SEEK_END)
+        write_string(settings, _DIGEST)
+        write_string(settings, connection.digest)
+        self.channels[-1] = self.channels[-1]._replace(metadata=settings.getvalue())
+        self.chunk.bio.seek(at)
+        write_channel(self.chunk.bio, self.channels[-1], self.schemas)
 
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
         sent_ns = timestamp if self.sent_ns is None else self.sent_ns

@@ -26,6 +26,9 @@ _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinition
 class SqliteStorage(Sqlite3Reader):
     """rosbags' reader of messages, on a database opened together with its write-ahead log."""
 
+    broken = ""
+    """What is missing at the end; SQLite leaves out what was not written completely."""
+
     def open(self) -> None:
         """Open and read which topics there are.
 

@@ -17,6 +17,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError
+from gr_ros2.core.names import first
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
@@ -182,7 +183,7 @@ def _read(settings: RaceSettings, path: Path, asked: str) -> tuple[RaceRecording
     found = {name: topic.info.type_name for name, topic in contents.topics.items()}
     topic = next(iter(found), "") if asked == AUTO else f"/{asked.lstrip('/')}"
     if topic not in found or (len(found) > 1 and asked == AUTO):
-        has = "; ".join([", ".join(found) or "it has none", *contents.remarks])
+        has = "; ".join([", ".join(first(found)) or "it has none", *contents.remarks])
         raise ConfigError(f"topic = {asked!r}: name one that {path} has: {has}")
     payloads: list[bytes] = []
     stamps: list[int] = []

@@ -108,6 +108,8 @@ class DeliveredBag:
 def bag_origin_ns(scenario: Scenario, topics: Collection[str]) -> int:
     """ns since 1970 at the run's time 0: the first message of a recording, or the start time of the simulator.
 
+    A recording that begins before 1970, which MCAP has no stamps for, is taken to begin then.
+
     :param topics: absolute names of the topics that count
     :raises ConfigError: when the recording has none of the scenario's topics
     """
@@ -116,4 +118,4 @@ def bag_origin_ns(scenario: Scenario, topics: Collection[str]) -> int:
     first = next(iter(read_bag(scenario.bag_path, topics)), None)
     if first is None:
         raise ConfigError(f"{scenario.bag_path}: has no messages on {', '.join(topics)}")
-    return first.stamp_ns
+    return max(first.stamp_ns, 0)

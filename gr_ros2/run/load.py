@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.names import first
 from gr_ros2.middleware.bag_files import BagContents, bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy, configured
 from gr_ros2.run.robot_settings import sources_of
@@ -91,7 +92,7 @@ def recorded_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
         contents.check(name, registry[topic_id].type_name)
     found = {name: topic_id for name, topic_id in names.items() if name in contents.topics}
     if not found:
-        has = "; ".join([", ".join(contents.topics) or "no topics", *contents.remarks])
+        has = "; ".join([", ".join(first(contents.topics)) or "no topics", *contents.remarks])
         raise ConfigError(f"{contents.path}: has none of {', '.join(names)}; it has {has}")
     return found
 
@@ -123,15 +124,16 @@ def _sim_load(scenario: Scenario, source: SourceConfig, registry: Registry) -> t
 
 def _bag_load(scenario: Scenario, source: SourceConfig, registry: Registry) -> tuple[float, float]:
     assert scenario.bag_path is not None
-    packets, messages, first, last = 0, 0, 0, 0
+    packets, messages = 0, 0
+    begin = last = None
     for message in read_bag(scenario.bag_path, recorded_names(scenario, registry)):
         packets += _packets_alone(len(message.payload), scenario.packet_len, source.wire_format)
         messages += 1
-        first = first or message.stamp_ns
+        begin = message.stamp_ns if begin is None else begin
         last = message.stamp_ns
-        if scenario.duration_s and (last - first) * 1e-9 > scenario.duration_s * (scenario.bag_speed or 1):
+        if scenario.duration_s and (last - begin) * 1e-9 > scenario.duration_s * (scenario.bag_speed or 1):
             break
-    seconds = (last - first) * 1e-9 / (scenario.bag_speed or 1)
+    seconds = ((last or 0) - (begin or 0)) * 1e-9 / (scenario.bag_speed or 1)
     return packets, min(seconds or 1.0, max(messages, 1))
 
 

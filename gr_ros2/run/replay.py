@@ -114,9 +114,7 @@ def _made_for(
             )
         if name not in recorded:
             raise ConfigError(f"topics = {name!r}: {source} has {', '.join(first(recorded)) or 'no topics'}")
-    rows = {name: recorded[name].info.type_name for name in topics or recorded}
-    if not rows:
-        raise ConfigError("; ".join([f"{source}: has no topics that a link can carry", *contents.remarks]))
+    rows = {name: recorded[name].info.type_name for name in topics or contents.some()}
     most = scenario.ros_source.wire_format.max_topics
     if len(rows) > most:
         raise ConfigError(

@@ -5,6 +5,7 @@ Invariant: nothing is sent. A recording of the graph lies in a temporary folder 
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -14,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.names import first
 from gr_ros2.middleware import Middleware, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents
@@ -24,9 +26,9 @@ from gr_ros2.settings.files import find_registry, read_settings, settled
 from gr_ros2.settings.registry import Registry
 from gr_ros2.settings.topic_choice import TopicChoice
 
+_log = logging.getLogger(__name__)
 _LOOK_S = 2.0
 """s for which the graph is asked what there is: discovery does not say when it is complete."""
-_BAGS = (".mcap", ".db3")
 _DEFAULT = {
     "name": "link",
     "registry": "",
@@ -34,11 +36,6 @@ _DEFAULT = {
     "phy": {"name": "psk", "sample_rate": 1e6},
     "front_end": {"name": "sim"},
 }
-
-
-def is_bag(path: Path) -> bool:
-    """Whether this is a recording: a bag folder, or a file of one."""
-    return path.suffix in _BAGS or (path / "metadata.yaml").is_file()
 
 
 def link_values(path: Path | None, overrides: Sequence[str]) -> dict[str, Any] | None:
@@ -64,16 +61,18 @@ def of_recording(values: Mapping[str, Any], bag: Path, duration_s: float | None)
     :raises BagError: when it cannot be read
     """
     link, contents = link_from(values), bag_contents(bag)
+    for line in contents.remarks:
+        _log.warning(line)
     chosen: list[str] = []
     known = {item.name for item in fields(Scenario)}
     settings = {key: value for key, value in values.items() if key in known}
     if not link.registry:
         choice = TopicChoice(link.ros_source.topics, link.ros_source.namespace)
         chosen = [name for name in contents.topics if choice.row_name(name) is not None]
-        if not chosen:
+        if contents.topics and not chosen:
             raise ConfigError(
                 f"{bag}: has nothing of {choice.everything or ', '.join(link.ros_source.topics) or 'no topics'}; "
-                f"it has {', '.join(contents.topics)}; set ros_source.namespace or ros_source.topics"
+                f"it has {', '.join(first(contents.topics))}; set ros_source.namespace or ros_source.topics"
             )
         settings["registry"] = find_registry("odom", Path())  # replaced by that of the recording
         settings["ros_source"] = {**values.get("ros_source", {}), "topics": []}

@@ -10,12 +10,16 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2.reader import zstd  # type: ignore[attr-defined]
+
 from gr_ros2.cli.main import BAD_INPUT, run
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.sim.fleet import Fleet
 from gr_ros2.sim.publisher import SimPublisher
 from gr_ros2.sim.sim_settings import SimSettings
 from tests.domains import free_domains
+from tests.middleware.foreign_bags import Foreign, unclosed
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -112,6 +116,21 @@ def test_a_bag_alone_or_over_a_link_is_planned(tmp_path: Path, capsys: pytest.Ca
     assert "which ones? --bag FILE or --graph" in capsys.readouterr().err
     assert run(["plan", "demo", "--graph"]) == BAD_INPUT
     assert "has no front_end, so it is no link" in capsys.readouterr().err
+
+
+def test_recordings_as_others_leave_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "one.bag").write_bytes(b"#ROSBAG V2.0\n\xb3")
+    with Writer(tmp_path / "empty", version=8, storage_plugin=StoragePlugin.MCAP):
+        pass
+    for name, says in (("one.bag", "is of ROS 1; make one of ROS 2"), ("empty", "has no topics that a link can carry")):
+        assert run(["plan", str(tmp_path / name)]) == BAD_INPUT
+        assert f"gr-ros2: bag {tmp_path / name}: {says}" in capsys.readouterr().err
+    (tmp_path / "killed").mkdir()
+    packed = tmp_path / "killed" / "in.mcap.zstd"
+    packed.write_bytes(zstd.compress(unclosed(tmp_path / "in.mcap", [Foreign("/a")]).read_bytes()))
+    for path in (packed, packed.parent):
+        assert run(["plan", str(path), "--no-advice"]) == 0
+        assert re.search(r"^ /a ", capsys.readouterr().out, re.MULTILINE)
 
 
 def test_what_is_on_the_graph_now_is_planned(

@@ -17,6 +17,7 @@ from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.settings.service_rows import rows_of
 from tests.domains import domain
+from tests.middleware.foreign_bags import Foreign, make_mcap
 from tests.waiting import wait_for
 
 LATCHED = Qos("reliable", "transient_local")
@@ -226,3 +227,15 @@ def test_a_bag_that_gives_no_registry(tmp_path: Path, capsys: pytest.CaptureFixt
     ):
         assert run(["registry", "from-bag", *arguments]) == 2
         assert says in capsys.readouterr().err
+
+
+def test_a_bag_of_many_topics_is_told_in_a_few_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    topics = [Foreign(f"/t{number}", count=1) for number in range(1000)]
+    topics += [Foreign(f"/s{number}", SERVICE.type_name, count=1) for number in range(1000)]
+    bag = str(make_mcap(tmp_path / "in.mcap", topics))
+    for arguments in ([], ["--topics", "odom"]):
+        assert run(["registry", "from-bag", bag, *arguments]) == 2
+        said = capsys.readouterr().err
+        assert "and 990 more" in said and len(said) < 1000
+    assert run(["registry", "from-bag", bag, "--topics", "t1"]) == 0
+    assert len(capsys.readouterr().err.splitlines()) == 11

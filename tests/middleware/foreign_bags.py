@@ -185,8 +185,34 @@ def make_mcap(
     return path
 
 
+def unclosed(
+    path: Path, topics: Sequence[Foreign], *, chunked: bool = True, tail: bytes = b"", profile: str = "ros2"
+) -> Path:
+    """A file whose writer was killed: definitions and chunks of one message, the newest first, and no end.
+
+    :param chunked: False = the messages stand in no chunk, as rosbag2's profile ``fastwrite`` writes them
+    :param tail: what the writer had begun to write
+    """
+    file = bytearray(b"\x89MCAP0\r\n") + _record(0x01, _text(profile) + _text("by hand"))
+    for place, topic in enumerate(topics, 1):
+        file += _schema(place, topic) + _channel(place, topic, False)
+    for place, stamp, payload in reversed(in_order(topics)):
+        record = _record(0x05, struct.pack("<HIQQ", place, 0, stamp, stamp) + payload)
+        size = struct.pack("<Q", len(record))
+        chunk = struct.pack("<QQ", stamp, stamp) + size + bytes(4) + _text("") + size + record
+        file += _record(0x06, chunk) if chunked else record
+    path.write_bytes(file + tail)
+    return path
+
+
 def make_folder(
-    path: Path, files: Sequence[Path], topics: Sequence[Foreign], message_count: int | None = None, version: int = 4
+    path: Path,
+    files: Sequence[Path],
+    topics: Sequence[Foreign],
+    *,
+    message_count: int | None = None,
+    version: int = 4,
+    storage: str | None = None,
 ) -> Path:
     """A bag folder: the files moved into it beside a metadata.yaml that claims ``topics``."""
     path.mkdir()
@@ -196,7 +222,7 @@ def make_folder(
     claimed = sum(topic.count for topic in topics) if message_count is None else message_count
     information = {
         "version": version,
-        "storage_identifier": "mcap" if files[0].suffix == ".mcap" else "sqlite3",
+        "storage_identifier": {".mcap": "mcap"}.get(files[0].suffix, "sqlite3") if storage is None else storage,
         "relative_file_paths": [file.name for file in files],
         "duration": {"nanoseconds": 10**9},
         "starting_time": {"nanoseconds_since_epoch": START_NS},

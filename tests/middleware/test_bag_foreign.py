@@ -8,12 +8,17 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+import yaml
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from gr_ros2.core.errors import BagError, ConfigError
-from gr_ros2.middleware import Qos
+from gr_ros2.middleware import Qos, TopicInfo
 from gr_ros2.middleware.bag import BagMiddleware
-from gr_ros2.middleware.bag_files import bag_contents, bag_topics, read_bag
+from gr_ros2.middleware.bag_files import RecordedTopic, bag_contents, bag_topics, read_bag
+from gr_ros2.middleware.bag_recorder import BagRecorder
 from gr_ros2.middleware.type_definitions import definition, same_type, text_hash
+from tests.middleware import foreign_bags
 from tests.middleware.foreign_bags import (
     Foreign,
     broken_off,
@@ -24,6 +29,8 @@ from tests.middleware.foreign_bags import (
     make_sqlite,
     profile,
     qos,
+    unclosed,
+    without_qos,
 )
 from tests.waiting import wait_for
 
@@ -83,10 +90,162 @@ def test_a_bag_whose_topics_stand_in_the_log_alone(tmp_path: Path) -> None:
     assert counts(tmp_path / "in.db3") == {"/a": 10}
 
 
-def test_a_folder_without_metadata_names_its_files(tmp_path: Path) -> None:
-    crashed(tmp_path / "in.db3", [Foreign("/a")], [Foreign("/a")])
-    with pytest.raises(BagError, match=r"has no metadata\.yaml, .* \(in\.db3\)"):
-        counts(tmp_path)
+def test_a_folder_without_metadata_is_read(tmp_path: Path) -> None:
+    late = Foreign("/a", count=5, start=10)
+    make_sqlite(tmp_path / "in_9.db3", [Foreign("/a")])
+    crashed(tmp_path / "in_10.db3", [late], [late])  # the tenth comes after the second
+    assert [one.payload for one in read_bag(tmp_path)] == Foreign("/a").payloads + sorted(late.payloads * 2)
+    assert ["there is no metadata.yaml" in line for line in bag_contents(tmp_path).remarks] == [True]
+
+
+@pytest.mark.parametrize("storage", ["", "my_storage"])
+def test_what_metadata_calls_the_storage_does_not_matter(tmp_path: Path, storage: str) -> None:
+    path = make_folder(
+        tmp_path / "in", [make_mcap(tmp_path / "a.mcap", [Foreign("/a")])], [Foreign("/a")], storage=storage
+    )
+    assert counts(path) == {"/a": 10} and not bag_contents(path).remarks
+
+
+@pytest.mark.parametrize(
+    "text", ["rosbag2_bagfile_information: [1, 2", "a: 1", "rosbag2_bagfile_information: {version: 4}"]
+)
+def test_metadata_that_cannot_be_used_is_a_remark(tmp_path: Path, text: str) -> None:
+    path = make_folder(tmp_path / "in", [make_mcap(tmp_path / "a.mcap", [Foreign("/a")])], [Foreign("/a")])
+    (path / "metadata.yaml").write_text(text)
+    assert counts(path) == {"/a": 10}
+    assert len(bag_contents(path).remarks) == 1 and "metadata.yaml cannot be used" in bag_contents(path).remarks[0]
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "foreign"])
+def test_a_file_that_cannot_be_read_is_a_remark(tmp_path: Path, damage: str) -> None:
+    names = ["a_0.mcap", "a_1.mcap", "a_2.mcap"]
+    files = [make_mcap(tmp_path / name, [Foreign("/a", start=10 * n)]) for n, name in enumerate(names)]
+    path = make_folder(tmp_path / "in", files, [Foreign("/a", count=30)])
+    if damage == "missing":
+        (path / names[1]).unlink()
+    else:
+        (path / names[1]).write_bytes(b"" if damage == "empty" else b"text" * 99)
+    assert counts(path) == {"/a": 20}
+    said, differs = bag_contents(path).remarks
+    assert names[1] in said and "counts 30 messages of /a, the files have 20" in differs
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("folder", [True, False])
+@pytest.mark.parametrize("tail", [b"", b"\x05", b"\x06" + (2000).to_bytes(8, "little") + b"abc", bytes(5000)])
+def test_a_recorder_that_was_killed(tmp_path: Path, chunked: bool, folder: bool, tail: bytes) -> None:
+    topics = [Foreign("/a", count=30), Foreign("/b", count=7)]
+    path = unclosed(tmp_path / "in_0.mcap", topics, chunked=chunked, tail=tail)
+    read = list(read_bag(tmp_path if folder else path))
+    assert counts(path) == {"/a": 30, "/b": 7}
+    assert [one.payload for one in read if one.topic == "/a"] == topics[0].payloads
+    assert [one.stamp_ns for one in read] == sorted(one.stamp_ns for one in read)
+    (said,) = bag_contents(path).remarks
+    assert said.endswith(f"in_0.mcap has no end, as after a crash: {len(tail)} bytes of it cannot be read")
+
+
+def test_a_recorder_that_was_killed_before_it_wrote_a_message(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match=r"in\.mcap: cannot be read \(has no end, as after a crash"):
+        counts(unclosed(tmp_path / "in.mcap", []))
+
+
+def test_the_profile_of_a_file_does_not_matter(tmp_path: Path) -> None:
+    assert counts(unclosed(tmp_path / "in.mcap", [Foreign("/a")], profile="")) == {"/a": 10}
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap", "yaml", "yaml list"])
+def test_a_qos_that_lacks_something_hinders_nothing(tmp_path: Path, kind: str) -> None:
+    short = "- reliability: best_effort\n  durability: transient_local\n  history: keep_last\n  depth: 100\n"
+    topics = [
+        Foreign("/a"),
+        Foreign("/b", qos=short),
+        Foreign("/c", qos="- {depth: [1], deadline: {sec: x}, history: 2.5}"),
+    ]
+    if "yaml" in kind:
+        path = make_folder(tmp_path / "in", [make_mcap(tmp_path / "a.mcap", without_qos(topics))], topics)
+        if "list" in kind:
+            metadata = yaml.safe_load((path / "metadata.yaml").read_text())
+            for row in metadata["rosbag2_bagfile_information"]["topics_with_message_count"]:
+                row["topic_metadata"]["offered_qos_profiles"] = yaml.safe_load(
+                    row["topic_metadata"]["offered_qos_profiles"]
+                )
+            (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    else:
+        path = make_sqlite(tmp_path / "a.db3", topics) if kind == "sqlite3" else make_mcap(tmp_path / "a.mcap", topics)
+    assert counts(path) == {"/a": 10, "/b": 10, "/c": 10}
+    plain = Qos("reliable", "volatile", 10)
+    assert [info.publishers[0] for info in bag_topics(path)] == [
+        plain,
+        Qos("best_effort", "transient_local", 100),
+        plain,
+    ]
+    assert not bag_contents(path).remarks
+
+
+@pytest.mark.parametrize("text", ["[", "reliable", "- [1, 2]", "- {depth: -3}"])
+def test_a_qos_that_cannot_be_read_is_a_remark(tmp_path: Path, text: str) -> None:
+    path = make_sqlite(tmp_path / "a.db3", [Foreign("/a"), Foreign("/b", qos=text)])
+    assert counts(path) == {"/a": 10, "/b": 10}
+    assert bag_contents(path).remarks == [
+        f"{path}: the QoS of /b cannot be read: reliable, volatile and 10 are taken instead"
+    ]
+    assert bag_contents(path).topics["/b"].info.publishers == (Qos("reliable", "volatile", 10),)
+
+
+def test_stamps_before_1970(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foreign_bags, "START_NS", -(10**9))
+    database = make_sqlite(tmp_path / "in.db3", [Foreign("/a", count=30)])
+    stamps = [one.stamp_ns for one in read_bag(database)]
+    assert stamps[0] < -(10**8) and len(stamps) == 30 and stamps == sorted(stamps)
+    rows = foreign_bags.in_order([Foreign("/a", count=30)])
+    monkeypatch.setattr(
+        foreign_bags, "in_order", lambda _: [(place, stamp % 2**64, data) for place, stamp, data in rows]
+    )
+    for file in (
+        make_mcap(tmp_path / "in.mcap", [Foreign("/a", count=30)]),
+        unclosed(tmp_path / "k.mcap", [Foreign("/a")]),
+    ):
+        assert [one.stamp_ns for one in read_bag(file)] == stamps
+
+
+def test_a_bare_file_has_the_hashes_of_its_types(tmp_path: Path) -> None:
+    digest = "RIHS01_" + "ab" * 32
+    text = MessageDefinition(MessageDefinitionFormat.MSG, "int32 data\n")
+    info = TopicInfo("/a", "my_msgs/msg/X", (Qos(),))
+    recorder = BagRecorder(tmp_path / "in", "mcap", {}, lambda *_: None)
+    recorder.write(recorder.copy(RecordedTopic(info, "/a", text, digest, ())), 1, b"\0\1\0\0\1\0\0\0")
+    recorder.close()
+    (file,) = (tmp_path / "in").glob("*.mcap")
+    assert bag_contents(tmp_path / "in").topics["/a"].digest == digest
+    assert bag_contents(shutil.copy(file, tmp_path / "bare.mcap")).topics["/a"].digest == digest
+    with Reader(tmp_path / "in") as reader:
+        assert [bytes(data) for _, _, data in reader.messages()] == [b"\0\1\0\0\1\0\0\0"]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_compressed_bags_with_and_without_metadata(tmp_path: Path, storage: str, mode: CompressionMode) -> None:
+    writer = Writer(tmp_path / "in", version=8, storage_plugin=StoragePlugin[storage.upper()])
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        channel = writer.add_connection(
+            "/a", "std_msgs/msg/String", msgdef="string data\n", rihs01="RIHS01_" + "0" * 64
+        )
+        for number, payload in enumerate(Foreign("/a").payloads):
+            writer.write(channel, number, payload)
+    (file,) = [file for file in (tmp_path / "in").iterdir() if file.suffix != ".yaml"]
+    for path in (tmp_path / "in", file):
+        assert [one.payload for one in read_bag(path)] == Foreign("/a").payloads
+    (tmp_path / "in" / "metadata.yaml").unlink()
+    assert [one.payload for one in read_bag(tmp_path / "in")] == Foreign("/a").payloads
+
+
+def test_a_bag_of_ros_1_is_told_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "in.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(99))
+    with pytest.raises(
+        BagError, match=r"is of ROS 1; make one of ROS 2 of it: rosbags-convert --src .*in\.bag --dst in$"
+    ):
+        counts(tmp_path / "in.bag")
 
 
 def test_an_empty_file_beside_a_log_is_refused_and_the_log_stays(tmp_path: Path) -> None:

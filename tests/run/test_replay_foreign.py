@@ -23,6 +23,7 @@ from gr_ros2.middleware.type_definitions import UNKNOWN, definition
 from gr_ros2.run.replay import Replayed, replay
 from gr_ros2.run.runner import run_scenario
 from gr_ros2.run.scenario import load_scenario
+from tests.middleware import foreign_bags
 from tests.middleware.foreign_bags import (
     Foreign,
     crashed,
@@ -144,6 +145,17 @@ def test_no_topic_is_lost_to_a_qos_that_stands_twice(tmp_path: Path, storage: st
     assert counts(tmp_path / "out") == {"/scan": 357, "/odom": 20}
     expected = [profile(history=3, depth=0)]
     assert recorded_profiles(tmp_path / "out") == {"/odom": expected, "/scan": expected}
+
+
+@pytest.mark.parametrize("name", ["out", "out.mcap", "out.db3"])
+def test_a_recording_from_before_1970_begins_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(foreign_bags, "START_NS", -(10**18))
+    source = make_sqlite(tmp_path / "in.db3", [Foreign("/a", count=20)])
+    run(source, tmp_path / name)
+    sent, received = list(read_bag(source)), list(read_bag(tmp_path / name))
+    assert [one.payload for one in received] == [one.payload for one in sent]
+    assert received[0].stamp_ns >= 0
+    assert received[-1].stamp_ns - received[0].stamp_ns == pytest.approx(sent[-1].stamp_ns - sent[0].stamp_ns, abs=1e6)
 
 
 def test_counts_that_differ_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
