@@ -60,7 +60,7 @@ def test_what_needs_none_works(tmp_path: Path) -> None:
 def test_what_needs_it_says_so_in_one_line(tmp_path: Path) -> None:
     said = {
         ("demo", "--out", "run"): "phy 'ofdm' needs GNU Radio 3.10 (apt install gnuradio)",
-        ("race", "--help"): "this needs GNU Radio 3.10",
+        ("race", "--short"): "this needs GNU Radio 3.10",
         ("plan", "demo"): "phy 'ofdm' needs GNU Radio 3.10 (apt install gnuradio)",
         ("link", "--robot", "1", "--radio", "udp", "--listen", "0", "--peer", "127.0.0.1:9"): "GNU Radio 3.10",
     }
