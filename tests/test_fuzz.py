@@ -32,6 +32,7 @@ import fuzz.framing
 import fuzz.kernels
 import fuzz.medium
 import fuzz.pings
+import fuzz.sigmf
 import fuzz.wifi
 
 ROOT = Path(__file__).parents[1]
@@ -51,6 +52,7 @@ HARNESSES = {
     "kernels": (fuzz.kernels.kernels, fuzz.kernels.corpus),
     "medium": (fuzz.medium.medium, fuzz.medium.corpus),
     "pings": (fuzz.pings.pings, fuzz.pings.corpus),
+    "sigmf": (fuzz.sigmf.sigmf, fuzz.sigmf.corpus),
     "wifi": (fuzz.wifi.wifi, fuzz.wifi.corpus),
 }
 COUNTS = {
@@ -70,6 +72,7 @@ COUNTS = {
     "kernels": 300,
     "medium": 500,
     "pings": 200,
+    "sigmf": 2_000,
     "wifi": 200,
 }
 """Inputs of a short run; `python -m fuzz.NAME` goes on for as long as it is let."""

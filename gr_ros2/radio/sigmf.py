@@ -33,6 +33,9 @@ VERSION = "1.0.0"
 META, DATA = ".sigmf-meta", ".sigmf-data"
 SAMPLE = np.dtype("<c8")
 _DATATYPE = "cf32_le"
+_BESIDE_SAMPLES = {"core:dataset", "core:metadata_only", "core:header_bytes", "core:trailing_bytes"}
+"""What says that the samples are not all of the data file, or that there is none."""
+_MOST_HZ = 1e15
 _MOST_ANNOTATIONS = 100_000
 """Largest number of annotated bursts. Bursts beyond it are recorded without annotation."""
 _MOST_GAPS = 10_000
@@ -101,27 +104,60 @@ def base_path(path: Path) -> Path:
 def read_recording(path: Path) -> tuple[SigmfRecording, NDArray[np.complex64]]:
     """Read a recording. Its samples stay in the file until they are used.
 
-    :raises ConfigError: when the recording does not exist, is not SigMF, or has a datatype other than cf32_le; the
-        message names it
+    :raises ConfigError: when the recording does not exist, is not SigMF, or its data are other than cf32_le samples of
+        one channel alone; the message names it
     """
     base = base_path(path)
     meta, data = Path(f"{base}{META}"), Path(f"{base}{DATA}")
     try:
-        whole = json.loads(meta.read_text(encoding="utf-8"))
-        about, captures = whole["global"], whole["captures"]
-        datatype, sample_rate = about["core:datatype"], float(about["core:sample_rate"])
-        size = data.stat().st_size
+        text, size = meta.read_bytes(), data.stat().st_size
     except OSError as error:
         raise ConfigError(f"recording {error.filename}: {error.strerror}; it takes {META} and {DATA}") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ConfigError(f"recording {meta}: no SigMF metadata with datatype and sample rate ({error!r})") from error
-    if datatype != _DATATYPE or about.get("core:num_channels", 1) != 1:
-        raise ConfigError(f"recording {meta}: datatype {datatype!r}; only {_DATATYPE} of one channel can be replayed")
-    frequency = captures[0].get("core:frequency") if captures else None
+    try:
+        about = read_metadata(text)
+    except ValueError as error:
+        raise ConfigError(f"recording {meta}: {error}") from error
     # An empty file cannot be mapped; an incomplete last sample is left out.
     count = size // SAMPLE.itemsize
     samples = np.memmap(data, SAMPLE, "r", shape=(count,)) if count else np.empty(0, SAMPLE)
-    return SigmfRecording(sample_rate, frequency, str(about.get("core:description", ""))), samples
+    return about, samples
+
+
+def read_metadata(text: bytes) -> SigmfRecording:
+    """What the metadata of a recording say.
+
+    :raises ValueError: they are not SigMF, or data that they describe cannot be replayed; with thing, value and remedy
+    """
+    try:
+        whole = json.loads(text)
+        about, captures = whole["global"], whole["captures"]
+        if not isinstance(about, dict) or not all(isinstance(capture, dict) for capture in captures):
+            raise TypeError("global is no object, or captures are no list of objects")
+        datatype, sample_rate = about["core:datatype"], about["core:sample_rate"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"no SigMF metadata with datatype, sample rate and captures ({one_line(error)})") from error
+    if datatype != _DATATYPE or about.get("core:num_channels", 1) != 1:
+        channels = about.get("core:num_channels", 1)
+        raise ValueError(
+            f"datatype {datatype!r:.80}, channels {channels!r:.80}; only {_DATATYPE} of one channel can be replayed"
+        )
+    for part in (about, *captures):
+        for key in _BESIDE_SAMPLES & part.keys():
+            if part[key]:
+                raise ValueError(
+                    f"{key} = {part[key]!r:.80}: the samples do not fill {DATA} alone; write them, and nothing else, "
+                    f"to a recording without {key}"
+                )
+    _check_hz("core:sample_rate", sample_rate, above=0)
+    frequency = captures[0].get("core:frequency") if captures else None
+    if frequency is not None:
+        _check_hz("core:frequency", frequency, above=-_MOST_HZ)
+    return SigmfRecording(float(sample_rate), frequency, str(about.get("core:description", "")))
+
+
+def _check_hz(key: str, value: Any, above: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not above < value <= _MOST_HZ:
+        raise ValueError(f"{key} = {value!r:.80}: set a number in Hz, above {above:g} and up to {_MOST_HZ:g}")
 
 
 class SigmfRecorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]

@@ -179,6 +179,48 @@ def test_samples_that_are_no_numbers_are_zeros_and_counted(tmp_path: Path) -> No
         assert robot.counters()["not_finite"] == len(bad)
 
 
+RECORDED = {"core:datatype": "cf32_le", "core:sample_rate": 1e6, "core:version": "1.0.0"}
+
+
+@pytest.mark.parametrize(
+    ("about", "captures", "says"),
+    [
+        ({}, ["x"], "captures are no list of objects"),
+        ({}, {"a": 1}, "captures are no list of objects"),
+        ({}, 3, "no SigMF metadata"),
+        ({}, [{}, {"core:header_bytes": 80}], "core:header_bytes = 80: .* without core:header_bytes"),
+        ({"core:trailing_bytes": 3}, [], "core:trailing_bytes = 3: .* without core:trailing_bytes"),
+        ({"core:dataset": "other.bin"}, [], "core:dataset = 'other.bin': .* without core:dataset"),
+        ({"core:metadata_only": True}, [], "core:metadata_only = True"),
+        ({"core:sample_rate": float("nan")}, [], "core:sample_rate = nan: set a number in Hz"),
+        ({"core:sample_rate": 0}, [], "core:sample_rate = 0: set a number in Hz"),
+        ({"core:sample_rate": "1e6"}, [], "core:sample_rate = '1e6': set a number in Hz"),
+        ({"core:sample_rate": None}, [], "core:sample_rate = None: set a number in Hz"),
+        ({}, [{"core:frequency": "100 MHz"}], "core:frequency = '100 MHz': set a number in Hz"),
+        ({}, [{"core:frequency": float("inf")}], "core:frequency = inf: set a number in Hz"),
+        ({"core:num_channels": 2}, [], "datatype 'cf32_le', channels 2; only cf32_le of one channel"),
+    ],
+)
+def test_metadata_that_cannot_be_honoured_are_refused_in_one_line(
+    tmp_path: Path, about: dict[str, Any], captures: Any, says: str
+) -> None:
+    whole = {"global": RECORDED | about, "captures": captures, "annotations": []}
+    (tmp_path / "in.sigmf-meta").write_text(json.dumps(whole))
+    (tmp_path / "in.sigmf-data").write_bytes(bytes(800))
+    with pytest.raises(ConfigError, match=rf"^recording .*in\.sigmf-meta: .*{says}") as caught:
+        read_recording(tmp_path / "in")
+    assert "\n" not in str(caught.value)
+
+
+def test_metadata_of_others_that_can_be_honoured(tmp_path: Path) -> None:
+    captures = [{"core:sample_start": 0, "core:header_bytes": 0, "core:frequency": 433000000}, {"core:sample_start": 9}]
+    whole = {"global": RECORDED | {"core:sample_rate": 1000000, "core:trailing_bytes": 0}, "captures": captures}
+    (tmp_path / "in.sigmf-meta").write_text(json.dumps(whole))
+    (tmp_path / "in.sigmf-data").write_bytes(bytes(800))
+    about, samples = read_recording(tmp_path / "in")
+    assert (about.sample_rate, about.frequency, len(samples)) == (1e6, 433e6, 100)
+
+
 def test_an_empty_recording_ends_at_once(tmp_path: Path) -> None:
     SigmfRecorder(tmp_path / "empty", SigmfRecording(RATE)).close()
     with Robot(2, {"name": "file", "read": str(tmp_path / "empty")}) as robot:
