@@ -64,6 +64,7 @@ class Subscriptions:
         static = [topic for topic in registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
+        self._shared_said: set[str] = set()
         self._moved: dict[int, int] = {}
         """Topic ids under which messages leave now, by those that were subscribed, where ``to`` has changed."""
         chosen = registry.chosen(config.topics) if registry else []
@@ -273,6 +274,18 @@ class Subscriptions:
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
             self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
+        shared = all(offer.durability == "transient_local" for offer in offers) and topic.topic_id not in self._static
+        kept = 1 if topic.options.depth == AUTO else max(topic.options.depth, 1)
+        if shared and len(offers) > kept and topic.name not in self._shared_said:
+            self._shared_said.add(topic.name)
+            self._log.warning(
+                "topic %s: %d publishers keep messages for late subscribers, and a robot that joins late gets the "
+                "newest %d of all; set ros_source.topic_options.%s.depth to the number of publishers",
+                topic.name,
+                len(offers),
+                kept,
+                topic.name,
+            )
 
     def _take(self, topic_id: int, payload: bytes) -> None:
         """Accept a message of the ROS graph, in a thread of the middleware."""
