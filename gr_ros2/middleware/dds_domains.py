@@ -7,6 +7,7 @@ its settings. Source of the meaning of the discovery ranges: rmw_cyclonedds and 
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 from collections.abc import Mapping
@@ -17,6 +18,8 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import cdr_dds
 from gr_ros2.middleware.ros_graph import DiscoveryOptions
 
+_log = logging.getLogger(__name__)
+_LAST_PORT = 65535
 _LOOPBACK = '<NetworkInterface address="127.0.0.1"/>'
 _UNICAST_ONLY = '<NetworkInterface autodetermine="true" multicast="false" priority="3"/>'
 """Cyclone DDS looks for peers through the interface of the highest priority only; the loopback interface has 2."""
@@ -38,13 +41,22 @@ read these objects, asks for them and answers with what it has; then other nodes
 do not match any more (``invalid type object``, ``Inconsistent TypeObject``). Opaque topics need no type information."""
 
 
-def configuration(options: DiscoveryOptions, environment: Mapping[str, str] = os.environ) -> str:
-    """The XML of a domain, followed by CYCLONEDDS_URI, which therefore takes precedence."""
-    content = _COMPATIBILITY + ("" if options.range == "SYSTEM_DEFAULT" else _discovery(options))
+def participants_of(domain_id: int) -> int:
+    """Participants on one machine that a domain has ports for, and that are asked for: 100, and fewer in the last
+    domain, whose ports would exceed 16 bits (RTPS 2.5, section 9.6.2.3)."""
+    return min(100, (_LAST_PORT - 7400 - 250 * domain_id - 11) // 2 + 1)
+
+
+def configuration(options: DiscoveryOptions, participants: int, environment: Mapping[str, str] = os.environ) -> str:
+    """The XML of a domain, followed by CYCLONEDDS_URI, which therefore takes precedence.
+
+    :param participants: most of one machine
+    """
+    content = _COMPATIBILITY + ("" if options.range == "SYSTEM_DEFAULT" else _discovery(options, participants))
     return f'<CycloneDDS><Domain Id="any">{content}</Domain></CycloneDDS>,{environment.get("CYCLONEDDS_URI", "")}'
 
 
-def _discovery(options: DiscoveryOptions) -> str:
+def _discovery(options: DiscoveryOptions, participants: int) -> str:
     peers = "".join(f"<Peer Address={quoteattr(peer)} {_NEVER_FORGET}/>" for peer in options.peers)
     interval = _ASK_AGAIN if peers else ""
     if options.range == "OFF":
@@ -61,7 +73,8 @@ def _discovery(options: DiscoveryOptions) -> str:
         general = "<AllowMulticast>spdp</AllowMulticast>"
         discovery = "<ParticipantIndex>auto</ParticipantIndex>"  # sets the ports at which peers look for us
         interval, peers = _ASK_AGAIN, f"{_NODES_ON_LOCALHOST}{peers}"
-    discovery += f"{interval}<Peers>{peers}</Peers>"
+    most = f"<MaxAutoParticipantIndex>{participants - 1}</MaxAutoParticipantIndex>"
+    discovery += f"{most}{interval}<Peers>{peers}</Peers>"
     return f"<General>{general}</General><Discovery>{discovery}</Discovery>"
 
 
@@ -115,7 +128,15 @@ class DomainPool:
                 f"domain {domain_id}: other code of this process has it open; "
                 f"{options} needs it opened here first, or another domain"
             )
-        entity = None if others else cdr_dds.create_domain(domain_id, configuration(options))
+        participants = participants_of(domain_id)
+        if participants < participants_of(0):
+            _log.warning(
+                "domain %d: its ports end after %d participants of a machine, and further ones find nobody; set "
+                "ROS_DOMAIN_ID or domain_id to a lower one",
+                domain_id,
+                participants,
+            )
+        entity = None if others else cdr_dds.create_domain(domain_id, configuration(options, participants))
         return _Domain(options, entity)
 
     def _close_unused(self, domain_id: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import select
 import shutil
 import signal
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -435,7 +437,7 @@ RANGE, PEERS, URI = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "CYCLON
 @pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT"])
 def test_type_objects_of_fast_dds_are_left_alone(reach: str) -> None:
     options = ros_graph.discovery_options("auto", {RANGE: reach})
-    assert "<IgnoreTypeInformation>1.15</IgnoreTypeInformation>" in configuration(options, {})
+    assert "<IgnoreTypeInformation>1.15</IgnoreTypeInformation>" in configuration(options, 100, {})
 
 
 OTHER_DEVICE = (
@@ -604,3 +606,34 @@ def test_participants_open_and_close_again_and_again(monkeypatch: pytest.MonkeyP
             wait_for(received.__len__, "the message")
             assert received == [message(1)]
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("dds-")]
+
+
+LAST_DOMAIN = """
+import sys
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.dds import DdsMiddleware
+from tests.waiting import wait_for
+with DdsMiddleware(domain_id=232, node_name=sys.argv[1], localhost_only=sys.argv[2] == "localhost") as one:
+    publisher = one.advertise(f"/{sys.argv[1]}", "std_msgs/msg/String", Qos())
+    other = {"first": "/second", "second": "/first"}[sys.argv[1]]
+    wait_for(lambda: other in {info.topic for info in one.discover()}, "the other")
+    print("found", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("where", ["localhost", "subnet"])
+def test_in_the_last_domain_all_is_found_and_one_line_says_how_many_fit(where: str) -> None:
+    """Port 65536, which DDS would ask for the 64th participant, does not exist."""
+    command = [sys.executable, "-c", LAST_DOMAIN]
+    pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with (
+        subprocess.Popen([*command, "first", where], text=True, cwd=ROOT, **pipes) as first,
+        subprocess.Popen([*command, "second", where], text=True, cwd=ROOT, **pipes) as second,
+    ):
+        for process in (first, second):
+            assert process.stdout is not None
+            assert process.stdout.readline() == "found\n"
+        for process in (first, second):
+            (line,) = process.communicate()[1].splitlines()
+            assert re.match("domain 232: its ports end after 63 participants of a machine, .*; set ROS_DOMAIN_ID", line)
