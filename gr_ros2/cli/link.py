@@ -227,6 +227,7 @@ def _live(running: RobotLink) -> LiveRun:
         links=(running.radio,),
         ledger=None,
         received_as=running.sink.outputs.heard.name_of,
+        alarms=running.same_numbers,
     )
 
 

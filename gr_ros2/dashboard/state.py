@@ -8,7 +8,7 @@ Counts are exact during the run. When the result is known, every number comes fr
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from math import nan
 from threading import Lock
 from typing import get_args
@@ -219,12 +219,14 @@ class DashboardState:
         *,
         snr_db: float | None = None,
         late_s: float = 0.0,
+        told: Sequence[str] = (),
     ) -> Snapshot:
         """A snapshot of the link now. Until the run is over, it also becomes the newest point of the history.
 
         :param queued: messages waiting at the source, by source and topic id
         :param snr_db: of the newest packets received, dB
         :param late_s: how late the computer was in the last seconds, s
+        :param told: what the link itself says is wrong
         """
         ledger = {} if self._ledger is None else self._ledger()
         with self._lock:
@@ -247,7 +249,7 @@ class DashboardState:
             rejected = {kind: n for kind, n in sorted(self._packets.items()) if kind.startswith("rejected_")}
             air = {f"air_{kind}": self._packets[f"air_{kind}"] for kind in get_args(AirKind)}
             heard = list(self._received)
-            alarms = {} if over or self._start is None else dict(self._alarms(now, elapsed, keys, late_s))
+            alarms = {} if over or self._start is None else dict(self._alarms(now, elapsed, keys, late_s, told))
             past = np.array(self._air, dtype=float).reshape(-1, 2 + len(get_args(AirKind)))
             busy = dict(zip(get_args(AirKind), past[:, 2:].T, strict=True))
             return Snapshot(
@@ -282,7 +284,9 @@ class DashboardState:
                 last_packets=packet_views(heard, self._packet_len, self._names, colours, start)[-PACKETS_SHOWN:],
             )
 
-    def _alarms(self, now: float, elapsed: float, keys: list[Key], late_s: float) -> Iterator[tuple[str, list[str]]]:
+    def _alarms(
+        self, now: float, elapsed: float, keys: list[Key], late_s: float, told: Sequence[str]
+    ) -> Iterator[tuple[str, list[str]]]:
         """What is wrong now, by the state that it stands for, the worst first."""
         if late_s >= LATE_S:
             yield (
@@ -292,7 +296,7 @@ class DashboardState:
         silent = [now - last for last, _ in self._robots.values()]
         if self._silence.age(min(silent, default=elapsed), now) > _SILENT_S:
             yield "down", ["no robot has been heard" + (f" for {min(silent):.0f} s" if silent else " yet")]
-        poor = []
+        poor = [*told]
         for key in keys:
             topic, share = self._topics[key], _pdr_now(self._topics[key], now)
             enough = elapsed > RATE_S and topic.sent_rate.totals(now)[0] >= _ENOUGH

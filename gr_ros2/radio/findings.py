@@ -111,9 +111,12 @@ OUTRUN = ("superseded", "queue_bound", "stale", "cannot_complete")
 """Reasons to drop a message that did not find its turn."""
 
 
-def same_id(robot: int, stats: Mapping[str, Any]) -> str | None:
-    """One line if another robot sends under this robot's id, which both are told."""
-    if not stats["sink"]["rejected"].get("same_id"):
+def same_id(robot: int, rejected: Mapping[str, int]) -> str | None:
+    """One line if another robot sends under this robot's id, which both are told.
+
+    :param rejected: packets that were refused, by kind of error
+    """
+    if not rejected.get("same_id"):
         return None
     return f"another robot sends as robot {robot}, which is this one; give one of them another robot_id"
 

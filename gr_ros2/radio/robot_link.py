@@ -288,24 +288,27 @@ class RobotLink(Flowgraph):
     def findings(self) -> list[str]:
         """What a person should know about this link and its surroundings: one line each, mostly none."""
         now, own = self._clock(), self.config.ros_source.src_id()
-        heard = peers(self.end, now)
-        robots = [peer["robot"] for peer in heard]
+        robots = [peer["robot"] for peer in peers(self.end, now)]
         here, there = self.source.middleware, self.sink.middleware
         names = {info.topic for graph in {here, there} for info in graph.discover() if info.publishers}
         services = here.discover_services() if isinstance(here, ServiceGraph) else ()
         full, self._outrun = outrun(self._outrun, self.source.stats()["topics"])
-        sink = self.sink.stats()
         lines = [
             shortcut([*names, *services], own, robots),
-            foreign(names, sink["topics"]),
-            same_id(own, {"sink": sink}),
-            *doubled(heard),
+            foreign(names, self.sink.stats()["topics"]),
+            *self.same_numbers(),
             full if self._ros.shares else None,
         ]
         with self.end.lock:
             if self._ros.slots is not None and self._ros.slots.unheard(now):
                 lines.append(unheard(own, robots))
         return [line for line in lines if line is not None]
+
+    def same_numbers(self) -> list[str]:
+        """One line for each number under which two robots send."""
+        with self.end.lock:
+            own = same_id(self.config.ros_source.src_id(), self.end.endpoint.received.rejected)
+        return [*([own] if own else []), *doubled(peers(self.end, self._clock()))]
 
     @property
     def finished(self) -> bool:

@@ -100,6 +100,7 @@ class LiveRun:
     :param team: robots that share a channel, None where none do
     :param received_as: absolute name under which a topic of a sender, by its name in a registry, comes out here; ''
         where the names of ``topics`` are shown
+    :param alarms: what is wrong with the robots that are heard, one line each
     """
 
     name: str
@@ -113,6 +114,7 @@ class LiveRun:
     clock: Callable[[], float] = time.monotonic
     team: TeamRecord | None = None
     received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
+    alarms: Callable[[], Sequence[str]] = tuple
 
 
 class RunObserver(LinkObserver, Protocol):

@@ -10,6 +10,11 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from rich.console import Console
+
+from gr_ros2.cli.link import _live
+from gr_ros2.cli.status import peer_table
+from gr_ros2.dashboard.monitor import RunMonitor
 from gr_ros2.radio.findings import about, compared, differences, heard_nobody, in_words
 from gr_ros2.state.keys import new_key_file
 from tests.radio.cables import SerialCable
@@ -134,3 +139,32 @@ def test_bytes_that_are_no_packets_are_named(tmp_path: Path) -> None:
             Robot(2, ends[1], state=str(tmp_path / "2"), **common),
         ):
             wait_for(lambda: "no packets" in " ".join(heard_nobody(one.link.stats())), "frames that are no packets")
+
+
+def test_two_robots_of_one_number_are_named_in_status_log_and_on_the_dashboard(tmp_path: Path) -> None:
+    """Robots 1 and 1 are out of each other's reach, and robot 2 hears both."""
+    monitor = RunMonitor()
+    addresses = [f"ipc://{tmp_path}/{place}" for place in range(3)]
+
+    def robot(place: int, number: int, connect: list[str], **values: Any) -> Robot:
+        front_end = {"name": "zmq", "bind": addresses[place], "connect": connect}
+        return Robot(number, front_end, version=1, state=str(tmp_path / f"state-{place}"), **values)
+
+    third = robot(2, 2, addresses[:2], observer=monitor)
+    with third, robot(0, 1, addresses[2:]), robot(1, 1, addresses[2:]):
+        monitor.run_started(_live(third.link))
+        wait_for(lambda: any(peer["doubled"] for peer in third.link.stats()["peers"]), "both robots")
+        (line,) = third.link.findings()
+        assert line.startswith("two robots send as robot 1")
+        third.say(0)
+        wait_for(lambda: line in monitor.tick().alarms, "the alarm")
+        assert monitor.tick().state in ("degraded", "late")
+        assert "two robots" in rendered(peer_table(third.link.stats()["peers"]))
+    monitor.run_ended(None)
+
+
+def rendered(table: Any) -> str:
+    console = Console(width=200)
+    with console.capture() as shown:
+        console.print(table)
+    return shown.get()
