@@ -9,8 +9,9 @@ from fuzz.loop import main, within
 from gr_ros2.radio.framing import Cobs, Framing, Kiss, Slip
 from gr_ros2.radio.kiss import Ax25Kiss, KissOptions
 
-BASE, PER_BYTE = 300, 1
-"""Lines of Python that a piece of the stream may take, and more for each byte of it."""
+BASE, PER_BYTE = 300, 16
+"""Lines of Python that a piece of the stream may take, and more for each byte of it: every byte may end a frame, which
+takes ten to fourteen lines, however long the piece is."""
 LONGEST = 300
 _TNC = KissOptions(device="tcp://localhost:8001", callsign="N0CALL")
 _PACKET = b"\0\xc0\xdb" + bytes(range(61))
@@ -36,7 +37,8 @@ def corpus() -> list[bytes]:
     """Frames of all kinds, alone and one after the other."""
     rng = random.Random(1)
     frames = [one.frame(rng.randbytes(length)) for one in framings() for length in (1, 64, 254, 255, LONGEST)]
-    return [b"", bytes(8), b"\xc0" * 8, b"\xdb" * 8, *frames, b"".join(frames)]
+    ends = [pattern * 2000 for pattern in (b"\0", b"\xc0", b"\xc0\0", b"\0\1", b"\xc0\xdb")]
+    return [b"", bytes(8), b"\xc0" * 8, b"\xdb" * 8, *frames, b"".join(frames), *ends]
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import fuzz.calls
 import fuzz.compression
 import fuzz.control_socket
 import fuzz.endpoint
+import fuzz.insider
 import fuzz.loop
 import fuzz.mac
 import fuzz.receiver
@@ -40,6 +41,7 @@ HARNESSES = {
     "wire": (fuzz.wire.wire, fuzz.wire.corpus),
     "wire_v1": (fuzz.wire_v1.wire_v1, fuzz.wire_v1.corpus),
     "endpoint": (fuzz.endpoint.endpoint, fuzz.endpoint.corpus),
+    "insider": (fuzz.insider.insider, fuzz.insider.corpus),
     "receiver": (fuzz.receiver.receiver, fuzz.receiver.corpus),
     "mac": (fuzz.mac.mac, fuzz.mac.corpus),
     "relay": (fuzz.relay.relay, fuzz.relay.corpus),
@@ -59,6 +61,7 @@ COUNTS = {
     "wire": 5_000,
     "wire_v1": 5_000,
     "endpoint": 100,
+    "insider": 100,
     "receiver": 300,
     "mac": 400,
     "relay": 400,
@@ -118,6 +121,14 @@ def test_the_corpus_reaches_delivery(monkeypatch: pytest.MonkeyPatch) -> None:
         except AssertionError:  # the engine delivered, and the harness saw no event of that type
             delivered.append(script)
     assert len(delivered) >= 4
+
+
+def test_scripts_of_an_insider_reach_delivery(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its packets have right trailers: with the key as without, some of what they say is used."""
+    found: set[str] = set()
+    monkeypatch.setattr(fuzz.insider, "check", lambda _, events, __: found.update(type(e).__name__ for e in events))
+    run(fuzz.insider.insider, fuzz.insider.corpus(), seed=1, count=60)
+    assert {"Met", "Received", "Announced", "Delivered", "Lost", "Gone", "Rejected"} <= found
 
 
 def test_a_failing_input_is_named() -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import NamedTuple, Protocol
 
-from gr_ros2.core.errors import CodecError, WireError
+from gr_ros2.core.errors import CodecError, PadError, WireError
 from gr_ros2.link.events import Announced, Delivered, Lost
 from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
@@ -142,11 +142,6 @@ class Inbox:
         self.began = inf
 
     @property
-    def room(self) -> int:
-        """Bytes of the longest body."""
-        return self._room
-
-    @property
     def newest(self) -> int:
         """The newest packet number seen."""
         return self.decoder.newest
@@ -188,7 +183,12 @@ class Inbox:
     def repair(
         self, number: int, mask: int, repair_id: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
     ) -> None:
-        """Take a repair; only one that was not here before calls for a report."""
+        """Take a repair; only one that was not here before calls for a report.
+
+        :raises PadError: it is longer than bodies of this start are
+        """
+        if combined.count(0, self._room) < len(combined) - self._room:
+            raise PadError(f"a combination of {len(combined)} bytes, where bodies have {self._room}")
         self.reports.unreported += new
         self.reports.confirms = True
         self._advance(number, now, here=False)

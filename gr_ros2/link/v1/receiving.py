@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
 
-from gr_ros2.core.errors import EntryKindError, LengthError, NoKeyError, NotSealedError, WireError
+from gr_ros2.core.errors import EntryKindError, NoKeyError, NotSealedError, WireError
 from gr_ros2.link.access import Access
 from gr_ros2.link.events import (
     AirPacket,
@@ -171,10 +171,7 @@ class ReceivingSide:
                 return
             if arrival.snr_db is not None and opened.new and opened.trusted:
                 opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
-            inbox, room = opened.neighbour.inbox, header.room(self._settings.packet_len)
-            if opened.entries is None and room != inbox.room:  # it could not be combined with others
-                raise LengthError(f"bodies of {room} bytes, where those of this start have {inbox.room}")
-            inbox.began = began
+            opened.neighbour.inbox.began = began
             self._use(arrival, opened, now)
         except WireError as error:
             self.stats.rejected[error.kind] += 1

@@ -16,6 +16,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, SealMode
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import CAN_HEAR, Hello
+from gr_ros2.wire.mac_block import Block, write_block
 from gr_ros2.wire.v1 import (
     BROADCAST,
     QOS_REPAIR,
@@ -164,19 +165,24 @@ def test_a_report_costs_no_more_the_more_was_sent(mode: SealMode) -> None:
     assert lines[1] < MOST_LINES
 
 
-def forged(boot: int, number: int, *entries: EntryV1, to: int = BROADCAST, **repair: int | bool) -> bytes:
+def forged(
+    boot: int, number: int, *entries: EntryV1, to: int = BROADCAST, block: bytes = b"", **repair: int | bool
+) -> bytes:
     """A packet of robot 1, as anybody can make it where no key is set."""
-    header = Header(QOS_REPAIR if repair else 0, False, 1, number, to, to != BROADCAST)
+    header = Header(QOS_REPAIR if repair else 0, False, 1, number, to, int(to != BROADCAST), block)
     fields = RepairHeader(**repair) if repair else None  # type: ignore[arg-type]
-    combined = b"\xff" * header.room(64) if repair.get("mask") else b""
+    combined = b"\xff" * (64 - v1.CRC_LEN - header.size - v1.REPAIR_HEADER_LEN) if repair.get("mask") else b""
     return encode(PacketV1(header, entries, fields, combined), 64, boot)
 
 
-def test_a_packet_whose_bodies_have_another_length_than_those_of_its_start_is_refused() -> None:
+@pytest.mark.parametrize("shares", [False, True])
+def test_a_combination_that_is_longer_than_bodies_are_is_refused(shares: bool) -> None:
+    """After a hello for one robot, bodies have two bytes less; with a short block, a packet has room for more."""
     two = Robot(2, registry())
-    two.receive(forged(5, 0, Hello(5, 0, CAN_HEAR, 0), to=2, repair_id=0, clear=True), 0.0)
-    two.receive(forged(5, 3, repair_id=1, mask=3), 0.1)
-    two.receive(forged(5, 4, Part(0, b"too long")), 0.1)
-    assert two.end.received.rejected["length"] == 2
-    two.receive(forged(5, 4, Part(0, b"not too long"), to=2), 0.2)
+    block = write_block(Block(1, (2, 3))) if shares else b""
+    to = BROADCAST if shares else 2
+    two.receive(forged(5, 0, Hello(5, 0, CAN_HEAR, 0), to=to, block=block, repair_id=0, clear=True), 0.0)
+    two.receive(forged(5, 3, block=block, repair_id=1, mask=3), 0.1)
+    assert two.end.received.rejected["pad"] == 1
+    two.receive(forged(5, 4, Part(0, b"a message"), to=to, block=block), 0.2)
     assert two.end.neighbours.all[1].inbox.newest == 4
