@@ -53,7 +53,7 @@ def pings(data: bytes) -> None:
     """Take the bytes as entries heard, and answer in between."""
     robot, now, at = _Robot(), 0.0, 0
     while at + _HEAD + 2 <= len(data):
-        src_id, later = data[at], data[at + 1]
+        src_id, later = data[at] % 255, data[at + 1]  # nobody can ask for robot 255
         now += later / 100
         try:
             at, entry = read_control(data, at + _HEAD, len(data))
