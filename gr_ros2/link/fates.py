@@ -34,7 +34,7 @@ class Fate(str, Enum):
     EXPIRED = "expired", "sink", "#b565a7", "given up incomplete after the reassembly timeout"
     MEMORY = "memory", "sink", "#7f7f7f", "given up incomplete when the sink's memory was full"
     NOT_FRESH = "not_fresh", "sink", "#4b0082", "not taken, since they may have been withheld for longer than max_age_s"
-    LATE = "late", "sink", "#cc6677", "not delivered, since they came after the deadline of commands"
+    LATE = "late", "sink", "#cc6677", "not delivered, since they came after their deadline or an outage"
     NOT_FOR_US = "not_for_us", "sink", "#bbbbbb", "for another robot"
     UNSUPPORTED = "unsupported", "sink", "#17becf", "coded or encrypted in a way the sink cannot undo"
     UNKNOWN_DICTIONARY = "unknown_dictionary", "sink", "#999933", "coded with a dictionary the sink does not have"

@@ -48,15 +48,15 @@ class Combining:
         self._place = 0.0
 
     def window(self, now: float) -> list[Sent]:
-        """The next of the windows over all live packets, from the oldest one kept on.
+        """The next of the windows over all live packets, from the oldest one needed on.
 
         Their positions follow the golden section, which spreads any number of them evenly. Windows that would reach
         beyond the ends are moved to the ends, so that the packets there are in as many windows as others.
         """
         packets = self._packets
         self._place = (self._place + _GOLDEN) % 1
-        span = packets.newest - packets.oldest + 1
-        first = packets.oldest + min(max(int(self._place * span) - MAX_WINDOW // 2, 0), max(span - MAX_WINDOW, 0))
+        span = packets.newest - packets.needed + 1
+        first = packets.needed + min(max(int(self._place * span) - MAX_WINDOW // 2, 0), max(span - MAX_WINDOW, 0))
         last = min(first + MAX_WINDOW - 1, packets.newest)
         found = packets.live(first, last, now)
         while not found and last < packets.newest:  # continue at the next live one

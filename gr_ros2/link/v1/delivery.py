@@ -47,6 +47,7 @@ class DeliveryRules:
         self.sealed_after: Callable[[int], float] | None = None
         self.newest: dict[int, tuple[int, int]] = {}
         self._own, self._settings = settings.src_id, settings
+        self._silent_before = 0
         self._max_age_s, self._max_ages = settings.max_age_s, settings.max_ages
         self._commands, self._deadlines = settings.commands, settings.deadlines
         self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
@@ -84,6 +85,10 @@ class DeliveryRules:
             self.newest[topic_id] = max(self._direct.get(topic_id, _NEVER), max(over, default=_NEVER))
             self._made.pop(topic_id, None)
 
+    def silent_before(self, number: int) -> None:
+        """The robot was silent for long before its packets reached a number: what comes of earlier ones is that old."""
+        self._silent_before = number
+
     def came_over(self, ready: Ready) -> None:
         """A message has come over another robot."""
         self._over.append((ready.topic_id, ready.order))
@@ -112,6 +117,9 @@ class DeliveryRules:
         if now - oldest > withheld_s:
             return Fate.NOT_FRESH
         if now - ready.made > min(deadline_s, ready.limit_s):
+            return Fate.LATE
+        before = ready.over is None and ready.order[0] < self._silent_before
+        if before and (topic.fresh or not (topic.reliable or topic.latched)):
             return Fate.LATE
         return passed_over(topic) if self._passed(ready) and (ready.topic_id, ready.order) not in self._over else None
 

@@ -103,7 +103,9 @@ class EndpointV1:
             proves=keys.sealed and settings.hears and settings.idle_is_free,
             slower=settings.slower,
         )
-        self.messages = messages = Outbox(topics, settings, self, boot=boot, room=room, codec=codec, observer=observer)
+        self.messages = messages = Outbox(
+            topics, settings, self, window.peers, boot=boot, room=room, codec=codec, observer=observer
+        )
         self.sent = messages.stats
         self._receiving = ReceivingSide(
             settings, boot, keys, decoder_for=decoder_for, access=access, heard=heard or {}, save=save
@@ -172,7 +174,7 @@ class EndpointV1:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self._sending.repairs.mode != "off" and self.window.packets.unconfirmed(self._now)
+        mending = self._sending.repairs.mode != "off" and self.window.packets.wanted(self._now)
         return self.messages.idle and not mending
 
     @property

@@ -37,7 +37,7 @@ _PACKET_COST, _EQUATION_COST = 250, 350
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
 of the list of gaps)."""
 _INCOMPLETE_S = 60.0
-"""s that an incomplete message waits for its next fragment."""
+"""s that an incomplete message waits for its next fragment, unless its sender repairs it until it is here."""
 
 
 class Bounds(NamedTuple):
@@ -120,7 +120,7 @@ class Inbox:
         self.decoder = RepairDecoder(room, self._plausible, bounds.span, bounds.equations)
         self.decoder.begin(first)
         self.decoder.newest = first - 1
-        self._first = first
+        self._first, self._give_up_s, self._heard = first, give_up_s, inf
         self._most = settings.max_source_bytes
         self.order = Order(
             self.decoder,
@@ -219,7 +219,7 @@ class Inbox:
         """Go on without packets that have been waited for long enough."""
         self._now = now
         self._settle()
-        for partial in self._reassembly.expired(now, _INCOMPLETE_S):
+        for partial in self._reassembly.expired(now, _INCOMPLETE_S, self._repaired_until_here):
             self._lose(partial, Fate.EXPIRED)
 
     def next_timeout(self) -> float | None:
@@ -228,6 +228,16 @@ class Inbox:
         if waiting is None:
             return ordered
         return waiting + _INCOMPLETE_S if ordered is None else min(ordered, waiting + _INCOMPLETE_S)
+
+    def _repaired_until_here(self, topic_id: int) -> bool:
+        topic = self.announced.topics.get(topic_id)
+        return self.order.told and topic is not None and topic.reliable
+
+    def ended(self, now: float) -> None:
+        """The sender has started again: no packet of this start comes any more, so nothing waits for one."""
+        self._now = now
+        self._release(self.order.without(()))
+        self.close(Fate.SENDER_RESTARTED)
 
     def close(self, reason: Fate) -> None:
         """Give up everything that is not delivered."""
@@ -247,7 +257,10 @@ class Inbox:
 
     def _settle(self) -> None:
         """Deliver the messages that waited for what is here or given up now."""
-        for ready in self.order.settle(self._now):
+        self._release(self.order.settle(self._now))
+
+    def _release(self, due: Iterable[Ready]) -> None:
+        for ready in due:
             if ready.topic_id == CARRIED_TOPIC:
                 self._of_another(ready)
             else:
@@ -263,13 +276,16 @@ class Inbox:
     def _advance(self, number: int, now: float, *, here: bool) -> None:
         """The sender has reached this number, of which the decoder is told next. Packets between the newest one and it
         are missing for now."""
-        self._now = now
+        silence = now - self._heard
+        self._now = self._heard = now
         self.order.heard()
         newest = self.decoder.newest
         if number <= newest:
             return
         gone = number - newest - here
         self.deliveries.reached(number, self.began)
+        if silence >= self._give_up_s:
+            self.deliveries.silent_before(number)
         if gone:
             met = newest >= self._first  # what came before the first packet that was heard is not lost
             self._stats.missed[self.src_id] += gone * met

@@ -40,7 +40,7 @@ from gr_ros2.link.v1.peers import START
 from gr_ros2.link.v1.proofs import OwnHellos, Proofs
 from gr_ros2.link.v1.replays import Floor, Floors, Save
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Trailer
-from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, Heard, Hello
+from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, WANTS_PROOF, Heard, Hello
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
     EntryV1,
@@ -325,10 +325,13 @@ class Neighbours:
         echoes = [(n.src_id, *n.echo) for n in self.all.values() if n.echo and n.proves and not n.silent]
         return [Heard(src_id, echo, since & 0xFFFF) for src_id, echo, since in echoes if newest - since < 1 << 16]
 
-    def since(self, src_id: int) -> int:
-        """The number that this robot had reached when it heard the newest hello of another one."""
+    def since(self, src_id: int) -> tuple[int, bool]:
+        """The number that this robot had reached when it heard the newest hello of another one, and whether that one
+        lacks a proof."""
         neighbour = self.all.get(src_id)
-        return 0 if neighbour is None or neighbour.echo is None else neighbour.echo[1]
+        if neighbour is None or neighbour.echo is None:
+            return 0, False
+        return neighbour.echo[1], neighbour.hello.capabilities & WANTS_PROOF != 0
 
     def check_own(self, data: bytes, header: Header) -> None:
         """Look at a packet that has this robot's own id.

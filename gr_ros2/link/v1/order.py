@@ -2,9 +2,9 @@
 
 A message of a topic with reliable publishers waits until every packet before the one in which it began is here or
 given up, unless it is known that those packets carried other topics (``gap_contents``). A sender that gets reports
-repairs a missing packet, or says that it does not any more. Only then it is given up, or when the sender is gone, or
-when the messages that wait fill the memory. From a sender without reports a missing packet is also given up ``hold_s``
-after it was missed, or at once if hardly any missing packet comes back.
+repairs a missing packet, or says that it does not any more, also after an outage. Only then it is given up, or when the
+sender has started again, or when the messages that wait fill the memory. From a sender without reports a missing packet
+is also given up ``hold_s`` after it was missed, or at once if hardly any missing packet comes back.
 
 A message that came over other robots waits in the same way: what its sender repairs is older, and would come too late.
 Only when other robots have brought messages for ``give_up_s`` and the sender itself nothing, no message waits for it.
@@ -193,10 +193,10 @@ class Order:
         return given_up
 
     def without(self, topic_ids: Collection[int]) -> list[Ready]:
-        """Give up the messages that wait, except those of these topics."""
+        """The messages that wait, in their order, except those of these topics; they do not wait any more."""
         given_up: list[Ready] = []
         for topic_id in [topic_id for topic_id in self._waiting if topic_id not in topic_ids]:
-            given_up += self._waiting.pop(topic_id)
+            given_up += sorted(self._waiting.pop(topic_id), key=lambda ready: ready.order)
         self.held -= sum(len(ready.payload) + _COST for ready in given_up)
         return given_up
 

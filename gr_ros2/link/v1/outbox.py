@@ -27,6 +27,7 @@ from gr_ros2.link.v1.kept import KeptMessages
 from gr_ros2.link.v1.lifetime import WORTH
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.packing import ENTRY, Packing
+from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopic, SentTopics
 from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO, Auto
@@ -62,13 +63,13 @@ class Outbox:
 
     :param topics: topics that it may send; the announced table is made from them
     :param owner: is told what comes and changes
+    :param peers: those that say what they have, so that it is known when a message is over
     :param boot: boot number of this start, for keys
     :param room: bytes of the longest body
     :ivar topics: what it sends
     :ivar sent: the same, with what waits
     :ivar kept: what it keeps for robots that join late
     :ivar packing: what goes into the next packet
-    :ivar reported: whether receivers report, so that it is known when a message is over
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Outbox:
         topics: Registry | None,
         settings: Settings,
         owner: Owner,
+        peers: Peers,
         *,
         boot: int,
         room: int,
@@ -84,9 +86,8 @@ class Outbox:
     ) -> None:
         self.topics = topics
         self.stats = SenderStats()
-        self.reported = False
         self._settings = settings
-        self._owner = owner
+        self._owner, self._peers = owner, peers
         self._room = room
         self._codec = codec
         self._observer = observer
@@ -266,14 +267,15 @@ class Outbox:
     def _left(self, message: Message, now: float) -> None:
         """A message has left whole."""
         topic = self.sent[message.topic_id]
+        reported = self._peers.confirm(in_order=topic.in_order)
         topic.lifetimes.left(
             message.lifetime,
             policy=topic.queue.policy,
             depth=topic.publishers.depth,
-            reported=self.reported,
+            reported=reported,
             waited_for=now + WORTH * self._settings.hold_s,
         )
-        self.kept.left(message, now, reported=self.reported)
+        self.kept.left(message, now, reported=reported)
         if message.topic_id == RELAYED_TOPIC:
             self.relayed_left(now)
         elif self.custody is not None and message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):

@@ -92,6 +92,9 @@ class Peer:
 class Peers:
     """The robots that report what they have of one sender's packets.
 
+    What one that is out of range lacks of messages in order is kept for it and repaired when it is back, however long
+    that takes.
+
     :param packets: the packets that they confirm
     :param unreported: what holds while there are none
     :param shared: on a channel that others share
@@ -111,6 +114,7 @@ class Peers:
     ) -> None:
         self.all: dict[int, Peer] = {}
         self._interval = _INTERVAL_S * slower
+        self._away: dict[int, Peer] = {}
         self.loss = unreported.loss
         self.proven = 0
         self.in_vain = False
@@ -153,23 +157,46 @@ class Peers:
         self._unreported.over()
         peer = self.all.get(src_id)
         if peer is None:
-            free = next(bit for bit in range(256) if not self._packets.everybody >> bit & 1)
-            peer = self.all[src_id] = Peer(1 << free, now, interval=self._interval)
-            self._packets.everybody |= peer.bit
+            packets = self._packets
+            if src_id in self._away:
+                peer = self._away.pop(src_id)
+                peer.heard = now
+            else:
+                free = next(bit for bit in range(256) if not (packets.everybody | packets.away) >> bit & 1)
+                peer = Peer(1 << free, now, interval=self._interval)
+            self.all[src_id] = peer
+            packets.here(peer.bit)
             self._note()
         return peer
 
-    def forget(self, src_id: int) -> None:
-        """A peer is gone."""
+    def leave(self, src_id: int) -> None:
+        """A peer is out of range, until it is met again or forgotten."""
         peer = self.all.pop(src_id, None)
         if peer is not None:
+            peer.waits, peer.waits_since = -1, inf
+            self._away[src_id] = peer
+            self._packets.leave(peer.bit)
             self._note()
-            self._packets.forget(peer.bit)
 
-    def prove(self, src_id: int, number: int) -> None:
-        """A peer is told that packets above a number were sealed after it had started."""
+    def forget(self, src_id: int) -> None:
+        """A peer has ended."""
+        for peers in (self.all, self._away):
+            if src_id in peers:
+                self._packets.forget(peers.pop(src_id).bit)
+                self._note()
+
+    def confirm(self, *, in_order: bool) -> bool:
+        """Whether some peer will say that it has a message: for one that is delivered in order, also if all are out of
+        range."""
+        return bool(self.all or (in_order and self._away))
+
+    def prove(self, src_id: int, number: int, *, wanted: bool = False) -> None:
+        """A peer is told that packets above a number were sealed after it had started.
+
+        :param wanted: it says that it lacks such a proof
+        """
         peer = self.all.get(src_id)
-        if peer is not None and peer.newest < 0:  # a report shows that it knows
+        if peer is not None and (wanted or peer.newest < 0):  # a report shows that it knows
             peer.proven = number
             if number <= START:
                 records = self._packets.records

@@ -11,6 +11,7 @@ number of incomplete messages.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
@@ -119,11 +120,18 @@ class Reassembly:
             ended.append(self._release(next(iter(self._partials.values()))))
         return ended
 
-    def expired(self, now: float, after: float) -> list[PartialMessage]:
-        """Give up messages without a new fragment for so many s."""
+    def expired(self, now: float, after: float, keep: Callable[[int], bool]) -> list[PartialMessage]:
+        """Give up messages without a new fragment for so many s.
+
+        :param keep: whether those of a topic wait longer; asked again after as many s
+        """
         ended = []
         while self._partials and (partial := next(iter(self._partials.values()))).last + after <= now:
-            ended.append(self._release(partial))
+            if keep(partial.topic_id):
+                partial.last = now
+                self._partials.move_to_end((partial.topic_id, partial.begin))
+            else:
+                ended.append(self._release(partial))
         return ended
 
     def overtaken(self, topic_id: int, begin: int) -> list[PartialMessage]:

@@ -117,16 +117,13 @@ class ReceivingSide:
             neighbour.inbox.handle_timeout(now)
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now, self._give_up_s):
-            self._forget(gone.src_id)
-            gone.inbox.order.told = False
-            gone.inbox.handle_timeout(now)
+            self._end(gone.src_id, self._window.peers.leave)
             if self.relaying is None or not self.relaying.reaches(gone.src_id, gone.boot, now):
                 self._outcomes.events.append(Gone(gone.src_id, gone.boot))
         if self.relaying is not None:
             self.relaying.handle_timeout(now)
         for neighbour in self.neighbours.all.values():
             neighbour.timeout = None
-        self._messages.reported = bool(self._window.peers)
         return self._outcomes.take()
 
     def next_timeout(self) -> float | None:
@@ -273,8 +270,8 @@ class ReceivingSide:
         """Something of a robot comes for the first time, or again: it is answered, so that it can prove that it hears
         this start."""
         if opened.replaced is not None:
-            opened.replaced.inbox.close(Fate.SENDER_RESTARTED)
-        self._forget(opened.neighbour.src_id)
+            opened.replaced.inbox.ended(now)
+            self._end(opened.replaced.src_id, self._window.peers.forget)
         self._sending.met(now)
 
     def _meet(self, neighbour: Neighbour, now: float) -> None:
@@ -283,10 +280,10 @@ class ReceivingSide:
         if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
             self._window.peers.meet(neighbour.src_id, now)
             if neighbour.proves:
-                self._window.peers.prove(neighbour.src_id, self.neighbours.since(neighbour.src_id))
+                since, wanted = self.neighbours.since(neighbour.src_id)
+                self._window.peers.prove(neighbour.src_id, since, wanted=wanted)
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)
-            self._messages.reported = True
         self._outcomes.events.append(Met(neighbour.src_id, neighbour.boot, hears))
         self._greeted(neighbour)
         if neighbour.proofs.proven is not None:
@@ -294,8 +291,8 @@ class ReceivingSide:
 
     def _greeted(self, neighbour: Neighbour) -> None:
         """The newest hello of a robot that is heard."""
-        told = self._settings.hears and neighbour.hello.capabilities & REPORTED != 0
-        neighbour.inbox.order.told = told
+        # Who was told once is told to the end of this start: its sender keeps what it lacks.
+        neighbour.inbox.order.told |= self._settings.hears and neighbour.hello.capabilities & REPORTED != 0
 
     def _entry(self, entry: Control) -> None:
         """Handle an entry that is not a message, from the sender of the packet that is processed."""
@@ -323,13 +320,12 @@ class ReceivingSide:
         self._sending.repairs.reported()
         if self.relaying is not None:
             self.relaying.custody.reported(sender, now)
-        self._messages.reported = True
         if self._rate is not None and report.snr_db is not None:
             self._rate.report(sender, report.snr_db, loss, now)
 
-    def _forget(self, src_id: int) -> None:
-        """A receiver is gone, or has started again."""
-        self._window.peers.forget(src_id)
+    def _end(self, src_id: int, end: Callable[[int], None]) -> None:
+        """A receiver is out of range, or its start has ended."""
+        end(src_id)
         if self.relaying is not None:
             self.relaying.custody.gone(src_id)
         if not self._window.peers:

@@ -84,7 +84,7 @@ class RepairWindow:
         :param held: whether a repair has to wait, at this time in s; only asked if there is one. A thrifty sender has
             few repairs under way: what a report names as lost does not wait then
         """
-        if self.mode == "off" or not self.packets.unconfirmed(now):
+        if self.mode == "off" or not self.packets.wanted(now):
             return None
         thrifty = self.mode == "thrifty"
         if self._shared is not None and self.peers and (again := self._urgent_of_all(now, idle=True)) is not None:
@@ -150,7 +150,7 @@ class RepairWindow:
         alive; otherwise (). A packet with these lifetimes and no content makes room for repairs."""
         packets = self.packets
         if packets.full(packets.newest) or packets.newest <= self.peers.proven:
-            for number in range(packets.newest, packets.oldest - 1, -1):
+            for number in range(packets.newest, packets.needed - 1, -1):
                 record = packets.records.get(number)
                 if record is not None and record.alive(now):
                     return record.lifetimes

@@ -97,7 +97,7 @@ class SendingSide:
         due = reports.due(now)
         if due and reports.overdue:
             return reports.packet(due, now)
-        if self._window.pressing and not packing.urgent and (first := self.repairs.first(now)) is not None:
+        if (first := self._repair_first(now)) is not None:
             return first
         room = self._writer.room
         if self._relaying is not None and messages.relayed is not None:
@@ -117,6 +117,13 @@ class SendingSide:
         if due:
             return reports.packet(due, now)
         return reports.asks(now) or self.repairs.spare(now) or reports.early(now)
+
+    def _repair_first(self, now: float) -> SentPacket | None:
+        """A repair that goes before new messages."""
+        packing = self._messages.packing
+        if not self._window.pressing or packing.urgent:
+            return None
+        return self.repairs.first(now, waiting=packing.next_timeout(now) <= now)
 
     def behind(self, now: float) -> bool:
         """Whether messages that wait do so because the computer is too slow."""
@@ -207,5 +214,6 @@ class SendingSide:
         self._neighbours.own_hellos.said(sent.data, now)
         for entry in entries:
             if isinstance(entry, Heard):
-                window.peers.prove(entry.src_id, self._neighbours.since(entry.src_id))
+                since, wanted = self._neighbours.since(entry.src_id)
+                window.peers.prove(entry.src_id, since, wanted=wanted)
         return sent

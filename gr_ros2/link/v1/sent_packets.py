@@ -1,7 +1,9 @@
 """The source packets of one sender that are still worth repairing.
 
 A packet is *alive* until every peer that reports has confirmed it, or until all messages in it are over: late, or
-replaced by newer ones.
+replaced by newer ones. Packets with messages that are delivered in order are kept for peers that are out of range,
+too. *Needed* is a packet only by those that are here, or, where none is, by whoever may hear it, until it was repaired
+often enough for them.
 
 Invariants: a repair id is used once per number; no live packet is more than ``span`` numbers old.
 """
@@ -38,6 +40,11 @@ class Sent:
     covered: float = 0.0
     combined: int = 0
 
+    @property
+    def in_order(self) -> bool:
+        """Whether a message in it is delivered in order."""
+        return any(lifetime.in_order for lifetime in self.lifetimes)
+
     def alive(self, now: float) -> bool:
         """Whether a message in it is still worth something."""
         for lifetime in self.lifetimes:  # noqa: SIM110 - any() with a generator takes three times as long
@@ -53,13 +60,15 @@ class SentPackets:
     :ivar newest: number of the last source packet; 0 before the first
     :ivar oldest: no older packet is kept
     :ivar records: all packets from ``oldest`` on that may be alive, by number and in this order
+    :ivar needed: none before this is needed
     :ivar everybody: the bits of all peers that report
+    :ivar away: the bits of those that did and are out of range
     """
 
     def __init__(self, span: int = SPAN) -> None:
-        self.newest = self.oldest = 0
+        self.newest = self.oldest = self.needed = 0
         self.records: dict[int, Sent] = {}
-        self.everybody = 0
+        self.everybody = self.away = 0
         self._span = span
         self._repair_ids: dict[int, int] = {}
         """Repair ids already used, as bits, by number."""
@@ -70,48 +79,81 @@ class SentPackets:
         self.newest = number
         if self.records or lifetimes:
             if not self.records:
-                self.oldest = number
-            self.records[number] = Sent(number, body, data, lifetimes, now)
+                self.oldest = self.needed = number
+            record = self.records[number] = Sent(number, body, data, lifetimes, now)
+            if self.away and not record.in_order:
+                record.confirmed = self.away
             if number - self.oldest >= self._span:
                 first = number - self._span + 1
                 for old in range(self.oldest, first):
                     self.records.pop(old, None)
                 self.oldest = first
 
-    def forget(self, bit: int) -> None:
-        """A peer is gone."""
+    def here(self, bit: int) -> None:
+        """A peer reports."""
+        self.everybody |= bit
+        self.away &= ~bit
+        self.needed = self.oldest
+
+    def leave(self, bit: int) -> None:
+        """A peer is out of range."""
         self.everybody &= ~bit
+        self.away |= bit
+        for record in self.records.values():
+            if not record.in_order:
+                record.confirmed |= bit
+
+    def forget(self, bit: int) -> None:
+        """A peer is gone for good."""
+        self.everybody &= ~bit
+        self.away &= ~bit
         for record in self.records.values():
             record.confirmed &= ~bit
 
     def retire(self, now: float) -> None:
         """Forget the oldest packets that are not alive."""
-        records, everybody = self.records, self.everybody
+        records, away = self.records, self.away
         oldest = self.oldest
         while oldest <= self.newest:
             record = records.get(oldest)
             if record is not None:
-                done = everybody and record.confirmed & everybody == everybody
-                if not done and record.alive(now):
+                if (not self._served(record) or record.confirmed & away != away) and record.alive(now):
                     break
                 del records[oldest]
             oldest += 1
         self.oldest = oldest
+        needed = self.needed if away and self.needed > oldest else oldest
+        while away and needed <= self.newest:
+            record = records.get(needed)
+            if record is not None and not self._served(record) and record.alive(now):
+                break
+            needed += 1
+        self.needed = needed
+
+    def _served(self, record: Sent) -> bool:
+        """Whether nobody who is here needs a packet."""
+        everybody = self.everybody
+        return record.confirmed & everybody == everybody if everybody else record.covered >= 1
 
     def unconfirmed(self, now: float) -> bool:
         """Whether anything is alive."""
         self.retire(now)
         return bool(self.records)
 
+    def wanted(self, now: float) -> bool:
+        """Whether anything is needed."""
+        self.retire(now)
+        return self.needed <= self.newest
+
     def live(self, first: int, last: int, now: float) -> list[Sent]:
         """The packets from one number to another that are alive."""
         found: list[Sent] = []
-        records, everybody = self.records, self.everybody
+        records, here, everybody = self.records, self.everybody, self.everybody | self.away
         kept: Iterable[Sent] = records.values()
         if first > self.oldest or last < self.newest:
             kept = [records[number] for number in range(first, last + 1) if number in records]
         for record in kept:
-            if everybody and record.confirmed & everybody == everybody:
+            if record.confirmed & everybody == everybody and (here or record.covered >= 1):
                 continue
             for lifetime in record.lifetimes:  # ``alive``, whose call would take half of this loop's time
                 if now < lifetime.expires:

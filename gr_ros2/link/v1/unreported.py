@@ -63,7 +63,7 @@ class Unreported:
         self._owed = max(self._owed - 1, 0.0)
 
     def cover(self, packets: Sequence[Sent], now: float) -> None:
-        """These packets were combined, and nobody reports: those that were combined often enough are over."""
+        """These packets were combined, and nobody reports: those that were combined often enough are not needed."""
         if now < self._silent_from:
             if self._silent_from == inf:
                 self._silent_from = now + self._meeting_s
@@ -71,8 +71,6 @@ class Unreported:
         share = 1 / self._enough(len(packets))
         for record in packets:
             record.covered += share
-            if record.covered >= 1:
-                record.lifetimes = ()
 
     def _enough(self, count: int) -> float:
         """Number of repairs after which so many packets are complete at a peer with the expected loss, all but
