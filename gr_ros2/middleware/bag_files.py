@@ -171,7 +171,7 @@ class _QosTexts(YAML):
 def _loaded(text: str) -> list[dict[str, Any]]:
     try:
         profiles = YAML(typ="safe").load(text)
-    except YAMLError:
+    except (YAMLError, RecursionError):  # the second for brackets within brackets
         profiles = None
     return [_profile(one) for one in (profiles if isinstance(profiles, list) else [profiles])]
 

@@ -182,7 +182,7 @@ def test_a_qos_that_lacks_something_hinders_nothing(tmp_path: Path, kind: str) -
     assert not bag_contents(path).remarks
 
 
-@pytest.mark.parametrize("text", ["[", "reliable", "- [1, 2]", "- {depth: -3}"])
+@pytest.mark.parametrize("text", ["[", "reliable", "- [1, 2]", "- {depth: -3}", pytest.param("[" * 2000, id="deep")])
 def test_a_qos_that_cannot_be_read_is_a_remark(tmp_path: Path, text: str) -> None:
     path = make_sqlite(tmp_path / "a.db3", [Foreign("/a"), Foreign("/b", qos=text)])
     assert counts(path) == {"/a": 10, "/b": 10}
