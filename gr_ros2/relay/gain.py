@@ -43,7 +43,8 @@ ARRIVALS = 16
 TOLD = 2
 """Streams of which a packet tells the newest number."""
 EXPIRES_S = 15.0
-"""s for which a number refuses lower ones: what was made later than that after it is newer, or the number was false."""
+"""s for which a number refuses lower ones: what was made later than that after it came is newer, or the number was false.
+A message may be much younger than its age says, but it was made before it came."""
 EVEN = 4
 """Robots of a line or a grid have up to 4 messages of equal worth, one that joins two groups 6. Among robots that all
 have much to relay, weights gain nothing and take the slots out of their order."""
@@ -66,11 +67,11 @@ class Stream(NamedTuple):
 class _State:
     """A stream, and who has what of it."""
 
-    __slots__ = ("arrivals", "has", "made", "newest", "period")
+    __slots__ = ("arrivals", "came", "has", "newest", "period")
 
     def __init__(self) -> None:
         self.newest = -1
-        self.made = -inf
+        self.came = -inf
         self.period = FIRST_PERIOD_S
         self.arrivals: deque[tuple[int, float]] = deque(maxlen=ARRIVALS)
         self.has: dict[int, float] = {}
@@ -141,7 +142,7 @@ class Gains:
         :return: whether it is newer than what is here
         """
         state = self._state(stream)
-        new = stream.origin != self.src_id and self._arrived(state, number, now if made is None else made)
+        new = stream.origin != self.src_id and self._arrived(state, number, now, now if made is None else made)
         state.has[via] = max(number, state.has.get(via, number))
         robot = self._heard.get(via)
         for name in () if robot is None else robot.named:
@@ -160,7 +161,7 @@ class Gains:
 
     def own(self, topic_id: int, start: int, number: int, now: float) -> None:
         """This robot has a new message of its own."""
-        self._arrived(self._state(Stream(self.src_id, start, topic_id)), number, now)
+        self._arrived(self._state(Stream(self.src_id, start, topic_id)), number, now, now)
 
     def gain(self, stream: Stream, now: float) -> float:
         """By how many s sending its newest message makes the neighbours younger, all together."""
@@ -227,13 +228,13 @@ class Gains:
             self._told[stream.origin, stream.start & 0xFF, stream.topic_id] = state
         return state
 
-    def _arrived(self, state: _State, number: int, made: float) -> bool:
+    def _arrived(self, state: _State, number: int, now: float, made: float) -> bool:
         if number <= state.newest:
-            if made <= state.made + EXPIRES_S:
+            if made <= state.came + EXPIRES_S:
                 return False
             state.arrivals.clear()
             state.has.clear()
-        state.newest, state.made = number, made
+        state.newest, state.came = number, now
         arrivals = state.arrivals
         arrivals.append((number, made))
         first, since = arrivals[0]

@@ -26,8 +26,8 @@ _OVER = 256
 """Messages over other robots that are remembered, because the origin's own packets may bring them too."""
 _NEVER = (-1, -1)
 EXPIRES_S = 15.0
-"""s for which a number that came over others refuses lower ones: what was made later than that after it is newer, or
-the number was false. Ages of messages are right to less than that."""
+"""s for which a number that came over others refuses lower ones: what was made later than that after it came is newer, or
+the number was false. A message may be much younger than its age says, but it was made before it came."""
 MAX_AGE_S = 15.0
 """Default of ``max_age_s``. How long ago a packet was sealed is known to the time from one hello to the echo of the
 next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
@@ -54,8 +54,8 @@ class DeliveryRules:
         """Numbers that the robot's packets have reached, and when, s."""
         self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
         """Messages that came over other robots, by topic id and order: they may come again."""
-        self._made: dict[int, float] = {}
-        """When the newest message of a topic was made, s, where it came over others."""
+        self._came: dict[int, float] = {}
+        """When the newest message of a topic came, s, where it came over others."""
         self._direct: dict[int, tuple[int, int]] = {}
         """The newest message of a topic that its maker's own packets brought."""
 
@@ -83,7 +83,7 @@ class DeliveryRules:
         for topic_id in [topic_id for topic_id, order in self.newest.items() if order[0] > number]:
             over = (order for of, order in self._over if of == topic_id and order[0] <= number)
             self.newest[topic_id] = max(self._direct.get(topic_id, _NEVER), max(over, default=_NEVER))
-            self._made.pop(topic_id, None)
+            self._came.pop(topic_id, None)
 
     def silent_before(self, number: int) -> None:
         """The robot was silent for long before its packets reached a number: what comes of earlier ones is that old."""
@@ -96,7 +96,7 @@ class DeliveryRules:
     def adopt(self, far: DeliveryRules) -> None:
         """Go on from what has come over other robots."""
         self.newest.update(far.newest)
-        self._made.update(far._made)
+        self._came.update(far._came)
         self._over.extend(far._over)
 
     def lacks(self, mark: tuple[int, int], number: int) -> bool:
@@ -123,16 +123,16 @@ class DeliveryRules:
             return Fate.LATE
         return passed_over(topic) if self._passed(ready) and (ready.topic_id, ready.order) not in self._over else None
 
-    def takes(self, ready: Ready, topic: AnnouncedTopic) -> bool:
+    def takes(self, ready: Ready, topic: AnnouncedTopic, now: float) -> bool:
         """Note a message that nothing refuses; returns whether it is new."""
         if self._passed(ready):
             return False
         self.newest[ready.topic_id] = ready.order
         if ready.over is None:
             self._direct[ready.topic_id] = ready.order
-            self._made.pop(ready.topic_id, None)
+            self._came.pop(ready.topic_id, None)
         else:
-            self._made[ready.topic_id] = ready.made
+            self._came[ready.topic_id] = now
         if topic.latched:
             mark, marks = crc32(ready.payload), self.marks.get(ready.topic_id, ())
             if mark in marks:
@@ -160,7 +160,7 @@ class DeliveryRules:
         """Whether a later message of its topic was delivered."""
         if ready.order > self.newest.get(ready.topic_id, _NEVER):
             return False
-        return ready.over is None or ready.made <= self._made.get(ready.topic_id, inf) + EXPIRES_S
+        return ready.over is None or ready.made <= self._came.get(ready.topic_id, inf) + EXPIRES_S
 
 
 def passed_over(topic: AnnouncedTopic) -> Fate:

@@ -398,7 +398,7 @@ class Inbox:
         if refusal is not None:
             self._give_up([ready], refusal)
             return
-        new = self.deliveries.takes(ready, topic)
+        new = self.deliveries.takes(ready, topic, self._now)
         for partial in self._reassembly.overtaken(ready.topic_id, ready.order[0]):
             self._lose(partial, passed_over(topic))
         if not new:

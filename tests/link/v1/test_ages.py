@@ -10,11 +10,14 @@ import pytest
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.link.queues import PublisherQos
+from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.relaying import FORGET_S, Relaying
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
+from gr_ros2.wire.relayed import Relayed, write_relayed
+from gr_ros2.wire.v1 import RELAYED_TOPIC
 from tests.link.v1.air import SLOT_S, Robot, registry
 from tests.link.v1.test_commands import TWIST
 from tests.link.v1.test_custody import custody_of, line_of, named
@@ -214,3 +217,19 @@ def test_ages_in_a_mesh_are_never_less_than_the_truth() -> None:
         line.run(3)
     assert len(seen) > 500
     assert max(seen) < 1.0
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_message_that_seemed_older_than_it_is_does_not_come_again(mode: SealMode) -> None:
+    """In a packet that had to be repaired it seems as old as the packet before; over another robot it came at once."""
+    line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3)))
+    line.run(10)
+    last = relaying_of(line.robots[2])
+    number = line.robots[0].end.window.packets.newest + 1
+    events: list[Any] = []
+    for later, text, seems_s in ((1, b"second", 40.0), (1, b"second", 0.0), (0, b"first", 0.0)):
+        message = Relayed(1, line.robots[0].boot & 0xFFFF, number + later, 0, 0, 1, text, age=0)
+        came = Ready(RELAYED_TOPIC, (1, 0), write_relayed(message), 0, False, True, made=line.now - seems_s)
+        last.receive(2, came, line.now)
+        events += last._outcomes.take()
+    assert [event.payload for event in events if isinstance(event, Delivered)] == [b"second"]
