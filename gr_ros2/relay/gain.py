@@ -43,8 +43,8 @@ ARRIVALS = 16
 TOLD = 2
 """Streams of which a packet tells the newest number."""
 EXPIRES_S = 15.0
-"""s for which a number refuses lower ones: what was made later than that after it came is newer, or the number was false.
-A message may be much younger than its age says, but it was made before it came."""
+"""s for which a number refuses lower ones: what was made later than that after it came is newer, or the number was
+false. A message may be much younger than its age says, but it was made before it came."""
 EVEN = 4
 """Robots of a line or a grid have up to 4 messages of equal worth, one that joins two groups 6. Among robots that all
 have much to relay, weights gain nothing and take the slots out of their order."""

@@ -26,8 +26,8 @@ _OVER = 256
 """Messages over other robots that are remembered, because the origin's own packets may bring them too."""
 _NEVER = (-1, -1)
 EXPIRES_S = 15.0
-"""s for which a number that came over others refuses lower ones: what was made later than that after it came is newer, or
-the number was false. A message may be much younger than its age says, but it was made before it came."""
+"""s for which a number that came over others refuses lower ones: what was made later than that after it came is newer,
+or the number was false. A message may be much younger than its age says, but it was made before it came."""
 MAX_AGE_S = 15.0
 """Default of ``max_age_s``. How long ago a packet was sealed is known to the time from one hello to the echo of the
 next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
