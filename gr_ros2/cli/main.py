@@ -27,9 +27,9 @@ _NO_GNU_RADIO = (
     "environment made by /usr/bin/python3 -m venv --system-site-packages; without it there are packet, registry, dict, "
     "key and scenarios, and with `phy: modem` or `direct` also plan, and replay by packets (`time: packets`)"
 )
-_EXTRAS = dict.fromkeys(("matplotlib", "plotext", "pyarrow", "jinja2"), "lab")
-"""The extra of this package that brings a library which only experiments need, by the name that is imported. The
-dashboard, sweeps and Zenoh name theirs where they import it."""
+_LABORATORY = ("matplotlib", "plotext", "pyarrow", "jinja2")
+"""Packages that only experiments need, of the extra ``lab``. The dashboard, sweeps and Zenoh name theirs where they
+import it."""
 
 Commands = Mapping[str, tuple[str, str]]
 """name -> (``module:attribute``, the line that help shows), in the order in which help lists them."""
@@ -135,9 +135,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), BAD_INPUT if isinstance(error, _BAD_INPUT_ERRORS) else FAILED)
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing in _EXTRAS:
-            extra = _EXTRAS[missing]
-            return _fail(f"this needs {missing}, of the laboratory: pip install 'gr-ros2[{extra}]'", BAD_INPUT)
+        if missing in _LABORATORY:
+            return _fail(f"this needs {missing}, of the laboratory: pip install 'gr-ros2[lab]'", BAD_INPUT)
         if missing not in _GNU_RADIO:
             raise
         return _fail(_NO_GNU_RADIO, BAD_INPUT)

@@ -13,7 +13,7 @@ from click.shell_completion import CompletionItem
 
 from gr_ros2.core.backends import BackendTable
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.files import BUILTIN_DIR
+from gr_ros2.settings.files import builtin_scenarios
 
 
 class Completed(click.ParamType):
@@ -38,7 +38,7 @@ class ScenarioName(Completed):
     name = "scenario"
 
     def candidates(self) -> Iterable[CompletionItem]:
-        return map(CompletionItem, sorted(path.stem for path in BUILTIN_DIR.glob("*.yaml")))
+        return map(CompletionItem, builtin_scenarios())
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         return super().shell_complete(ctx, param, incomplete) or [CompletionItem(incomplete, type="file")]

@@ -5,13 +5,12 @@ from __future__ import annotations
 import click
 
 from gr_ros2.settings.config import read_yaml
-from gr_ros2.settings.files import BUILTIN_DIR
+from gr_ros2.settings.files import BUILTIN_DIR, builtin_scenarios
 
 
 @click.command()
 def scenarios() -> None:
     """List the built-in scenarios, one line each."""
-    found = {path.stem: str(read_yaml(path)["description"]) for path in BUILTIN_DIR.glob("*.yaml")}
-    width = max(map(len, found))
-    for name, description in sorted(found.items()):
-        print(f"{name:{width}}  {description}")
+    width = max(map(len, builtin_scenarios()))
+    for name in builtin_scenarios():
+        print(f"{name:{width}}  {read_yaml(BUILTIN_DIR / f'{name}.yaml')['description']}")

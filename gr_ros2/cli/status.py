@@ -59,13 +59,7 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
     for peer in peers:
         table.add_row(
             str(peer["robot"]),
-            "two robots"
-            if peer["doubled"]
-            else "silent"
-            if peer["silent"]
-            else f"over {peer['over']}, hop {peer['hops']}"
-            if peer["hops"]
-            else "heard",
+            _peer_state(peer),
             _seconds(peer["heard_s"]),
             "" if peer["snr_db"] is None else f"{peer['snr_db']:.1f} dB",
             f"{peer['lost']} ({peer['loss']:.1%} lately)",
@@ -73,6 +67,14 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
             "yes" if peer["sealed"] else "no",
         )
     return table
+
+
+def _peer_state(peer: Mapping[str, Any]) -> str:
+    if peer["doubled"]:
+        return "two robots"
+    if peer["silent"]:
+        return "silent"
+    return f"over {peer['over']}, hop {peer['hops']}" if peer["hops"] else "heard"
 
 
 def _topic_table(stats: Stats) -> Table | str:

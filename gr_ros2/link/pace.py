@@ -16,8 +16,8 @@ _INTERVALS = 15
 """Number of packet intervals whose median estimates the interval of credits."""
 _ENOUGH, _RECENT_S = 3, 10.0
 """Intervals that must have been measured within so many seconds, or ``_INTERVALS`` of them where these are longer,
-before a message is dropped because of them. With one,
-the pause of a busy computer stopped the commands of a link for good: what was dropped measured nothing better."""
+before a message is dropped because of them. With one, the pause of a busy computer stopped the commands of a link for
+good: what was dropped measured nothing better."""
 
 
 class Pace:

@@ -8,7 +8,7 @@ gives a mapping from which `scenario_from` makes the same scenario again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -33,7 +33,7 @@ from gr_ros2.settings.config import (
 )
 from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.files import BUILTIN_DIR, ENDS, SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings.files import BUILTIN_DIR, ENDS, SHARED_KEYS, builtin_scenarios, read_settings, with_shared
 from gr_ros2.settings.registry import Registry, check_outputs
 from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire import BROADCAST
@@ -359,23 +359,13 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
     :raises ConfigError: when there is no such scenario, or a setting is wrong
     """
     path = BUILTIN_DIR / f"{name_or_path}.yaml"
-    if str(name_or_path) not in _builtin_names():
+    if str(name_or_path) not in builtin_scenarios():
         path = Path(name_or_path)
         if not path.is_file():
             raise ConfigError(
                 f"scenario {str(name_or_path)!r} is neither a file nor built in; "
-                f"built in are {', '.join(sorted(_builtin_names()))}"
+                f"built in are {', '.join(builtin_scenarios())}"
             )
     values = read_settings(path, overrides)
     values.update((key, value) for key, value in settings.items() if value is not None)
     return scenario_from(values, str(name_or_path))
-
-
-def builtin_scenarios() -> Iterator[Scenario]:
-    """The scenarios that come with gr-ros2, by name."""
-    for name in sorted(_builtin_names()):
-        yield load_scenario(name)
-
-
-def _builtin_names() -> list[str]:
-    return [path.stem for path in BUILTIN_DIR.glob("*.yaml")]

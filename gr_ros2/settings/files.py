@@ -99,6 +99,11 @@ def find_registry(name: str, directory: Path) -> str:
     raise ConfigError(f"registry = {name!r}: no such file; built in are {known}")
 
 
+def builtin_scenarios() -> list[str]:
+    """The names of the scenarios that come with gr-ros2, sorted."""
+    return sorted(path.stem for path in BUILTIN_DIR.glob("*.yaml"))
+
+
 def portable_registry(path: str) -> str:
     """How a file anywhere names a registry: a built-in one by its name, another by its absolute path; '' is none."""
     if not path:

@@ -10,11 +10,11 @@ import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.medium.base import Path as Way
-from gr_ros2.run.scenario import builtin_scenarios, changed, dump, load_scenario, scenario_from
+from gr_ros2.run.scenario import changed, dump, load_scenario, scenario_from
 from gr_ros2.settings.config import Agreed, ChannelConfig, replaced
-from gr_ros2.settings.files import parse_override
+from gr_ros2.settings.files import builtin_scenarios, parse_override
 
-BUILTIN = {scenario.name: scenario for scenario in builtin_scenarios()}
+BUILTIN = {scenario.name: scenario for scenario in map(load_scenario, builtin_scenarios())}
 
 
 def test_the_built_in_ones() -> None:
