@@ -85,11 +85,14 @@ def test_the_state_of_a_link_is_a_latched_topic() -> None:
     [(0.5, 0, "up"), (0.5, 400, "degraded"), (4.0, 0, "degraded"), (11.0, 0, "lost"), (11.0, 400, "lost")],
 )
 def test_a_link_is_up_degraded_or_lost(silence: float, missing: int, said: str) -> None:
-    health = make()
+    health = make(period_s=silence)  # a watcher that looks more rarely has not seen the silence
     parts(health, 0.0)
+    heard = stats()
+    heard["sink"]["silence_s"] = {2: 0.0}
+    health.links(heard, health.judge(heard, 1.0)[0])
     now = stats(packets=1000, missing=missing)
     now["sink"]["silence_s"] = {2: silence}
-    receiver = health.judge(now, 1.0)[0]
+    receiver = health.judge(now, 1.0 + silence)[0]
     state = health.links(now, receiver)[2]
     assert state.message == said
     assert state.level == {"up": Level.OK, "degraded": Level.WARN, "lost": Level.ERROR}[said]
