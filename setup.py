@@ -109,21 +109,18 @@ setup(
     long_description_content_type="text/markdown",
     license="GPL-3.0-or-later",
     python_requires=">=3.10",
-    packages=find_packages(include=["gr_ros2", "gr_ros2.*"]),
+    packages=find_packages(include=["gr_ros2*"]),
     package_data={
         "gr_ros2": [
             "py.typed",
             "grc/*.yml",
             "wireshark/*",
             "examples/*",
-            "scenarios/*",
-            "sweeps/*",
-            "losses/*",
-            "losses/*/*",
-            "report/templates/*",
+            "registries/*",
             "dashboard/templates/*",
             "compression/dictionaries/*",
-        ]
+        ],
+        "gr_ros2_lab": ["py.typed", "scenarios/*", "sweeps/*", "losses/*", "losses/*/*", "report/templates/*"],
     },
     ext_modules=[
         *(kernels(variant, flags) for variant, flags in VARIANTS.items()),

@@ -10,8 +10,8 @@ from bench.yardstick import Cost, cost
 from gr_ros2.compression import LinkCodec
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.settings.registry import Registry
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
 from tests.recordings import DRIVES
 
 DRIVE = DRIVES[-1]

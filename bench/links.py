@@ -16,12 +16,12 @@ import numpy as np
 
 from bench.rows import Row
 from bench.runs import DOMAINS, DRIVE
-from gr_ros2.record.result import TopicResult
-from gr_ros2.run.outcome import Outcome
-from gr_ros2.run.runner import run_scenario
-from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.study.ablation import air_bytes
-from gr_ros2.study.forecast import Planner
+from gr_ros2.observe.result import TopicResult
+from gr_ros2_lab.run.outcome import Outcome
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import Scenario, load_scenario
+from gr_ros2_lab.study.ablation import air_bytes
+from gr_ros2_lab.study.forecast import Planner
 
 WHOLE_S, PART_S, PLAIN_S = 38.0, 15.0, 8.0
 PACED = ["version=0", "reports=null", "ros_source.topic_options={}"]

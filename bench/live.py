@@ -21,8 +21,8 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.settings.files import find_registry
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
 
 REPEATS, WARM_UP_S, MEASURED_S = 5, 3.0, 8.0
 RATE_HZ = 35.0

@@ -29,8 +29,8 @@ from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.middleware.type_definitions import typestore
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
 
 TYPES = {"odom": "nav_msgs/msg/Odometry", "scan": "sensor_msgs/msg/LaserScan", "image": "sensor_msgs/msg/Image"}
 PERIODIC = ("odom", "scan")

@@ -20,10 +20,10 @@ from bench.mac_rivals import Csma, Sotdma
 from bench.rows import Row
 from bench.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 from gr_ros2.mac import Aloha, Slots
-from gr_ros2.run.load import make_phy
-from gr_ros2.run.scenario import load_scenario
-from gr_ros2.run.simulate import Simulation, offered_by
-from gr_ros2.run.task_run import TaskRun
+from gr_ros2_lab.run.load import make_phy
+from gr_ros2_lab.run.scenario import load_scenario
+from gr_ros2_lab.run.simulate import Simulation, offered_by
+from gr_ros2_lab.run.task_run import TaskRun
 
 AIRTIME_S, GUARD_S = 1 / 75, 0.001
 SLOT_S = AIRTIME_S + GUARD_S

@@ -14,10 +14,10 @@ from pathlib import Path
 from bench.rows import Row
 from gr_ros2.link.events import Delivered
 from gr_ros2.phy.ofdm import RATES
-from gr_ros2.run.load import make_phy
-from gr_ros2.run.scenario import scenario_from
-from gr_ros2.run.simulate import Offered, Simulation
 from gr_ros2.settings.files import find_registry
+from gr_ros2_lab.run.load import make_phy
+from gr_ros2_lab.run.scenario import scenario_from
+from gr_ros2_lab.run.simulate import Offered, Simulation
 
 PACKET_LEN, MESSAGE_LEN = 220, 205
 SNRS_DB = range(31)

@@ -27,7 +27,7 @@ from gr_ros2.link import rate as engine
 from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.reports import Reporter
-from gr_ros2.medium.fading import RayleighFading
+from gr_ros2_lab.medium.fading import RayleighFading
 
 MCS_TABLE = (
     Mcs("bpsk-cc", 0.006272, -1.4, 0.4),

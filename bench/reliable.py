@@ -18,12 +18,12 @@ from statistics import mean
 
 from bench.rows import Row
 from gr_ros2.link import Accepted, Delivered, SentPacket
-from gr_ros2.run.load import make_phy
-from gr_ros2.run.scenario import load_scenario
-from gr_ros2.run.simulate import Offered, Simulation
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
 from gr_ros2.wire.control import Report, write_control
+from gr_ros2_lab.run.load import make_phy
+from gr_ros2_lab.run.scenario import load_scenario
+from gr_ros2_lab.run.simulate import Offered, Simulation
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
 
 ROBOTS, LOSS, PACKETS_S, PACKET_LEN = 20, 0.1, 75, 512
 PERIOD_S, SIZE = 10.0, 2000

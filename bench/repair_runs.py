@@ -12,9 +12,9 @@ from typing import Any, Literal
 
 from bench.repair import ODOMETRY
 from bench.rows import Row
-from gr_ros2.record.result import Result
-from gr_ros2.run.runner import run_scenario
-from gr_ros2.run.scenario import load_scenario
+from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
 from tests.recordings import DRIVES
 
 DRIVE = DRIVES[-1]

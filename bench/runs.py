@@ -8,9 +8,9 @@ from tempfile import TemporaryDirectory
 
 from bench.rows import Row
 from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.record.result import Result
-from gr_ros2.run.runner import DELIVERED_BAG, run_scenario
-from gr_ros2.run.scenario import load_scenario
+from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.run.runner import DELIVERED_BAG, run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
 from tests.recordings import DRIVES
 
 DRIVE = DRIVES[-1]

@@ -26,11 +26,11 @@ from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.run.load import make_phy
-from gr_ros2.run.scenario import Scenario, load_scenario
-from gr_ros2.run.simulate import Offered, offered, simulate
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
+from gr_ros2_lab.run.load import make_phy
+from gr_ros2_lab.run.scenario import Scenario, load_scenario
+from gr_ros2_lab.run.simulate import Offered, offered, simulate
 
 SCENARIOS = ("paper-ofdm-paced", "narrow-ofdm-paced", "six-topics-paced")
 LOSSES = (0.0, 0.2)

@@ -15,12 +15,12 @@ from bench.rows import Row
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
-from gr_ros2.radio.medium import MediumConfig, MediumProcess
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.settings.config import build
-from gr_ros2.settings.files import BUILTIN_DIR
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2.settings.files import REGISTRY_DIR
+from gr_ros2_lab.medium.process import MediumConfig, MediumProcess
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
 
 RATE_HZ, SECONDS, DRAIN_S = 35.0, 20.0, 2.0
 PHY = {"name": "ofdm", "sample_rate": 300_000}
@@ -85,7 +85,7 @@ def _count(heard: Counter[int], number: int, _payload: bytes) -> None:
 def _link(number: int, medium: str, addresses: dict[str, str], folder: Path) -> Any:
     end = {"middleware": "memory", "domain_id": number}
     values = {
-        "registry": str(BUILTIN_DIR / "odom.csv"),
+        "registry": str(REGISTRY_DIR / "odom.csv"),
         "packet_len": PACKET_LEN,
         "phy": PHY,
         "medium": medium,

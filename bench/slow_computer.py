@@ -28,9 +28,9 @@ import numpy as np
 from bench.rows import Row
 from gr_ros2.gr.latency import CLOCK_TYPE, has_header, leading_time
 from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.record.metrics import age
-from gr_ros2.record.result import Result, read_result
-from gr_ros2.run.runner import DELIVERED_BAG
+from gr_ros2_lab.record.metrics import age
+from gr_ros2_lab.record.result import Result, read_result
+from gr_ros2_lab.run.runner import DELIVERED_BAG
 
 SHARE = 1 / 3
 DURATION_S = 20.0

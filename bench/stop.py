@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 from bench.rows import Row
 from bench.runs import DOMAINS
-from gr_ros2.record.result import read_result
+from gr_ros2_lab.record.result import read_result
 
 REPEATS, PATIENCE_S = 3, 60.0
 MOST = 2.0

@@ -1,8 +1,8 @@
 """Many robots on one channel at packet level: each sends a message of one packet whenever it may.
 
 The robots have the engines of ``gr_ros2.mac`` and clocks of their own; nothing else of a robot is simulated. The medium
-is :class:`gr_ros2.medium.packets.PacketMedium` with a PHY that loses nothing unless packets overlap, and the event loop
-is that of ``run.simulate``. A host takes ``latency_s`` from the end of a packet to what it does about it.
+is :class:`gr_ros2_lab.medium.packets.PacketMedium` with a PHY that loses nothing unless packets overlap, and the event
+loop is that of ``run.simulate``. A host takes ``latency_s`` from the end of a packet to what it does about it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from bench.swarm_traffic import ByGain, OwnOnly, SwarmTraffic
 from gr_ros2.link.access import Access
 from gr_ros2.mac import read_block
-from gr_ros2.medium.base import Hearers, Medium, Path, Reception, Surroundings, Transmission
-from gr_ros2.medium.packets import PacketMedium
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.record.team_numbers import jain
-from gr_ros2.run.simulate import EventLoop
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.wire.mac_block import Block
+from gr_ros2_lab.medium.base import Hearers, Medium, Path, Reception, Surroundings, Transmission
+from gr_ros2_lab.medium.packets import PacketMedium
+from gr_ros2_lab.record.team_numbers import jain
+from gr_ros2_lab.run.simulate import EventLoop
 
 
 @dataclass

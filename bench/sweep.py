@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 import yaml
 
 from bench.rows import Row
-from gr_ros2.medium.loss_table import PACKETS
-from gr_ros2.study.sweep.definition import load_sweep
-from gr_ros2.study.sweep.run import run_sweep
-from gr_ros2.study.sweep.summaries import ALL, Summary, rows_of, summaries
+from gr_ros2_lab.medium.loss_table import PACKETS
+from gr_ros2_lab.study.sweep.definition import load_sweep
+from gr_ros2_lab.study.sweep.run import run_sweep
+from gr_ros2_lab.study.sweep.summaries import ALL, Summary, rows_of, summaries
 
 WORKERS = 2
 MOST = 0.4

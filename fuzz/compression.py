@@ -12,9 +12,9 @@ from fuzz.loop import main, within
 from gr_ros2.compression import LinkCodec
 from gr_ros2.core.errors import CodecError
 from gr_ros2.settings.registry import Registry, Topic
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sensors import TYPES as SIMULATED
-from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sensors import TYPES as SIMULATED
+from gr_ros2_lab.sim.sim_settings import SimSettings
 
 BASE, PER_BYTE = 20_000, 500
 """Lines of Python that a coded message may take, and more for each byte of it."""

@@ -9,9 +9,9 @@ from math import inf, nan
 import numpy as np
 
 from fuzz.loop import KEPT, main, within
-from gr_ros2.radio.medium import STEP_S, MediumConfig, MediumProcess
 from gr_ros2.radio.zmq import HEADER, MAGIC
 from gr_ros2.settings.config import build
+from gr_ros2_lab.medium.process import STEP_S, MediumConfig, MediumProcess
 
 RATE = 1e6
 MOST_LINES = 2_000

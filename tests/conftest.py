@@ -16,10 +16,10 @@ from hypothesis import settings
 # Workers share the cores: threads of theirs for linear algebra would only wait for each other. Read as numpy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from gr_ros2.record.result import Result
+from gr_ros2_lab.record.result import Result
 from tests import domains
+from tests.lab.record.results import RESULT
 from tests.outcomes import pytest_addoption, pytest_configure, pytest_xdist_make_scheduler  # noqa: F401
-from tests.record.results import RESULT
 
 # Helpers that assert say what they saw, as tests do.
 pytest.register_assert_rewrite("tests.e2e.support", "tests.middleware.support", "tests.waiting")
@@ -137,7 +137,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
             file.write_text("<svg/>")
         return files
 
-    monkeypatch.setattr("gr_ros2.report.page.save_figure", empty)
+    monkeypatch.setattr("gr_ros2_lab.report.page.save_figure", empty)
 
 
 @pytest.fixture

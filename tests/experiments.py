@@ -23,7 +23,6 @@ import numpy as np
 from click.testing import CliRunner
 from gnuradio import blocks, gr
 
-from gr_ros2.cli.run import run
 from gr_ros2.compression.train import learn
 from gr_ros2.gr import RosSink
 from gr_ros2.gr.factory import EndpointSetup, make_endpoint
@@ -34,25 +33,26 @@ from gr_ros2.phy import PHY
 from gr_ros2.phy.channel import Channel
 from gr_ros2.phy.measure import SampleRecording, deliver, modulated, record
 from gr_ros2.phy.threads import run_flowgraph
-from gr_ros2.race.contenders import CONTENDERS
-from gr_ros2.race.measure import Identity, RaceSender
-from gr_ros2.race.race_settings import RaceSettings, conditions, read_recordings
-from gr_ros2.race.slots import run_slots
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.run.robots import surroundings
-from gr_ros2.run.scenario import load_scenario
 from gr_ros2.settings.config import ChannelConfig, SourceConfig, build
 from gr_ros2.settings.registry import Registry
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
-from gr_ros2.study.sweep.figures import curves_figure, heat_figure
-from gr_ros2.study.sweep.summaries import rows_of, summaries
+from gr_ros2_lab.cli.run import run
+from gr_ros2_lab.race.contenders import CONTENDERS
+from gr_ros2_lab.race.measure import Identity, RaceSender
+from gr_ros2_lab.race.race_settings import RaceSettings, conditions, read_recordings
+from gr_ros2_lab.race.slots import run_slots
+from gr_ros2_lab.run.robots import surroundings
+from gr_ros2_lab.run.scenario import load_scenario
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
+from gr_ros2_lab.study.sweep.figures import curves_figure, heat_figure
+from gr_ros2_lab.study.sweep.summaries import rows_of, summaries
 from tests.domains import free_domains
 from tests.gr.probe import Probe
-from tests.study.sweeps import plan
-from tests.study.test_sweep_summaries import IMU, ODOM, results, topic
+from tests.lab.study.sweeps import plan
+from tests.lab.study.test_sweep_summaries import IMU, ODOM, results, topic
 from tests.waiting import wait_for
 
 PACKETS = [random.Random(length).randbytes(length) for length in (64, 20, 64)]

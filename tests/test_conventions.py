@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 TESTS = Path(__file__).parent
-PACKAGE = TESTS.parent / "gr_ros2"
+ROOT = TESTS.parent
+MODULES = sorted(ROOT.glob("gr_ros2*/**/*.py"))
 EXPECTING = {"raises", "fail", "wait_for"}
 """Calls that fail a test which does not see what it expects; so do helpers named ``check…``."""
 
@@ -159,14 +160,13 @@ def shared(modules: Iterable[tuple[str, ast.Module]]) -> dict[str, list[str]]:
     for module, tree in modules:
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
-                folder = module.split("/", maxsplit=1)[0] if node.name.startswith("_") else ""
+                folder = "/".join(module.split("/")[:-1][:2]) if node.name.startswith("_") else ""
                 found[folder, node.name].append(module)
     return {name: modules for (_, name), modules in found.items() if len(modules) > 1}
 
 
 def test_a_class_has_its_name_to_itself() -> None:
-    paths = sorted(PACKAGE.rglob("*.py"))
-    assert shared((str(path.relative_to(PACKAGE)), ast.parse(path.read_text())) for path in paths) == {}
+    assert shared((str(path.relative_to(ROOT)), ast.parse(path.read_text())) for path in MODULES) == {}
 
 
 def test_two_classes_of_one_name_are_found() -> None:
@@ -215,7 +215,7 @@ def undocumented(trees: Iterable[ast.Module]) -> set[str]:
 
 
 def test_what_is_public_has_a_docstring() -> None:
-    found = undocumented(ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py")))
+    found = undocumented(ast.parse(path.read_text()) for path in MODULES)
     assert found == set()
 
 

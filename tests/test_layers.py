@@ -17,42 +17,51 @@ import gr_ros2.wire
 
 pytestmark = pytest.mark.xdist_group("layers")  # each module is parsed once
 
-ROOT = Path(gr_ros2.__file__).resolve().parent
-MODULES = [path.relative_to(ROOT).as_posix() for path in sorted(ROOT.rglob("*.py"))]
+ROOT = Path(gr_ros2.__file__).resolve().parents[1]
+ROBOT, LAB = "gr_ros2", "gr_ros2_lab"
+MODULES = [path.relative_to(ROOT).as_posix() for one in (ROBOT, LAB) for path in sorted((ROOT / one).rglob("*.py"))]
 
-LAYERS = (
-    {"core"},
-    {"wire", "state"},
-    {"settings", "relay"},
-    {"link", "calls"},
-    {"mac"},
-    {"middleware", "compression"},
-    {"phy", "sim", "grc"},
-    {"medium"},
-    {"gr"},
-    {"radio"},
-    {"record"},
-    {"run", "report"},
-    {"study"},
-    {"dashboard", "race", "doctor"},
-    {"cli"},
-    {"ros"},
-)
-"""From the bottom up. A part imports itself and what lies below it, not its neighbours."""
+LAYERS = {
+    ROBOT: (
+        {"core"},
+        {"wire", "state"},
+        {"settings", "relay"},
+        {"link", "calls"},
+        {"mac"},
+        {"middleware", "compression"},
+        {"phy", "grc"},
+        {"gr"},
+        {"radio"},
+        {"observe"},
+        {"dashboard", "doctor"},
+        {"cli"},
+        {"ros"},
+    ),
+    LAB: (
+        {"sim"},
+        {"medium", "record"},
+        {"run", "report"},
+        {"study"},
+        {"race"},
+        {"cli"},
+    ),
+}
+"""Of each package from the bottom up. A part imports itself and what lies below it in its package, not its neighbours.
+The laboratory imports the robot's parts, its commands also those that print; a robot's part imports none of it."""
 
-MAY_PRINT = {"cli", "ros"}
-
+SHELLS = {"cli", "ros"}
+"""Parts that print, exit and read argv."""
 PURE = {"wire", "link", "mac", "relay", "calls"}
 PURE_CODECS = {"backports", "cryptography"}
 """Small codecs and ciphers without IO that these may import beside the standard library."""
 
 CONFINED = {
-    "gnuradio": ("gr/", "phy/", "radio/", "race/links.py"),
-    "pmt": ("gr/", "phy/", "radio/", "race/links.py"),
-    "rclpy": ("middleware/rclpy.py", "middleware/rclpy_executor.py", "ros/"),
-    "rcl_interfaces": ("ros/",),
-    "distributed": ("study/sweep/cluster.py",),
-    "zenoh": ("middleware/zenoh.py", "race/"),
+    "gnuradio": ("gr_ros2/gr/", "gr_ros2/phy/", "gr_ros2/radio/", "gr_ros2_lab/race/links.py"),
+    "pmt": ("gr_ros2/gr/", "gr_ros2/phy/", "gr_ros2/radio/", "gr_ros2_lab/race/links.py"),
+    "rclpy": ("gr_ros2/middleware/rclpy.py", "gr_ros2/middleware/rclpy_executor.py", "gr_ros2/ros/"),
+    "rcl_interfaces": ("gr_ros2/ros/",),
+    "distributed": ("gr_ros2_lab/study/sweep/cluster.py",),
+    "zenoh": ("gr_ros2/middleware/zenoh.py", "gr_ros2_lab/race/"),
 }
 BLOCKED = (*CONFINED, "cyclonedds")
 WITHOUT_BACKENDS = (
@@ -70,26 +79,26 @@ WITHOUT_BACKENDS = (
     "gr_ros2.phy",
     "gr_ros2.radio",
     "gr_ros2.radio.config",
-    "gr_ros2.sim",
-    "gr_ros2.record.ledger",
-    "gr_ros2.record.metrics",
-    "gr_ros2.record.result",
-    "gr_ros2.run.scenario",
+    "gr_ros2_lab.sim",
+    "gr_ros2_lab.record.ledger",
+    "gr_ros2_lab.record.metrics",
+    "gr_ros2_lab.record.result",
+    "gr_ros2_lab.run.scenario",
     "gr_ros2.cli.main",
 )
 
 KNOW_THEIR_VERSION = (
-    "wire/",
-    "link/v0/",
-    "link/v1/",
-    "mac/",
-    "relay/",
-    "link/reader.py",
+    "gr_ros2/wire/",
+    "gr_ros2/link/v0/",
+    "gr_ros2/link/v1/",
+    "gr_ros2/mac/",
+    "gr_ros2/relay/",
+    "gr_ros2/link/reader.py",
 )
 """The codec of a version, its engines, and what reads packets without being an end. All others ask a Format."""
-FACTORY = "gr/factory.py"
+FACTORY = "gr_ros2/gr/factory.py"
 """The module outside ``link`` that makes the endpoint of a version."""
-SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "dashboard", "settings"}
+SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "observe", "dashboard", "settings"}
 """Parts that handle packets and have no bytes of their own, as coders, modems and capture files have."""
 
 _GENERATORS = {"Random", "SystemRandom", "default_rng", "Generator", "SeedSequence", "PCG64"}
@@ -103,9 +112,14 @@ def parsed(module: str) -> ast.Module:
     return ast.parse((ROOT / module).read_text("utf-8"))
 
 
+def place(module: str) -> tuple[str, str]:
+    """Package and part of a module: ``gr_ros2`` and ``link`` of ``gr_ros2/link/v0/sender.py``."""
+    package, inner = module.split("/", maxsplit=1)
+    return package, inner.split("/", maxsplit=1)[0].removesuffix(".py")
+
+
 def part(module: str) -> str:
-    """``link`` of ``link/v0/sender.py``."""
-    return module.split("/", maxsplit=1)[0].removesuffix(".py")
+    return place(module)[1]
 
 
 @functools.cache
@@ -129,9 +143,9 @@ def breaking(rule: Callable[[str], Any], modules: Iterable[str] = MODULES) -> di
     return {module: found for module, found in said.items() if found}
 
 
-def level(name: str) -> int:
-    found = [number for number, layer in enumerate(LAYERS) if name in layer]
-    assert found, f"gr_ros2.{name} stands in no layer; add it to LAYERS"
+def level(package: str, name: str) -> int:
+    found = [number for number, layer in enumerate(LAYERS[package]) if name in layer]
+    assert found, f"{package}.{name} stands in no layer; add it to LAYERS"
     return found[0]
 
 
@@ -153,18 +167,24 @@ def calls_and_uses(module: str) -> set[str]:
     return found
 
 
-def ours(module: str) -> list[str]:
-    """The parts of gr_ros2 that a module imports."""
+def ours(module: str) -> list[tuple[str, str]]:
+    """The parts of both packages that a module imports."""
     names = [name.split(".") for name in imports(module)]
-    return [name[1] for name in names if name[0] == "gr_ros2" and len(name) > 1 and name[1] != "__version__"]
+    return [(name[0], name[1]) for name in names if name[0] in LAYERS and len(name) > 1 and name[1] != "__version__"]
 
 
 def test_arrows_point_down_only() -> None:
-    def up(module: str) -> list[str]:
-        own = part(module)
-        if own == "__init__":
-            return ours(module)
-        return [name for name in ours(module) if name != own and level(name) >= level(own)]
+    def up(module: str) -> list[tuple[str, str]]:
+        package, own = place(module)
+
+        def may(other: str, name: str) -> bool:
+            if own == "__init__":
+                return False
+            if other == package:
+                return name == own or level(package, name) < level(package, own)
+            return package == LAB and (name not in SHELLS or own in SHELLS)
+
+        return [found for found in ours(module) if not may(*found)]
 
     assert breaking(up) == {}
 
@@ -176,9 +196,8 @@ def test_no_modules_import_each_other() -> None:
     def imported(module: str) -> set[str]:
         found = set()
         for name in imports(module):
-            inner = name.removeprefix("gr_ros2.")
-            known = inner if inner in names else inner.rpartition(".")[0]
-            if name.startswith("gr_ros2.") and known in names:
+            known = name if name in names else name.rpartition(".")[0]
+            if known in names:
                 found.add(names[known])
         return found - {module}
 
@@ -190,7 +209,7 @@ def test_no_modules_import_each_other() -> None:
 
 def test_wire_and_link_are_pure() -> None:
     def impure(module: str) -> set[str]:
-        outside = {name.split(".")[0] for name in imports(module)} - {"gr_ros2"}
+        outside = {name.split(".")[0] for name in imports(module)} - {ROBOT}
         foreign = outside - set(sys.stdlib_module_names) - PURE_CODECS
         return foreign | outside & {"threading", "time", "socket", "asyncio", "logging", "subprocess"}
 
@@ -232,7 +251,8 @@ def test_no_width_of_a_field_stands_outside_of_the_wire() -> None:
                 found += [ast.unparse(node) for value in given if value in widths]
         return found
 
-    speaking = [m for m in MODULES if part(m) in SPEAKS_OF_PACKETS and not m.startswith(("link/v1/", "link/reader.py"))]
+    own = ("gr_ros2/link/v1/", "gr_ros2/link/reader.py")
+    speaking = [m for m in MODULES if part(m) in SPEAKS_OF_PACKETS and not m.startswith(own)]
     assert breaking(written, speaking) == {}
 
 
@@ -245,7 +265,7 @@ def test_back_end_packages_are_imported_in_their_adapters_only(package: str) -> 
 
 def test_library_code_never_prints_asks_exits_or_reads_argv() -> None:
     forbidden = {"print", "input", "exit", "quit", "breakpoint", "sys.exit", "sys.argv", "os._exit"}
-    library = [module for module in MODULES if part(module) not in MAY_PRINT]
+    library = [module for module in MODULES if part(module) not in SHELLS]
     assert breaking(lambda module: forbidden & calls_and_uses(module), library) == {}
 
 
@@ -265,10 +285,10 @@ def test_every_module_says_what_it_is() -> None:
 
 
 def test_everything_but_the_adapters_imports_without_any_back_end() -> None:
-    wanted = [name for name in WITHOUT_BACKENDS if (ROOT.parent / name.replace(".", "/")).with_suffix(".py").exists()]
-    wanted += [name for name in WITHOUT_BACKENDS if (ROOT.parent / name.replace(".", "/") / "__init__.py").exists()]
+    wanted = [name for name in WITHOUT_BACKENDS if (ROOT / name.replace(".", "/")).with_suffix(".py").exists()]
+    wanted += [name for name in WITHOUT_BACKENDS if (ROOT / name.replace(".", "/") / "__init__.py").exists()]
     assert set(wanted) == set(WITHOUT_BACKENDS)
-    wanted += [f"gr_ros2.{m.removesuffix('.py').replace('/', '.')}" for m in MODULES if part(m) in PURE]
+    wanted += [m.removesuffix(".py").replace("/", ".") for m in MODULES if part(m) in PURE]
     code = f"""
 import sys
 from importlib import import_module
@@ -287,6 +307,8 @@ for name in {wanted!r}:
 
 
 def test_the_picture_of_the_architecture_shows_these_layers() -> None:
-    page = (ROOT.parent / "docs" / "explanation" / "architecture.md").read_text("utf-8")
-    shown = page.split("lies below it:", maxsplit=1)[1].split("```", maxsplit=1)[0]
-    assert [set(layer.split()) for layer in shown.split("│")] == [*LAYERS]
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text("utf-8")
+    picture = page.split("lies below it:", maxsplit=1)[1].split("```", maxsplit=1)[0]
+    for package, shown in zip(LAYERS, picture.strip().split("\n\n"), strict=True):
+        name, layers = shown.split(maxsplit=1)
+        assert (name, [set(layer.split()) for layer in layers.split("│")]) == (package, [*LAYERS[package]])

@@ -25,21 +25,21 @@ from click.testing import CliRunner
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.cli.medium import medium
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.factory import make_endpoint
 from gr_ros2.link.endpoint import LIVE_OPTIONS
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
 from gr_ros2.phy.wifi_frames import DataFrames
-from gr_ros2.race.contenders import chosen
-from gr_ros2.run.scenario import load_scenario
-from gr_ros2.run.simulate import simulate
 from gr_ros2.settings.config import DiagnosticsConfig, SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.settings.fields import AUTO, Setting, settings_of
 from gr_ros2.settings.registry import Registry, Topic
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2_lab.cli.medium import medium
+from gr_ros2_lab.race.contenders import chosen
+from gr_ros2_lab.run.scenario import load_scenario
+from gr_ros2_lab.run.simulate import simulate
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
 from tests.experiments import (
     GRAPH,
     dictionary,
@@ -315,7 +315,7 @@ effects(
     imu_orientation_noise=drives(imu_orientation_noise=0.2),
     start_time_s=drives(start_time_s=1000.0),
     prefix_frames=drives(prefix_frames=True),
-    transforms=Elsewhere("sim/test_transforms.py::test_every_frame_hangs_on_the_map"),
+    transforms=Elsewhere("lab/sim/test_transforms.py::test_every_frame_hangs_on_the_map"),
 )
 effects(
     "Losses in bursts",
@@ -371,8 +371,8 @@ effects(
     duration_s=run("duration_s=3"),
     drain_s=run("drain_s=0", "ros_source.packet_rate=0"),
     sim=run("sim.odom_rate=20"),
-    task=Elsewhere("run/test_task_run.py::test_followers_keep_their_places_by_the_link_alone"),
-    controller=Elsewhere("run/test_task_run.py::test_robots_meet_in_real_time_whoever_drives_them"),
+    task=Elsewhere("lab/run/test_task_run.py::test_followers_keep_their_places_by_the_link_alone"),
+    controller=Elsewhere("lab/run/test_task_run.py::test_robots_meet_in_real_time_whoever_drives_them"),
     reports=run("reports={}", LOSSY),
     airtime=run("airtime=eu869.4"),
 )
@@ -401,13 +401,13 @@ effects(
     seal=ENDS["seal"],
     state=Refused(("state=robot.json",)),
     localhost_only=Elsewhere("middleware/test_dds.py::test_a_domain_is_on_loopback_or_not_for_the_whole_process"),
-    own_domains=Elsewhere("run/test_domains.py::test_one_graph_is_that_of_the_shell"),
+    own_domains=Elsewhere("lab/run/test_domains.py::test_one_graph_is_that_of_the_shell"),
     description=lambda: (printed(), printed("description=another")),
     repetitions=lambda: (printed(), printed("repetitions=2")),
-    time=Elsewhere("run/test_simulated_runner.py::test_in_noise_packets_lose_what_samples_lose"),
+    time=Elsewhere("lab/run/test_simulated_runner.py::test_in_noise_packets_lose_what_samples_lose"),
     bag_speed=run("bag_speed=2", *DRIVE),
     back=run("back={ros_source: {namespace: /robot_2}}"),
-    receivers=Elsewhere("run/test_version1.py::test_every_receiver_has_losses_of_its_own"),
+    receivers=Elsewhere("lab/run/test_version1.py::test_every_receiver_has_losses_of_its_own"),
     robots=run("robots=3", scenario="two-robots-half-duplex"),
     duplex=run("duplex=full", scenario="two-robots-half-duplex"),
     gains_db=lambda: (reached(), reached("gains_db=-90")),
@@ -540,7 +540,7 @@ effects(
     duration_s=differs(prepared, duration_s=0.3),
     packet_len=differs(raced, packet_len=96),
     sample_rate=differs(prepared, sample_rate=50_000.0),
-    bag_topic=Elsewhere("race/test_race_settings.py::test_of_a_bag_the_named_topic_is_taken_for_as_long_as_asked"),
+    bag_topic=Elsewhere("lab/race/test_race_settings.py::test_of_a_bag_the_named_topic_is_taken_for_as_long_as_asked"),
     peers=lambda: (list(chosen((), "two")), list(chosen(("gr-ros2",), "two"))),
     loss=differs(prepared, loss=(0.5,)),
     load=differs(prepared, load=(0.8,)),

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.sim.transforms import TF_TYPE
+from gr_ros2_lab.sim.transforms import TF_TYPE
 from tests.domains import free_domains
 from tests.waiting import PATIENCE_S, wait_for
 

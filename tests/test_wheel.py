@@ -19,7 +19,8 @@ from pathlib import Path
 import gr_ros2
 from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.compression.dictionary import shipped
-from gr_ros2.settings.files import BUILTIN_DIR
+from gr_ros2.settings.files import REGISTRY_DIR
+from gr_ros2_lab.run.builtin import SCENARIO_DIR
 from gr_ros2.grc.path import example, grc_path
 from gr_ros2.middleware.dds_library import load
 from gr_ros2.phy.kernels.library import loaded
@@ -27,7 +28,8 @@ print(json.dumps({
     "package": str(Path(gr_ros2.__file__).parent),
     "blocks": sorted(path.name for path in grc_path().iterdir() if path.name != "__pycache__"),
     "examples": sorted(path.name for path in example("topics.csv").parent.iterdir()),
-    "scenarios": sorted(path.name for path in BUILTIN_DIR.iterdir()),
+    "registries": sorted(path.name for path in REGISTRY_DIR.iterdir()),
+    "scenarios": sorted(path.name for path in SCENARIO_DIR.iterdir()),
     "dissector": DISSECTOR.read_text(),
     "dictionary": shipped().number,
     "kernels": loaded().functions is not None,
@@ -74,14 +76,15 @@ def test_it_finds_what_is_no_python(installed: Path, tmp_path: Path) -> None:
     done = subprocess.run([python, "-I", "-c", PROGRAM], cwd=tmp_path, capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
     assert found["package"].startswith(str(installed))
-    package = ROOT / "gr_ros2"
 
     def tracked(folder: str) -> list[str]:
-        return sorted(path.name for path in (package / folder).iterdir() if path.name != "__pycache__")
+        return sorted(path.name for path in (ROOT / folder).iterdir() if path.name != "__pycache__")
 
-    for name, folder in {"blocks": "grc", "examples": "examples", "scenarios": "scenarios"}.items():
-        assert found[name] == tracked(folder), folder
-    assert found["dissector"] == (package / "wireshark" / "gr_ros2.lua").read_text()
+    for name, package in {"blocks": "gr_ros2/grc", "scenarios": "gr_ros2_lab/scenarios"}.items():
+        assert found[name] == tracked(package), package
+    for name in ("examples", "registries"):
+        assert found[name] == tracked(f"gr_ros2/{name}"), name
+    assert found["dissector"] == (ROOT / "gr_ros2" / "wireshark" / "gr_ros2.lua").read_text()
     assert found["dictionary"] > 0
     assert found["kernels"] == bool(shutil.which("g++"))
     if sys.version_info >= (3, 14):  # before, it comes from a package of its own

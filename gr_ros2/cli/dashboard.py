@@ -23,7 +23,7 @@ from gr_ros2.settings.config import STRICT, build
 
 if TYPE_CHECKING:
     from gr_ros2.dashboard.server import Dashboard
-    from gr_ros2.run.observers import LateObservers
+    from gr_ros2.observe.observers import LateObservers
 
 ADDRESS, PORT = "127.0.0.1", 5006
 _ASK_S = 0.5
@@ -61,12 +61,12 @@ def audience(
 
     :param where: value of ``--dashboard``; None for no dashboard at the start
     :param name: what the program is doing, for clients that search for it
-    :param instruments: see :class:`gr_ros2.run.observers.RunObserver`
+    :param instruments: see :class:`gr_ros2.observe.observers.RunObserver`
     :param answers: what clients may ask beside that, by name; called with the value given, in a thread of its own
     :raises ConfigError: when the dashboard cannot be served at this place
     :raises BackendMissingError: when the package that draws it is not installed
     """
-    from gr_ros2.run.observers import LateObservers
+    from gr_ros2.observe.observers import LateObservers
 
     seen = LateObservers(instruments or where is not None)
     urls: list[str] = []

@@ -38,8 +38,8 @@ from gr_ros2.settings.yaml_text import yaml_text
 from gr_ros2.wire import BROADCAST
 
 if TYPE_CHECKING:
+    from gr_ros2.observe.observers import LiveRun
     from gr_ros2.radio.robot_link import RobotLink
-    from gr_ros2.run.observers import LiveRun
 
 _log = logging.getLogger(__name__)
 _SHOW_S = 0.5
@@ -130,8 +130,8 @@ def link(
         raise click.UsageError("--against needs --check")
     # These load GNU Radio, which takes time. A wrong setting is reported before that.
     with uninterrupted():
+        from gr_ros2.observe.observers import RunObservers
         from gr_ros2.radio.robot_link import RobotLink
-        from gr_ros2.run.observers import RunObservers
 
     console = make_console()
     answers: dict[str, Callable[[Any], Any]] = {}
@@ -213,8 +213,8 @@ def _in_one_line(values: Mapping[str, Any], overrides: Sequence[str], save: Path
 
 
 def _live(running: RobotLink) -> LiveRun:
-    """The link as observers see it. They see only this end, so there is no ledger."""
-    from gr_ros2.run.observers import LiveRun
+    """The link as observers see it. They see only this end, so they have no fates."""
+    from gr_ros2.observe.observers import LiveRun
 
     source = running.source
     return LiveRun(
@@ -225,7 +225,7 @@ def _live(running: RobotLink) -> LiveRun:
         topics={(source.src_id, topic.topic_id): name for name, topic in source.subscriptions.subscribed.items()},
         sources={source.src_id: source},
         links=(running.radio,),
-        ledger=None,
+        fates=None,
         received_as=running.sink.outputs.heard.name_of,
         alarms=running.same_numbers,
     )

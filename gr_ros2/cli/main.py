@@ -27,9 +27,9 @@ _NO_GNU_RADIO = (
     "environment made by /usr/bin/python3 -m venv --system-site-packages; without it there are packet, registry, dict, "
     "key and scenarios, and with `phy: modem` or `direct` also plan, and replay by packets (`time: packets`)"
 )
-_LABORATORY = ("matplotlib", "plotext", "pyarrow", "jinja2")
-"""Packages that only experiments need, of the extra ``lab``. The dashboard, sweeps and Zenoh name theirs where they
-import it."""
+_LABORATORY = ("gr_ros2_lab", "matplotlib", "plotext", "pyarrow", "jinja2")
+"""What only experiments need: the second package, and those of the extra ``lab``. The dashboard, sweeps and Zenoh name
+theirs where they import it."""
 
 Commands = Mapping[str, tuple[str, str]]
 """name -> (``module:attribute``, the line that help shows), in the order in which help lists them."""
@@ -43,25 +43,25 @@ REGISTRY_COMMANDS: Commands = {
     "from-graph": ("gr_ros2.cli.registry:from_graph", "Write a registry from the topics on the ROS graph."),
 }
 COMMANDS: Commands = {
-    "demo": ("gr_ros2.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
-    "run": ("gr_ros2.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
+    "demo": ("gr_ros2_lab.cli.run:demo", "Two simulated robots over an OFDM link, with tables and pictures."),
+    "run": ("gr_ros2_lab.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
     "link": ("gr_ros2.cli.link:link", "One robot's end of a link, live: its ROS topics to the air and back."),
     "status": ("gr_ros2.cli.status:status", "What a running link does: who is heard, what crosses, what is dropped."),
     "peers": ("gr_ros2.cli.status:peers", "The robots that a running link hears."),
     "set": ("gr_ros2.cli.status:set_live", "Change a setting of a running link, such as whom a topic is for."),
     "ping": ("gr_ros2.cli.ping:ping", "Ask another robot over the link: round trip, loss, SNR, clocks."),
-    "medium": ("gr_ros2.cli.medium:medium", "One simulated channel for several links with front end zmq."),
+    "medium": ("gr_ros2_lab.cli.medium:medium", "One simulated channel for several links with front end zmq."),
     "doctor": ("gr_ros2.cli.doctor:doctor", "What this machine has and lacks for a link, and what mends it."),
-    "plan": ("gr_ros2.cli.plan:plan", "Does this traffic fit this radio? A forecast, and what to change."),
-    "replay": ("gr_ros2.cli.replay:replay", "A bag through a link into a bag: what arrives, and when."),
-    "losses": ("gr_ros2.cli.losses:losses", "How many packets a radio loses at which SNR, measured."),
-    "sweep": ("gr_ros2.cli.sweep:sweep", "One scenario at many settings, on all cores or a Dask cluster."),
-    "report": ("gr_ros2.cli.report:report", "The HTML report of one or several runs, from their folders."),
-    "compare": ("gr_ros2.cli.compare:compare", "Runs side by side: a table, and their curves in one figure."),
-    "race": ("gr_ros2.cli.race:race", "gr-ros2, DDS and Zenoh over the same radio, side by side (root)."),
-    "ablate": ("gr_ros2.cli.ablate:ablate", "What each part is worth: a scenario with one part off at a time."),
+    "plan": ("gr_ros2_lab.cli.plan:plan", "Does this traffic fit this radio? A forecast, and what to change."),
+    "replay": ("gr_ros2_lab.cli.replay:replay", "A bag through a link into a bag: what arrives, and when."),
+    "losses": ("gr_ros2_lab.cli.losses:losses", "How many packets a radio loses at which SNR, measured."),
+    "sweep": ("gr_ros2_lab.cli.sweep:sweep", "One scenario at many settings, on all cores or a Dask cluster."),
+    "report": ("gr_ros2_lab.cli.report:report", "The HTML report of one or several runs, from their folders."),
+    "compare": ("gr_ros2_lab.cli.compare:compare", "Runs side by side: a table, and their curves in one figure."),
+    "race": ("gr_ros2_lab.cli.race:race", "gr-ros2, DDS and Zenoh over the same radio, side by side (root)."),
+    "ablate": ("gr_ros2_lab.cli.ablate:ablate", "What each part is worth: a scenario with one part off at a time."),
     "dashboard": ("gr_ros2.cli.dashboard:dashboard", "Open the live page of a run or link that goes on now."),
-    "scenarios": ("gr_ros2.cli.scenarios:scenarios", "List the built-in scenarios."),
+    "scenarios": ("gr_ros2_lab.cli.scenarios:scenarios", "List the built-in scenarios."),
     "packet": ("gr_ros2.cli.main:packet", "Look into packets."),
     "registry": ("gr_ros2.cli.main:registry", "Check and write topic registries."),
     "dict": ("gr_ros2.cli.dict:group", "Dictionaries for message compression."),
@@ -136,7 +136,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
         if missing in _LABORATORY:
-            return _fail(f"this needs {missing}, of the laboratory: pip install 'gr-ros2[lab]'", BAD_INPUT)
+            how = "apt install gr-ros2-lab, or pip install 'gr-ros2[lab]'"
+            return _fail(f"this needs {missing}, of the laboratory: {how}", BAD_INPUT)
         if missing not in _GNU_RADIO:
             raise
         return _fail(_NO_GNU_RADIO, BAD_INPUT)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, get_type_hints
 
@@ -13,7 +12,6 @@ from click.shell_completion import CompletionItem
 
 from gr_ros2.core.backends import BackendTable
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.files import builtin_scenarios
 
 
 class Completed(click.ParamType):
@@ -30,21 +28,6 @@ class Completed(click.ParamType):
         incomplete: str,
     ) -> list[CompletionItem]:
         return [item for item in self.candidates() if item.value.startswith(incomplete)]
-
-
-class ScenarioName(Completed):
-    """The name of a built-in scenario or the path of a YAML file. ``load_scenario`` finds out which of them it is."""
-
-    name = "scenario"
-
-    def candidates(self) -> Iterable[CompletionItem]:
-        return map(CompletionItem, builtin_scenarios())
-
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return super().shell_complete(ctx, param, incomplete) or [CompletionItem(incomplete, type="file")]
-
-
-SCENARIO = ScenarioName()
 
 
 class OrAuto(click.ParamType):
@@ -108,13 +91,3 @@ def set_option(settings: type[Any], what: str = "one setting") -> Callable[[Any]
         metavar="KEY=VALUE",
         help=f"Change {what}, dots between keys.",
     )
-
-
-pictures_option = click.option(
-    "--pictures", is_flag=True, help="Also the figures as PNG and SVG, and every number as CSV and Parquet."
-)
-
-
-def written_line(files: Sequence[Path]) -> str:
-    """What was written: the page, and how much beside it."""
-    return f"Written: {files[0]}" + (f" and {len(files) - 1} files beside it" if files[1:] else "")

@@ -24,8 +24,8 @@ from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 
 if TYPE_CHECKING:
-    from gr_ros2.record.result import Result
-    from gr_ros2.run.observers import LiveRun
+    from gr_ros2.observe.observers import LiveRun
+    from gr_ros2.observe.result import RunResult
 
 LINK_TYPE = 147
 """DLT_USER0, for private use. The dissector gives it a meaning."""
@@ -40,7 +40,7 @@ _CLOSE_S = 1.0
 
 
 class PacketCapture(Closing):
-    """An open capture: a :class:`gr_ros2.run.observers.RunObserver`, and also the observer of a link without runs.
+    """An open capture: a :class:`gr_ros2.observe.observers.RunObserver`, and also the observer of a link without runs.
 
     :param path: file to write, replaced if it exists
     :param clock: the clock of the events, s, until a run brings its own clock
@@ -76,7 +76,7 @@ class PacketCapture(Closing):
         """Take the run's clock."""
         self._offset = time.time() - run.clock()
 
-    def run_ended(self, result: Result | None) -> None:
+    def run_ended(self, result: RunResult | None) -> None:
         """Do nothing: the code that opened the capture closes it."""
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - a LinkObserver's signature

@@ -23,7 +23,7 @@ from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.bag_files import bag_contents
 from gr_ros2.middleware.services import ServiceGraph
-from gr_ros2.record.positions import humble_types
+from gr_ros2.observe.positions import humble_types
 from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, TopicOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import MAX_TOPICS, Registry, Topic

@@ -48,8 +48,8 @@ from gr_ros2.dashboard.tables import (
     topics_html,
 )
 from gr_ros2.dashboard.views import Snapshot
-from gr_ros2.record.team import STRIP_S, TeamView
-from gr_ros2.report.colours import AIR_COLOURS, OUTCOME_COLOURS
+from gr_ros2.observe.colours import AIR_COLOURS, OUTCOME_COLOURS
+from gr_ros2.observe.team import STRIP_S, TeamView
 from gr_ros2.settings.config import ChannelConfig
 
 AHEAD = 3

@@ -20,8 +20,8 @@ from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.dashboard.windows import RATE_S, Floats
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.record.result import Result
-from gr_ros2.run.observers import LiveLink, LiveRun
+from gr_ros2.observe.observers import LiveLink, LiveRun
+from gr_ros2.observe.result import RunResult
 from gr_ros2.settings.config import ChannelConfig
 
 TICK_S = 0.5
@@ -56,7 +56,7 @@ class RadioView:
 
 
 class RunMonitor:
-    """A :class:`gr_ros2.run.observers.RunObserver` that keeps a snapshot for others to draw."""
+    """A :class:`gr_ros2.observe.observers.RunObserver` that keeps a snapshot for others to draw."""
 
     name = "dashboard"
     instruments = True
@@ -82,7 +82,7 @@ class RunMonitor:
             run.packet_len,
             name=run.name,
             duration_s=run.duration_s,
-            ledger=None if run.ledger is None else run.ledger.fates,
+            ledger=run.fates,
             tick_s=TICK_S,
             airtime=run.links[0].phy.airtime if run.links and run.links[0].phy.has_airtime else None,
             received_as=run.received_as,
@@ -90,9 +90,9 @@ class RunMonitor:
         self._run = run
         self.refused = ""
 
-    def run_ended(self, result: Result | None) -> None:
+    def run_ended(self, result: RunResult | None) -> None:
         if self._state is not None:
-            whole = self._run is not None and self._run.ledger is not None
+            whole = self._run is not None and self._run.fates is not None
             self._state.finish(result, failed=result is None and whole)
             self.tick()
         with self._ticking:
@@ -134,7 +134,7 @@ class RunMonitor:
         snr_db = links[0].snr_db if links else None
         late_s = max((_late_s(link.gate_lateness(), now) for link in links), default=0.0)
         snapshot = state.tick(now, queued, snr_db=snr_db, late_s=late_s, told=run.alarms())
-        self.snapshot = snapshot if run.team is None else replace(snapshot, team=run.team.view())
+        self.snapshot = snapshot if run.team is None else replace(snapshot, team=run.team())
         if not links:
             return
         spectrum = self._spectrum

@@ -33,7 +33,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard.admission import SETTINGS, Admission, BoundedServer, keep
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.monitor import TICK_S, RunMonitor
-from gr_ros2.record.result import Result
+from gr_ros2.observe.result import RunResult
 
 _LOOK_S = 0.1
 _LAST_PICTURE_S = 2.0
@@ -107,7 +107,7 @@ class Dashboard(Closing, RunMonitor):
             loop.add_callback(self._leave, loop)
             self._thread.join()
 
-    def run_ended(self, result: Result | None) -> None:
+    def run_ended(self, result: RunResult | None) -> None:
         super().run_ended(result)
         if self._loop is not None:
             self._loop.add_callback(self._show, always=True)

@@ -36,9 +36,9 @@ from gr_ros2.link.events import (
 )
 from gr_ros2.link.fates import Fate, arrived
 from gr_ros2.link.tracker import Tracked, Tracker
-from gr_ros2.record.metrics import Latency, latency, latency_cdf
-from gr_ros2.record.positions import PositionReader, position_reader
-from gr_ros2.record.result import Result, TopicResult
+from gr_ros2.observe.latency import Latency, latency, latency_cdf
+from gr_ros2.observe.positions import PositionReader, position_reader
+from gr_ros2.observe.result import RunResult, TopicResult
 from gr_ros2.settings.registry import Registry, Topic
 
 HISTORY_S = 180.0
@@ -147,7 +147,7 @@ class DashboardState:
         """When each robot was heard last, itself or over others, and packets received of it."""
         self._ways: dict[int, tuple[int, int | None]] = {}
         """How many robots have sent the newest message of each robot on, and the last of them."""
-        self._result: Result | None = None
+        self._result: RunResult | None = None
         for key in topics:
             self._topic(key)
 
@@ -204,7 +204,7 @@ class DashboardState:
             for full_name, topic in topics:
                 self._learn((src_id, topic.topic_id), topic.name, topic.type_name, full_name)
 
-    def finish(self, result: Result | None, *, failed: bool = False) -> None:
+    def finish(self, result: RunResult | None, *, failed: bool = False) -> None:
         """End the run. There is no result if the run failed, or if only one end of the link was observed."""
         with self._lock:
             self._result = result

@@ -14,8 +14,8 @@ from gr_ros2.dashboard.packets import NO_COLOUR
 from gr_ros2.dashboard.views import PacketView, Snapshot, SpanView, TopicView
 from gr_ros2.link.events import AirKind
 from gr_ros2.link.fates import Fate, fate_order
-from gr_ros2.record.team import PairView
-from gr_ros2.report.colours import COLOURS, fate_colour, ink_on
+from gr_ros2.observe.colours import COLOURS, fate_colour, ink_on
+from gr_ros2.observe.team import PairView
 from gr_ros2.wire import BROADCAST
 
 Number = float | int | None

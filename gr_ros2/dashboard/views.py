@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from gr_ros2.dashboard.windows import Floats, Point
-from gr_ros2.record.metrics import Latency
-from gr_ros2.record.team import TeamView
+from gr_ros2.observe.latency import Latency
+from gr_ros2.observe.team import TeamView
 
 
 @dataclass(frozen=True)

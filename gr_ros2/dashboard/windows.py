@@ -44,7 +44,7 @@ class Rate:
 
 
 class AgeMeter:
-    """Age of information of one topic, exactly as :func:`gr_ros2.record.metrics.age` computes it, kept as a sum."""
+    """Age of information of one topic, exactly as :func:`gr_ros2_lab.record.metrics.age` computes it, kept as a sum."""
 
     def __init__(self) -> None:
         self._start: float | None = None

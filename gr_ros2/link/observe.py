@@ -2,7 +2,7 @@
 
 Invariants: an observer receives every event in order until its first exception; that ends only this observer
 (:class:`gr_ros2.core.guard.Guard`), and the link and the other observers go on. An observer is called in the thread of
-the event. A slow observer has to be attached through a bounded queue (``gr_ros2.run.observers.RunObservers``).
+the event. A slow observer has to be attached through a bounded queue (``gr_ros2.observe.observers.RunObservers``).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The `zmq` front end: bursts of samples over ZeroMQ, between processes or machines without radios.
 
 Every robot publishes at one address and subscribes to the addresses of the others. Each packet is one message: a
-header, then its samples. Instead of the others there may be a medium process (:mod:`gr_ros2.radio.medium`), which sends
+header, then its samples. Instead of the others there may be a medium process (`gr-ros2 medium`), which sends
 what all of them together make of the air at this robot. In lock step it also sends the time, as messages without
 samples, which the robot sends back when it has sent all that begins before.
 

@@ -17,8 +17,8 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import Agreed, read_yaml
 from gr_ros2.settings.yaml_text import parse_yaml
 
-BUILTIN_DIR = Path(__file__).resolve().parent.parent / "scenarios"
-"""Folder of the built-in scenarios and registries."""
+REGISTRY_DIR = Path(__file__).resolve().parent.parent / "registries"
+"""Folder of the built-in registries."""
 
 SHARED_KEYS = tuple(field.name for field in fields(Agreed))
 """Settings that both ends of a link must agree on."""
@@ -92,16 +92,11 @@ def find_registry(name: str, directory: Path) -> str:
     if not name:
         return name
     path = Path(name).expanduser()
-    for candidate in (directory / path, BUILTIN_DIR / path, BUILTIN_DIR / f"{name}.csv"):
+    for candidate in (directory / path, REGISTRY_DIR / path, REGISTRY_DIR / f"{name}.csv"):
         if candidate.is_file():
             return str(candidate.resolve())
-    known = ", ".join(sorted(path.stem for path in BUILTIN_DIR.glob("*.csv")))
+    known = ", ".join(sorted(path.stem for path in REGISTRY_DIR.glob("*.csv")))
     raise ConfigError(f"registry = {name!r}: no such file; built in are {known}")
-
-
-def builtin_scenarios() -> list[str]:
-    """The names of the scenarios that come with gr-ros2, sorted."""
-    return sorted(path.stem for path in BUILTIN_DIR.glob("*.yaml"))
 
 
 def portable_registry(path: str) -> str:
@@ -109,7 +104,7 @@ def portable_registry(path: str) -> str:
     if not path:
         return path
     found = Path(path).resolve()
-    return found.stem if found.parent == BUILTIN_DIR else str(found)
+    return found.stem if found.parent == REGISTRY_DIR else str(found)
 
 
 def parse_override(text: str) -> tuple[tuple[str, ...], Any]:

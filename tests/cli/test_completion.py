@@ -13,7 +13,7 @@ import pytest
 from gr_ros2.cli.completion import SHELLS
 from gr_ros2.cli.main import COMMANDS, run
 from gr_ros2.cli.params import setting_keys
-from gr_ros2.run.scenario import Scenario, dump, load_scenario
+from gr_ros2_lab.run.scenario import Scenario, dump, load_scenario
 
 
 @pytest.mark.parametrize("shell", SHELLS)

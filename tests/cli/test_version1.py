@@ -11,9 +11,9 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli.main import run
 from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.record.result import read_result
-from tests.run.test_replay import COUNT, make_bag
-from tests.study.sweeps import write_sweep_file
+from gr_ros2_lab.record.result import read_result
+from tests.lab.run.test_replay import COUNT, make_bag
+from tests.lab.study.sweeps import write_sweep_file
 
 PLAIN = ("--set", "version=0", "--set", "ros_source.topic_options={}")
 LOSSY = ("--set", "version=1", "--set", "reports={}", "--set", "channel.packet_loss=0.2")

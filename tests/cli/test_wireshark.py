@@ -19,13 +19,13 @@ from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.core.errors import ConfigError, WireError
 from gr_ros2.link.events import PacketId, Received, SentPacket
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.run.scenario import load_scenario
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.relayed import read_relayed
 from gr_ros2.wire.v0 import V0, PacketV0, with_crc
 from gr_ros2.wire.v1 import CARRIED_TOPIC, Header, crc, session_crc, write_header
 from gr_ros2.wire.v1 import decode as read
+from gr_ros2_lab.run.scenario import load_scenario
 from tests.cli.test_packet import hello
 from tests.link.test_reader import talk
 
@@ -320,7 +320,7 @@ def test_our_own_decoder_reads_the_capture(tmp_path: Path, capsys: pytest.Captur
 def test_a_run_captures_every_packet_at_both_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     memory = ["--set", "ros_source.middleware=memory", "--set", "ros_sink.middleware=memory"]
-    from gr_ros2.run.runner import REGISTRY_FILE
+    from gr_ros2_lab.run.runner import REGISTRY_FILE
 
     path = tmp_path / "run.pcapng"
     command = ["run", "paper-direct", "--duration", "0.5", "--out", str(tmp_path / "out"), "--pcap", str(path)]
@@ -336,8 +336,8 @@ def test_a_run_captures_every_packet_at_both_ends(tmp_path: Path, capsys: pytest
 def relayed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The capture of four robots, of which each hears the next one alone."""
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    from gr_ros2.run.observers import RunObservers
-    from gr_ros2.run.simulated_runner import run_simulated
+    from gr_ros2.observe.observers import RunObservers
+    from gr_ros2_lab.run.simulated_runner import run_simulated
 
     gains = [[-100 if abs(one - other) < 2 else None for other in range(4)] for one in range(4)]
     scenario = load_scenario("line", ["robots=4", "duration_s=8", f"gains_db={json.dumps(gains)}"])

@@ -13,8 +13,8 @@ from rosbags.typesys.store import Typestore
 from gr_ros2.compression import Dictionary, LinkCodec
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry, Topic, normalize_type
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 _CODES = {

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.compression.schema import Types, shape_of
-from gr_ros2.sim.sensors import TYPES as SIMULATED
+from gr_ros2_lab.sim.sensors import TYPES as SIMULATED
 from tests.compression.support import STORE, Writer, codec_for, simulated
 
 EVERY_TYPE = sorted(name for name in STORE.fielddefs if not any("wstring" in str(d) for d in STORE.fielddefs[name][1]))

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.names import MAX_TOPIC_LEN, check_node, check_topic, filled, topic_fault
 from gr_ros2.radio.config import link_from
-from gr_ros2.run.scenario import load_scenario, scenario_from
 from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.settings.registry import Registry, check_outputs
+from gr_ros2_lab.run.scenario import load_scenario, scenario_from
 
 NAMES = st.text(st.sampled_from("aZ_09/-~ {}é\n"), max_size=12)
 REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "tf": "tf2_msgs/TFMessage"})

@@ -10,7 +10,7 @@ from gr_ros2.link import AirPacket
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.link.v0.receiver import Receiver
 from gr_ros2.link.v0.sender import Sender
-from gr_ros2.record.positions import humble_types
+from gr_ros2.observe.positions import humble_types
 from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry
 from tests.packets import data_of

@@ -28,8 +28,8 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.record.result import Result, read_result
-from gr_ros2.settings.files import BUILTIN_DIR
+from gr_ros2.settings.files import REGISTRY_DIR
+from gr_ros2_lab.record.result import Result, read_result
 from tests.domains import free_domains
 from tests.waiting import PATIENCE_S, wait_for
 
@@ -372,7 +372,7 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
 def test_a_live_link_shows_the_names_that_come_out_and_no_empty_card(viewer: Viewer, tmp_path: Path) -> None:
     (domain,) = free_domains(1)
     settings = {
-        "registry": str(BUILTIN_DIR / "table4.csv"),
+        "registry": str(REGISTRY_DIR / "table4.csv"),
         "packet_len": 220,
         "ros_source": {"namespace": "/robot_1", "domain_id": domain},
         "ros_sink": {"domain_id": domain},

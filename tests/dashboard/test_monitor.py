@@ -11,8 +11,8 @@ pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
 
 from gr_ros2.core.errors import RunError
 from gr_ros2.dashboard.monitor import RunMonitor
-from gr_ros2.run.runner import run_scenario
-from gr_ros2.run.scenario import load_scenario
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
 from tests.waiting import wait_for
 
 ENDS = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
@@ -84,8 +84,8 @@ def test_the_next_run_starts_from_nothing() -> None:
 
 def test_a_run_that_fails_is_said_to_have_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     monitor = RunMonitor()
-    monkeypatch.setattr("gr_ros2.run.runner._MATCH_S", -1.0)
-    monkeypatch.setattr("gr_ros2.run.runner._Run._sim_matched", lambda _: False)
+    monkeypatch.setattr("gr_ros2_lab.run.runner._MATCH_S", -1.0)
+    monkeypatch.setattr("gr_ros2_lab.run.runner._Run._sim_matched", lambda _: False)
     scenario = load_scenario("paper-direct", ENDS, duration_s=0.5)
     with pytest.raises(RunError, match="did not find each other"):
         run_scenario(scenario, observers=[monitor])

@@ -13,11 +13,11 @@ import pytest
 from gr_ros2.dashboard.state import LATENCIES, PACKETS_SHOWN, UNDER_WAY, DashboardState
 from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.link.events import Accepted, Announced, Delivered, SentPacket
-from gr_ros2.record.recorder import Recorder
-from gr_ros2.record.result import Result
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Topic
 from gr_ros2.wire.table import AnnouncedTopic
+from gr_ros2_lab.record.recorder import Recorder
+from gr_ros2_lab.record.result import Result
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, Hears, at
 from tests.link.v1.air import Robot, registry
 

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 from gr_ros2.dashboard.state import DashboardState
 from gr_ros2.dashboard.tables import colour, heard_html, packets_html, paths_html, team_html, tiles_html, topics_html
 from gr_ros2.dashboard.views import RobotView, Snapshot
-from gr_ros2.record.team import PairView, TeamView
+from gr_ros2.observe.team import PairView, TeamView
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, at
 
 

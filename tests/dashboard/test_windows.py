@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.dashboard.windows import AgeMeter, PathComparison, PathWindow, Rate
-from gr_ros2.record.metrics import age
+from gr_ros2_lab.record.metrics import age
 
 
 def test_a_rate_forgets_what_is_older_than_its_window() -> None:

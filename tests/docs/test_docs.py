@@ -20,9 +20,9 @@ import yaml
 from gr_ros2.cli import main as command_line
 from gr_ros2.cli.main import LazyGroup, cli
 from gr_ros2.radio.config import link_from
-from gr_ros2.radio.medium import load_medium
-from gr_ros2.run.scenario import load_scenario, scenario_from
-from gr_ros2.study.sweep.definition import load_sweep
+from gr_ros2_lab.medium.process import load_medium
+from gr_ros2_lab.run.scenario import load_scenario, scenario_from
+from gr_ros2_lab.study.sweep.definition import load_sweep
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands
 from tests.once import once
 from tests.waiting import PATIENCE_S
@@ -35,7 +35,7 @@ LINK: dict[str, Any] = {
 }
 SCENARIO: dict[str, Any] = {
     "name": "trial",
-    "registry": str(ROOT / "gr_ros2/scenarios/odom.csv"),
+    "registry": str(ROOT / "gr_ros2/registries/odom.csv"),
     "ros_source": {"namespace": "/robot_1"},
 }
 SWEEP: dict[str, Any] = {
@@ -86,12 +86,18 @@ ONLY_PARSED = {
     ("docs/how-to/dashboard.md", "gr-ros2 run demo --dashboard=0.0.0.0:5006"): "opens a port to the network",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep mine.yaml --scheduler tcp://HOST:8786"): "needs a Dask cluster",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep mine.yaml --set duration_s=5 --workers 1"): "the sweep above, shorter",
-    ("docs/how-to/sweeps.md", "gr-ros2 sweep pdr-vs-snr"): "takes minutes; tests/study runs the built-in sweeps' cells",
+    (
+        "docs/how-to/sweeps.md",
+        "gr-ros2 sweep pdr-vs-snr",
+    ): "takes minutes; tests/lab/study runs its cells",
     ("docs/how-to/sweeps.md", "gr-ros2 sweep rate-vs-snr"): "the same",
-    ("docs/how-to/teams.md", "gr-ros2 sweep formation"): "takes minutes; tests/study runs the built-in sweeps' cells",
+    (
+        "docs/how-to/teams.md",
+        "gr-ros2 sweep formation",
+    ): "takes minutes; tests/lab/study runs its cells",
     ("docs/how-to/teams.md", "gr-ros2 sweep rendezvous"): "the same",
-    ("docs/how-to/experiments.md", "gr-ros2 plan my_link.yaml --graph"): "needs a robot; tests/cli/test_plan.py",
-    ("docs/how-to/experiments.md", "gr-ros2 ablate paper-ofdm-paced"): "takes minutes; tests/cli/test_ablate.py",
+    ("docs/how-to/experiments.md", "gr-ros2 plan my_link.yaml --graph"): "needs a robot; tests/lab/cli/test_plan.py",
+    ("docs/how-to/experiments.md", "gr-ros2 ablate paper-ofdm-paced"): "takes minutes; tests/lab/cli/test_ablate.py",
     **{
         (
             "docs/how-to/packet-radios.md",
@@ -161,7 +167,7 @@ def test_every_yaml_is_accepted(block: Block, tmp_path: Path) -> None:
         else:
             assert kind == "scenario"
             assert scenario_from(
-                {**merged(SCENARIO, keys, values), "registry": str(ROOT / "gr_ros2/scenarios/odom.csv")}
+                {**merged(SCENARIO, keys, values), "registry": str(ROOT / "gr_ros2/registries/odom.csv")}
             )
         return
     path = tmp_path / name
@@ -239,9 +245,9 @@ def fill(folder: Path) -> None:
         shutil.copy(mcap, folder / name)
     here(*demo, "--out", "robot", "--set", "ros_sink.namespace_format=/robot_{src_id}", folder=folder)
     shutil.copytree(folder / "robot" / "delivered", folder / "my_bag")
-    shutil.copy(ROOT / "gr_ros2/scenarios/demo.yaml", folder / "my_scenario.yaml")
+    shutil.copy(ROOT / "gr_ros2_lab/scenarios/demo.yaml", folder / "my_scenario.yaml")
     shutil.copy(ROOT / "gr_ros2/examples/link-sim.yaml", folder / "my_link.yaml")
-    shutil.copy(ROOT / "gr_ros2/scenarios/table4.csv", folder / "table4.csv")
+    shutil.copy(ROOT / "gr_ros2/registries/table4.csv", folder / "table4.csv")
     for path in (ROOT / "gr_ros2/examples").glob("link-*.yaml"):
         shutil.copy(path, folder)
 

@@ -11,8 +11,9 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.record.result import Result, TopicResult, read_result
-from gr_ros2.record.team import Team, read_team
+from gr_ros2.observe.result import TopicResult
+from gr_ros2_lab.record.result import Result, read_result
+from gr_ros2_lab.record.team import Team, read_team
 from tests.docs.pages import blocks, commands
 from tests.docs.test_docs import here
 from tests.once import once
@@ -23,7 +24,7 @@ PAGE = "docs/four-robots.md"
 SHORTER = {"demo": "12", "team": "10", "at-once": "4", "samples": "20", "packets": "20"}
 """s instead of a minute, or of 20 s: what the page says holds for them as well."""
 NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets", None)
-"""The last is in real time, as tests/run/test_live.py has four robots."""
+"""The last is in real time, as tests/lab/run/test_live.py has four robots."""
 
 
 @pytest.fixture(scope="module")

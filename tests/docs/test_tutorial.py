@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.record.result import read_result
+from gr_ros2_lab.record.result import read_result
 from tests.docs.pages import blocks, commands
 from tests.docs.test_docs import here
 from tests.once import once
@@ -73,7 +73,7 @@ def _arrived(folder: Path) -> float:
     """Share of the packets with messages that arrived."""
     import numpy as np
 
-    from gr_ros2.record.trace import read_trace
+    from gr_ros2_lab.record.trace import read_trace
 
     received = read_trace(folder).packets().times()[1]
     return float(np.mean(~np.isnan(received)))

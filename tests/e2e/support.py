@@ -8,9 +8,9 @@ from pathlib import Path
 
 from gr_ros2.link.fates import arrived
 from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.record.result import Result
-from gr_ros2.run.runner import DELIVERED_BAG
-from gr_ros2.run.scenario import Scenario, load_scenario
+from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.run.runner import DELIVERED_BAG
+from gr_ros2_lab.run.scenario import Scenario, load_scenario
 from tests.domains import free_domains
 from tests.middleware.support import same
 

@@ -15,8 +15,8 @@ from gr_ros2.cli import main as command
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.run.runner import run_scenario
 from gr_ros2.settings.registry import Registry
+from gr_ros2_lab.run.runner import run_scenario
 from tests.domains import free_domains
 from tests.e2e.support import check_books, on_free_domains, scenario, set_options
 from tests.gr.probe import Probe, pdu

@@ -13,8 +13,8 @@ from gnuradio import gr
 
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.record.result import read_result
 from gr_ros2.settings.registry import Registry
+from gr_ros2_lab.record.result import read_result
 from tests.domains import free_domains
 from tests.e2e.support import COMMAND, check_books, delivered_bag, set_options
 from tests.middleware.support import LATCHED, Peer, message, same

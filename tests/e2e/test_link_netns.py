@@ -16,7 +16,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
 from gr_ros2.core.errors import RunError
-from gr_ros2.race.namespaces import Namespace, check_means, inside
+from gr_ros2_lab.race.namespaces import Namespace, check_means, inside
 from tests.e2e import link_peer
 from tests.e2e.support import COMMAND
 from tests.middleware.support import CUSTOM

@@ -21,14 +21,14 @@ from gr_ros2.cli import main as command
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.core.errors import ConfigError, CrcError, RunError
 from gr_ros2.link.events import PacketId, ReceiverEvent, Rejected, SenderEvent
+from gr_ros2.observe import observers as run_observers
+from gr_ros2.observe.observers import LiveRun
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
-from gr_ros2.record.ledger import Ledger
-from gr_ros2.record.result import Result, read_result
-from gr_ros2.run import observers as run_observers
-from gr_ros2.run.observers import LiveRun
-from gr_ros2.run.outcome import DELIVERED_BAG
-from gr_ros2.run.runner import run_scenario
-from gr_ros2.run.scenario import Scenario, load_scenario
+from gr_ros2_lab.record.ledger import Ledger
+from gr_ros2_lab.record.result import Result, read_result
+from gr_ros2_lab.run.outcome import DELIVERED_BAG
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import Scenario, load_scenario
 from tests.e2e.support import COMMAND, check_complete
 from tests.radio.robots import ROOT, Robot, link_command
 from tests.waiting import wait_for

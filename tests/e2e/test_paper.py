@@ -9,9 +9,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.record.result import read_result
-from gr_ros2.run.runner import DELIVERED_BAG, run_scenario
-from gr_ros2.run.scenario import load_scenario
+from gr_ros2_lab.record.result import read_result
+from gr_ros2_lab.run.runner import DELIVERED_BAG, run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
 from tests.domains import free_domains
 from tests.e2e.support import check_books, check_complete, check_identical, delivered_bag, scenario
 from tests.middleware.support import RELIABLE

@@ -9,8 +9,8 @@ import pytest
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware, BagPublisher
 from gr_ros2.middleware.bag_files import BagMessage, read_bag
-from gr_ros2.run.runner import run_scenario
-from gr_ros2.run.scenario import load_scenario
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
 from tests.e2e.support import check_complete, check_identical, delivered_bag, on_free_domains
 from tests.recordings import Drive, every_drive
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.record.result import read_result
+from gr_ros2_lab.record.result import read_result
 from tests.e2e.support import COMMAND, check_books, delivered_bag, on_free_domains, set_options
 from tests.waiting import PATIENCE_S, wait_for
 

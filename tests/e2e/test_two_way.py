@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.report.page import read_runs, write_report
-from gr_ros2.run.runner import run_scenario
+from gr_ros2_lab.report.page import read_runs, write_report
+from gr_ros2_lab.run.runner import run_scenario
 from tests.e2e.support import check_books, check_complete, delivered_bag, scenario
 
 

@@ -11,12 +11,12 @@ import pytest
 from gr_ros2.link.events import Received, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.record.result import Result
-from gr_ros2.run.observers import LiveRun
-from gr_ros2.run.runner import run_scenario
-from gr_ros2.run.scenario import Scenario, scenario_from
+from gr_ros2.observe.observers import LiveRun
 from gr_ros2.settings.files import find_registry
 from gr_ros2.wire.control import Report
+from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import Scenario, scenario_from
 from tests.domains import free_domains
 from tests.e2e.support import check_books, delivered_bag
 from tests.waiting import wait_for

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from gr_ros2.run.runner import run_scenario
-from gr_ros2.run.scenario import load_scenario
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.study.forecast import Planner
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.study.forecast import Planner
 from tests.e2e.support import check_complete, check_identical, delivered_bag, scenario
 
 

@@ -22,9 +22,9 @@ from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy.pdus import credit_of
-from gr_ros2.record.recorder import Recorder
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0
+from gr_ros2_lab.record.recorder import Recorder
 from tests.domains import free_domains
 from tests.gr.probe import Hears, Probe
 from tests.waiting import PATIENCE_S, wait_for

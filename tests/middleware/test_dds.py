@@ -26,10 +26,10 @@ from gr_ros2.middleware.base import Durability
 from gr_ros2.middleware.cdr_dds import RawReader
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.dds_domains import POOL, configuration
-from gr_ros2.race.namespaces import Namespace, inside
+from gr_ros2_lab.race.namespaces import Namespace, inside
 from tests.domains import domain
+from tests.lab.race.support import needs_namespaces
 from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, RELIABLE, STRING, Peer, message, same
-from tests.race.support import needs_namespaces
 from tests.waiting import PATIENCE_S, wait_for
 
 ROOT = Path(__file__).parents[2]

@@ -15,11 +15,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import numpy as np
 from gnuradio import gr
 
-from gr_ros2.medium.loss_table import table_for
 from gr_ros2.phy import measure
 from gr_ros2.phy.gfsk import GfskPhy
 from gr_ros2.phy.threads import KeptAlive
 from gr_ros2.settings.config import ChannelConfig
+from gr_ros2_lab.medium.loss_table import table_for
 
 
 class Pressing(KeptAlive, gr.sync_block):  # type: ignore[misc]

@@ -33,8 +33,8 @@ from gr_ros2.phy.wifi import WifiOptions, WifiPhy, band_snr_db
 from gr_ros2.phy.wifi_frames import ENCODINGS, MAX_PACKET, DataFrames, Encoding, FrameDecoder, scrambler, training
 from gr_ros2.settings.config import ChannelConfig, SinkConfig, SourceConfig
 from gr_ros2.settings.registry import Registry
-from gr_ros2.sim.fleet import Fleet
-from gr_ros2.sim.sim_settings import SimSettings
+from gr_ros2_lab.sim.fleet import Fleet
+from gr_ros2_lab.sim.sim_settings import SimSettings
 from tests.gr.probe import Probe
 from tests.waiting import wait_for
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from gr_ros2.radio.medium import MediumConfig, MediumProcess
 from gr_ros2.radio.zmq import HEADER, MAGIC, SAMPLE
 from gr_ros2.settings.config import build
+from gr_ros2_lab.medium.process import MediumConfig, MediumProcess
 
 RATE = 2e6
 BEGINS_S, CALLS = 0.004, 40

@@ -19,9 +19,9 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ros_link import make_link
 from gr_ros2.link.access import Access
 from gr_ros2.mac import Aloha, Slots
-from gr_ros2.radio.medium import MediumConfig, MediumProcess
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.settings.config import build
+from gr_ros2_lab.medium.process import MediumConfig, MediumProcess
 from tests.middleware.support import message
 from tests.radio.cables import free_ports
 from tests.radio.robots import Robot, config

@@ -16,7 +16,7 @@ pytest.importorskip("zmq", reason="needs pyzmq")
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.sim.motion import State
+from gr_ros2_lab.sim.motion import State
 from tests.docs.pages import blocks
 from tests.domains import domain
 from tests.radio.robots import config

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import link_from
-from gr_ros2.run.scenario import scenario_from
 from gr_ros2.settings.config import (
     BurstLoss,
     ChannelConfig,
@@ -27,6 +26,7 @@ from gr_ros2.settings.config import (
     build,
     read_yaml,
 )
+from gr_ros2_lab.run.scenario import scenario_from
 
 CONFIGS = (TopicOptions, SourceConfig, SinkConfig, ChannelConfig, PhyConfig)
 

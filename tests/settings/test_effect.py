@@ -14,13 +14,13 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ros_link import make_link
 from gr_ros2.radio.config import LinkConfig, link_from
-from gr_ros2.radio.medium import MediumConfig
-from gr_ros2.run.scenario import Scenario, scenario_from
 from gr_ros2.settings.airtime import AirtimeConfig
 from gr_ros2.settings.config import PhyConfig, ScenarioChannel, SinkConfig, SourceConfig, TopicOptions, build
 from gr_ros2.settings.effect import conditions_of
 from gr_ros2.settings.fields import Setting, settings_of
 from gr_ros2.settings.registry import Registry
+from gr_ros2_lab.medium.process import MediumConfig
+from gr_ros2_lab.run.scenario import Scenario, scenario_from
 from tests.settings.test_fields import classes
 
 ROBOTS = [{"connect": f"tcp://127.0.0.1:555{n}", "bind": f"tcp://127.0.0.1:655{n}"} for n in (1, 2)]

@@ -14,14 +14,14 @@ import pytest
 from pydantic import Field
 
 from gr_ros2.phy import PHY
-from gr_ros2.race.race_settings import RaceSettings
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
-from gr_ros2.radio.medium import MediumConfig
-from gr_ros2.run.scenario import Scenario
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.fields import AUTO, REQUIRED, Auto, Setting, label, meanings, members, settings_of
-from gr_ros2.study.sweep.definition import Sweep
+from gr_ros2_lab.medium.process import MediumConfig
+from gr_ros2_lab.race.race_settings import RaceSettings
+from gr_ros2_lab.run.scenario import Scenario
+from gr_ros2_lab.study.sweep.definition import Sweep
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 ROOTS = (Scenario, LinkConfig, MediumConfig, Sweep, RaceSettings, TopicOptions)

@@ -8,8 +8,9 @@ import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import read_yaml
-from gr_ros2.settings.files import BUILTIN_DIR, parse_override
+from gr_ros2.settings.files import parse_override
 from gr_ros2.settings.yaml_bounds import MOST_CHARACTERS, MOST_LEVELS, check_bounds
+from gr_ros2_lab.run.builtin import SCENARIO_DIR
 from tests.work import calls
 
 CALLS_PER_CHARACTER, CALLS = 100, 10_000
@@ -58,7 +59,7 @@ def test_a_file_without_end_is_not_read_to_it() -> None:
 
 
 def test_what_people_write_passes(tmp_path: Path) -> None:
-    scenarios = list(BUILTIN_DIR.rglob("*.yaml"))
+    scenarios = list(SCENARIO_DIR.rglob("*.yaml"))
     assert scenarios
     for path in scenarios:
         check_bounds(path.read_text(encoding="utf-8"))

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 import gr_ros2
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import load_link
-from gr_ros2.run.scenario import load_scenario
 from gr_ros2.settings.files import parse_override
 from gr_ros2.settings.yaml_text import parse_yaml
-from gr_ros2.study.sweep.definition import load_sweep
+from gr_ros2_lab.run.scenario import load_scenario
+from gr_ros2_lab.study.sweep.definition import load_sweep
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(max_size=20),
@@ -72,7 +72,8 @@ def test_a_value_on_the_command_line_is_checked() -> None:
 
 
 def test_nothing_else_reads_yaml() -> None:
-    root = Path(gr_ros2.__file__).parent
+    root = Path(gr_ros2.__file__).parents[1]
     reads = re.compile(r"\byaml\.(\w+_)?load")
-    users = [path.relative_to(root).as_posix() for path in root.rglob("*.py") if reads.search(path.read_text("utf-8"))]
-    assert users == ["settings/yaml_text.py"]
+    files = root.glob("gr_ros2*/**/*.py")
+    users = [path.relative_to(root).as_posix() for path in files if reads.search(path.read_text("utf-8"))]
+    assert users == ["gr_ros2/settings/yaml_text.py"]

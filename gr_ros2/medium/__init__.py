@@ -1,6 +1,0 @@
-"""Who receives what, when, and at which SNR: the medium between robots, at packets or at samples."""
-
-from gr_ros2.medium.base import FixedPaths, Medium, Path, Reception, Surroundings, Transmission
-from gr_ros2.medium.choice import make_medium
-
-__all__ = ["FixedPaths", "Medium", "Path", "Reception", "Surroundings", "Transmission", "make_medium"]

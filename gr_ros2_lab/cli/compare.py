@@ -1,0 +1,31 @@
+"""`gr-ros2 compare`: runs side by side."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+
+from gr_ros2.cli.console import console
+from gr_ros2.core.errors import ConfigError
+from gr_ros2_lab.cli.params import pictures_option, written_line
+from gr_ros2_lab.report.compare import compare_grid, write_comparison
+from gr_ros2_lab.report.page import read_runs
+from gr_ros2_lab.report.table import as_table
+
+
+@click.command()
+@click.argument("directories", nargs=-1, required=True, metavar="DIR DIR...", type=click.Path(path_type=Path))
+@pictures_option
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to write; default results/compare-TIME.")
+def compare(directories: tuple[Path, ...], out: Path | None, pictures: bool) -> None:
+    """Print what differs between the runs in these folders, side by side; write compare.html and a table."""
+    runs = read_runs(directories)
+    if len(runs) < 2:
+        raise ConfigError(f"{directories[0]}: nothing to compare it with; give two folders or more")
+    written = write_comparison(
+        runs, out or Path("results") / f"compare-{time.strftime('%Y%m%d-%H%M%S')}", pictures=pictures
+    )
+    console().print(as_table(compare_grid(runs)))
+    print(written_line(written))

@@ -1,0 +1,26 @@
+"""`gr-ros2 report`: the HTML report of runs, made again from their files."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+
+from gr_ros2_lab.cli.params import pictures_option, written_line
+from gr_ros2_lab.report.page import read_runs, write_report
+
+
+@click.command()
+@click.argument("directories", nargs=-1, required=True, metavar="DIR...", type=click.Path(path_type=Path))
+@pictures_option
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to write; default: DIR, or results/report-TIME.")
+def report(directories: tuple[Path, ...], out: Path | None, pictures: bool) -> None:
+    """Write report.html of the runs in these folders; of several runs also a table (CSV, Parquet).
+
+    One folder gets its own report, over all its runs where it holds repetitions; several share one, with their
+    latencies in one figure.
+    """
+    runs = read_runs(directories)
+    default = directories[0] if len(directories) == 1 else Path("results") / f"report-{time.strftime('%Y%m%d-%H%M%S')}"
+    print(written_line(write_report(runs, out or default, pictures=pictures)))

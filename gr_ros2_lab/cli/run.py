@@ -1,0 +1,246 @@
+"""`gr-ros2 demo` and `gr-ros2 run`: one experiment, its progress, its tables and its report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from gr_ros2.cli.console import LOG_S
+from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.dashboard import audience, dashboard_option
+from gr_ros2.cli.ending import FAILED
+from gr_ros2.cli.params import set_option
+from gr_ros2.cli.pcap import capture, pcap_option
+from gr_ros2.core.backends import uninterrupted
+from gr_ros2.observe.observers import RunObserver
+from gr_ros2.settings.fields import AUTO
+from gr_ros2_lab.cli.params import SCENARIO, pictures_option
+from gr_ros2_lab.cli.terminal import path_text
+from gr_ros2_lab.record.repetitions import REPETITIONS_FILE, repetition_folder
+from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.report.explain import explanation, lateness_lines
+from gr_ros2_lab.report.repetitions import repetition_grid
+from gr_ros2_lab.report.table import (
+    as_table,
+    hops_grid,
+    ledger_table,
+    notes,
+    packets_line,
+    paper_grid,
+    paper_results,
+    summary_table,
+    team_grid,
+)
+from gr_ros2_lab.run import runner
+from gr_ros2_lab.run.outcome import Outcome
+from gr_ros2_lab.run.scenario import Scenario, load_scenario
+
+_NEXT = """
+Next:  gr-ros2 demo --dashboard    the same live in a browser, with sliders for noise and loss
+       gr-ros2 plan demo           the forecast; --set phy.sample_rate=100e3 asks about a slower radio
+       gr-ros2 doctor              what this machine has and lacks for a link of your own
+       gr-ros2 link --help         your own robot's topics, live"""
+
+_options = [
+    click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),
+    click.option("--seed", type=int, help="Seed of robots, channel and sender."),
+    click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
+    click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),
+    click.option("--no-report", is_flag=True, help="No report; `gr-ros2 report FOLDER` makes it later."),
+    pictures_option,
+    set_option(Scenario),
+    dashboard_option,
+    pcap_option,
+]
+
+
+def _with_options(function: Any) -> Any:
+    for option in reversed(_options):
+        function = option(function)
+    return function
+
+
+@click.command()
+@click.argument("scenario", type=SCENARIO)
+@_with_options
+def run(scenario: str, **options: Any) -> int:
+    """Run SCENARIO, a built-in name or a YAML file, and write its result."""
+    return _run(scenario, **options)
+
+
+@click.command()
+@click.option("--wire", type=click.Choice(["0", "1"]), default="1", help="Of the wire format; 0 repairs nothing.")
+@click.option("--robots", type=click.IntRange(2, 6), help="So many robots that all send, on one channel, in slots.")
+@_with_options
+def demo(wire: str, robots: int | None, overrides: tuple[str, ...], **options: Any) -> int:
+    """Two simulated robots: the topics of one cross an OFDM link that loses packets, and come out at the other.
+
+    With --robots, that many drive apart among obstacles and tell each other where they are on one channel.
+    """
+    if robots is not None:
+        if wire == "0":
+            raise click.UsageError("--robots: version 0 says nothing about slots; leave --wire out")
+        return _run("demo-team", overrides=(f"robots={robots}", *overrides), **options)
+    older = () if wire == "1" else ("version=0", "reports=null")
+    status = _run("demo", overrides=(*older, *overrides), **options)
+    make_console().print(_NEXT, soft_wrap=True)
+    return status
+
+
+def _run(
+    name: str,
+    *,
+    out: Path | None,
+    seed: int | None,
+    repetitions: int | None,
+    duration: float | None,
+    no_report: bool,
+    pictures: bool,
+    overrides: tuple[str, ...],
+    dashboard: str | None,
+    pcap: Path | None,
+) -> int:
+    scenario = load_scenario(name, overrides, seed=seed, repetitions=repetitions, duration_s=duration)
+    out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    console = make_console()
+    # An unthrottled flowgraph runs as fast as it can, so it gets instruments only if a dashboard is requested.
+    looked_at = audience(dashboard, console, scenario.name, instruments=scenario.time != "unthrottled")
+    with looked_at as run_observers, capture(pcap) as captures, _bar(console) as bar:
+        seen: list[RunObserver] = [run_observers, *captures]
+        if scenario.repetitions == 1:
+            outcome = runner.run_scenario(scenario, out, _advance(bar, scenario, scenario.name), seen)
+        else:
+            turns = (f"{scenario.name} {k} of {scenario.repetitions}" for k in count(1))
+            results = runner.run_repetitions(scenario, out, lambda: _advance(bar, scenario, next(turns)), seen)
+    drawn = None if no_report else pictures  # None: nothing at all
+    if scenario.repetitions == 1:
+        _report_run(console, scenario, outcome, out, drawn)
+        results = [outcome.result]
+    else:
+        _report_repetitions(console, scenario, results, out, drawn)
+    return FAILED if any(result.incomplete for result in results) else 0
+
+
+def _advance(bar: Progress, scenario: Scenario, title: str) -> Callable[[runner.Progress], None]:
+    """A function that shows the progress of a run."""
+    how_long = f"{scenario.duration_s:g} s" if scenario.duration_s else "its recording"
+    clock = "simulated time, as fast as it can be computed" if scenario.simulated else "real time"
+    bar.console.print(f"{title}: {scenario.description or 'an experiment'}; {how_long} of {clock}", soft_wrap=True)
+    task = bar.add_task(title, total=scenario.duration_s or None, sent=0, delivered=0)
+    shown = time.monotonic()
+    begun = False
+
+    def advance(progress: runner.Progress) -> None:
+        nonlocal shown, begun
+        if not begun:
+            begun = True
+            bar.console.print(*_graphs(progress.graphs), sep="", end="", soft_wrap=True)
+        done = min(progress.elapsed_s, scenario.duration_s) if scenario.duration_s else progress.elapsed_s
+        bar.update(task, completed=done, sent=progress.sent, delivered=progress.delivered)
+        if not bar.console.is_terminal and time.monotonic() - shown >= LOG_S:
+            shown = time.monotonic()
+            bar.console.print(
+                f"{title}: {done:.1f} s of {how_long}, {progress.sent} sent, {progress.delivered} delivered",
+                soft_wrap=True,
+            )
+
+    return advance
+
+
+def _graphs(graphs: Iterable[tuple[str, int | None]]) -> Iterator[str]:
+    """How other programs join in, a line each."""
+    for what, domain in graphs:
+        if domain is not None:
+            yield f"ROS_DOMAIN_ID={domain} ROS_LOCALHOST_ONLY=1 ros2 topic list   # {what}\n"
+
+
+def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path, drawn: bool | None) -> None:
+    _print(console, scenario, outcome)
+    kept = f"result.json, bag {runner.DELIVERED_BAG}/, {runner.REGISTRY_FILE}, the tables messages and packets"
+    if drawn is None or outcome.result.interrupted:
+        # After Ctrl-C the prompt returns at once, without a second of drawing.
+        console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
+        return
+    with uninterrupted():  # matplotlib is loaded only when there is something to draw
+        from gr_ros2_lab.report.page import Run, write_report
+    runs = [Run(out, scenario.name, outcome.result, outcome.trace)]
+    written = [path.name for path in write_report(runs, out, pictures=drawn)]
+    console.print(f"\nWritten to {out}: {', '.join([written[0], kept, *written[1:]])}", soft_wrap=True)
+
+
+def _report_repetitions(
+    console: Console, scenario: Scenario, results: Sequence[Result], out: Path, drawn: bool | None
+) -> None:
+    if len(results) < scenario.repetitions:
+        console.print(f"stopped after {len(results)} of {scenario.repetitions} runs")
+    if not results:
+        return
+    console.print(as_table(repetition_grid(results)))
+    for number, result in enumerate(results):
+        for line in result.incomplete:
+            console.print(f"rep-{number}: {line}", soft_wrap=True)
+    kept = f"{REPETITIONS_FILE}, the runs in rep-0 to {repetition_folder(out, len(results) - 1).name}"
+    if drawn is None or len(results) < scenario.repetitions:
+        console.print(f"\nWritten to {out}: {kept}. For the report: gr-ros2 report {out}", soft_wrap=True)
+        return
+    with uninterrupted():
+        from gr_ros2_lab.report.page import read_runs, write_report
+    report, *_ = write_report(read_runs([out]), out, pictures=drawn)
+    console.print(f"\nWritten to {out}: {report.name}, {kept}", soft_wrap=True)
+
+
+def _bar(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[sent]} sent, {task.fields[delivered]} delivered"),
+        TimeRemainingColumn(),
+        console=console,
+        transient=not console.is_terminal,
+    )
+
+
+def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
+    """What came of it first, then the tables, then why."""
+    result = outcome.result
+    late = lateness_lines(result)
+    for line in late:  # first, since all that follows depends on it
+        console.print(line, style="bold red", soft_wrap=True)
+    arrived, *why = explanation(result, outcome.trace)[len(late) :]
+    console.print(f"{arrived}\n", style="bold", soft_wrap=True)
+    if paper_results([result]):
+        console.print(as_table(paper_grid([result])))
+    console.print(summary_table([result]))
+    console.print(ledger_table(result))
+    for grid in (team_grid(outcome.result), hops_grid(outcome.result)):
+        if grid is not None:
+            console.print(as_table(grid))
+    for path in outcome.trace.paths():
+        title = f"{path.topic} sent (blue), {path.published_as} received (red), m"
+        console.print(Text.from_ansi(path_text(path.sent, path.received, title)), soft_wrap=True)
+    for line in (*notes(result), *why, packets_line(result), *_radio(scenario, result)):
+        console.print(line, soft_wrap=True)
+
+
+def _radio(scenario: Scenario, result: Result) -> Iterator[str]:
+    """The PHY and what a packet takes on it."""
+    phy = result.phy
+    if not phy["sample_rate"]:
+        return
+    chosen = ""
+    if scenario.phy.sample_rate == AUTO:
+        chosen = (
+            f", chosen to carry {scenario.phy.headroom:.0%} of the messages uncompressed, each in packets of its own"
+        )
+    yield (
+        f"Radio: {phy['name']} at {phy['sample_rate']:,.0f} samples/s{chosen}; a full packet of {scenario.packet_len} "
+        f"B takes {phy['airtime_s'] * 1e3:.2f} ms."
+    )

@@ -1,0 +1,318 @@
+"""The radio between two network namespaces. It carries ROS topics or IP packets through the same flowgraph.
+
+Invariants: every frame occupies the air for the airtime of its length, one frame after another, for every sender. A
+frame is logged when it leaves. No frame waits here, so a sender notices when the link is full. Each direction has its
+own air.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from array import array
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from gnuradio import gr
+
+from gr_ros2.core.closing import Closing
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.factory import EndpointSetup
+from gr_ros2.gr.robot_blocks import RobotBlocks
+from gr_ros2.link import ReceiverEvent, SenderEvent
+from gr_ros2.link.events import SentPacket
+from gr_ros2.middleware import Middleware, join_graph
+from gr_ros2.phy import PHY, Phy
+from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.phy.pdus import PDUS, packets_of, pdu_of
+from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
+from gr_ros2.settings.registry import Registry
+from gr_ros2_lab.race.contenders import ADDRESSES, MTU, Contender
+from gr_ros2_lab.race.namespaces import inside
+from gr_ros2_lab.race.race_settings import PHY_NAME
+from gr_ros2_lab.race.tun import Tun, loopback_up, own_air
+
+DOMAINS = (1, 2)
+"""DDS domains at both ends of gr-ros2, the sending end first. One process cannot use one domain in two namespaces."""
+SOURCE_ID = 1
+DEPTH = 1000
+"""Messages that the local graphs keep. The number is large, because no message may be lost there."""
+
+_POLL_S = 0.05
+_JOIN_S = 1.0
+_SHORT_FRAME = 100
+
+
+@dataclass(frozen=True)
+class RaceRadio:
+    """The radio of all contenders: their PHY at a sample rate, and the share of its frames that are lost.
+
+    :param seed: seed of the losses; each direction has its own losses
+    """
+
+    sample_rate: float
+    packet_loss: float
+    seed: int
+
+    def with_frames_of(self, length: int) -> Phy:
+        """The PHY for frames of at most ``length`` bytes."""
+        phy: Phy = PHY.load(PHY_NAME)(length, self.sample_rate)
+        return phy
+
+    @cached_property
+    def _phy(self) -> Phy:
+        return self.with_frames_of(MTU)
+
+    def airtime_s(self, length: int) -> float:
+        """Airtime of a frame of ``length`` bytes, s."""
+        return self._phy.airtime(length)
+
+    def channel(self, direction: int) -> ChannelConfig:
+        """The channel of one direction, 0 or 1."""
+        return ChannelConfig(packet_loss=self.packet_loss, seed=2 * self.seed + direction)
+
+
+@dataclass
+class LinkLog:
+    """The frames of one direction: the time at which each left (s, monotonic), its size in bytes, its airtime in s."""
+
+    t: array[float] = field(default_factory=lambda: array("d"))
+    size: array[float] = field(default_factory=lambda: array("d"))
+    airtime: array[float] = field(default_factory=lambda: array("d"))
+
+    def note(self, t: float, size: int, airtime: float) -> None:
+        """Add one frame."""
+        self.t.append(t)
+        self.size.append(size)
+        self.airtime.append(airtime)
+
+
+@dataclass(frozen=True)
+class LinkReport:
+    """The traffic on the air: the frames in both directions, and the number of losses by reason."""
+
+    forward: LinkLog
+    reverse: LinkLog
+    drops: dict[str, int]
+
+
+class RaceRosLink(Closing):
+    """gr-ros2 between two namespaces: a ROS graph and a robot's end of the link at each end, the radio between them.
+
+    Version 1 uses both directions: messages there, reports back. Version 0 sends nothing back.
+
+    :param namespaces: paths of the namespaces of the sending and the receiving end
+    :param topic: its absolute name and its type
+    :param packet_len: bytes of the longest packet
+    :param contender: the contender whose settings are used
+    :raises GrRos2Error: when a part does not start
+    """
+
+    def __init__(
+        self,
+        radio: RaceRadio,
+        namespaces: tuple[str, str],
+        topic: tuple[str, str],
+        packet_len: int,
+        contender: Contender,
+    ) -> None:
+        self._radio, self._settings, self._packet_len = radio, contender.settings, packet_len
+        self._registry = Registry.from_rows([topic])
+        self._logs = (LinkLog(), LinkLog())
+        with ExitStack() as stack:
+            ends: list[tuple[RosSource, RosSink]] = []
+            for direction, (namespace, domain_id) in enumerate(zip(namespaces, DOMAINS, strict=True)):
+                loopback_up(namespace)
+                graph = stack.enter_context(inside(namespace, lambda domain=domain_id: _graph(domain)))  # type: ignore[misc]
+                ends.append(self._end(direction, graph))
+                for block in ends[-1]:
+                    stack.callback(block.close)
+            (self._source, _), (_, self._sink) = ends
+            self._sink.outputs.announce(SOURCE_ID, [0])
+            self._links: list[LoopbackLink] = []
+            for direction, (source, _) in enumerate(ends):
+                phy, sink = radio.with_frames_of(packet_len), ends[1 - direction][1]
+                self._links.append(LoopbackLink(phy, source, sink, channel=radio.channel(direction)))
+                stack.callback(self._links[-1].stop)
+            for link in reversed(self._links):  # the receiving end listens when the sending end begins
+                link.start()
+            self._stack = stack.pop_all()
+
+    def _end(self, direction: int, graph: Middleware) -> tuple[RosSource, RosSink]:
+        """The blocks of one robot, which share one endpoint. Its packets take a direction each."""
+        common: dict[str, Any] = {
+            "version": self._settings["version"],
+            "robot_id": SOURCE_ID + direction,
+            "packet_len": self._packet_len,
+        }
+        compression = self._settings["compression"]
+        source = SourceConfig(subscriber_depth=DEPTH, compression=compression, **common, **self._settings["source"])
+        sink = SinkConfig(publisher_depth=DEPTH, **common)
+        phy = self._radio.with_frames_of(self._packet_len)
+        start = EndpointSetup(1, reports=True, any_length=phy.any_length)
+        log = _FrameLog(phy, self._logs[direction])
+        blocks = RobotBlocks(self._registry, source, sink, start=start, observer=log, seed=self._radio.seed)
+        return blocks.source(graph), blocks.sink(graph)
+
+    @property
+    def output_topic(self) -> str:
+        """The topic on which the receiving end publishes the messages."""
+        return self._sink.registry[0].republished(self._sink.config.namespace_format, SOURCE_ID)
+
+    def matched(self) -> bool:
+        """Whether both blocks have found the programs at their ends: each side of a match is told of it by itself."""
+        return self._source.matched and self._sink.matched
+
+    def report(self) -> LinkReport:
+        """The traffic on the air so far."""
+        topics = self._source.stats()["topics"].values()
+        drops = {reason: count for topic in topics for reason, count in topic["refused"].items()}
+        on_air = sum(link.counts().dropped for link in self._links)
+        return LinkReport(*self._logs, {**drops, "on_air": on_air})
+
+    def close(self) -> None:
+        """Stop the radio and leave both graphs."""
+        self._stack.close()
+
+
+class _FrameLog:
+    """Logs the packets that one end sends."""
+
+    def __init__(self, phy: Phy, log: LinkLog) -> None:
+        self._phy, self._log = phy, log
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:  # noqa: ARG002 - a LinkObserver's signature
+        if isinstance(event, SentPacket):
+            self._log.note(event.now, len(event.data), self._phy.airtime(len(event.data)))
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """Do nothing: what arrives was logged when it was sent."""
+
+
+class RaceIpLink(Closing):
+    """IP between two namespaces, in both directions: a TUN device at each end, one frame of the same length per packet.
+
+    :param namespaces: paths of the namespaces of the sending and the receiving end
+    :raises GrRos2Error: when a part does not start
+    """
+
+    def __init__(self, radio: RaceRadio, namespaces: tuple[str, str]) -> None:
+        byte_airtime = (radio.airtime_s(MTU) - radio.airtime_s(_SHORT_FRAME)) / (MTU - _SHORT_FRAME)
+        overhead = radio.airtime_s(_SHORT_FRAME) / byte_airtime - _SHORT_FRAME
+        self._logs = (LinkLog(), LinkLog())
+        with ExitStack() as stack:
+            self._tuns: list[Tun] = []
+            for namespace, own, other in zip(namespaces, ADDRESSES, reversed(ADDRESSES), strict=True):
+                setup = own_air(own, other, mtu=MTU, byte_rate=1 / byte_airtime, overhead=overhead)
+                tun = Tun(namespace, setup)
+                stack.callback(tun.close)
+                self._tuns.append(tun)
+            self._links: list[LoopbackLink] = []
+            for direction, log in enumerate(self._logs):
+                phy = radio.with_frames_of(MTU)
+                source = TunSource(self._tuns[direction], radio, log)
+                sink = TunSink(self._tuns[1 - direction])
+                link = LoopbackLink(
+                    phy, source, sink, channel=radio.channel(direction), throttled=False, paced=False
+                )  # TunSource delays each frame by its airtime
+                stack.callback(link.stop)
+                link.start()
+                phy.prefer_latency()
+                self._links.append(link)
+            self._stack = stack.pop_all()
+
+    def matched(self) -> bool:
+        """True: IP has no ends that must find each other."""
+        return True
+
+    def report(self) -> LinkReport:
+        """The traffic on the air so far."""
+        drops = {
+            "queue_full": sum(tun.dropped() for tun in self._tuns),
+            "on_air": sum(link.counts().dropped for link in self._links),
+            "not_taken": sum(link.sink.refused for link in self._links),
+        }
+        return LinkReport(*self._logs, drops)
+
+    def close(self) -> None:
+        """Stop the radio and remove the interfaces."""
+        self._stack.close()
+
+
+class TunSource(gr.basic_block):  # type: ignore[misc]
+    """Sends the IP packets of a TUN device to message port `pdus`, each at the end of its airtime.
+
+    :param log: takes the frames that have left
+    """
+
+    def __init__(self, tun: Tun, radio: RaceRadio, log: LinkLog) -> None:
+        super().__init__("gr_ros2_tun_source", None, None)
+        self._tun, self._log = tun, log
+        self.emitted = 0
+        """PDUs that have left."""
+        self._airtimes = [radio.airtime_s(length) for length in range(MTU + 1)]
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.message_port_register_out(PDUS)
+
+    def start(self) -> bool:
+        shorten_switch_interval()
+        self._thread = threading.Thread(target=self._run, name="gr-ros2-tun", daemon=True)
+        self._thread.start()
+        return True
+
+    def stop(self) -> bool:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
+            self._thread = None
+        return True
+
+    def _run(self) -> None:
+        free = time.monotonic()
+        while not self._stop.is_set():
+            packet = self._tun.read(0)  # a packet that is already here has waited until the air is free
+            if packet is None:
+                packet = self._tun.read(_POLL_S)
+                free = max(free, time.monotonic())
+                if packet is None:
+                    continue
+            airtime = self._airtimes[len(packet)]
+            free += airtime
+            if self._stop.wait(max(0.0, free - time.monotonic())):
+                return
+            self._log.note(free, len(packet), airtime)
+            self.message_port_pub(PDUS, pdu_of(packet))
+            self.emitted += 1
+
+
+class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
+    """Writes the PDUs of message port `pdus` to a TUN device."""
+
+    def __init__(self, tun: Tun) -> None:
+        super().__init__("gr_ros2_tun_sink", None, None)
+        self._tun = tun
+        self.handled = 0
+        """PDUs that this block has handled."""
+        self.refused = 0
+        """Handled PDUs that were not an IP packet, or that the kernel refused."""
+        self.message_port_register_in(PDUS)
+        self.set_msg_handler(PDUS, self._write)
+
+    def _write(self, pdu: Any) -> None:
+        packets, reason = packets_of(pdu)
+        try:
+            if reason:
+                self.refused += 1
+            for packet in packets:
+                self._tun.write(packet.data)
+        except OSError:
+            self.refused += 1
+        self.handled += 1
+
+
+def _graph(domain_id: int) -> Middleware:
+    return join_graph(DEFAULT_MIDDLEWARE, domain_id=domain_id, node_name="gr_ros2_race", localhost_only=True)

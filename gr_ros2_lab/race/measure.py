@@ -1,0 +1,295 @@
+"""The results of one contender under one condition, as numbers, and the best contenders of a condition.
+
+Invariants: a message is delivered when its bytes arrive unchanged, and it counts once. Bytes in alignment gaps and the
+padding of DDS may change. A number that does not apply is None. Winners are computed from the numbers as the tables
+show them, so contenders with the same shown number win together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from gr_ros2.compression import LinkCodec
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.observe.latency import latency
+from gr_ros2.settings.registry import Registry
+from gr_ros2_lab.race.contenders import Races
+from gr_ros2_lab.race.links import LinkLog, LinkReport
+from gr_ros2_lab.race.race_settings import RaceRecording
+from gr_ros2_lab.record.metrics import Age, age
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RaceCell:
+    """Results of one contender under one condition. Times are in s, sizes in bytes. Both directions of the air count.
+
+    :param load: share of the airtime that the recording needs without compression, one frame per message
+    :param loss: probability that a frame is lost
+    :param matched: both ends found each other before the first message
+    :param delivered: messages of ``sent`` that arrived unchanged; ``altered`` and ``duplicates`` are counted apart
+    :param airtime_per_message: airtime of all frames since the first message, per message delivered
+    :param air_bytes_per_message: bytes of all frames since the first message, per message delivered
+    :param air_bytes_reverse: share of these bytes that the receiving end sent
+    :param discovery_bytes: bytes of all frames before the first message
+    :param first_message: time from joining the network to the first delivery
+    :param robots: 2 and more on one channel: all numbers are those of all pairs; None for a talker and a listener
+    :param age_peak: the highest age of any pair
+    :param all_heard: time from the last robot's joining until every robot has a message of every other one
+    :param drops: frames and messages that were dropped on the way, by name
+    :param busy: load average per processor; above 1, the times come from the computer and not from the radio
+    """
+
+    contender: str
+    load: float
+    loss: float
+    sample_rate: float
+    matched: bool
+    sent: int
+    delivered: int
+    altered: int
+    duplicates: int
+    pdr: float | None
+    latency_p50: float | None
+    latency_p99: float | None
+    age_mean: float | None
+    airtime_per_message: float | None
+    air_bytes_per_message: float | None
+    air_bytes_reverse: float | None
+    discovery_bytes: float
+    first_message: float | None
+    drops: dict[str, int]
+    busy: float
+    robots: int | None = None
+    age_peak: float | None = None
+    all_heard: float | None = None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A number that is compared between contenders.
+
+    :param better: whether the largest or the smallest number wins
+    :param races: those in which it is compared
+    """
+
+    heading: str
+    better: Literal["most", "least"]
+    shown: Callable[[float], str]
+    races: tuple[Races, ...] = ("two", "team")
+
+
+def _ms(value: float) -> str:
+    return f"{value * 1e3:.0f}" if value >= 0.1 else f"{value * 1e3:.1f}"
+
+
+def _whole(value: float) -> str:
+    return f"{value:.0f}"
+
+
+COLUMNS = {
+    "pdr": Column("PDR", "most", "{:.3f}".format),
+    "latency_p50": Column("latency p50 [ms]", "least", _ms),
+    "latency_p99": Column("latency p99 [ms]", "least", _ms),
+    "age_mean": Column("age mean [ms]", "least", _ms),
+    "age_peak": Column("age peak [ms]", "least", _ms, ("team",)),
+    "airtime_per_message": Column("airtime /msg [ms]", "least", _ms, ("two",)),
+    "air_bytes_per_message": Column("air bytes /msg", "least", _whole),
+    "discovery_bytes": Column("discovery bytes", "least", _whole),
+    "first_message": Column("first message [s]", "least", "{:.2f}".format, ("two",)),
+    "all_heard": Column("all hear all [s]", "least", "{:.2f}".format, ("team",)),
+}
+"""The compared numbers, by field of :class:`RaceCell`."""
+
+
+def columns(cells: Sequence[RaceCell]) -> dict[str, Column]:
+    """Those of the race to which these cells belong."""
+    races: Races = "team" if any(cell.robots for cell in cells) else "two"
+    return {name: column for name, column in COLUMNS.items() if races in column.races}
+
+
+class Identity:
+    """Finds the message of a recording that has the given bytes.
+
+    :raises ConfigError: when two messages of the recording are the same
+    """
+
+    def __init__(self, recording: RaceRecording) -> None:
+        self._codec = LinkCodec(Registry.from_rows([(recording.topic, recording.type_name)]))
+        self._numbers = {self._plain(payload): number for number, payload in enumerate(recording.payloads)}
+        if len(self._numbers) < len(recording.payloads):
+            raise ConfigError(
+                f"{recording.path}: {recording.topic} holds the same message twice, so that it is not known which of "
+                "them arrived; choose a topic with a stamp"
+            )
+
+    def number(self, payload: bytes) -> int | None:
+        """Position of the message in the recording, from 0; None if the recording has no such message."""
+        return self._numbers.get(self._plain(payload))
+
+    def _plain(self, payload: bytes) -> bytes:
+        """The payload without the bytes that DDS and the codec may change: alignment gaps, zeros after the message."""
+        return self._codec.decode(0, self._codec.encode(0, payload)).rstrip(b"\0")
+
+
+@dataclass(frozen=True)
+class RaceSender:
+    """What a robot sends, and how its messages are recognized."""
+
+    recording: RaceRecording
+    identity: Identity
+
+    def sent(self, t_first: float) -> list[float]:
+        """When each message counts as sent, if the first one did at ``t_first``."""
+        return [t_first + due for due in self.recording.due]
+
+
+@dataclass(frozen=True)
+class RaceStream:
+    """The messages of one program at another one. All times are s on one clock.
+
+    :param t_sent: due time of each message, in the order of the recording
+    :param heard: time of each arrival, and the bytes that arrived
+    """
+
+    identity: Identity
+    t_sent: Sequence[float]
+    heard: Sequence[tuple[float, bytes]]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What was observed of one contender. All times are s on one clock.
+
+    :param began: when the first program began to join; of a team the last one
+    :param streams: of every pair of programs
+    :param busy: see :class:`RaceCell`
+    """
+
+    began: float
+    matched: bool
+    streams: Sequence[RaceStream]
+    air: LinkReport
+    busy: float
+
+
+def measure(
+    seen: Observed, *, contender: str, load: float, loss: float, sample_rate: float, robots: int | None = None
+) -> RaceCell:
+    """Compute all numbers of a cell."""
+    altered = duplicates = sent = 0
+    latencies: list[Floats] = []
+    ages: list[Age] = []
+    firsts: list[float] = []
+    for stream in seen.streams:
+        t_sent = np.array(stream.t_sent)
+        t_delivered = np.full(len(t_sent), np.nan)
+        for now, payload in stream.heard:
+            number = stream.identity.number(payload)
+            if number is None or number >= len(t_sent):
+                altered += 1
+            elif not np.isnan(t_delivered[number]):
+                duplicates += 1
+            else:
+                t_delivered[number] = now
+        done = ~np.isnan(t_delivered)
+        sent += len(t_sent)
+        latencies.append(t_delivered[done] - t_sent[done])
+        if done.any():
+            firsts.append(float(t_delivered[done].min()) - seen.began)
+        found = age(t_sent[done], t_delivered[done], float(t_sent[-1])) if len(t_sent) else None
+        ages += [] if found is None else [found]
+    delivered = sum(map(len, latencies))
+    times = latency(np.sort(np.concatenate(latencies)))
+    first = min((stream.t_sent[0] for stream in seen.streams if len(stream.t_sent)), default=np.inf)
+    logs = (seen.air.forward, seen.air.reverse)
+    before, _ = _traffic(logs, -np.inf, first)
+    size, airtime = _traffic(logs, first, np.inf)
+    reverse, _ = _traffic(logs[1:], first, np.inf)
+    return RaceCell(
+        contender=contender,
+        load=load,
+        loss=loss,
+        sample_rate=sample_rate,
+        matched=seen.matched,
+        sent=sent,
+        delivered=delivered,
+        altered=altered,
+        duplicates=duplicates,
+        pdr=delivered / sent if sent else None,
+        latency_p50=None if times is None else times.p50,
+        latency_p99=None if times is None else times.p99,
+        age_mean=sum(found.mean for found in ages) / len(ages) if ages else None,
+        airtime_per_message=airtime / delivered if delivered else None,
+        air_bytes_per_message=size / delivered if delivered else None,
+        air_bytes_reverse=reverse / size if size else None,
+        discovery_bytes=before,
+        first_message=min(firsts, default=None),
+        drops={name: count for name, count in seen.air.drops.items() if count},
+        busy=seen.busy,
+        robots=robots,
+        age_peak=max((found.peak for found in ages), default=None),
+        all_heard=max(firsts) if len(firsts) == len(seen.streams) else None,
+    )
+
+
+def shown(cell: RaceCell, column: str) -> str:
+    """A number as the tables show it; a dash if it is None."""
+    value = getattr(cell, column)
+    return "–" if value is None else COLUMNS[column].shown(value)
+
+
+def winners(cells: Sequence[RaceCell]) -> dict[str, list[str]]:
+    """The best contenders in each column. All cells must have the same condition."""
+    best: dict[str, list[str]] = {}
+    for name, column in columns(cells).items():
+        values = {cell.contender: getattr(cell, name) for cell in cells if getattr(cell, name) is not None}
+        if not values:
+            best[name] = []
+            continue
+        top = (max if column.better == "most" else min)(values.values())
+        best[name] = [contender for contender, value in values.items() if column.shown(value) == column.shown(top)]
+    return best
+
+
+def ahead(cells: Sequence[RaceCell], contender: str) -> dict[str, list[str]]:
+    """Who is better than a contender, by column. All cells must have the same condition; equal shown numbers are equal.
+
+    A contender without a number is behind all that have one.
+    """
+    own = {cell.contender: cell for cell in cells}.get(contender)
+    found: dict[str, list[str]] = {}
+    for name, column in columns(cells).items():
+        value = None if own is None else getattr(own, name)
+        for cell in cells:
+            other = getattr(cell, name)
+            if other is None or (value is not None and column.shown(other) == column.shown(value)):
+                continue
+            if value is None or (other > value) == (column.better == "most"):
+                found.setdefault(name, []).append(cell.contender)
+    return found
+
+
+def by_condition(cells: Sequence[RaceCell]) -> Mapping[tuple[float, float], list[RaceCell]]:
+    """The cells, grouped by (load, loss)."""
+    groups: dict[tuple[float, float], list[RaceCell]] = {}
+    for cell in cells:
+        groups.setdefault((cell.load, cell.loss), []).append(cell)
+    return groups
+
+
+def _traffic(logs: Sequence[LinkLog], begin: float, end: float) -> tuple[float, float]:
+    """Bytes, and airtime in s, of the frames between two times."""
+    size = airtime = 0.0
+    for log in logs:
+        t = np.array(log.t)
+        inside = (t >= begin) & (t < end)
+        size += float(np.array(log.size)[inside].sum())
+        airtime += float(np.array(log.airtime)[inside].sum())
+    return size, airtime

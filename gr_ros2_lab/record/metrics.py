@@ -1,0 +1,97 @@
+"""The metrics of one topic, computed from the submission and delivery times of its messages.
+
+Invariants: a number that does not apply is None, never a guess; negative latencies (clock skew) are kept and counted;
+all times are seconds on one clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gr_ros2.link.fates import arrived
+from gr_ros2.observe.latency import Floats, Latency, latency, latency_cdf
+from gr_ros2_lab.record.ledger import TopicLedger
+
+
+@dataclass(frozen=True, slots=True)
+class Age:
+    """s: at each instant since the first delivery, now minus the submission time of the newest message delivered."""
+
+    mean: float
+    peak: float
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMetrics:
+    """The numbers of one topic.
+
+    :param pdr: delivered / sent, 0..1; None where nothing was sent
+    :param goodput_Bps: delivered serialized bytes / duration, B/s; None where the duration is 0
+    :param latency_cdf_s: CDF_POINTS quantiles of the latency, ascending; empty where nothing was delivered
+    :param negative_latencies: deliveries that seem to come before their submission
+    """
+
+    sent: int
+    delivered: int
+    delivered_bytes: int
+    pdr: float | None
+    goodput_Bps: float | None
+    latency_s: Latency | None
+    latency_cdf_s: tuple[float, ...]
+    negative_latencies: int
+    age_s: Age | None
+
+
+def topic_metrics(ledger: TopicLedger, duration_s: float, t_end: float) -> TopicMetrics:
+    """All numbers of one topic.
+
+    :param duration_s: s during which messages were submitted
+    :param t_end: s on the ledger's clock, end of the observation of the age: the end of submission
+    """
+    t_sent, t_delivered = np.frombuffer(ledger.t_sent), np.frombuffer(ledger.t_delivered)
+    done = ~np.isnan(t_delivered)
+    latencies = np.sort(t_delivered[done] - t_sent[done])
+    delivered = arrived(ledger.fates)
+    delivered_bytes = int(np.array(ledger.size)[done].sum())
+    return TopicMetrics(
+        sent=ledger.sent,
+        delivered=delivered,
+        delivered_bytes=delivered_bytes,
+        pdr=delivered / ledger.sent if ledger.sent else None,
+        goodput_Bps=delivered_bytes / duration_s if duration_s > 0 else None,
+        latency_s=latency(latencies),
+        latency_cdf_s=latency_cdf(latencies),
+        negative_latencies=int((latencies < 0).sum()),
+        age_s=age(t_sent[done], t_delivered[done], t_end),
+    )
+
+
+def age(t_sent: Floats, t_delivered: Floats, t_end: float) -> Age | None:
+    """Exact mean and peak of the age of information, computed from its :func:`age_sawtooth`.
+
+    :return: None where nothing was delivered before the end of the observation
+    """
+    start, until, newest = age_sawtooth(t_sent, t_delivered, t_end)
+    if not len(start):
+        return None
+    low, high = start - newest, until - newest  # age at both ends of each tooth
+    lengths = until - start
+    return Age(float(((low + high) / 2 * lengths).sum() / lengths.sum()), float(high.max()))
+
+
+def age_sawtooth(t_sent: Floats, t_delivered: Floats, t_end: float) -> tuple[Floats, Floats, Floats]:
+    """The age of information is a sawtooth. It rises with slope 1 and falls to ``t_delivered - t_sent`` when a message
+    is delivered that is newer than all messages before.
+
+    :param t_sent: s, when each delivered message was submitted, in any order
+    :param t_delivered: s, when it was delivered
+    :param t_end: s, end of the observation
+    :return: for each tooth its start, its end, and the submission time of the newest message delivered by then
+    """
+    order = np.argsort(t_delivered, kind="stable")
+    times, newest = t_delivered[order], np.maximum.accumulate(t_sent[order])
+    inside = times < t_end
+    times, newest = times[inside], newest[inside]
+    return times, np.append(times[1:], t_end)[: len(times)], newest

@@ -1,0 +1,199 @@
+"""A channel for each robot that sends, in one flowgraph: full duplex in real time.
+
+Packets pass at the pace of the air, or with time ``unthrottled`` as fast as the flowgraph takes them. Every robot has a
+receiver for each channel that it hears. A robot that sends nothing but reports has a source without topics.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.factory import EndpointSetup
+from gr_ros2.gr.robot_blocks import RobotBlocks
+from gr_ros2.link.lateness import Lateness
+from gr_ros2.middleware import Middleware
+from gr_ros2.middleware.bag import BagMiddleware
+from gr_ros2.phy import Phy
+from gr_ros2.phy.flowgraph import Flowgraph
+from gr_ros2.phy.loopback import SimulatedLink
+from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Registry, options_of
+from gr_ros2_lab.medium.base import Surroundings
+from gr_ros2_lab.record.lateness import modem_lateness
+from gr_ros2_lab.run.domains import open_graph
+from gr_ros2_lab.run.load import recorded_names
+from gr_ros2_lab.run.recorders import RunRecords
+from gr_ros2_lab.run.robot_settings import RobotSettings, sources_of
+from gr_ros2_lab.run.robots import start_of_run
+from gr_ros2_lab.run.scenario import Scenario
+
+_QUIET_S = 0.3
+"""A PHY is empty if nothing waits for it and it has given no packet for this time."""
+
+
+class OwnChannels:
+    """See :class:`gr_ros2_lab.run.live.LiveMedium`, and :class:`gr_ros2_lab.run.live.LiveRobots` for the parameters."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        robots: Sequence[RobotSettings],
+        registry: Registry,
+        phy: Phy,
+        around: Surroundings,
+        *,
+        records: RunRecords,
+        stack: ExitStack,
+    ) -> None:
+        self._scenario, self._registry, self._records, self._stack = scenario, registry, records, stack
+        self._hearing = Counter(receiver for number in range(around.robots) for receiver in around.reached(number))
+        start = start_of_run(scenario, phy)
+        self.blocks = [
+            self._blocks(number, robot, start, sends=bool(around.reached(number)))
+            for number, robot in enumerate(robots)
+        ]
+        self._flowgraph = Flowgraph("gr_ros2_channels", scenario.name)
+        self.links = [self._link(number, phy, around) for number in range(around.robots) if around.reached(number)]
+        self._offering = [source.src_id() for source in sources_of(robots)]
+        stack.callback(self.stop)
+        self.clock: Callable[[], float] = time.monotonic
+        self.channels = len(self._offering)
+
+    def start(self) -> None:
+        """Start the flowgraph."""
+        self._flowgraph.start()
+        if self._throttled:
+            self.links[0].phy.prefer_latency()
+
+    def run_began(self, now: float) -> None:
+        """Messages come from now on, s, monotonic."""
+        for link in self.links:
+            link.run_began(now)
+
+    def check(self) -> None:
+        """Nothing here can break."""
+
+    def stop(self) -> None:
+        """Stop the flowgraph."""
+        self._flowgraph.stop()
+
+    def empty(self, unresolved: bool) -> bool:
+        """Whether nothing is left at a gate or in a PHY; see :class:`gr_ros2_lab.run.live.LiveMedium`."""
+        before = [link.counts() for link in self.links]
+        if any(counts.backlog or counts.transmitted < counts.passed for counts in before):
+            return False
+        time.sleep(_QUIET_S if unresolved else 0)
+        return [link.counts() for link in self.links] == before
+
+    def lateness(self, records: RunRecords) -> dict[str, list[Lateness]] | None:
+        """How late packets were in each part; None where the links wait for the computer."""
+        if not self._throttled:
+            return None
+        parts: dict[str, list[Lateness]] = {"gate": [], "modem": []}
+        for src_id, link in zip(self._offering, self.links, strict=False):
+            gate = link.gate_lateness()
+            if gate is not None:
+                parts["gate"].append(gate)
+                parts["modem"].append(modem_lateness(link.passed_at(), records.recorder.received_at(src_id)))
+        return parts
+
+    def counted(self, robot: int) -> dict[str, Any]:
+        """``channel``: the packets it lost on purpose, by the setting that caused the loss."""
+        return {"channel": dict(self.links[robot].counts().losses)}
+
+    def counters(self) -> dict[str, Any]:
+        """Nothing: the channels have nothing in common."""
+        return {}
+
+    @property
+    def _throttled(self) -> bool:
+        return self._scenario.time != "unthrottled"
+
+    def _blocks(
+        self, number: int, robot: RobotSettings, start: EndpointSetup, *, sends: bool
+    ) -> tuple[RosSource | None, RosSink | None]:
+        """The blocks of a robot, which share one endpoint."""
+        scenario, source, sink = self._scenario, robot.source, robot.sink
+        if source is None and sink is not None and number > 1:
+            sink = _apart(sink, self._registry, number)
+        hears = bool(self._hearing[number])
+        if source is not None and not sends:
+            raise ConfigError(
+                f"gains_db: nobody hears {source.namespace}, whose channel in real time would have no receiver; set "
+                "duplex: half, or time to packets or samples"
+            )
+        if source is None and not hears:
+            raise ConfigError(
+                f"gains_db: receiver {number} hears nobody; set a higher gain, or time to packets or samples"
+            )
+        if source is not None and scenario.bag_path is not None and not scenario.bag_speed:
+            # A bag that is read as fast as the link takes it: the reader waits, so that nothing is dropped.
+            source = replace(source, backpressure=True)
+        observer = self._records.of(number)
+        blocks = RobotBlocks(self._registry, source, sink, start=start, observer=observer, seed=scenario.seed)
+        here, there = self._graphs(source, sink)
+        sending, receiving = blocks.source(here) if sends else None, blocks.sink(there) if hears else None
+        for block in (sending, receiving):
+            if block is not None:
+                self._stack.callback(block.close)
+        return sending, receiving
+
+    def _graphs(self, source: SourceConfig | None, sink: SinkConfig | None) -> tuple[Middleware, Middleware]:
+        """The participants of a robot's two halves: one for both where they are on the same graph."""
+        ends = [end for end in (source, sink) if end is not None]
+        places = [(end.middleware, end.domain_id) for end in ends]
+        if source is not None and (path := self._scenario.bag_path) is not None:
+            recorded_names(self._scenario, self._registry)  # raises if the recording has nothing for this link
+            graphs: list[Middleware] = [BagMiddleware(path=path, speed=self._scenario.bag_speed)]
+        else:
+            node = "sink" if source is None else "source"
+            graphs = [open_graph(self._scenario, ends[0], node)]
+            if places[-1] != places[0]:
+                graphs.append(open_graph(self._scenario, ends[1], "sink"))
+        for graph in graphs:
+            self._stack.enter_context(graph)
+        return graphs[0], graphs[-1]
+
+    def _link(self, number: int, phy: Phy, around: Surroundings) -> SimulatedLink:
+        """The channel of a robot to all who hear it."""
+        scenario = self._scenario
+        first, *others = [around.path(number, receiver) for receiver in around.reached(number)]
+        return SimulatedLink(
+            phy,
+            self.blocks[number][0],
+            self.blocks[first.receiver][1],
+            channel=first.channel,
+            throttled=self._throttled,
+            rule=scenario.airtime.rule,
+            delay_s=first.delay_s,
+            instrumented=self._records.run_observers.instruments,
+            further=[(path.channel, self.blocks[path.receiver][1]) for path in others],
+            within=self._flowgraph,
+            shared=self._hearing[first.receiver] > 1,
+        )
+
+
+def _apart(config: SinkConfig, registry: Registry, number: int) -> SinkConfig:
+    """The settings of a further receiver's sink, which publishes on the same graph in a namespace of its own."""
+    inside = f"/receiver_{number}/"
+    options = {
+        topic.name: replaced(
+            options_of(topic.name, config.topic_options), publish_as=inside + topic.options.publish_as.lstrip("/")
+        )
+        for topic in registry.with_options(config.topic_options)
+        if topic.options.publish_as != AUTO
+    }
+    return replaced(
+        config,
+        namespace_format=inside + config.namespace_format.lstrip("/"),
+        topic_options={**config.topic_options, **options},
+        merge_tf=inside + config.merge_tf.lstrip("/") if config.merge_tf else "",
+    )

@@ -1,0 +1,110 @@
+"""The results of a sweep as files: tables, figures, and a page with both.
+
+Invariant: everything is made from the rows alone, so the page of an incomplete sweep has the same form as that of a
+finished one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from gr_ros2_lab.record.statistics import Estimate
+from gr_ros2_lab.report.page import Drawings, Picture, Section, render_page
+from gr_ros2_lab.report.table import Grid, number
+from gr_ros2_lab.study.sweep.definition import PDR, VALUES, SweepPlan
+from gr_ros2_lab.study.sweep.figures import curves_figure, heat_figure
+from gr_ros2_lab.study.sweep.summaries import Results, Summary, rows_of, summaries, summary_rows, write_tables
+
+PAGE_FILE = "sweep.html"
+RUNS_TABLE, CELLS_TABLE = "sweep", "cells"
+
+_SHOWN = (PDR, "goodput_Bps", "latency_p50_s", "latency_p99_s", "age_mean_s")
+
+
+def write_sweep(plan: SweepPlan, results: Results, failures: Sequence[str], folder: Path) -> list[Path]:
+    """Write `sweep.html`, the tables and the figures.
+
+    :param failures: runs without a result, one line each
+    :return: the files written, the page first
+    :raises ConfigError: when they cannot be written
+    """
+    rows = rows_of(plan, results)
+    found = summaries(plan, rows)
+    tables = write_tables(rows, folder, RUNS_TABLE) + write_tables(summary_rows(found), folder, CELLS_TABLE)
+    pictures, notes = _draw(plan, found, folder)
+    wanted = sum(len(cell.runs) for cell in plan.cells)
+    sentences = [
+        *notes,
+        *(f"failed: {line}" for line in failures),
+        *([f"{wanted - len(results)} of {wanted} runs are missing"] if len(results) < wanted else []),
+    ]
+    lead = (
+        f"{plan.sweep.description or plan.name} · {len(plan.cells)} cells of {plan.sweep.scenario}, "
+        f"{plan.sweep.repetitions} runs each, time by {plan.sweep.time}"
+    )
+    settings = {"Cells": yaml.safe_dump([dict(cell.point) for cell in plan.cells], sort_keys=False, allow_unicode=True)}
+    sections = [
+        Section(sentences=sentences, pictures=pictures),
+        Section(heading="Numbers", lead=_INTERVALS, grids=[summary_grid(plan, found)], details=settings),
+    ]
+    return render_page(folder / PAGE_FILE, plan.name, lead, sections, tables)
+
+
+_INTERVALS = (
+    "In brackets and as bars: 95 % intervals, of the PDR by Wilson over all messages of a cell, of other numbers by "
+    "Student over its runs."
+)
+
+
+def summary_grid(plan: SweepPlan, found: Sequence[Summary], shown: Sequence[str] = _SHOWN) -> Grid:
+    """A line per cell and topic. If there are several topics, each cell has a section.
+
+    :param shown: names of ``VALUES``
+    """
+    topics = {summary.topic for summary in found}
+    several = len(topics) > 2  # with one topic, "all topics" says the same
+    lines: dict[int, list[tuple[str, ...]]] = {}
+    first = next((summary.topic for summary in found), "")
+    for summary in found:
+        if several or summary.topic == first:
+            lines.setdefault(summary.cell.number, []).append(
+                (
+                    *(_plain(summary.cell.values[key]) for key in plan.keys),
+                    *([summary.topic] if several else []),
+                    str(summary.runs),
+                    str(summary.sent),
+                    *(_estimate(name, summary.numbers[name]) for name in shown),
+                )
+            )
+    headings = (*plan.keys, *(["topic"] if several else []), "runs", "sent", *(VALUES[name] for name in shown))
+    sections = [tuple(cell) for cell in lines.values()]
+    if not several:
+        sections = [tuple(line for section in sections for line in section)]
+    return Grid(f"{len(lines)} cells", headings, tuple(sections), texts=len(plan.keys) + several)
+
+
+def _draw(plan: SweepPlan, found: Sequence[Summary], folder: Path) -> tuple[list[Picture], list[str]]:
+    pictures, notes = [], []
+    for name, drawn in (("curves", curves_figure(plan, found)), ("heatmap", heat_figure(plan, found))):
+        if drawn is None:
+            continue
+        figure, left_out = drawn
+        caption = f"{VALUES[plan.sweep.value]}, " + ("with 95 % intervals" if name == "curves" else "over two settings")
+        pictures.append(Drawings(folder).save(figure, name, caption, wide=True))
+        if left_out:
+            notes.append(f"{name}: {left_out} further panels are in the tables only; name fewer keys, or set by")
+    return pictures, notes
+
+
+def _estimate(name: str, estimate: Estimate | None) -> str:
+    form = "{:.3f}" if name == PDR else "{:.4g}"
+    if estimate is None or estimate.low is None or estimate.high is None:
+        return number(None if estimate is None else estimate.value, form)
+    return f"{form.format(estimate.value)} [{form.format(estimate.low)}, {form.format(estimate.high)}]"
+
+
+def _plain(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else "–" if value is None else str(value)

@@ -1,0 +1,56 @@
+"""Runs side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from gr_ros2_lab.report.compare import compare_grid, write_comparison
+from gr_ros2_lab.report.page import Run
+from tests.lab.record.runs import make_run
+
+
+def _two(tmp_path: Path) -> list[Run]:
+    one, other = make_run(tmp_path / "a", "one"), make_run(tmp_path / "b", "two")
+    odom, _ = other.result.topics
+    quick = replace(other.result, topics=(replace(odom, delivered=39, pdr=0.975),), phy={"name": "direct"})
+    return [one, replace(other, result=quick)]
+
+
+def test_a_column_per_run_and_a_dash_where_one_has_nothing(tmp_path: Path) -> None:
+    grid = compare_grid(_two(tmp_path))
+    assert grid.headings == ("", "", "one", "two")
+    odom, imu, link = ({line[1]: line[2:] for line in section} for section in grid.sections)
+    assert odom["PDR"] == ("0.625", "0.975")
+    assert not {"latency p50 [ms]", "lost fragments"} & odom.keys(), "they are equal"
+    assert imu["sent"] == ("9", "–")
+    assert "path error [m]" not in imu
+    assert link["airtime of a packet [ms]"] == ("10.0", "–")
+    assert "packets sent" not in link
+
+
+def test_the_page_and_its_figures_are_written(tmp_path: Path) -> None:
+    page, *others = write_comparison(_two(tmp_path), tmp_path / "out", pictures=True)
+    assert page == tmp_path / "out" / "compare.html"
+    text = page.read_text()
+    assert text.count("data:image/") == 4
+    assert "one · two" in text
+    names = {path.name for path in others}
+    assert names == {
+        *(f"{name}.{kind}" for name in ("latency", "ledger", "delivery", "age") for kind in ("png", "svg")),
+        *("summary.csv", "summary.parquet"),
+    }
+
+
+def test_settings_that_differ_stand_first(tmp_path: Path) -> None:
+    one, other = make_run(tmp_path / "a", "one"), make_run(tmp_path / "b", "two")
+    configs = [
+        {"packet_len": size, "ros_source": {"packet_len": size, "repair": "off"}, "channel": {"snr_db": snr_db}}
+        for size, snr_db in ((64, 10), (220, 10))
+    ]
+    runs = [
+        replace(run, result=replace(run.result, config=config))
+        for run, config in zip((one, other), configs, strict=True)
+    ]
+    assert compare_grid(runs).sections == ((("setting", "packet_len", "64", "220"),),)
+    assert compare_grid([one, one]).title == "Nothing differs"

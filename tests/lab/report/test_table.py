@@ -1,0 +1,71 @@
+"""The tables a person reads."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+from rich.console import Console
+from rich.table import Table
+
+from gr_ros2.observe.result import LatencyResult
+from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.report.table import as_table, ledger_table, notes, paper_grid, summary_table
+
+
+def _text(table: Table, width: int = 140) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    console.print(table)
+    return console.file.getvalue()  # type: ignore[attr-defined,no-any-return]
+
+
+def test_the_papers_table_with_latency(result: Result) -> None:
+    lines = _text(summary_table([result])).splitlines()
+    heading = " ".join(lines[2].split() + lines[3].split())
+    for name in ("Topic", "Sent", "Recv", "PDR", "Goodput", "[B/s]", "p50", "p99", "[ms]"):
+        assert name in heading
+    odom = next(line for line in lines if "odom" in line).split()
+    assert odom == ["/robot_1/odom", "10", "9", "0.90", "123.5", "100", "200", "300"]
+    lines = _text(summary_table([result, replace(result, scenario="again")])).splitlines()
+    assert " ".join(lines[3].split()).startswith("Config Topic [s] Sent Recv")
+    assert [next(line for line in lines if name in line).split()[2] for name in ("paper-direct", "again")] == [
+        "15.0"
+    ] * 2
+    assert next(line for line in lines if "imu" in line).split()[-3:] == ["–", "–", "–"]
+
+
+def test_latencies_keep_three_digits(result: Result) -> None:
+    quick = replace(result, topics=(replace(result.topics[0], latency_s=LatencyResult(0.00123456, 0.0567, 1.234)),))
+    assert next(line for line in _text(summary_table([quick])).splitlines() if "odom" in line).split()[-3:] == [
+        *("1.23", "56.7", "1234"),
+    ]
+
+
+def test_nothing_is_cut_off_in_80_columns(result: Result) -> None:
+    assert "…" not in _text(summary_table([result]), width=80)
+
+
+def test_the_ledger_shows_every_row_that_occurred(result: Result) -> None:
+    text = _text(ledger_table(result))
+    assert "lost_fragments" in text
+    assert "expired" not in text
+    assert next(line for line in text.splitlines() if "odom" in line).split() == ["/robot_1/odom", "10", "9", "1"]
+
+
+def test_notes_say_what_must_not_be_missed(result: Result) -> None:
+    assert len(notes(result)) == 1
+    assert "deviates from the sent path by 0.010 m" in notes(result)[0]
+    bad = replace(result, topics=(replace(result.topics[0], corrupt=2),), interrupted=True)
+    assert "2 messages arrived altered" in notes(bad)[0]
+    assert "stopped after 15.0 s" in notes(bad)[-1]
+
+
+def test_the_papers_own_line_stands_above_ours(result: Result) -> None:
+    text = _text(as_table(paper_grid([result, replace(result, scenario="x", phy={"name": "ofdm"})])))
+    lines = [line.split() for line in text.splitlines()]
+    assert [line for line in lines if line and line[0] in ("OFDM", "Direct")] == [
+        ["OFDM", "the", "paper", "38.0", "1328", "12", "0.01", "228.6"],
+        ["OFDM", "x", "15.0", "10", "9", "0.90", "123.5"],
+        ["Direct", "the", "paper", "15.0", "452", "452", "1.00", "21767.9"],
+        ["Direct", "paper-direct", "15.0", "10", "9", "0.90", "123.5"],
+    ]

@@ -1,0 +1,97 @@
+"""Runs on one computer do not receive each other's messages, and say so where they do."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.middleware.free_domains import ReservedDomain
+from gr_ros2_lab.record.result import read_result
+from gr_ros2_lab.run.domains import on_own_domains
+from gr_ros2_lab.run.robot_settings import RobotSettings
+from gr_ros2_lab.run.scenario import load_scenario
+from tests.domains import free_domains
+
+DEMO = [sys.executable, "-m", "gr_ros2.cli", "demo", "--no-report", "--duration", "3"]
+
+
+def domains(robots: Iterable[RobotSettings]) -> list[list[int | str]]:
+    """Those of the halves of each robot."""
+    return [[half.domain_id for half in (robot.source, robot.sink) if half is not None] for robot in robots]
+
+
+def two_demos(tmp_path: Path, *words: str) -> list[tuple[subprocess.Popen[str], str, str]]:
+    """Both ended, with what they printed."""
+    started = [
+        subprocess.Popen(
+            [*DEMO, "--out", str(tmp_path / str(number)), *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for number in range(2)
+    ]
+    return [(one, *one.communicate()) for one in started]
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_two_demos_at_once_do_not_mix(tmp_path: Path) -> None:
+    used = set()
+    for number, (one, out, err) in enumerate(two_demos(tmp_path)):
+        assert one.returncode == 0, err
+        used |= {int(domain) for domain in re.findall(r"ROS_DOMAIN_ID=(\d+)", out)}
+        sent = {topic.topic: topic.sent for topic in read_result(tmp_path / str(number)).topics}
+        # Two robots on one graph would send twice as many.
+        assert sent["/robot_1/odom"] <= 90
+        assert sent["/robot_1/map"] == 1
+    assert len(used) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_a_run_that_receives_what_it_did_not_send_fails(tmp_path: Path) -> None:
+    (domain,) = free_domains(1)
+    ended = two_demos(tmp_path, "--set", f"ros_source.domain_id={domain}")
+    for one, _, err in ended:
+        if one.returncode:
+            assert one.returncode == 1
+            assert re.search(
+                rf"demo: \d+ messages were received on /robot_1/\w+ and this run published \d+: another program "
+                rf"publishes there, on ROS domain {domain}; end it, or set another domain_id",
+                err,
+            )
+    assert any(one.returncode for one, _, _ in ended)
+
+
+def test_a_domain_that_is_named_stays() -> None:
+    words = ["ros_source.domain_id=7"]
+    with ExitStack() as stack:
+        assert (here := domains(on_own_domains(load_scenario("two-way", words), stack)))[0] == [7, 7]
+        assert len({*here[1]}) == 1
+        assert here[1][0] not in (7, "auto")
+
+
+def test_two_ends_have_two_graphs_that_are_free_again_afterwards() -> None:
+    with ExitStack() as stack:
+        robots = on_own_domains(load_scenario("demo", ["receivers=[{}]"]), stack)
+        (here,), (there,), (elsewhere,) = domains(robots)
+        assert isinstance(here, int)
+        assert here != there
+        assert elsewhere == there, "who only receives is on one graph"
+    with ReservedDomain([here]) as again:
+        assert again.number == here
+
+
+def test_one_graph_is_that_of_the_shell() -> None:
+    with ExitStack() as stack:
+        scenario = load_scenario("one-graph")  # it has own_domains: false
+        assert on_own_domains(scenario, stack) is scenario.all_robots
