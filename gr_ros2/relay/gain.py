@@ -236,10 +236,10 @@ class Gains:
             state.has.clear()
         state.newest, state.came = number, now
         arrivals = state.arrivals
-        arrivals.append((number, made))
-        first, since = arrivals[0]
-        if number > first and made > since:
-            state.period = (made - since) / (number - first)
+        arrivals.append((number, max(made, now - EXPIRES_S)))
+        (first, since), (_, at) = arrivals[0], arrivals[-1]
+        if number > first and at > since:
+            state.period = (at - since) / (number - first)
         return True
 
     def _count_as_heard(self, state: _State, robot: int, number: int, share: float) -> None:

@@ -32,11 +32,14 @@ class Routes:
         """A message of a robot has come over another one.
 
         :param hops: robots that have sent it on; 0 where ``via`` has made it
+        :param now: when ``via`` sent it, s; not later, where that is not known
         """
         ways = self._ways.setdefault(robot, {})
         before, at = ways.get(via, (hops, now))
-        if hops <= before or now > at + STALE_S:  # a detour says nothing about the shortest way
+        if hops < before or now > at + STALE_S:
             ways[via] = hops, now
+        elif hops == before:  # a detour says nothing about the shortest way
+            ways[via] = hops, max(at, now)
 
     def doubt(self, robot: int, via: int, now: float) -> None:
         """What was handed to ``via`` for ``robot`` has not arrived."""

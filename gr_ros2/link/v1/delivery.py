@@ -14,9 +14,11 @@ from zlib import crc32
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Ready
+from gr_ros2.relay.gain import EXPIRES_S
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO
+from gr_ros2.wire.relayed import NO_AGE, age_of
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST
 
@@ -25,9 +27,8 @@ _REACHED = 256
 _OVER = 256
 """Messages over other robots that are remembered, because the origin's own packets may bring them too."""
 _NEVER = (-1, -1)
-EXPIRES_S = 15.0
-"""s for which a number that came over others refuses lower ones: what was made later than that after it came is newer,
-or the number was false. A message may be much younger than its age says, but it was made before it came."""
+UNKNOWN_S = 2 * age_of(NO_AGE - 1)
+"""s that are taken for an age that is unknown."""
 MAX_AGE_S = 15.0
 """Default of ``max_age_s``. How long ago a packet was sealed is known to the time from one hello to the echo of the
 next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
@@ -60,30 +61,41 @@ class DeliveryRules:
         """The newest message of a topic that its maker's own packets brought."""
 
     def reached(self, number: int, now: float) -> None:
-        """The robot's packets have reached a number, s."""
+        """The robot has reached a number, as a packet shows that arrived at a time, s."""
         self._reached.append((number, now))
 
     def made(self, ready: Ready, now: float) -> float:
         """When a message of this robot was made at the latest, s: before a packet arrived that left after it. One that
         had to be repaired may have left right after the packet before it."""
-        before, after = now, now
+        number, before, after = ready.order[0], now - UNKNOWN_S, now
         for reached, at in reversed(self._reached):
-            before = at
-            if reached < ready.order[0]:
+            if reached < number:
+                before = at
                 break
             after = at
-        return before if ready.repaired else after
+        if not ready.repaired:
+            return after
+        return before if self.sealed_after is None else max(before, self.sealed_after(number))
 
     def sealed(self, ready: Ready) -> float:
         """Time in s after which a message of this robot was sealed; infinite where that needs no proof."""
         return inf if self.sealed_after is None else self.sealed_after(ready.order[0])
 
-    def overrule(self, number: int) -> None:
-        """Forget the messages with greater numbers that came over others."""
+    def overrule(self, number: int, now: float) -> bool:
+        """The robot itself has reached a number: forget the messages with greater ones that came over others before.
+
+        :param now: when that packet arrived, s; where it can be proven when it was sealed, that counts
+        :return: whether none is left
+        """
+        since, doubted = now if self.sealed_after is None else self.sealed_after(number), False
         for topic_id in [topic_id for topic_id, order in self.newest.items() if order[0] > number]:
+            if self._came.get(topic_id, -inf) > since:
+                doubted = True
+                continue
             over = (order for of, order in self._over if of == topic_id and order[0] <= number)
             self.newest[topic_id] = max(self._direct.get(topic_id, _NEVER), max(over, default=_NEVER))
             self._came.pop(topic_id, None)
+        return not doubted
 
     def silent_before(self, number: int) -> None:
         """The robot was silent for long before its packets reached a number: what comes of earlier ones is that old."""
@@ -160,7 +172,7 @@ class DeliveryRules:
         """Whether a later message of its topic was delivered."""
         if ready.order > self.newest.get(ready.topic_id, _NEVER):
             return False
-        return ready.over is None or ready.made <= self._came.get(ready.topic_id, inf) + EXPIRES_S
+        return ready.over is None or min(ready.made, ready.sealed) <= self._came.get(ready.topic_id, inf) + EXPIRES_S
 
 
 def passed_over(topic: AnnouncedTopic) -> Fate:

@@ -238,9 +238,9 @@ class EndpointV1:
     def _inbox(self, src_id: int) -> Inbox | None:
         """What has come of a robot, directly or over others."""
         neighbour, relaying = self.neighbours.all.get(src_id), self._receiving.relaying
-        if neighbour is not None and neighbour.proven:
-            return neighbour.inbox
-        return None if relaying is None else relaying.far.get(src_id)
+        if relaying is not None:
+            return relaying.present(src_id)
+        return neighbour.inbox if neighbour is not None and neighbour.proven else None
 
     def unpublished(self, event: Delivered) -> Lost:
         """See :class:`gr_ros2.link.endpoint.Endpoint`."""

@@ -191,7 +191,7 @@ class Inbox:
             raise PadError(f"a combination of {len(combined)} bytes, where bodies have {self._room}")
         self.reports.unreported += new
         self.reports.confirms = True
-        self._advance(number, now, here=False)
+        self._advance(number, now, here=False, late=True)
         window = mask.bit_length()
         if oldest:
             self.order.repaired_from(number - window + 1)
@@ -273,19 +273,24 @@ class Inbox:
             return False
         return True
 
-    def _advance(self, number: int, now: float, *, here: bool) -> None:
+    def _advance(self, number: int, now: float, *, here: bool, late: bool = False) -> None:
         """The sender has reached this number, of which the decoder is told next. Packets between the newest one and it
-        are missing for now."""
-        silence = now - self._heard
-        self._now = self._heard = now
+        are missing for now.
+
+        :param late: it may have reached it long ago
+        """
+        self._now = now
         self.order.heard()
         newest = self.decoder.newest
+        if not late:
+            silence, self._heard = now - self._heard, now
+            if number > newest:
+                self.deliveries.reached(number, self.began)
+            if silence >= self._give_up_s:
+                self.deliveries.silent_before(number + (not here))
         if number <= newest:
             return
         gone = number - newest - here
-        self.deliveries.reached(number, self.began)
-        if silence >= self._give_up_s:
-            self.deliveries.silent_before(number)
         if gone:
             met = newest >= self._first  # what came before the first packet that was heard is not lost
             self._stats.missed[self.src_id] += gone * met
@@ -380,10 +385,13 @@ class Inbox:
             self._known(ready)
         self._settle()
 
-    def overrule(self, number: int) -> None:
-        """The robot itself has reached this number: what came over others with a greater one was false."""
-        self.deliveries.overrule(number)
+    def overrule(self, number: int) -> bool:
+        """The robot itself has reached this number: what came over others before with a greater one was false.
+
+        :return: whether none of that is left
+        """
         self._give_up(self.order.beyond(number), Fate.DAMAGED)
+        return self.deliveries.overrule(number, self.began)
 
     def adopt(self, far: Inbox) -> None:
         """Go on from what has come of this start over other robots."""
@@ -392,6 +400,8 @@ class Inbox:
             self.order.wait(ready)
         if not self.announced.topics:
             self.announced = far.announced
+        for ready in far.announced.waiting():
+            self._known(ready)
 
     def _deliver(self, ready: Ready, topic: AnnouncedTopic) -> None:
         refusal = self.deliveries.refusal(ready, topic, self._now)

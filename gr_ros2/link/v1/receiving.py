@@ -222,13 +222,13 @@ class ReceivingSide:
         if opened.met:
             self._meet(neighbour, now)
         self._sender, inbox = neighbour, neighbour.inbox
-        if self.relaying is not None and opened.new and opened.trusted:
-            self.relaying.reached(neighbour, number)
         mask, clear, repair_id = 0, False, NOT_A_REPAIR
         if repair is not None:
             mask, clear, repair_id = repair.mask, repair.clear, repair.repair_id
         entries: Sequence[EntryV1] = ()
         if not mask:
+            if self.relaying is not None and opened.new and opened.trusted:
+                self.relaying.reached(neighbour, number)
             entries = opened.entries or read_body(opened.body, header.room(self._settings.packet_len))
         encrypted = neighbour.trailer.encrypts and not clear
         packet = PacketV1(header, tuple(entries), repair, opened.body if mask else b"", encrypted)
@@ -285,6 +285,8 @@ class ReceivingSide:
             if self._rate is not None:
                 self._rate.meet(neighbour.src_id)
         self._outcomes.events.append(Met(neighbour.src_id, neighbour.boot, hears))
+        if self.relaying is not None:
+            self.relaying.met(neighbour)
         self._greeted(neighbour)
         if neighbour.proofs.proven is not None:
             neighbour.inbox.order.repaired_from(neighbour.proofs.proven - REACH)
@@ -347,9 +349,5 @@ class ReceivingSide:
             relaying=self.relaying,
             give_up_s=0.0 if far else self._give_up_s,  # who is not heard repairs nothing
         )
-        known = None if self.relaying is None else self.relaying.far.get(src_id)
-        if known is not None and known.boot == boot and self.relaying is not None:
-            inbox.adopt(known)
-            self.relaying.ahead.add(src_id)
         inbox.reports.tells_snr = self._rate is not None
         return inbox

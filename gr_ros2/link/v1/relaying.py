@@ -10,9 +10,10 @@ topic is relayed.
 A message has an age, which grows at every robot. Where its table is known, a robot sends nothing on that is older than
 its topic allows. All that a start of a robot has said is forgotten ``FORGET_S`` after it was last there.
 
-*Trust.* Which start a robot is in and its table come from it alone as long as it is heard. A number that came over
-others counts until the robot itself says less, or until a much later message has a lower one; a start of a robot that
-is not heard counts until nothing of it has come for ``STALE_S``.
+*Trust.* Which start a robot is in, its table and how far it is come from it alone as long as it is heard. Of a robot
+that is not heard, a number or a start that came over others counts until the robot itself says less, or until something
+with a lower one was made ``EXPIRES_S`` after it came. Repairs tell nothing of that, since they may be sent long after
+what is in them.
 
 Invariants: a message is delivered once, whether it comes directly or over others; what is sent on is bounded by
 ``MOST_STREAMS`` and ``max_source_bytes``, and of the neighbours that brought it, the one with most of it loses first.
@@ -30,6 +31,7 @@ from gr_ros2.link.endpoint import HeardRobot
 from gr_ros2.link.events import Gone, Met
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.v1.custody import Custody
+from gr_ros2.link.v1.delivery import UNKNOWN_S
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
@@ -37,7 +39,7 @@ from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sent_topics import SentTopic
 from gr_ros2.link.v1.sequences import Sequences
-from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.relay.gain import EXPIRES_S, HEARD_S, Gains, Stream
 from gr_ros2.relay.rooms import Rooms
 from gr_ros2.relay.routes import STALE_S
 from gr_ros2.settings.registry import CALLS_TYPE
@@ -46,7 +48,6 @@ from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import NOBODY, Block
 from gr_ros2.wire.relayed import (
     MOST_HOPS,
-    NO_AGE,
     RECEIPT_TOPIC,
     RELAYED_LEN,
     Receipt,
@@ -70,8 +71,6 @@ FORGET_S = 60.0
 FAR_S = 600.0
 """s after which a robot that is known over others only is forgotten, and with it what has come of it."""
 _BOOT_LEN = 8
-_LONG_S = 2 * age_of(NO_AGE - 1)
-"""s that are taken for an age that is unknown."""
 
 
 class _ToPass(NamedTuple):
@@ -113,9 +112,11 @@ class Relaying:
         self._far_rooms: Rooms[int] = Rooms(BROADCAST, most)
         self._there: dict[int, float] = {}
         """When a robot was there last, s."""
+        self._came: dict[int, float] = {}
+        """When something of its present start came over others, s."""
         self._swept = 0.0
         self.ahead: set[int] = set()
-        """Robots of which a message came over others with a number that they have not reached themselves."""
+        """Robots of which a message came over others with a number that they had not reached themselves."""
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
         self._carried_here = Sequences[Ready](most)
@@ -148,12 +149,21 @@ class Relaying:
         if now > self._swept + TABLE_S:
             self._sweep(now)
 
+    def met(self, neighbour: Neighbour) -> None:
+        """A robot is heard: what is known of its start over others goes on there, and no other start is known."""
+        src_id = neighbour.src_id
+        if (far := self.far.get(src_id)) is not None:
+            if far.boot == neighbour.boot:
+                neighbour.inbox.adopt(far)
+                self.ahead.add(src_id)
+            self._forget(src_id, Fate.SENDER_RESTARTED)
+
     def reached(self, neighbour: Neighbour, number: int) -> None:
         """A robot itself has reached this number: whoever has said more was wrong."""
         src_id = neighbour.src_id
         if src_id in self.ahead and number >= neighbour.inbox.newest:
-            self.ahead.discard(src_id)
-            neighbour.inbox.overrule(number)
+            if neighbour.inbox.overrule(number):
+                self.ahead.discard(src_id)
             self._drop_of(src_id, lambda stream: self._newest[stream].message.number > number)
 
     def newest(self, src_id: int, newest: Newest) -> None:
@@ -187,10 +197,10 @@ class Relaying:
             return
         origin, start = message.origin, message.start
         neighbour = self._neighbours.all.get(origin)
-        heard = neighbour is not None and not neighbour.gone
+        heard = None if neighbour is None or neighbour.gone else neighbour
         age_s, limit_s = age_of(message.age), age_of(message.limit)
-        made = max(ready.made - age_s, now - _LONG_S)
-        another = heard and neighbour is not None and neighbour.boot & 0xFFFF != start
+        made = max(ready.made - age_s, now - UNKNOWN_S)
+        another = heard is not None and heard.boot & 0xFFFF != start
         if (message.hops == 0) != (origin == via) or another:
             self._dropped["false_origin"] += 1
             if another:
@@ -199,7 +209,7 @@ class Relaying:
         if origin == self.src_id:
             self._dropped["relayed_before"] += 1
             return
-        self.custody.routes.note(origin, via, message.hops, now)
+        self.custody.routes.note(origin, via, message.hops, ready.made)
         kept = _ToPass(message, made, made + min(limit_s, self._limit_s(message)))
         if now > kept.until:
             self._dropped["too_old"] += 1
@@ -211,7 +221,10 @@ class Relaying:
         if taker != BROADCAST:
             self._handed(taker, via, kept, of, now)
             return
-        if table and not self._starts(message, via, now, made, heard=heard):
+        if table and not self._starts(message, via, now, made, heard=heard is not None):
+            return
+        if heard is not None and message.number > heard.inbox.newest and now < heard.heard + HEARD_S:
+            self._dropped["ahead"] += 1  # its next packet tells whether it has come so far
             return
         inbox = self._inbox(origin, start)
         if inbox is None or (not table and inbox.announced.topic_of(message) is None):
@@ -271,6 +284,7 @@ class Relaying:
 
     def _reached(self, inbox: Inbox, made: float, now: float) -> None:
         """Something of a robot came over others."""
+        self._came[inbox.src_id] = now
         self._there[inbox.src_id] = max(self._there.get(inbox.src_id, -inf), made)
         boot, at = self._here.get(inbox.src_id, (-1, -inf))
         at = max(made, at if boot == inbox.boot else -inf)
@@ -359,8 +373,9 @@ class Relaying:
         for origin, at in list(self._there.items()):
             if now > at + FORGET_S:
                 self._drop_of(origin, lambda _: True)
-            if now > at + FAR_S:
+            if now > max(at, self._came.get(origin, at)) + FAR_S:
                 del self._there[origin]
+                self._came.pop(origin, None)
                 self._forget(origin, Fate.GIVEN_UP)
         for src_id in [src_id for src_id in self._tables if src_id not in self._neighbours.all]:
             del self._tables[src_id]
@@ -391,30 +406,47 @@ class Relaying:
         if heard:
             self._dropped["relayed_before"] += 1
             return False
-        known = self.far.get(origin)
         if self._inbox(origin, message.start) is None:
-            if known is not None and known.boot > boot and self.reaches(origin, known.boot, now):
+            if now > made + FORGET_S:
+                self._dropped["too_old"] += 1
+                return False
+            known, neighbour = self.present(origin), self._neighbours.all.get(origin)
+            if known is not None and known.boot > boot and made <= self._came_at(origin) + EXPIRES_S:
                 self._dropped["old_start"] += 1
                 self._neighbours.sent_by_another_start(origin, made, now)
                 return False
+            if known is not None:
+                known.ended(now)
             self._forget(origin, Fate.SENDER_RESTARTED)
             self._drop_of(origin, lambda _: True)
-            known = self.far[origin] = self._make_inbox(origin, boot)
+            if neighbour is None or neighbour.boot != boot or not neighbour.proven:
+                self.far[origin] = self._make_inbox(origin, boot)
             self._neighbours.met_over_others(origin, now)
             self.found(origin, now)
-        if known is not None:
+        if origin in self.far:
             for lost in self._far_rooms.put(origin, via, len(message.payload)):
                 self._dropped["max_sources"] += 1
                 self._forget(lost, Fate.MEMORY)
         return True
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
-        """Where messages of a start of a robot come together, directly or over others."""
+        """Where messages of a start of a robot come together, directly or over others; None for one that is not the
+        present start."""
+        inbox = self.present(origin)
+        return None if inbox is None or inbox.boot & 0xFFFF != start else inbox
+
+    def _came_at(self, origin: int) -> float:
+        """When something of the present start of a robot came, s."""
         neighbour = self._neighbours.all.get(origin)
-        for inbox in (None if neighbour is None else neighbour.inbox, self.far.get(origin)):
-            if inbox is not None and inbox.boot & 0xFFFF == start:
-                return inbox
-        return None
+        heard = -inf if neighbour is None or not neighbour.proven else neighbour.heard
+        return max(heard, self._came.get(origin, -inf))
+
+    def present(self, origin: int) -> Inbox | None:
+        """The inbox of the present start of a robot: that of one that is heard, or else the latest that is known."""
+        neighbour, far = self._neighbours.all.get(origin), self.far.get(origin)
+        if neighbour is None or not neighbour.proven:
+            return far
+        return neighbour.inbox if far is None or not neighbour.gone or neighbour.boot >= far.boot else far
 
     # ---- what leaves
 
