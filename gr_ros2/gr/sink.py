@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from gnuradio import gr
 
-from gr_ros2.core.errors import GrRos2Error, SealError
+from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.core.guard import Guard
 from gr_ros2.gr.block_settings import read_registry, settings
 from gr_ros2.gr.early import CHECK_S
@@ -42,8 +42,10 @@ from gr_ros2.settings.config import SinkConfig, replaced, robot_of
 from gr_ros2.settings.registry import Registry, Topic, check_outputs
 
 _SHORTEST_WAIT_S = 1e-3
+_MOST_JOINED = 65535
+"""Bytes of the longest PDU that is cut into packets; this bounds the work for one."""
 _COUNTED = (
-    *("not_a_pair", "not_u8", Fate.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
+    *("not_a_pair", "not_u8", "joined", Fate.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
 )
 
@@ -243,10 +245,19 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             if problem:
                 self._failures.note(problem, f"ros2_sink: a message that is no PDU of bytes ({problem}) was dropped")
             else:
-                self._take(packets)
+                self._take([piece for packet in packets for piece in self._cut(packet)])
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
         self.handled += max(len(packets), 1)
+
+    def _cut(self, packet: AirPacket) -> list[AirPacket]:
+        """The packets in one PDU: a TCP socket joins them. The trailer of each then says whether it is one."""
+        most, data = self.config.packet_len, packet.data
+        if not most < len(data) <= _MOST_JOINED:
+            return [packet]
+        what = f"ros2_sink: a PDU of {len(data)} bytes is cut into packets of packet_len = {most}"
+        self._failures.note("joined", f"{what}; a TCP socket joins packets, a UDP socket does not")
+        return [packet._replace(data=data[start : start + most]) for start in range(0, len(data), most)]
 
     def _take(self, packets: Iterable[AirPacket]) -> None:
         events: list[ReceiverEvent] = []
@@ -287,8 +298,8 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             self._guard(self._observer.receiver_event, event, self._clock())
 
     def _warn(self, event: Rejected) -> None:
-        """Log each refusal that concerns keys, once for each reason."""
-        if isinstance(event.error, SealError) and event.error.kind not in self._said:
+        """Log the first refusal of each reason."""
+        if event.error.kind not in self._said:
             self._said.add(event.error.kind)
             self._log.warning("ros2_sink: a packet was refused (%s): %s", event.error.kind, event.error)
 

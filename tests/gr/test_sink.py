@@ -136,7 +136,7 @@ def test_garbage_is_counted_and_nothing_else_is_lost(rig: Rig) -> None:
     ]
     for message in garbage:
         rig.probe.post_message(message)
-    for data in (b"", bytes(13), bytes(PACKET_LEN), bytes(5000), broken, *good):
+    for data in (b"", bytes(13), bytes(PACKET_LEN), bytes(70000), broken, *good):
         rig.probe.post(data)
     wait_for(lambda: rig.heard == [stamped(5)] and sink.handled == 9 + len(good))
     stats = sink.stats()
@@ -144,6 +144,27 @@ def test_garbage_is_counted_and_nothing_else_is_lost(rig: Rig) -> None:
     assert stats["rejected"]["length"] == 3
     assert sum(stats["rejected"].values()) == 5
     assert stats["handled"] == 9 + len(good)
+
+
+def test_joined_packets_are_cut_and_what_is_refused_is_logged_once(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    sink = rig.make()
+    rig.start()
+    first, second, third = (packets((0, stamped(number)))[:] for number in (1, 2, 3))
+    broken = bytes([*first[0][:-1], first[0][-1] ^ 1])
+    sent = [*first, *second[:1]], [broken], [*second[1:], *third], [broken]
+    for joined in sent:
+        rig.probe.post(b"".join(joined))
+    rig.probe.post(b"".join(third) + b"tail")
+    rig.probe.post(b"".join(third) + b"tail")
+    wait_for(lambda: sink.handled == 6)
+    assert rig.heard[:3] == [stamped(1), stamped(2), stamped(3)]
+    stats = sink.stats()
+    assert stats["rejected"] == {"crc": 2, "length": 2}
+    assert stats["joined"] == 4
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == len(set(said)) == 3
+    assert [re.search(r"is cut|\((?:crc|length)\)", line)[0] for line in said] == ["is cut", "(crc)", "(length)"]
+    assert "a TCP socket joins packets" in said[0]
 
 
 def test_an_incomplete_message_expires_without_further_packets(rig: Rig) -> None:
