@@ -36,13 +36,14 @@ class Zstd:
     """One compressor and its decompressor.
 
     :param dictionary: a dictionary that both ends have, made by ``train``, or any bytes to refer to; b'' = none
+    :param level: of zstd, 1 = fast to 22 = small; for sending only
     """
 
-    def __init__(self, dictionary: bytes = b"") -> None:
+    def __init__(self, dictionary: bytes = b"", level: int = _LEVEL) -> None:
         raw = not dictionary.startswith(_DICTIONARY_MAGIC)
         self._dictionary = zstd.ZstdDict(dictionary, is_raw=raw) if dictionary else None
         options: dict[int, int] = {
-            zstd.CompressionParameter.compression_level: _LEVEL,
+            zstd.CompressionParameter.compression_level: level,
             zstd.CompressionParameter.content_size_flag: 0,
             zstd.CompressionParameter.dict_id_flag: 0,
         }

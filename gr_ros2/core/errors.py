@@ -12,7 +12,7 @@
     │   │       NotStoredError · SameIdError
     │   └── EncodeError
     ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``fate`` names why
-    │   └── UnknownDictionaryError · DamagedError
+    │   └── UnknownDictionaryError · DamagedError · MissingFrameError · UnfitError
     ├── MiddlewareError (RuntimeError)  the ROS side failed
     │   ├── BagError                    a bag cannot be read or written
     │   └── DescriptionError            a node's description of a type cannot be used
@@ -212,6 +212,16 @@ class DamagedError(CodecError):
     """Bytes that are not a coded message, or a message larger than the limit."""
 
     fate = "damaged"
+
+
+class MissingFrameError(CodecError):
+    """A frame whose predecessor was not decoded here: nothing is shown until the next key frame."""
+
+    fate = "damaged"
+
+
+class UnfitError(CodecError):
+    """A message that a codec of its type does not code, such as an image in an unknown encoding. It passes exactly."""
 
 
 class MiddlewareError(GrRos2Error, RuntimeError):

@@ -1,0 +1,140 @@
+"""The codecs of topics: which codec takes which type, and the frames of one topic.
+
+The first byte of a frame of a topic is the number of its codec; the codec's own frame follows.
+
+Invariants: no codec is imported before a message or a frame needs it; a message that no codec takes passes exactly, and
+what is said names the reason; frames of different senders never meet, since each sender has a decoder of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from gr_ros2.codecs.base import MAX_SIZE, Codec, Coded, Decoder, Encoder
+from gr_ros2.codecs.messages import CLOUD, GRID
+from gr_ros2.core.backends import Backend, BackendTable
+from gr_ros2.core.errors import BackendMissingError, ConfigError, DamagedError, UnfitError
+
+
+@dataclass(frozen=True)
+class CodecRow(Backend):
+    """One codec.
+
+    :param number: of its frames, 1..255
+    :param types: that it takes; of two that take a type, the first codec of the table that codes a message does
+    """
+
+    number: int = 0
+    types: tuple[str, ...] = ()
+
+
+CODECS = BackendTable(
+    "codec",
+    {
+        "exact": CodecRow("gr_ros2.codecs.exact", "ExactCodec", "any message as it is"),
+        "cloud": CodecRow("gr_ros2.codecs.cloud", "CloudCodec", "point clouds", number=3, types=(CLOUD,)),
+        "grid": CodecRow("gr_ros2.codecs.grid", "GridCodec", "what changes of a map", number=4, types=(GRID,)),
+    },
+    CodecRow,
+)
+_EXACT = "exact"
+OFF = "off"
+"""Instead of a codec's options: messages that it takes pass exactly."""
+
+
+class CodedTopic:
+    """How the messages of one topic are coded.
+
+    :param type_name: ``package/msg/Type``
+    :param options: by name of a codec, its options or 'off'
+    :raises ConfigError: for an unknown codec or option
+    """
+
+    def __init__(self, type_name: str, options: Mapping[str, Mapping[str, Any] | str] | None = None) -> None:
+        self.type_name = type_name
+        self.missing = ""
+        """What to install so that a codec of this type works; '' = nothing."""
+        self.codecs: dict[int, Codec] = {}
+        """By number, the preferred first, exact last."""
+        options = options or {}
+        if unknown := [name for name in options if name not in CODECS]:
+            raise ConfigError(f"no codec {unknown[0]!r}; known are {', '.join(CODECS)}")
+        for name, row in CODECS.items():
+            if type_name in row.types and options.get(name) != OFF:
+                try:
+                    CODECS.modules(name)
+                    self.codecs[row.number] = configured(name, type_name, options.get(name, {}))
+                except BackendMissingError as error:
+                    self.missing = str(error)
+        self.codecs[CODECS[_EXACT].number] = configured(_EXACT, type_name, {})
+
+    def encoder(self) -> TopicEncoder:
+        """For the sender."""
+        return TopicEncoder(self)
+
+    def decoder(self, max_size: int = MAX_SIZE) -> TopicDecoder:
+        """For a receiver, one for each sender.
+
+        :param max_size: bytes of the largest message that it makes
+        """
+        return TopicDecoder(self, max_size)
+
+
+def configured(name: str, type_name: str, options: Mapping[str, Any] | str) -> Codec:
+    """A codec with its options.
+
+    :raises ConfigError: for an unknown option, or a wrong value
+    :raises BackendMissingError: when what it needs is not installed
+    """
+    made = CODECS.load(name)
+    if not isinstance(options, Mapping):
+        raise ConfigError(f"{name}: {options!r} is neither its options nor {OFF!r}")
+    known = [field.name for field in fields(made)][1:]
+    if unknown := [option for option in options if option not in known]:
+        raise ConfigError(f"{name}: no option {unknown[0]!r}; known are {', '.join(known) or 'none'}")
+    codec: Codec = made(type_name, **options)
+    return codec
+
+
+class TopicEncoder:
+    """See Encoder; it raises no UnfitError."""
+
+    def __init__(self, topic: CodedTopic) -> None:
+        self._made: dict[int, Encoder] = {n: codec.encoder() for n, codec in topic.codecs.items()}
+        self._missing = topic.missing
+
+    def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:
+        """See Encoder."""
+        said = self._missing
+        for number, encoder in self._made.items():
+            try:
+                coded = encoder.encode(message, budget and budget - 1, key)
+            except UnfitError as error:
+                said = str(error)
+                continue
+            return coded._replace(data=bytes([number]) + coded.data, said=coded.said or said)
+        raise AssertionError("the exact codec takes every message")
+
+    def confirmed(self, name: int) -> None:
+        """See Encoder."""
+        for encoder in self._made.values():
+            encoder.confirmed(name)
+
+
+class TopicDecoder:
+    """See Decoder. Its memory is that of one decoder of each codec of the topic."""
+
+    def __init__(self, topic: CodedTopic, max_size: int) -> None:
+        self._topic, self._max_size = topic, max_size
+        self._made: dict[int, Decoder] = {}
+
+    def decode(self, data: bytes) -> bytes:
+        """See Decoder."""
+        number = data[0] if data else 0
+        if not data or number not in self._topic.codecs:
+            raise DamagedError(f"damaged frame: no codec {number} for {self._topic.type_name}")
+        if number not in self._made:
+            self._made[number] = self._topic.codecs[number].decoder(self._max_size)
+        return self._made[number].decode(data[1:])

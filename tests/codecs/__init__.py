@@ -1,0 +1,1 @@
+"""What every codec of a topic keeps, and each codec by itself."""

@@ -1,0 +1,142 @@
+"""Scenes that a robot may see, made by numpy and the same every time: a street by a lidar, a map that grows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gr_ros2.codecs.messages import CLOUD, GRID, header_of, store, write
+
+Array = npt.NDArray[Any]
+_TYPES = store().types
+
+
+def header(number: int = 0, frame_id: str = "camera") -> Any:
+    """A stamp of 0.1 s times the number."""
+    time = _TYPES["builtin_interfaces/msg/Time"](1_700_000_000 + number // 10, number % 10 * 100_000_000)
+    return header_of(time, frame_id)
+
+
+def street(number: int = 0, rings: int = 64, columns: int = 1800) -> Array:
+    """x, y, z (m) and intensity of a lidar scan of a street: ground, houses, parked cars, poles; noise of 2 cm.
+
+    :returns: shape (rings, columns, 4), float32; NaN where nothing was hit
+    """
+    rng = np.random.default_rng([7, number])
+    fixed = np.random.default_rng(7)
+    azimuth = np.linspace(-np.pi, np.pi, columns, endpoint=False)
+    elevation = np.radians(np.linspace(2.0, -24.8, rings))[:, None]
+    east, north, up = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    height, shift = 1.73, 0.8 * number
+    distance = np.where(up < 0, height / np.maximum(-up, 1e-6), np.inf)
+
+    def nearer(found: Array, hits: Array) -> Array:
+        return np.where(hits & (found > 0) & (found < distance), found, distance)
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for side in (-9.0, 10.0):  # fronts of houses, with gaps between them
+            far = side / np.broadcast_to(north, (rings, columns))
+            along, top = far * east + shift, far * up + height
+            distance = nearer(far, (top < 8) & (np.mod(along + side, 17.0) > 2.5))
+        boxes = [(x, side * 4.2, 4.3, 1.8, 1.5) for x in np.arange(-60, 80, 6.5) for side in (-1, 1)]
+        boxes += [(x, side * 6.5, 0.25, 0.25, 6.0) for x in np.arange(-60, 80, 11.0) for side in (-1, 1)]
+        boxes += [(*fixed.uniform((-60, -8), (80, 8)), 0.6, 0.6, 1.75) for _ in range(25)]
+        for place, y, long, wide, tall in boxes:
+            x = place - shift
+            if abs(x) < 3 and abs(y) < 3:
+                continue
+            near, far = np.full((rings, columns), 0.0), np.full((rings, columns), np.inf)
+            for ray, low, high in (
+                (east, x - long / 2, x + long / 2), (north, y - wide / 2, y + wide / 2), (up, -height, tall - height),
+            ):  # fmt: skip
+                one, other = low / ray, high / ray
+                near, far = np.maximum(near, np.minimum(one, other)), np.minimum(far, np.maximum(one, other))
+            distance = nearer(near, near < far)
+        for x in np.arange(-60, 80, 5.0):  # trees and hedges: a beam goes somewhere into what it meets first
+            for y, base, tall, radius in ((-7.2, 0.0, 1.2, 1.1), (7.6, 2.0, 6.0, 1.6), (-8.0, 2.5, 6.0, 1.5)):
+                middle = (x - shift) * east + y * north + ((base + tall) / 2 - height) * up
+                gap = (x - shift) ** 2 + y**2 + ((base + tall) / 2 - height) ** 2 - middle**2
+                leaves = middle - np.sqrt(np.maximum(radius**2 - gap, 0)) * rng.uniform(-1, 1, distance.shape)
+                distance = nearer(leaves, (gap < radius**2) & (rng.random(distance.shape) < 0.8))
+    distance = distance + rng.normal(0, 0.02, distance.shape)
+    distance[(distance > 100) | (rng.random(distance.shape) < 0.02)] = np.nan
+    intensity = np.clip(np.exp(-distance / 40) + rng.normal(0, 0.05, distance.shape), 0, 1)
+    return np.stack([distance * east, distance * north, distance * up, intensity], 2).astype(np.float32)
+
+
+def cloud(
+    points: Array,
+    *,
+    big: bool = False,
+    layout: tuple[tuple[str, int, int], ...] = (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 16, 7)),
+    step: int = 24,
+    row_padding: int = 0,
+    number: int = 0,
+) -> bytes:
+    """A PointCloud2.
+
+    :param points: shape (height, width, fields)
+    :param layout: name, offset and type of each field
+    """
+    high, wide, _ = points.shape
+    data = np.random.default_rng(1).integers(0, 256, (high, wide * step + row_padding), dtype=np.uint8)
+    order = ">" if big else "<"
+    kinds = {2: "u1", 4: "u2", 6: "u4", 7: "f4", 8: "f8"}
+    for n, (_, offset, kind) in enumerate(layout if points.size else ()):
+        view = np.ndarray((high, wide), order + kinds[kind], data, offset, (wide * step + row_padding, step))
+        with np.errstate(invalid="ignore"):
+            view[...] = points[:, :, n]
+    field = _TYPES["sensor_msgs/msg/PointField"]
+    return write(
+        CLOUD,
+        header=header(number, "lidar"),
+        height=high,
+        width=wide,
+        fields=[field(name=name, offset=offset, datatype=kind, count=1) for name, offset, kind in layout],
+        is_bigendian=big,
+        point_step=step,
+        row_step=wide * step + row_padding,
+        data=data.ravel(),
+        is_dense=False,
+    )
+
+
+def grid(
+    cells: Array, number: int = 0, origin: tuple[float, float] = (-10.0, -10.0), resolution: float = 0.05
+) -> bytes:
+    """An OccupancyGrid."""
+    types = _TYPES
+    pose = types["geometry_msgs/msg/Pose"](
+        position=types["geometry_msgs/msg/Point"](x=origin[0], y=origin[1], z=0.0),
+        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    made = header(number, "map")
+    info = types["nav_msgs/msg/MapMetaData"](
+        map_load_time=made.stamp, resolution=resolution, width=cells.shape[1], height=cells.shape[0], origin=pose
+    )
+    return write(GRID, header=made, info=info, data=cells.astype(np.int8).ravel())
+
+
+def exploring(steps: int, size: int = 600) -> list[bytes]:
+    """Maps of a robot that explores rooms: cells of 5 cm, the laser sees 6 m, occupied cells flicker."""
+    rng = np.random.default_rng(1)
+    truth = np.zeros((size, size), np.int8)
+    truth[::100], truth[:, ::150] = 100, 100
+    for row in range(0, size, 100):
+        for column in range(0, size, 150):
+            truth[row, column + 60 : column + 80] = truth[row + 40 : row + 60, column] = 0
+    for row, column in rng.integers(5, size - 15, (150, 2)):
+        truth[row : row + rng.integers(2, 9), column : column + rng.integers(2, 9)] = 100
+    known = np.full((size, size), -1, np.int8)
+    y, x = np.mgrid[:size, :size]
+    found = []
+    for step in range(steps):
+        turn = step / 120 * 2 * np.pi
+        place = size / 2 + size / 3 * np.sin(turn), size / 2 + size / 3 * np.cos(turn) * np.cos(turn / 2)
+        seen = ((y - place[0]) ** 2 + (x - place[1]) ** 2 < 120**2) & (rng.random((size, size)) < 0.8)
+        known[seen] = truth[seen]
+        known[seen & (truth == 100) & (rng.random((size, size)) < 0.02)] = 0
+        found.append(grid(known, step))
+    return found

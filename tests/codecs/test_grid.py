@@ -1,0 +1,84 @@
+"""Maps that grow: exact whatever was confirmed, and as small as what has changed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gr_ros2.codecs import CodedTopic
+from gr_ros2.codecs.grid import KEPT
+from gr_ros2.codecs.messages import GRID
+from gr_ros2.core.errors import MissingFrameError
+from tests.codecs.scenes import exploring, grid
+
+SIZE = 1000
+
+
+def test_a_small_change_of_a_large_map_costs_what_the_change_costs() -> None:
+    rng = np.random.default_rng(1)
+    cells = rng.choice(np.array([-1, 0, 100], np.int8), (SIZE, SIZE))
+    topic = CodedTopic(GRID)
+    encoder, decoder = topic.encoder(), topic.decoder()
+    first = encoder.encode(grid(cells))
+    decoder.decode(first.data)
+    encoder.confirmed(first.name)
+    cells[100:120, 300:330] = rng.choice(np.array([0, 100], np.int8), (20, 30))
+    message = grid(cells, 1)
+    changed = encoder.encode(message)
+    assert decoder.decode(changed.data) == message
+    assert len(changed.data) < 20 * 30 / 3 < len(first.data) / 1000
+    same = encoder.encode(grid(cells, 2))
+    assert len(same.data) < 20 * 30 / 3
+
+
+def test_a_map_that_has_grown_on_all_sides_is_compared_where_it_was() -> None:
+    rng = np.random.default_rng(1)
+    cells = rng.choice(np.array([-1, 0, 100], np.int8), (200, 300))
+    grown = np.full((260, 330), -1, np.int8)
+    grown[40:240, 10:310] = cells
+    topic = CodedTopic(GRID)
+    encoder, decoder = topic.encoder(), topic.decoder()
+    first = encoder.encode(grid(cells))
+    decoder.decode(first.data)
+    encoder.confirmed(first.name)
+    message = grid(grown, 1, origin=(-10 - 10 * 0.05, -10 - 40 * 0.05))
+    coded = encoder.encode(message)
+    assert decoder.decode(coded.data) == message
+    assert len(coded.data) < 150
+
+
+def test_nothing_is_referred_to_that_was_not_confirmed() -> None:
+    topic = CodedTopic(GRID)
+    encoder = topic.encoder()
+    maps = exploring(4, 200)
+    frames = [encoder.encode(message) for message in maps[:2]]
+    assert [frame.before for frame in frames] == [None, None]
+    encoder.confirmed(frames[0].name)
+    encoder.confirmed(12345)
+    changed = encoder.encode(maps[2])
+    assert changed.before == frames[0].name
+    assert encoder.encode(maps[3], key=True).before is None
+    with pytest.raises(MissingFrameError):
+        topic.decoder().decode(changed.data)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_any_history_is_exact(data: st.DataObject) -> None:
+    """Grids of any size and place; each frame arrives or not, and is confirmed sooner, later or never."""
+    topic = CodedTopic(GRID)
+    encoder, decoder = topic.encoder(), topic.decoder()
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    arrived: list[int] = []
+    for number in range(12):
+        high, wide = data.draw(st.integers(0, 12)), data.draw(st.integers(0, 12))
+        origin = data.draw(st.tuples(*[st.floats(-3, 3) | st.just(float("nan"))] * 2))
+        message = grid(rng.integers(-1, 3, (high, wide)), number, origin, data.draw(st.sampled_from([0.05, 0.0, 1.0])))
+        coded = encoder.encode(message, key=data.draw(st.booleans()) and number % 4 == 3)
+        if data.draw(st.booleans()):
+            assert decoder.decode(coded.data) == message
+            arrived = [*arrived, coded.name][-KEPT:]
+        if arrived and data.draw(st.booleans()):
+            encoder.confirmed(data.draw(st.sampled_from(arrived)))
