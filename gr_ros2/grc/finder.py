@@ -1,9 +1,9 @@
 """Lets another Python import gr-ros2 and its requirements from a different environment.
 
 `gr-ros2 grc-path --install` copies this file into the user's site-packages of GNU Radio's Python. A path file there
-calls ``offer`` at every start. Invariants: until ``gr_ros2`` is imported, the finder finds only ``gr_ros2``, and only
-if no other finder has found it; after that it also finds the packages of gr-ros2 that the other Python lacks or has too
-old, and nothing else; modules that the process imported before stay unchanged.
+calls ``offer`` at every start. Invariants: until one of ``PACKAGES`` is imported, the finder finds only these, and only
+if no other finder has found them; after that it also finds the packages of gr-ros2 that the other Python lacks or has
+too old, and nothing else; modules that the process imported before stay unchanged.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from collections.abc import Iterable, Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from typing import Any
 
-PACKAGE = "gr_ros2"
+PACKAGES = ("gr_ros2", "gr_ros2_lab")
 
 
 class EnvironmentFinder:
     """Finds modules of one environment.
 
-    :param folder: folder that contains the package ``gr_ros2``
+    :param folder: folder that contains ``PACKAGES``
     :param environment: site-packages of the environment
     :param modules: modules found there, by dotted names: top-level modules, and the parts of namespace packages
     :param packages: distributions of these modules, whose metadata is found too; normalised names (PEP 503)
@@ -37,7 +37,7 @@ class EnvironmentFinder:
         target: Any = None,
     ) -> ModuleSpec | None:
         """Called by Python's import."""
-        if name == PACKAGE:
+        if name in PACKAGES:
             found = PathFinder.find_spec(name, [self._folder], target)
             if found is not None and not self._wanted:
                 self._wanted = True

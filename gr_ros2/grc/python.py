@@ -19,7 +19,7 @@ from pathlib import Path
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.grc import finder as path_finder
-from gr_ros2.grc.finder import PACKAGE
+from gr_ros2.grc.finder import PACKAGES
 
 MODULE = "_gr_ros2_path_finder"
 PATH_FILE = "gr_ros2.pth"
@@ -244,7 +244,7 @@ def _modules(found: metadata.Distribution) -> set[str]:
             names.add(top[0])
         elif file.parts[:2] in regular:
             names |= {top[0], ".".join(file.parts[:2])}
-    return {name for name in names if name.replace(".", "").isidentifier() and name != PACKAGE}
+    return {name for name in names if name.replace(".", "").isidentifier() and name not in PACKAGES}
 
 
 def _plain(name: str) -> str:

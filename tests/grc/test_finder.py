@@ -15,9 +15,10 @@ from tests.packages import install
 
 @pytest.fixture
 def environment(tmp_path: Path) -> Path:
-    """A folder with our package, and an environment with packages it needs, and one that it does not."""
-    (tmp_path / "gr_ros2").mkdir()
-    (tmp_path / "gr_ros2" / "__init__.py").write_text("whose = 'ours'\n")
+    """A folder with our packages, and an environment with packages it needs, and one that it does not."""
+    for ours in path_finder.PACKAGES:
+        (tmp_path / ours).mkdir()
+        (tmp_path / ours / "__init__.py").write_text("whose = 'ours'\n")
     site = tmp_path / "site"
     (site / "family" / "child").mkdir(parents=True)
     (site / "family" / "child" / "__init__.py").write_text("whose = 'environment'\n")
@@ -59,6 +60,10 @@ def test_before_gr_ros2_is_imported_nothing_else_is_found(environment: Path, nam
 )
 def test_what_gr_ros2_needs_is_found_with_it(environment: Path, name: str, whose: str) -> None:
     assert said(environment, f"import gr_ros2, {name}; print(gr_ros2.whose, {name}.whose)") == f"ours {whose}"
+
+
+def test_the_laboratory_is_found_too(environment: Path) -> None:
+    assert said(environment, "import gr_ros2_lab, needed; print(gr_ros2_lab.whose, needed.whose)") == "ours environment"
 
 
 def test_what_it_does_not_need_is_not_found(environment: Path) -> None:
