@@ -23,7 +23,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from gr_ros2.core.errors import GrRos2Error, RunError
+from gr_ros2.core.errors import GrRos2Error, RunError, shortened
 
 _LINE = 4096
 """Most bytes of a request."""
@@ -155,13 +155,13 @@ class ControlSocket:
         try:
             query = parse(line)
         except ValueError as error:
-            return {"error": f"not understood ({error}); a question is one line of JSON, an object"}
+            return {"error": shortened(f"not understood ({error}); a question is one line of JSON, an object")}
         try:
             return {"name": self._name, **(self._answer(query) if query else {})}
         except GrRos2Error as error:
             return {"error": str(error)}
         except Exception as error:  # noqa: BLE001 - whatever error one client causes, the next one gets an answer
-            return {"error": f"{type(error).__name__}: {error}"}
+            return {"error": shortened(f"{type(error).__name__}: {error}")}
 
 
 class _Client:

@@ -33,7 +33,10 @@ _BEGIN, _END = 300, 900
 
 
 def shortened(message: str) -> str:
-    """A message of which at most 1,203 characters are shown; ``...`` stands for those in the middle."""
+    """A message in one line. At most 1,203 characters are shown; ``...`` stands for those in the middle. What cannot be
+    printed is escaped."""
+    if not message.isprintable():
+        message = "".join(char if char.isprintable() else repr(char)[1:-1] for char in " ".join(message.split()))
     return message if len(message) <= _BEGIN + _END else f"{message[:_BEGIN]}...{message[-_END:]}"
 
 

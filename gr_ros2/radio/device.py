@@ -25,11 +25,13 @@ from gr_ros2.radio.device_checks import DeviceChecks
 from gr_ros2.radio.energy import EnergyCounter
 from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters, Hertz, SharedAir
 from gr_ros2.radio.stream_events import BURSTS_OUT, GapCounter
-from gr_ros2.settings.config import STRICT, Count, Seconds, Text, build
+from gr_ros2.settings.config import STRICT, Seconds, Text, build
 from gr_ros2.settings.fields import AUTO, Auto
 
 SILENT_S = 3.0
 """A device without a sample given or taken for this time, s, counts as dead; a change of direction takes a tenth."""
+_MOST_ZEROS = 1 << 20
+"""Samples."""
 _TIMED_S = 0.001
 """``timing_error_s`` of a device that tags what it receives with the time, and sends at a time."""
 _FOLLOWED_S = 1.0
@@ -71,8 +73,8 @@ class DeviceOptions(SharedAir):
     antenna_rx: Annotated[Text, Field(title="Receive antenna")] = AUTO
     bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
     level: Annotated[float, Field(gt=0, le=1, title="Burst level (share of full scale)")] = 0.1
-    lead: Annotated[Count, Field(title="Zeros before a burst (samples)")] = 32
-    tail: Annotated[Count, Field(title="Zeros behind a burst (samples)")] = 64
+    lead: Annotated[int, Field(ge=0, le=_MOST_ZEROS, title="Zeros before a burst (samples)")] = 32
+    tail: Annotated[int, Field(ge=0, le=_MOST_ZEROS, title="Zeros behind a burst (samples)")] = 64
     multiple: Annotated[int, Field(ge=1, le=1 << 22, title="Burst length in steps of (samples)")] = 1
     turnaround_s: Annotated[Seconds, Field(title="Turn-around time (s)")] = 0.005
 

@@ -56,7 +56,8 @@ class LiveSettings:
         before = given.get(known, TopicOptions())
         changed = {**{each.name: getattr(before, each.name) for each in fields(TopicOptions)}, option: value}
         self._source.set_topic_options({**given, known: changed})
-        return f"{name} = {value}"
+        sent = {topic.name.lstrip("/") for topic in self._source.subscriptions.subscribed.values()}
+        return f"{name} = {value}" + ("" if topic.lstrip("/") in sent else f"; no topic {topic} is sent now")
 
 
 def _of_topic(name: str) -> tuple[str, str] | None:

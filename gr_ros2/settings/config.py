@@ -32,6 +32,7 @@ from gr_ros2.core.names import (
     checked_namespace,
     checked_namespace_form,
     checked_topic_form,
+    topic_fault,
 )
 from gr_ros2.settings.airtime import Airtime, AirtimeConfig
 from gr_ros2.settings.commands import COMMAND_TYPES, checked_commands
@@ -57,7 +58,9 @@ RobotId = Annotated[int, Field(ge=0, le=BROADCAST - 1)]
 DomainId = Annotated[int, Field(ge=0, le=232)]
 SampleRate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=0, le=2**31 - 1)]
+"""Of what DDS, GNU Radio and random generators take as a signed number of 32 bits."""
+Bytes = Annotated[int, Field(ge=4096, le=2**40)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Decibels = Annotated[float, Field(ge=-500, le=500, allow_inf_nan=False)]
 Text = Annotated[str, Field(min_length=1)]
@@ -223,6 +226,8 @@ class EndConfig(Agreed):
     @model_validator(mode="after")
     def _has_effect(self) -> EndConfig:
         for name, options in self.topic_options.items():
+            if fault := topic_fault(f"/{name.removeprefix('/')}"):
+                raise ValueError(f"topic_options has topic {name!r}: {fault}")
             refuse_without_effect(options, self.version, f"topic_options.{name}.", self.end)
         refuse_without_effect(self, self.version)
         return self
@@ -269,7 +274,7 @@ class SourceConfig(EndConfig):
     services: Annotated[bool, OnlyIn(1), Field(title="Services and actions too")] = True
     namespace: Namespace = ""
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
-    min_fragment: Annotated[int, OnlyIn(0), Field(ge=1, title="Smallest fragment (bytes)")] = 16
+    min_fragment: Annotated[int, OnlyIn(0), Field(ge=1, le=MAX_PACKET_LEN, title="Smallest fragment (bytes)")] = 16
     greedy: Annotated[bool, OnlyIn(0)] = False
     flush_timeout_s: Annotated[Seconds, OnlyIn(0)] = 0.0
     subscriber_depth: Annotated[Count, Field(title="Subscriber depth (messages)")] = 10
@@ -371,8 +376,8 @@ class SinkConfig(EndConfig):
     hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
     max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
-    max_source_bytes: Annotated[int, Field(ge=4096, title="Memory per sender (bytes)")] = 72_000_000
-    max_bytes: Annotated[int, OnlyIn(0), Field(ge=4096, title="Memory in all (bytes)")] = 64_000_000
+    max_source_bytes: Annotated[Bytes, Field(title="Memory per sender (bytes)")] = 72_000_000
+    max_bytes: Annotated[Bytes, OnlyIn(0), Field(title="Memory in all (bytes)")] = 64_000_000
     use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
     frame_prefix: FrameForm = ""
     merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""

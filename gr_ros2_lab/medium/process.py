@@ -41,6 +41,7 @@ from gr_ros2.radio.zmq import HEADER, MAGIC, SAMPLE, Address, OwnAddress, open_s
 from gr_ros2.settings.config import (
     LEVELS,
     STRICT,
+    Count,
     Decibels,
     PacketLen,
     PhyConfig,
@@ -105,7 +106,7 @@ class MediumConfig:
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
     channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
     time: Literal["lockstep", "real"] = "lockstep"
-    seed: int = 0
+    seed: Count = 0
     conditions: ClassVar = LEVELS
 
     @model_validator(mode="after")

@@ -45,13 +45,14 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
     for sink in sinks:
         top.msg_connect((source, "pdus"), (sink, "pdus"))
     live = LiveSettings(source, sinks[0])
-    live.change(TO, 2)  # also of a topic that the graph does not have yet
+    said = live.change(TO, 2)  # also of a topic that the graph does not have yet
+    assert said == f"{TO} = 2" + "; no topic goal is sent now" * found
     top.start()
     try:
         wait_for(publisher.matched, "the source's subscription")
         said: list[list[bytes]] = [[], []]
         for number, to in enumerate((2, 3, "auto", 3, 2)):
-            live.change(TO, to)
+            assert live.change(TO, to) == f"{TO} = {to}"
             publisher.publish(text(number))
             for place, robot in enumerate((2, 3)):
                 said[place] += [text(number)] * (to in (robot, "auto"))

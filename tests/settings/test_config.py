@@ -101,6 +101,8 @@ def test_an_unknown_key_further_down_is_named_with_its_path() -> None:
         (TopicOptions, "qos", "urgent"),
         (TopicOptions, "durability", "eternal"),
         (TopicOptions, "depth", -1),
+        (TopicOptions, "queue_depth", 1 << 64),
+        (SinkConfig, "publisher_depth", 10**30),
     ],
 )
 def test_out_of_range_names_key_and_value(cls: type[Any], key: str, value: Any) -> None:

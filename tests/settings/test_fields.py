@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import pytest
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
@@ -109,6 +109,18 @@ def test_no_text_is_written_twice() -> None:
                 written.setdefault((name, text), set()).add(part.__qualname__)
     assert len(written) > 250
     assert {name: found for name, found in written.items() if len(found) > 1} == {}
+
+
+def test_every_whole_number_is_bounded() -> None:
+    """One that no computer stores reaches DDS, GNU Radio or an array, and is refused there, with other words."""
+    unbounded = [
+        f"{cls.__name__}.{name}"
+        for cls in classes()
+        for name, schema in TypeAdapter(cls).json_schema().get("properties", {}).items()
+        for kind in (schema, *schema.get("anyOf", ()))
+        if kind.get("type") == "integer" and not {"maximum", "exclusiveMaximum", "enum", "const"} & kind.keys()
+    ]
+    assert unbounded == []
 
 
 def test_every_setting_says_what_it_is() -> None:
