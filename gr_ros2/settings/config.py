@@ -274,7 +274,7 @@ class SourceConfig(EndConfig):
     services: Annotated[bool, OnlyIn(1), Field(title="Services and actions too")] = True
     namespace: Namespace = ""
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
-    min_fragment: Annotated[int, OnlyIn(0), Field(ge=1, le=MAX_PACKET_LEN, title="Smallest fragment (bytes)")] = 16
+    min_fragment: Annotated[int, OnlyIn(0), Field(ge=1, le=65535, title="Smallest fragment (bytes)")] = 16
     greedy: Annotated[bool, OnlyIn(0)] = False
     flush_timeout_s: Annotated[Seconds, OnlyIn(0)] = 0.0
     subscriber_depth: Annotated[Count, Field(title="Subscriber depth (messages)")] = 10
