@@ -155,6 +155,7 @@ setup(
         "rosbags>=0.11,<0.12",
     ],
     extras_require={
+        "audio": ["sounddevice>=0.5,<0.6"],
         "dashboard": ["bokeh>=3.8,<4", "jinja2>=3.1,<4"],
         "lab": LABORATORY,
         "sweep": [*LABORATORY, "distributed>=2024.8"],

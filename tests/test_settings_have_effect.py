@@ -600,6 +600,7 @@ PLACES: dict[str, dict[str, Any]] = {
     "kiss": {"device": "/dev/a"},
     "serial": {"device": "/dev/a"},
     "udp": {"listen": "5555", "send_to": ("10.0.0.1:5555",)},
+    "audio": {},
 }
 """What each front end cannot do without."""
 
@@ -645,6 +646,19 @@ effects(
     framing=opens("serial", framing="slip"),
     rssi=Elsewhere("radio/test_packet_radios.py::test_the_byte_of_signal_strength_is_read_and_no_packet"),
 )
+KEYED = {"ptt": "rts", "ptt_device": "/dev/a"}
+effects(
+    "Front end `audio`",
+    **{
+        key: opens("audio", **{key: value})
+        for key, value in {
+            "half_duplex": True, "level": 0.3, "device": "USB", "device_rx": "USB", "centre_hz": 1500.0, "lead_s": 0.5,
+            "tail_s": 0.5, "latency_s": 0.2, "ptt": "vox",
+        }.items()
+    },
+    turnaround_s=opens("audio", {"half_duplex": True}, turnaround_s=0.2),
+    ptt_device=opens("audio", KEYED, ptt_device="/dev/b"),
+)  # fmt: skip
 effects(
     "Front end `udp`",
     listen=opens("udp", listen="5556"),

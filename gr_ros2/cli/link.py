@@ -236,7 +236,8 @@ def _opening(running: Any) -> str:
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     every = f", one packet per {front_end.airtime() * 1e3:.3g} ms" if front_end.airtime() else ""
     runs_on = f", runs on {phy.runs_on()}" if phy.runs_on() else ""
-    on_air = f", sends {front_end.on_air(running.config.front_end_options)}" if front_end.has_radio else ""
+    options = running.config.front_end_options
+    on_air = f", sends {front_end.on_air(options)}" if front_end.asks(options) else ""
     on_air = on_air if running.sends else ", only receives"
     return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}{on_air}{runs_on}; Ctrl-C ends it"
 

@@ -18,6 +18,7 @@ CHECKS: tuple[Check, ...] = (
     Check("Installed", "optional parts", installed.parts),
     Check("Radios", "USB", radios.usb),
     Check("Radios", "drivers", radios.programs),
+    Check("Radios", "sound", radios.sound),
     Check("ROS 2", "distribution", ros.distribution),
     Check("ROS 2", "RMW", ros.rmw),
     Check("ROS 2", "domain", ros.domain),

@@ -73,6 +73,26 @@ def programs() -> Iterator[Finding]:
             yield _asked(name, front_end.find_with)
 
 
+def sound() -> Iterator[Finding]:
+    """Sound devices, for the front end `audio`."""
+    try:
+        FRONT_ENDS.load("audio")
+    except BackendMissingError:
+        return  # reported by the checks of what is installed
+    from gr_ros2.radio.audio_card import PortAudioError, devices
+
+    try:
+        found = devices()
+    except PortAudioError as error:
+        yield Finding("sound", "note", " ".join(str(error).split()))
+        return
+    both = [device for device in found if device["max_input_channels"] and device["max_output_channels"]]
+    if not both:
+        yield Finding("sound", "note", "no sound device that plays and records")
+        return
+    yield Finding("sound", "ok", f"devices that play and record: {', '.join(device['name'] for device in both)}")
+
+
 def _asked(name: str, command: str) -> Finding:
     words = command.split()
     output = output_of(words)

@@ -23,6 +23,9 @@ class FrontEndBackend(Backend):
     sample_rate: float = 1e6
 
 
+_ROOM = {"payload_modulation": "bpsk", "fec": "cc", "fft_len": 256, "cp_len": 128, "scramble": True}
+"""OFDM with a prefix longer than most rooms echo."""
+
 FRONT_ENDS = BackendTable(
     "front_end",
     {
@@ -61,6 +64,16 @@ FRONT_ENDS = BackendTable(
             title="Pluto Radio",
             sample_rate=2.5e6,
         ),
+        "audio": FrontEndBackend(
+            "gr_ros2.radio.audio",
+            "AudioFrontEnd",
+            "sound: a loudspeaker and a microphone, a cable, or a voice radio",
+            "pip install gr-ros2[audio] and apt install libportaudio2",
+            title="Sound Card",
+            phy="ofdm",
+            phy_options=_ROOM,
+            sample_rate=8e3,
+        ),
         "kiss": FrontEndBackend(
             "gr_ros2.radio.kiss",
             "KissFrontEnd",
@@ -95,13 +108,16 @@ FRONT_ENDS = BackendTable(
 
 @dataclass(frozen=True)
 class Preset:
-    """A kind of packet radio: what a link over one needs, as its YAML would say it.
+    """A kind of radio: what a link over one needs, as its YAML would say it.
 
     :param front_end: a name of ``FRONT_ENDS``
     :param summary: one line of help: the radio, and how it has to be set up
     :param settings: of the front end
-    :param phy_options: of phy ``modem``
+    :param phy_options: of the PHY
     :param packet_len: bytes of the longest packet
+    :param phy: a name of ``gr_ros2.phy.PHY``; '' = that of the front end
+    :param sample_rate: samples/s; 0 = that of the front end
+    :param medium: who may send when; '' = everybody at any time
     """
 
     front_end: str
@@ -109,9 +125,38 @@ class Preset:
     settings: Mapping[str, Any]
     phy_options: Mapping[str, Any]
     packet_len: int
+    phy: str = ""
+    sample_rate: float = 0.0
+    medium: str = ""
 
 
 PRESETS: Mapping[str, Preset] = {
+    "sound": Preset(
+        "audio",
+        "loudspeakers and microphones in one room, about a metre apart",
+        {"half_duplex": True},
+        _ROOM,
+        64,
+        medium="slots",
+    ),
+    "voice": Preset(
+        "audio",
+        "the audio socket of a voice radio, FM or SSB, keyed by sound (VOX) unless front_end.ptt says how",
+        {"centre_hz": 1500.0, "half_duplex": True, "turnaround_s": 0.2, "ptt": "vox"},
+        {"fec": "cc"},
+        64,
+        "psk",
+        6e3,
+        "slots",
+    ),
+    "cable": Preset(
+        "audio",
+        "an audio cable from the output of each computer to the input of the other",
+        {"centre_hz": 11_000.0},
+        {"payload_modulation": "16qam", "fec": "cc", "scramble": True},
+        220,
+        sample_rate=24e3,
+    ),
     "sik": Preset(
         "serial",
         "SiK telemetry radios, RFD900: SERIAL_SPEED 57, AIR_SPEED 64, MAVLINK 0, ECC 0",

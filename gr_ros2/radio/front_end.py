@@ -108,6 +108,11 @@ class FrontEnd(ABC):
         return phy.has_samples or cls.loops_back
 
     @classmethod
+    def asks(cls, options: Mapping[str, Any]) -> bool:  # noqa: ARG003 - most do so in any case, or never
+        """Whether it sends only with a person's word, and with a key: where a transmitter is on the air."""
+        return cls.has_radio
+
+    @classmethod
     def on_air(cls, options: Mapping[str, Any]) -> str:  # noqa: ARG003 - the radio knows, and does not tell
         """Where and how loud it sends with these settings, as far as that is known here, in a few words.
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
-from gr_ros2.radio import FRONT_ENDS, PRESETS
+from gr_ros2.radio import FRONT_ENDS, PRESETS, Preset
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.topic_choice import words_of
 
@@ -82,14 +82,16 @@ def one_line(
         "registry": registry or "",
         "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}", **chosen_topics},
         **({"packet_len": preset.packet_len} if preset else {}),
-        "phy": _phy(front_end, preset.phy_options if preset else FRONT_ENDS[front_end].phy_options),
+        **({"medium": preset.medium} if preset and preset.medium else {}),
+        "phy": _phy(front_end, preset),
         "front_end": {"name": front_end, **(preset.settings if preset else {}), **chosen},
     }
 
 
-def _phy(front_end: str, options: Mapping[str, Any]) -> dict[str, Any]:
+def _phy(front_end: str, preset: Preset | None) -> dict[str, Any]:
     backend = FRONT_ENDS[front_end]
-    phy: dict[str, Any] = {"name": backend.phy}
-    if PHY.load(backend.phy).has_samples:
-        phy["sample_rate"] = backend.sample_rate
+    phy: dict[str, Any] = {"name": (preset and preset.phy) or backend.phy}
+    if PHY.load(phy["name"]).has_samples:
+        phy["sample_rate"] = (preset and preset.sample_rate) or backend.sample_rate
+    options = preset.phy_options if preset else backend.phy_options
     return {**phy, **({"options": dict(options)} if options else {})}

@@ -29,7 +29,7 @@ def permitted(
     :param guarded: whether a key seals the packets, or its user has said that none is needed
     :raises ConfigError: for a radio that would send without a word, or without a key
     """
-    if transmit is False or not front_end.has_radio:
+    if transmit is False or not front_end.asks(options):
         return transmit is not False
     on_air = f"front_end {front_end.name} sends {front_end.on_air(options)}"
     if transmit is not True:

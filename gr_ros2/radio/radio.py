@@ -271,7 +271,7 @@ def make_radio(
             record=record,
             limit=limit,
             listens=limits.listen_before_send and sends,
-            admits=SealedOnly(kind, options) if kind.has_radio and not open else None,
+            admits=SealedOnly(kind, options) if kind.asks(options) and not open else None,
             changeable=channel is not None,
         )
         radio.closing = undo.pop_all()

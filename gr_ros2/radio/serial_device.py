@@ -49,7 +49,7 @@ class StreamOptions(SharedAir):
         and do not listen before they send: without it, two can send at the same moments for ever
     """
 
-    device: Annotated[Device, Field(title="Device or address")]
+    device: Annotated[Device, Field(title="Device")]
     baud: Annotated[int, Field(ge=50, le=4_000_000, title="Speed of the serial line (baud)")] = 57_600
     backoff_s: Annotated[Seconds, Field(title="Random silence after a packet (s)")] = 0.0
     half_duplex: bool = True

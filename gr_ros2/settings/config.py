@@ -462,7 +462,7 @@ class ChannelConfig:
     packet_loss: Annotated[Probability, Field(title="Packet loss (share of packets)")] = 0.0
     burst_loss: BurstLoss | None = None
     outages: tuple[tuple[Seconds, Seconds], ...] = ()
-    seed: Count = 0
+    seed: Annotated[int, Field(ge=0, le=2**41)] = 0
 
     @model_validator(mode="after")
     def _outages_in_order(self) -> ChannelConfig:

@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -25,6 +25,7 @@ from gr_ros2_lab.run.scenario import load_scenario, scenario_from
 from gr_ros2_lab.study.sweep.definition import load_sweep
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands
 from tests.once import once
+from tests.radio.sound_server import sound_server_or_skip
 from tests.waiting import PATIENCE_S
 
 LINK: dict[str, Any] = {
@@ -48,6 +49,11 @@ SWEEP: dict[str, Any] = {
 OTHERS = {"rviz2", "export", "direwolf", "cd", "git", "python3", "colcon", "ros2", "tshark", "dask", "."}
 """Programs that are not ours."""
 ONLY_PARSED = {
+    (
+        "docs/how-to/sound.md",
+        "gr-ros2 link --robot 1 --radio voice --transmit --set key=fleet.key --set front_end.ptt=rts --set "
+        "front_end.ptt_device=/dev/ttyUSB0",
+    ): "needs a serial line; tests/radio/test_ptt.py",
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml"): "needs a USRP",
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml --check"): "the same; tests/cli/test_status.py",
     **{
@@ -234,6 +240,18 @@ def sample_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return once(tmp_path_factory, "sample-runs", fill)
 
 
+@pytest.fixture
+def loudspeaker(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A sound server whose microphone hears its loudspeaker, and the key of a fleet."""
+    if not (folder / "fleet.key").exists():
+        command_line.run(["key", "new", str(folder / "fleet.key")])
+    server = sound_server_or_skip(tmp_path)
+    for name, value in {**server.env, "PULSE_SINK": "a", "PULSE_SOURCE": "a.monitor"}.items():
+        monkeypatch.setenv(name, value)
+    yield
+    server.stop()
+
+
 def fill(folder: Path) -> None:
     demo = ("run", "demo", "--duration", "2", "--no-report", "--set", "time=packets")
     here(*demo, "--out", "clean", folder=folder)
@@ -292,6 +310,8 @@ def test_every_command_runs(
 ) -> None:
     if block.page != REPORTING:
         request.getfixturevalue("undrawn")
+    if block.page == "docs/how-to/sound.md":
+        request.getfixturevalue("loudspeaker")
     for other in blocks("yaml"):
         place, _, name = other.about.partition("=")
         if other.page == block.page and place == "file":

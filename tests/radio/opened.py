@@ -12,6 +12,7 @@ from unittest import mock
 from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.radio.audio_bursts import CARD_RATE
 from gr_ros2.radio.front_end import FrontEnd
 
 RATE = 1e6
@@ -70,6 +71,22 @@ class SoapyDriver:
         pass
 
 
+class Sound:
+    """In place of what opens a sound device; it has no blocks."""
+
+    ahead_s = 0.1
+
+    def __init__(self, said: Said, name: str, *values: Any, **named: Any) -> None:
+        self._said = said
+        said.append((name, *map(str, values), *(str(named[key]) for key in sorted(named) if key != "begun")))
+
+    def key(self, _: Any) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
 @contextmanager
 def drivers(said: Said) -> Iterator[None]:
     """Nothing is opened meanwhile; what would be opened is told."""
@@ -96,6 +113,10 @@ def drivers(said: Said) -> Iterator[None]:
             ("pluto.iio.fmcomms2_sink_fc32", block),
             ("pluto.iio.fmcomms2_source_fc32", block),
             ("pluto.PlutoFrontEnd._check_settings", lambda *_: None),
+            ("audio.look_again", lambda: None),
+            ("audio.Speaker", lambda *values, **named: Sound(said, "speaker", *values, **named)),
+            ("audio.Microphone", lambda *values: Sound(said, "microphone", *values)),
+            ("audio.Keyer", lambda *values: Sound(said, "key", *values)),
             ("kiss.open_stream", stream),
             ("serial.open_stream", stream),
             ("udp.Datagrams", datagrams),
@@ -108,7 +129,8 @@ def drivers(said: Said) -> Iterator[None]:
 def opened(name: str, options: Mapping[str, Any]) -> tuple[Any, ...]:
     """What a front end tells its device, says where it sends, makes of its samples, and how long a packet lasts."""
     kind: type[FrontEnd] = FRONT_ENDS.load(name)
-    phy = PHY.load("modem")(64, bit_rate=9600) if kind.carries_packets else PHY.load("psk")(64, RATE)
+    rate = CARD_RATE / 2 if name == "audio" else RATE
+    phy = PHY.load("modem")(64, bit_rate=9600) if kind.carries_packets else PHY.load("psk")(64, rate)
     said: Said = []
     with drivers(said):
         try:

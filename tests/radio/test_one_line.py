@@ -25,6 +25,7 @@ GIVEN: dict[str, dict[str, Any]] = {
     "soapy": {"frequency": 433.2e6, "device": "driver=hackrf"},
     "uhd": {"frequency": 433.2e6, "frequency-rx": 434.4e6},
     "pluto": {"frequency": 433.2e6},
+    "audio": {"device": "USB"},
     "kiss": {"device": "tcp://localhost:8001"},
     "serial": {"device": "/dev/ttyUSB0"},
     "udp": {"listen": "5551", "peer": ("10.0.0.2:5551",)},
