@@ -159,6 +159,8 @@ setup(
         "dashboard": ["bokeh>=3.8,<4", "jinja2>=3.1,<4"],
         "lab": LABORATORY,
         "sweep": [*LABORATORY, "distributed>=2024.8"],
+        # Each release has wheels for some versions of Python only.
+        "video": ["av>=17.1,<20"],
         "zenoh": ["eclipse-zenoh>=1.10,<2"],
     },
     entry_points={"console_scripts": ["gr-ros2 = gr_ros2.cli.__main__:main"]},

@@ -18,6 +18,8 @@ from gr_ros2.core.errors import DamagedError
 
 MAX_SIZE = 1 << 24
 """Bytes of the largest message that a decoder makes unless it is told otherwise."""
+KEY_TIMES = 4
+"""Budgets that a key frame of video has. With one, what is seen is coarse for a second."""
 _FOLLOWS = 0x80
 _NAME = 4
 """Bytes of a name."""
@@ -45,8 +47,8 @@ class Encoder(Protocol):
         """A message as a frame.
 
         :param message: as DDS carries it, encapsulation header first
-        :param budget: bytes that the frame may have; codecs of exact messages do not heed it; None = as many as
-            the options of the codec need
+        :param budget: bytes that the frame may have, a key frame of video ``KEY_TIMES`` as many; codecs of exact
+            messages do not heed it; None = as many as the options of the codec need
         :param key: make a key frame
         :raises DamagedError: for a message that contradicts itself, such as an image with too few bytes
         :raises UnfitError: for a message that the codec does not code

@@ -25,7 +25,7 @@ from gr_ros2.codecs.octree import Whole
 from gr_ros2.codecs.pack import Packer
 from gr_ros2.compression import bulk
 from gr_ros2.compression.zstd_frames import read_varint
-from gr_ros2.core.errors import ConfigError, DamagedError, UnfitError
+from gr_ros2.core.errors import CodecError, ConfigError, DamagedError, UnfitError
 from gr_ros2.wire import varint
 
 KEEP = ("", "intensity", "rgb")
@@ -215,7 +215,7 @@ class CloudDecoder:
         try:
             message = self._exact(body) if form == _EXACT else self._voxels(body)
         except (ValueError, OverflowError) as error:
-            if isinstance(error, DamagedError):
+            if isinstance(error, CodecError):
                 raise
             raise DamagedError(f"damaged cloud: {error}") from error
         if len(message) > self._max_size:
@@ -334,12 +334,14 @@ def _points(cloud: Any, reach: float) -> tuple[Whole, Whole]:
         raise UnfitError("cloud: no fields x, y and z of floating-point numbers")
     if not cloud.width * cloud.height:
         return np.zeros((3, 0)), np.zeros(0, bool)
-    points = np.stack([_column(cloud, fields[axis]).ravel() for axis in "xyz"])
-    with np.errstate(over="ignore", invalid="ignore"):
-        # What is not finite is within no range; where there is none, the greatest number is the range.
-        square = min(reach * reach, float(np.finfo(points.dtype).max))
-        inside = points[0] ** 2 + points[1] ** 2 + points[2] ** 2 <= square
-    return points[:, inside].astype(np.float64, order="C"), inside
+    points = np.stack([_column(cloud, fields[axis]).ravel() for axis in "xyz"]).astype(np.float64)
+    x, y, z = points
+    if reach < math.inf:
+        with np.errstate(over="ignore", invalid="ignore"):
+            inside = x * x + y * y + z * z <= reach * reach
+    else:
+        inside = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+    return np.compress(inside, points, axis=1), inside
 
 
 def _coarser(voxels: _Voxels) -> _Voxels:

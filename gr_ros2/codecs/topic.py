@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from gr_ros2.codecs.base import MAX_SIZE, Codec, Coded, Decoder, Encoder
-from gr_ros2.codecs.messages import CLOUD, GRID
+from gr_ros2.codecs.messages import CLOUD, COMPRESSED_IMAGE, GRID, IMAGE
 from gr_ros2.core.backends import Backend, BackendTable
 from gr_ros2.core.errors import BackendMissingError, ConfigError, DamagedError, UnfitError
 
@@ -30,10 +30,30 @@ class CodecRow(Backend):
     types: tuple[str, ...] = ()
 
 
+_VIDEO = "PyAV (pip install 'gr-ros2[video]')"
+
 CODECS = BackendTable(
     "codec",
     {
         "exact": CodecRow("gr_ros2.codecs.exact", "ExactCodec", "any message as it is"),
+        "camera": CodecRow(
+            "gr_ros2.codecs.camera",
+            "CameraCodec",
+            "pictures as video",
+            _VIDEO,
+            imports=("av",),
+            number=1,
+            types=(IMAGE, COMPRESSED_IMAGE),
+        ),
+        "depth": CodecRow(
+            "gr_ros2.codecs.depth",
+            "DepthCodec",
+            "depth images as inverse distances",
+            _VIDEO,
+            imports=("av",),
+            number=2,
+            types=(IMAGE, COMPRESSED_IMAGE),
+        ),
         "cloud": CodecRow("gr_ros2.codecs.cloud", "CloudCodec", "point clouds", number=3, types=(CLOUD,)),
         "grid": CodecRow("gr_ros2.codecs.grid", "GridCodec", "what changes of a map", number=4, types=(GRID,)),
     },

@@ -36,7 +36,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
     udp = {"name": "udp", "listen": f"127.0.0.1:{own}", "send_to": [f"127.0.0.1:{other}"]}
     modem = {"name": "modem", "options": {"bit_rate": 1e6}}
     with (
-        Robot(1, udp, version=1, phy=modem, state=str(tmp_path / "state")) as made,
+        Robot(1, udp, phy=modem, state=str(tmp_path / "state")) as made,
         audience(None, console(), "robot", answers=_answers(made.link)),
     ):
         yield made

@@ -6,8 +6,10 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
-from gr_ros2.codecs import CodedTopic
-from gr_ros2.codecs.messages import CLOUD, GRID
+import numpy as np
+
+from gr_ros2.codecs import CodedTopic, video
+from gr_ros2.codecs.messages import CLOUD, COMPRESSED_IMAGE, GRID, IMAGE
 from tests.codecs import scenes
 
 
@@ -41,8 +43,35 @@ def _maps() -> list[bytes]:
     return scenes.exploring(3, 200)
 
 
+def _colours() -> list[bytes]:
+    return [scenes.image(scenes.view(n, 160, 120), "rgb8", n) for n in range(5)]
+
+
+def _jpegs() -> list[bytes]:
+    return [
+        scenes.compressed(video.packed("mjpeg", scenes.picture(scenes.view(n, 160, 120), "yuvj420p")), "jpeg", n)
+        for n in range(5)
+    ]
+
+
+def _depths() -> list[bytes]:
+    return [scenes.image(np.rint(scenes.room(n, 160, 120) * 1000).astype("<u2"), "16UC1", n) for n in range(5)]
+
+
+def _metres() -> list[bytes]:
+    return [scenes.image(scenes.room(n, 160, 120), "32FC1", n) for n in range(3)]
+
+
 SAMPLES = {
     "exact": Sample("exact", "std_msgs/msg/String", {}, cache(_texts), exact=True),
+    "camera": Sample("camera", IMAGE, {"size": "full"}, cache(_colours), budget=1200),
+    "camera of JPEG": Sample("camera", COMPRESSED_IMAGE, {}, cache(_jpegs), budget=1200),
+    "camera to Foxglove": Sample("camera", IMAGE, {"output_type": "CompressedVideo"}, cache(_colours), budget=600),
+    "camera to FFmpeg": Sample("camera", COMPRESSED_IMAGE, {"output_type": "FFMPEGPacket"}, cache(_jpegs)),
+    "camera to JPEG": Sample("camera", IMAGE, {"output_type": "CompressedImage"}, cache(_colours)),
+    "depth": Sample("depth", IMAGE, {}, cache(_depths), budget=900),
+    "depth in 8 bits": Sample("depth", IMAGE, {"mode": "8"}, cache(_depths)),
+    "depth in metres": Sample("depth", IMAGE, {}, cache(_metres)),
     "cloud": Sample("cloud", CLOUD, {}, cache(_clouds), exact=True),
     "cloud as voxels": Sample("cloud", CLOUD, {"voxel": 0.2, "range": 30.0}, cache(_clouds)),
     "cloud with intensity": Sample("cloud", CLOUD, {"voxel": 0.2, "keep": "intensity"}, cache(_clouds)),

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
+import av
 import numpy as np
 import numpy.typing as npt
 
-from gr_ros2.codecs.messages import CLOUD, GRID, header_of, store, write
+from gr_ros2.codecs import video
+from gr_ros2.codecs.messages import CLOUD, COMPRESSED_IMAGE, GRID, IMAGE, header_of, store, write
 
 Array = npt.NDArray[Any]
 _TYPES = store().types
@@ -140,3 +143,105 @@ def exploring(steps: int, size: int = 600) -> list[bytes]:
         known[seen & (truth == 100) & (rng.random((size, size)) < 0.02)] = 0
         found.append(grid(known, step))
     return found
+
+
+@cache
+def _walls() -> Array:
+    """A large picture of textured surfaces with edges, float32 of shape (900, 1600, 3), 0..255."""
+    rng = np.random.default_rng(3)
+    made = np.zeros((900, 1600, 3), np.float32)
+    for size in (100, 50, 25, 5):
+        coarse = rng.normal(0, 9 + size / 5, (900 // size, 1600 // size, 3)).astype(np.float32)
+        made += np.kron(coarse, np.ones((size, size, 1), np.float32)) * (0.4 if size == 5 else 1)
+    made = made.mean(2, keepdims=True) + 0.5 * (made - made.mean(2, keepdims=True)) + 120
+    for _ in range(60):
+        top, left = rng.integers(0, 860), rng.integers(0, 1550)
+        high, wide = rng.integers(10, 160), rng.integers(10, 160)
+        made[top : top + high, left : left + wide] = (
+            0.7 * rng.integers(0, 256, 3) + 0.3 * made[top : top + high, left : left + wide]
+        )
+    return made
+
+
+def view(number: int, width: int = 640, height: int = 480) -> Array:
+    """What a camera sees that pans and zooms over walls while something moves: uint8 RGB with noise of the sensor."""
+    rng = np.random.default_rng([11, number])
+    turn = number / 15
+    zoom = 1.1 + 0.15 * np.sin(0.7 * turn)
+    middle_x, middle_y = 800 + 330 * np.sin(0.5 * turn), 450 + 120 * np.sin(0.83 * turn)
+    x = middle_x + (np.arange(width) - width / 2) * zoom * 640 / width
+    y = middle_y + (np.arange(height) - height / 2) * zoom * 480 / height
+    walls = _walls()
+    left, top = x.astype(int), y.astype(int)
+    right, down = (x - left).astype(np.float32)[None, :, None], (y - top).astype(np.float32)[:, None, None]
+    upper = walls[top][:, left] * (1 - right) + walls[top][:, left + 1] * right
+    lower = walls[top + 1][:, left] * (1 - right) + walls[top + 1][:, left + 1] * right
+    seen = upper * (1 - down) + lower * down
+    place = int((0.1 + 0.7 * (turn / 4 % 1)) * width)
+    seen[height // 2 : height // 2 + height // 4, place : place + width // 8] = (200, 60, 40)
+    return np.clip(seen + rng.normal(0, 2.5, seen.shape), 0, 255).astype(np.uint8)
+
+
+def image(pixels: Array, encoding: str, number: int = 0, padding: int = 0, big: bool = False) -> bytes:
+    """An Image whose rows have some bytes more than their pixels."""
+    rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
+    padded = np.pad(rows, ((0, 0), (0, padding)), constant_values=77)
+    return write(
+        IMAGE,
+        header=header(number),
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        is_bigendian=int(big),
+        step=padded.shape[1],
+        data=padded.ravel(),
+    )
+
+
+def picture(pixels: Array, kind: str) -> av.VideoFrame:
+    """RGB pixels as a picture of FFmpeg's pixel format ``kind``."""
+    return video.from_rows(pixels.reshape(len(pixels), -1), pixels.shape[1], "rgb24").reformat(format=kind)
+
+
+def compressed(data: bytes, label: str, number: int = 0) -> bytes:
+    """A CompressedImage."""
+    return write(COMPRESSED_IMAGE, header=header(number), format=label, data=np.frombuffer(data, np.uint8))
+
+
+def room(number: int = 0, width: int = 640, height: int = 480) -> Array:
+    """Depth of a room by a hand-held sensor, m, float32: walls, floor, boxes; 0 where a sensor sees none.
+
+    The noise grows with the square of the distance, as that of sensors of structured light does (2.5 mm at 1 m), and
+    steps of disparity are 1/8 pixel of 575; shadows lie left of edges, and far or slanted spots are missing.
+    """
+    rng = np.random.default_rng([13, number])
+    turn = 0.02 * number
+    u = (np.arange(width) - width / 2)[None, :] / (0.9 * width)
+    v = (np.arange(height) - height / 2)[:, None] / (0.9 * width)
+    x, z = np.cos(turn) * u + np.sin(turn), np.cos(turn) - np.sin(turn) * u
+    here = 0.3 * np.sin(0.1 * number), 0.01 * number
+    found = np.full((height, width), np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for plane, offset, along in ((x, 1.7, 0), (x, -1.5, 0), (z, 3.2, 1)):
+            far = (offset - here[along]) / np.broadcast_to(plane, found.shape)
+            found = np.where((far > 0) & (far < found), far, found)
+        for plane, offset in ((v, 0.9), (v, -1.6)):
+            far = offset / np.broadcast_to(plane, found.shape)
+            found = np.where((far > 0) & (far < found), far, found)
+        boxes = ((-0.9, 0.9, 1.6, 0.7), (0.3, 0.9, 2.3, 0.8), (0.9, 0.3, 2.8, 0.5), (-0.2, 0.1, 1.2, 0.2))
+        for left, bottom, place, size in boxes:
+            far = np.broadcast_to((place - here[1]) / z, found.shape)
+            across, down = far * x + here[0], far * v
+            hits = (across > left) & (across < left + size) & (down < bottom) & (down > bottom - size) & (far > 0)
+            bump = 0.03 * np.sin(9 * across) * np.cos(7 * down)
+            found = np.where(hits & (far < found), far + bump, found)
+    found = found + rng.normal(0, 0.0015, found.shape) * found**2
+    disparity = np.rint(575 * 0.075 / found * 8) / 8
+    found = 575 * 0.075 / disparity
+    edges = np.abs(np.diff(found, axis=1, prepend=found[:, :1])) > 0.15
+    for shift in range(1, 9):
+        found[:, :-shift] = np.where(edges[:, shift:], 0, found[:, :-shift])
+    blotches = np.kron(rng.random((-(-height // 12), -(-width // 12))), np.ones((12, 12)))[:height, :width]
+    found[(blotches < 0.01) | (found > 6) | (found < 0.4)] = 0
+    found[:, : width // 80] = 0
+    return found.astype(np.float32)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
+pytest.importorskip("av", reason="needs PyAV: pip install 'gr-ros2[video]'")
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 
+pytest.importorskip("av", reason="needs PyAV: pip install 'gr-ros2[video]'")
+
 from gr_ros2.codecs import CODECS, CodedTopic
-from gr_ros2.codecs.messages import CLOUD, GRID
+from gr_ros2.codecs.messages import CLOUD, GRID, IMAGE
 from gr_ros2.core.errors import ConfigError
 from tests.codecs import scenes
 
@@ -31,6 +35,15 @@ def test_a_message_that_its_codec_does_not_take_passes_exactly_and_the_reason_is
     coded = topic.encoder().encode(message)
     assert topic.decoder().decode(coded.data) == message
     assert coded.said == "cloud: no fields x, y and z of floating-point numbers"
+
+
+def test_without_its_package_a_topic_passes_exactly_and_the_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    topic = CodedTopic(IMAGE)
+    message = scenes.image(scenes.view(0, 32, 16), "rgb8")
+    coded = topic.encoder().encode(message)
+    assert topic.decoder().decode(coded.data) == message
+    assert "needs PyAV (pip install 'gr-ros2[video]')" in coded.said
 
 
 @pytest.mark.parametrize(

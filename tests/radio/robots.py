@@ -25,24 +25,17 @@ QOS = Qos("reliable", "volatile", 0)
 
 def config(number: int, front_end: dict[str, Any], **values: Any) -> LinkConfig:
     """Of robot ``number``: one topic, packets of 64 B, its graph in memory."""
-    graph = {"middleware": "memory", "domain_id": domain(number)}
     defaults = {
+        "robot": f"/robot_{number}",
         "registry": str(TOPICS),
         "packet_len": 64,
-        "version": 0,
         "phy": {"name": "psk", "sample_rate": RATE},
         "front_end": front_end,
         "transmit": values.pop("transmit", True),
         "open": "key" not in values,
-        "ros_source": {
-            "namespace": f"/robot_{number}",
-            "queue_depth": 0,
-            "subscriber_depth": 0,
-            **graph,
-            **values.pop("ros_source", {}),
-        },
-        # A busy machine may take longer than the default between two packets of a message.
-        "ros_sink": {"publisher_depth": 0, **graph, **values.pop("ros_sink", {})},
+        "queue_depth": 0,
+        "graph": {"middleware": "memory", "domain_id": domain(number), "depth": 0, **values.pop("graph", {})},
+        "publish": {"depth": 0, **values.pop("publish", {})},
     }
     return link_from({**defaults, **values})
 
@@ -114,8 +107,8 @@ def link_command(
     path.write_text(
         f"""
         registry: {TOPICS}
-        ros_source: {{robot_id: 1, middleware: memory}}
-        ros_sink: {{middleware: memory}}
+        robot: 1
+        graph: {{middleware: memory}}
         phy: {{name: psk, sample_rate: {sample_rate}}}
         front_end: {json.dumps(front_end)}
         transmit: true

@@ -126,7 +126,7 @@ def test_a_link_that_only_receives_opens_no_transmitter(driver: Path, tmp_path: 
         "import json\n"
         "from tests.radio.robots import *\n"
         f"state = {str(tmp_path / 'state')!r}\n"
-        f"with RobotLink(config(1, {front_end!r}, version=1, transmit=False, state=state)) as link:\n"
+        f"with RobotLink(config(1, {front_end!r}, transmit=False, state=state)) as link:\n"
         "    wait_for(lambda: link.front_end._gaps.nitems_read(0), 'samples')\n"
         "    link.check()\n"
         "    print(json.dumps(link.stats()))\n"
@@ -294,7 +294,7 @@ def test_a_device_that_falls_silent_is_waited_for_and_opened_again(driver: Path,
         "import json\n"
         "from tests.radio.robots import *\n"
         "front_end = {'name': 'soapy', 'args': 'driver=loopback,dies=0.2', 'frequency': 1e8}\n"
-        f"link = RobotLink(config(1, front_end, version=1, state={str(tmp_path / 'state')!r}))\n"
+        f"link = RobotLink(config(1, front_end, state={str(tmp_path / 'state')!r}))\n"
         "link.start()\n"
         "def again():\n"
         "    link.check()\n"
@@ -387,7 +387,7 @@ def test_a_device_listens_where_it_sends_and_does_not_hear_itself(monkeypatch: p
     with pytest.raises(ConfigError, match=r"airtime\.listen_before_send: front_end soapy measures no power where it"):
         RobotLink(config(1, {"name": "soapy", "frequency": 433e6}, airtime={"listen_before_send": True}))
     with pytest.raises(ConfigError, match="medium = 'slots' has times of its own; leave it out"):
-        config(1, {"name": "udp"}, version=1, medium="slots", airtime={"listen_before_send": True})
+        config(1, {"name": "udp"}, medium="slots", airtime={"listen_before_send": True})
 
 
 def test_airtime_counts_padding_guard_and_turnaround(monkeypatch: pytest.MonkeyPatch) -> None:

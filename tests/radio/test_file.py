@@ -110,7 +110,7 @@ def test_version_1_sends_a_command_in_the_air_that_it_needs(tmp_path: Path) -> N
     """Issue: a command of 13 B takes at most 45 % of the air of 64 B with `lora` at factor 9."""
     sent = Sent()
     phy = {"name": "lora", "sample_rate": RATE, "options": {"spreading_factor": 9}}
-    settings: dict[str, Any] = {"version": 1, "state": str(tmp_path / "state"), "phy": phy}
+    settings: dict[str, Any] = {"state": str(tmp_path / "state"), "phy": phy}
     source = {"repair": "off", "compression": False}
     front_end = {"name": "file", "write": str(tmp_path / "sent")}
     with Robot(1, front_end, observer=sent, ros_source=source, **settings) as robot:

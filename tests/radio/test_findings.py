@@ -30,7 +30,7 @@ def pair(folder: Path, wrong: dict[str, Any], **values: Any) -> tuple[Robot, Rob
 
     def robot(number: int, **own: Any) -> Robot:
         front_end = {"name": "zmq", "bind": addresses[number - 1], "connect": [addresses[2 - number]]}
-        own = {"version": 1, "state": str(folder / f"state-{number}"), **values, **own}
+        own = {"state": str(folder / f"state-{number}"), **values, **own}
         if not own["version"]:
             del own["state"]
         return Robot(number, front_end, hears=(3 - number,), **own)
@@ -79,12 +79,12 @@ def test_frequencies_that_do_not_meet_are_named() -> None:
 
 def test_files_are_compared_without_hearing_the_other_end(tmp_path: Path) -> None:
     uhd = {"name": "uhd", "frequency": 433.2e6, "frequency_rx": 434.4e6}
-    here = config(1, uhd, version=1)
+    here = config(1, uhd)
     swapped = {**uhd, "frequency": 434.4e6, "frequency_rx": 433.2e6}
-    assert compared(here, config(2, swapped, version=1)) == []
-    assert "sends at 433200000.0 Hz" in compared(here, config(2, uhd, version=1))[0]
+    assert compared(here, config(2, swapped)) == []
+    assert "sends at 433200000.0 Hz" in compared(here, config(2, uhd))[0]
     wrong = config(
-        1, swapped, packet_len=80, key=key(tmp_path, "other"), version=1, phy={"name": "psk", "sample_rate": 1e6}
+        1, swapped, packet_len=80, key=key(tmp_path, "other"), phy={"name": "psk", "sample_rate": 1e6}
     )
     found = " ".join(compared(here, wrong))
     for said in ("packet_len is 80 there", "phy has other settings", "key ", "both are robot 1"):
@@ -133,7 +133,7 @@ def test_bytes_that_are_no_packets_are_named(tmp_path: Path) -> None:
             for end, framing in zip(cable.ends, ("cobs", "slip"), strict=True)
         ]
         phy = {"name": "modem", "options": {"bit_rate": 1e6}}
-        common = {"version": 1, "phy": phy}
+        common = {"phy": phy}
         with (
             Robot(1, ends[0], state=str(tmp_path / "1"), **common) as one,
             Robot(2, ends[1], state=str(tmp_path / "2"), **common),
@@ -148,7 +148,7 @@ def test_two_robots_of_one_number_are_named_in_status_log_and_on_the_dashboard(t
 
     def robot(place: int, number: int, connect: list[str], **values: Any) -> Robot:
         front_end = {"name": "zmq", "bind": addresses[place], "connect": connect}
-        return Robot(number, front_end, version=1, state=str(tmp_path / f"state-{place}"), **values)
+        return Robot(number, front_end, state=str(tmp_path / f"state-{place}"), **values)
 
     third = robot(2, 2, addresses[:2], observer=monitor)
     with third, robot(0, 1, addresses[2:]), robot(1, 1, addresses[2:]):

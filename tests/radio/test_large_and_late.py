@@ -48,7 +48,6 @@ def test_a_map_crosses_once_and_a_robot_that_joins_late_gets_it_by_asking(tmp_pa
 
     def robot(number: int, *others: int, **values: Any) -> Robot:
         own: dict[str, Any] = {
-            "version": 1,
             "phy": {"name": "psk", "sample_rate": 2e5},
             "state": str(tmp_path / f"state-{number}"),
             "registry": "",
@@ -95,7 +94,7 @@ def test_a_message_of_almost_16_MB_crosses_and_memory_stays_bounded(tmp_path: Pa
     host = f"127.{20 + (os.getpid() >> 16) % 200}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
     ends = [{"name": "udp", "listen": f"{host}:{4001 + n}", "send_to": [f"{host}:{4002 - n}"]} for n in (0, 1)]
     values: dict[str, Any] = {
-        **{"version": 1, "packet_len": 4095, "registry": "", "ros_source": {"topics": "auto"}},
+        **{"packet_len": 4095, "registry": "", "ros_source": {"topics": "auto"}},
         "phy": {"name": "modem", "options": {"bit_rate": 2e7}},
     }
     sent = message(1, 4) + random.Random(1).randbytes(MAX_MESSAGE - 1004)

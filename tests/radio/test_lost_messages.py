@@ -63,7 +63,7 @@ def test_a_bag_of_a_link_says_what_is_missing_in_it(tmp_path: Path, storage: Sto
     ]
     # A computer that is too slow drops messages of a stream before they leave, which the other end cannot know of.
     sends = {"repair": "off", "topic_options": {"chat": {"queue": "fifo"}}}
-    common = {"version": 1, "phy": {"name": "modem", "options": {"bit_rate": 1e6}}, "diagnostics": {"period_s": 0.1}}
+    common = {"phy": {"name": "modem", "options": {"bit_rate": 1e6}}, "diagnostics": {"period_s": 0.1}}
     recorded: dict[str, list[bytes]] = {CHAT: [], EVENTS: []}
 
     def missing() -> int:

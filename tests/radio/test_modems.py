@@ -24,7 +24,7 @@ FAST = {"name": "modem", "options": {"bit_rate": 1e6}}
 
 def robot(number: int, front_end: dict[str, Any], tmp_path: Path, **values: Any) -> Robot:
     """A robot that speaks version 1."""
-    own = {"version": 1, "phy": FAST, "state": str(tmp_path / f"state-{number}")}
+    own = {"phy": FAST, "state": str(tmp_path / f"state-{number}")}
     return Robot(number, front_end, hears=(3 - number,), **{**own, **values})
 
 

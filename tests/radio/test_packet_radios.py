@@ -41,7 +41,6 @@ def robot(number: int, radio: str, folder: Path, faster: float = 1.0, **front_en
         number,
         {**preset["front_end"], **front_end},
         hears=(3 - number,),
-        version=1,
         phy=phy,
         packet_len=preset.get("packet_len", 220),
         state=str(folder / f"state-{number}"),

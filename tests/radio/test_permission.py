@@ -27,7 +27,7 @@ MODEM = {"name": "modem", "options": {"bit_rate": 1e6}}
 
 
 def may_send(front_end: dict[str, Any], **values: Any) -> bool:
-    link = config(1, front_end, **{"version": 1, "phy": MODEM, **values})
+    link = config(1, front_end, **{"phy": MODEM, **values})
     front_end_class = FRONT_ENDS.load(link.front_end_name)
     return permitted(link.transmit, front_end_class, link.front_end_options, guarded=bool(link.key) or link.open)
 
@@ -65,7 +65,7 @@ def test_the_power_is_said_where_it_is_known() -> None:
 def test_a_link_that_only_receives_hears_and_sends_nothing(tmp_path: Path) -> None:
     with SerialCable(tmp_path) as cable:
         ends = [{"name": "serial", "device": str(end), "half_duplex": False} for end in cable.ends]
-        common = {"version": 1, "phy": MODEM}
+        common = {"phy": MODEM}
         with (
             Robot(1, ends[0], state=str(tmp_path / "1"), **common) as one,
             Robot(2, ends[1], hears=(1,), state=str(tmp_path / "2"), transmit=False, **common) as two,
@@ -80,7 +80,7 @@ def test_a_link_that_only_receives_hears_and_sends_nothing(tmp_path: Path) -> No
 
 def test_who_only_receives_binds_no_address_over_zeromq_and_switches_nothing_on(tmp_path: Path) -> None:
     ends = [f"ipc://{tmp_path}/{name}" for name in "ab"]
-    common = {"version": 1, "phy": {"name": "psk", "sample_rate": 1e6}}
+    common = {"phy": {"name": "psk", "sample_rate": 1e6}}
     one = {"name": "zmq", "bind": ends[0], "connect": [ends[1]]}
     two = {"name": "zmq", "bind": ends[1], "connect": [ends[0]]}
     with (

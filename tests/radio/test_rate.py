@@ -18,7 +18,7 @@ from tests.radio.robot_process import RobotProcess
 from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for
 
-ADAPTIVE = {"version": 1, "phy": {"name": "ofdm", "sample_rate": RATE, "options": {"rate": "adaptive"}}}
+ADAPTIVE = {"phy": {"name": "ofdm", "sample_rate": RATE, "options": {"rate": "adaptive"}}}
 
 
 class Rates:

@@ -42,7 +42,6 @@ class Pair:
 
     def start(self, number: int) -> None:
         values = {
-            "version": 1,
             "phy": {"name": "psk", "sample_rate": SLOW},
             "state": str(self._folder / f"state-{number}"),
             **({} if number == 1 else {"registry": "", "ros_source": {"topics": "auto"}}),

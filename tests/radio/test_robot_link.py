@@ -66,7 +66,7 @@ def test_a_link_that_was_stopped_keeps_no_other_process_from_its_state(name: str
     )
     code = "import sys; from gr_ros2.state.boots import BootFile; BootFile(sys.argv[1], 1.0, 0, sealed=False)"
     command = [sys.executable, "-c", code, str(tmp_path / "state")]
-    with Robot(1, front_end, version=1, state=command[-1]):
+    with Robot(1, front_end, state=command[-1]):
         refused = subprocess.run(command, capture_output=True, check=False)
         assert b"a link of this robot runs already" in refused.stderr
     subprocess.run(command, check=True)
@@ -95,13 +95,13 @@ def full_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_link_starts_on_a_full_disk_and_says_so(full_disk: Path, caplog: pytest.LogCaptureFixture) -> None:
     state = full_disk / "state"
-    with Robot(1, SIM, hears=(1,), version=1, state=str(state)) as robot:
+    with Robot(1, SIM, hears=(1,), state=str(state)) as robot:
         said = robot.say(*range(5))
         wait_for(lambda: robot.heard == said, "every message")
         assert any(f"{state}: cannot be written (No space left on device)" in text for text in caplog.messages)
         assert not state.exists()
         (full_disk / "rest").unlink()
-    with Robot(1, SIM, version=1, state=str(state)):
+    with Robot(1, SIM, state=str(state)):
         assert state.exists()
 
 
@@ -202,7 +202,6 @@ def test_a_limit_of_airtime_holds_and_is_told_and_a_restart_knows_it(tmp_path: P
     limited: dict[str, Any] = {
         "airtime": {"duty_cycle": 0.01, "window_s": 100},
         "state": str(tmp_path / "robot.json"),
-        "version": 1,
     }
     with Robot(1, slow, **limited) as robot:
         robot.say(*range(5))

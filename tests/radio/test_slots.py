@@ -90,7 +90,6 @@ def heard(folder: Path, medium: str, robots: int = 2) -> tuple[list[int], Medium
                     number,
                     front_end(folder, number),
                     hears=tuple(n for n in numbers if n != number),
-                    version=1,
                     medium=medium,
                     phy=PHY,
                     packet_len=PACKET_LEN,
@@ -131,7 +130,6 @@ def test_a_message_reaches_a_robot_that_does_not_hear_its_sender(tmp_path: Path)
                     number,
                     front_end(tmp_path, number),
                     hears=(4 - number,) if number != 2 else (),
-                    version=1,
                     medium="slots",
                     relay="gain",
                     phy=PHY,
@@ -171,7 +169,7 @@ def test_the_guard_is_what_the_front_end_may_be_late_by(accesses: list[tuple[Acc
     (port,) = free_ports(1, socket.SOCK_DGRAM)
     options = {"name": "udp", "listen": f"127.0.0.1:{port}", "send_to": ["127.0.0.1:9"]}
     link = RobotLink(
-        config(1, options, version=1, medium="slots", phy={"name": "modem", "options": {"bit_rate": 9600}})
+        config(1, options, medium="slots", phy={"name": "modem", "options": {"bit_rate": 9600}})
     )
     try:
         ((access, slot_s),) = accesses
@@ -193,7 +191,7 @@ def test_the_block_of_grc_has_slots_too(accesses: list[tuple[Access, float]]) ->
 
 def test_a_front_end_that_hears_itself_alone_shares_nothing() -> None:
     with pytest.raises(ConfigError, match="medium = 'slots': front_end sim reaches no other robot") as refused:
-        RobotLink(config(1, {"name": "sim"}, version=1, medium="slots"))
+        RobotLink(config(1, {"name": "sim"}, medium="slots"))
     assert "\n" not in str(refused.value)
 
 
@@ -201,7 +199,7 @@ def test_two_robots_with_one_id_are_told_so_both(tmp_path: Path) -> None:
     with air(tmp_path, 3), ExitStack() as stack:
         links = []
         for place, number in ((1, 1), (2, 2), (3, 1)):
-            values = {"version": 1, "medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
+            values = {"medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
             state = str(tmp_path / f"state{place}.json")
             links.append(RobotLink(config(number, front_end(tmp_path, place), state=state, **values)))
             stack.callback(links[-1].stop)
@@ -215,7 +213,7 @@ def test_two_robots_with_one_id_are_told_so_both(tmp_path: Path) -> None:
 
 def test_a_channel_that_is_too_full_names_the_topics_that_grow_old(tmp_path: Path) -> None:
     with air(tmp_path, 2), ExitStack() as stack:
-        values: dict[str, Any] = {"version": 1, "medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
+        values: dict[str, Any] = {"medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
         options = {"topic_options": {"chat": {"queue": "latest"}}}
         robots = [
             stack.enter_context(Robot(number, front_end(tmp_path, number), ros_source=options, **values))

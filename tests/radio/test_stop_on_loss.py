@@ -57,7 +57,7 @@ def test_the_robot_stands_still_when_its_operator_is_gone(tmp_path: Path, how: s
     addresses = [f"ipc://{tmp_path}/{number}" for number in (1, 2)]
 
     def link(number: int, own: str, other: str) -> RobotLink:
-        values: dict[str, Any] = {"version": 1, "registry": "", "state": str(tmp_path / f"state-{number}")}
+        values: dict[str, Any] = {"registry": "", "state": str(tmp_path / f"state-{number}")}
         front_end = {"name": "zmq", "bind": own, "connect": [other]}
         quick = {"period_s": 0.1, "silence_warn_s": 1.0, "silence_error_s": 2.5}
         source = {"topics": ["cmd_vel"]} if number == 2 else {"topics": []}

@@ -189,7 +189,7 @@ def test_whatever_a_usrp_tells_is_counted_by_name() -> None:
 
 @pytest.mark.usefixtures("stand_ins")
 def test_a_usrp_that_only_receives_has_no_transmitter() -> None:
-    with Robot(1, {**FRONT_END, "half_duplex": True}, version=1, transmit=False) as robot:
+    with Robot(1, {**FRONT_END, "half_duplex": True}, transmit=False) as robot:
         for now in (100.0, 200.0):
             look(robot, now)
         assert Sink.made == []

@@ -42,7 +42,7 @@ def test_a_ros_service_switches_sending_off_and_on() -> None:
 
 
 def test_who_only_receives_says_that_it_cannot_send() -> None:
-    with Robot(1, SIM, hears=(1,), version=1, transmit=False) as robot, MemoryMiddleware(domain_id=domain(1)) as graph:
+    with Robot(1, SIM, hears=(1,), transmit=False) as robot, MemoryMiddleware(domain_id=domain(1)) as graph:
         replies: list[bytes] = []
         there: list[bool] = []
         client: ServiceClient = graph.client(

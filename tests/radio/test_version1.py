@@ -35,7 +35,6 @@ def robot(number: int, front_end: dict[str, Any], tmp_path: Path, **values: Any)
     """One that speaks version 1; the second has no registry."""
     other = 3 - number
     own: dict[str, Any] = {
-        "version": 1,
         "phy": {"name": "psk", "sample_rate": SLOW},
         "state": str(tmp_path / f"state-{number}"),
         **({} if number == 1 else {"registry": ""}),

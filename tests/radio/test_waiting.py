@@ -110,7 +110,7 @@ def test_a_link_on_the_same_graph_is_seen_without_diagnostics_too(tmp_path: Path
     from tests.radio.robots import Robot
 
     ends = [f"ipc://{tmp_path}/{number}" for number in "12"]
-    values: dict[str, Any] = {"version": 1, "diagnostics": {"period_s": 0}}
+    values: dict[str, Any] = {"diagnostics": {"period_s": 0}}
 
     def robot(number: int) -> Robot:
         front_end = {"name": "zmq", "bind": ends[number - 1], "connect": [ends[2 - number]]}

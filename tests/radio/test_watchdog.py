@@ -31,7 +31,7 @@ def udp() -> dict[str, object]:
 
 
 def test_a_link_that_goes_on_passes(tmp_path: Path) -> None:
-    with Robot(1, udp(), version=1, phy=MODEM, state=str(tmp_path / "state")) as one:
+    with Robot(1, udp(), phy=MODEM, state=str(tmp_path / "state")) as one:
         wait_for(lambda: one.link.stats()["packets"]["out"] > 2, "some hellos")
         one.link.check()
         assert one.link.source.stalled_s(one.link._clock()) < robot_link.STALLED_S
@@ -40,7 +40,7 @@ def test_a_link_that_goes_on_passes(tmp_path: Path) -> None:
 
 def test_a_sending_thread_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robot_link, "STALLED_S", 0.2)
-    with Robot(1, udp(), version=1, phy=MODEM, state=str(tmp_path / "state")) as one:
+    with Robot(1, udp(), phy=MODEM, state=str(tmp_path / "state")) as one:
         wait_for(lambda: one.link.stats()["packets"]["out"] > 2, "some hellos")
 
         def hangs() -> bool:
@@ -57,7 +57,7 @@ def test_a_sending_thread_that_hangs_is_named(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_link_that_was_frozen_as_a_whole_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Robot(1, udp(), version=1, phy=MODEM, state=str(tmp_path / "state")) as one:
+    with Robot(1, udp(), phy=MODEM, state=str(tmp_path / "state")) as one:
         wait_for(lambda: one.link.stats()["packets"]["out"] > 2, "some hellos")
         one.link.check()
         clock, frozen_s = one.link._clock, robot_link.STALLED_S + 2.0
@@ -71,7 +71,7 @@ def test_a_link_that_was_frozen_as_a_whole_goes_on(tmp_path: Path, monkeypatch: 
 
 
 def test_a_sending_thread_that_has_ended_is_named(tmp_path: Path) -> None:
-    with Robot(1, udp(), version=1, phy=MODEM, state=str(tmp_path / "state")) as one:
+    with Robot(1, udp(), phy=MODEM, state=str(tmp_path / "state")) as one:
         one.link.source.stop()
         assert one.link.source.stalled_s(0.0) == 0.0
         one.link.source._running = True

@@ -1,0 +1,315 @@
+"""The codec of pictures that are looked at: H.264 within a budget for each frame.
+
+An image is resized by factors of two until the budget is at least ``LEAST_PER_BLOCK`` bytes for each 16 × 16 pixels: a
+smaller picture is better than a coarser one then. What comes out has the size that was sent, in the type and encoding
+that came in, or as one of three types of compressed pictures; ``scaled_camera_info`` fits a CameraInfo to it.
+
+Invariants: stamp and frame of the header stay; depth, and any encoding that is not in ``ENCODINGS``, is not made a
+picture (UnfitError); frames form a chain, and one that is missing is never concealed.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import av
+import numpy as np
+from av.video.reformatter import VideoReformatter
+
+from gr_ros2.codecs import video
+from gr_ros2.codecs.base import MAX_SIZE, Coded
+from gr_ros2.codecs.messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    PACKET,
+    VIDEO,
+    Origin,
+    header_of,
+    read,
+    stamp_of,
+    store,
+    take_text,
+    text,
+    write,
+)
+from gr_ros2.codecs.video import BLOCK, MAX_PIXELS, Pixels, VideoDecoder, VideoEncoder
+from gr_ros2.compression.zstd_frames import read_varint
+from gr_ros2.core.errors import ConfigError, DamagedError, UnfitError
+from gr_ros2.wire import varint
+
+LEAST_PER_BLOCK = 3
+"""Bytes."""
+ENCODINGS = {
+    "rgb8": ("rgb24", 3),
+    "bgr8": ("bgr24", 3),
+    "8UC3": ("bgr24", 3),
+    "rgba8": ("rgba", 4),
+    "bgra8": ("bgra", 4),
+    "mono8": ("gray", 1),
+    "8UC1": ("gray", 1),
+    "yuv422": ("uyvy422", 2),
+    "uyvy": ("uyvy422", 2),
+    "yuv422_yuy2": ("yuyv422", 2),
+    "yuyv": ("yuyv422", 2),
+    "bayer_rggb8": ("bayer_rggb8", 1),
+    "bayer_bggr8": ("bayer_bggr8", 1),
+    "bayer_gbrg8": ("bayer_gbrg8", 1),
+    "bayer_grbg8": ("bayer_grbg8", 1),
+}
+"""ROS's name of an encoding: FFmpeg's, and bytes of a pixel."""
+OUTPUTS = {"CompressedImage": COMPRESSED_IMAGE, "CompressedVideo": VIDEO, "FFMPEGPacket": PACKET}
+"""Types that come out where they are asked for."""
+SAME, AUTO, FULL = "same", "auto", "full"
+_USUAL_PER_BLOCK = 8
+"""Bytes where no budget is given."""
+_SLOWLY, _CLEARLY = 8, 1.5
+"""The size follows the mean of about so many budgets, once it would be wrong by this factor."""
+_SMALLEST = 64
+"""Pixels of the shorter side, below which no image is halved."""
+_FORM = 1
+
+
+@dataclass(frozen=True)
+class CameraCodec:
+    """See Codec.
+
+    :param size: 'auto', 'full', or the most pixels as '320x240'
+    :param output: 'same', or the type that comes out: CompressedImage, CompressedVideo or FFMPEGPacket
+    """
+
+    type_name: str
+    size: str = AUTO
+    output_type: str = SAME
+
+    def __post_init__(self) -> None:
+        if self.size not in (AUTO, FULL) and not re.fullmatch(r"[1-9]\d{0,4}x[1-9]\d{0,4}", self.size):
+            raise ConfigError(f"camera: size is {self.size!r}; it takes auto, full, or pixels such as 320x240")
+        if self.output_type != SAME and self.output_type not in OUTPUTS:
+            raise ConfigError(f"camera: output_type is {self.output_type!r}; it takes same, {', '.join(OUTPUTS)}")
+
+    def encoder(self) -> CameraEncoder:
+        """See Codec."""
+        return CameraEncoder(self)
+
+    def decoder(self, max_size: int = MAX_SIZE) -> CameraDecoder:
+        """See Codec."""
+        return CameraDecoder(self, max_size)
+
+    @property
+    def output(self) -> str:
+        """See Codec."""
+        return OUTPUTS.get(self.output_type, self.type_name)
+
+
+class _Picture(NamedTuple):
+    """:param label: encoding, or format of a compressed image"""
+
+    origin: Origin
+    frame: av.VideoFrame
+    label: str
+
+
+class CameraEncoder:
+    """See Encoder."""
+
+    def __init__(self, options: CameraCodec) -> None:
+        self._options = options
+        self._video = VideoEncoder(_FORM)
+        self._resize = VideoReformatter()
+        self._mean = 0.0
+        self._halved: int | None = None
+        self._of = (0, 0)
+
+    def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:
+        """See Encoder."""
+        picture = _compressed(message) if self._options.type_name == COMPRESSED_IMAGE else _image(message)
+        width, height = picture.frame.width, picture.frame.height
+        if budget is None:
+            budget = _USUAL_PER_BLOCK * _blocks(width, height)
+        halved = self._halvings(width, height, budget, key)
+        shown = _shown(width, height, halved)
+        frame = picture.frame
+        if frame.format.name.startswith("bayer") and halved:
+            frame = self._resize.reformat(frame, format="rgb24")
+        coded = self._resize.reformat(frame, _even(shown[0]), _even(shown[1]), "yuv420p", interpolation="AREA")
+        head = b"".join([*map(varint, shown), text(picture.label), text(picture.origin.frame_id)])
+        said = f"H.264 of {shown[0]} × {shown[1]} pixels" + f", of {width} × {height}" * bool(halved)
+        said += ", without alpha" * picture.label.endswith("a8")
+        return self._video.encode(coded, head, picture.origin.stamp(), budget, key)._replace(said=said)
+
+    def confirmed(self, name: int) -> None:
+        """See Encoder."""
+
+    def _halvings(self, width: int, height: int, budget: int, key: bool) -> int:
+        """How often each side is halved."""
+        sizes = [0]
+        while min(_shown(width, height, sizes[-1] + 1)) >= _SMALLEST:
+            sizes.append(sizes[-1] + 1)
+        if self._options.size == FULL:
+            return 0
+        if self._options.size != AUTO:
+            most = tuple(map(int, self._options.size.split("x")))
+            fitting = [n for n in sizes if all(a <= b for a, b in zip(_shown(width, height, n), most, strict=True))]
+            return fitting[0] if fitting else sizes[-1]
+        if self._halved is None or self._of != (width, height):
+            self._halved, self._of, self._mean, key = None, (width, height), budget, True
+        else:
+            self._mean += (budget - self._mean) / _SLOWLY
+
+        def needs(halved: int) -> int:
+            return LEAST_PER_BLOCK * _blocks(*_shown(width, height, halved))
+
+        wanted = next((n for n in sizes if needs(n) <= self._mean), sizes[-1])
+        if (
+            self._halved is None
+            or key
+            or (wanted > self._halved and needs(self._halved) > _CLEARLY * self._mean)
+            or (wanted < self._halved and needs(wanted) * _CLEARLY < self._mean)
+        ):
+            self._halved = wanted
+        return self._halved
+
+
+class CameraDecoder:
+    """See Decoder."""
+
+    def __init__(self, options: CameraCodec, max_size: int) -> None:
+        self._options, self._max_size = options, max_size
+        self._video = VideoDecoder(min(MAX_PIXELS, max_size) if options.output == IMAGE else MAX_PIXELS)
+        self._resize = VideoReformatter()
+
+    def decode(self, data: bytes) -> bytes:
+        """See Decoder."""
+        output = self._options.output
+        head, side, h264, picture, key = self._video.read(data, output not in (VIDEO, PACKET))
+        width, at = read_varint(head)
+        height, more = read_varint(head[at:])
+        label, rest = take_text(head[at + more :])
+        frame_id, _ = take_text(rest)
+        stamp = stamp_of(side)
+        if (_even(width), _even(height)) != self._video.size:
+            raise DamagedError(f"damaged video: {width} × {height} pixels are not what was coded")
+        header, content = header_of(stamp, frame_id), np.frombuffer(h264, np.uint8)
+        if output == VIDEO:
+            return self._small(write(VIDEO, timestamp=stamp, frame_id=frame_id, data=content, format="h264"))
+        if picture is None:
+            packet = {"width": _even(width), "height": _even(height), "encoding": "h264", "flags": int(key)}
+            ns = max(0, stamp.sec) * 1_000_000_000 + stamp.nanosec
+            return self._small(write(PACKET, header=header, pts=ns, is_bigendian=False, data=content, **packet))
+        if output == COMPRESSED_IMAGE:
+            jpeg = video.packed("mjpeg", self._resize.reformat(picture, width, height, "yuvj420p"))
+            content = np.frombuffer(jpeg, np.uint8)
+            return self._small(write(output, header=header, format=_jpeg_label(label), data=content))
+        rows = self._pixels(picture, width, height, label)
+        size = {"height": height, "width": width, "step": rows.shape[1]}
+        pixels = np.ascontiguousarray(rows).ravel()
+        return self._small(write(IMAGE, header=header, encoding=label, is_bigendian=0, data=pixels, **size))
+
+    def _pixels(self, picture: av.VideoFrame, width: int, height: int, label: str) -> Pixels:
+        """The rows of an image in an encoding."""
+        if label not in ENCODINGS:
+            raise DamagedError(f"damaged video: encoding {label[:40]!r}")
+        kind, size = ENCODINGS[label]
+        if width * height * size > self._max_size:
+            raise DamagedError(f"damaged video: {width} × {height} pixels, at most {self._max_size} bytes are accepted")
+        if not kind.startswith("bayer"):
+            return video.to_rows(self._resize.reformat(picture, width, height, kind), width * size)
+        colours = video.to_rows(self._resize.reformat(picture, width, height, "rgb24"), 3 * width)
+        return _mosaic(colours.reshape(height, width, 3), label)
+
+    def _small(self, message: bytes) -> bytes:
+        if len(message) > self._max_size:
+            raise DamagedError(f"damaged video: a message of {len(message)} bytes, at most {self._max_size}")
+        return message
+
+
+def scaled_camera_info(message: bytes, width: int, height: int) -> bytes:
+    """A CameraInfo for the image after resizing; the same bytes where it has that size already.
+
+    Pixel (u, v) of the original has its centre at ((u + .5) · width / original width - .5, …) of the new one.
+
+    :param width, height: pixels of the new image
+    :raises DamagedError: not a CameraInfo
+    """
+    info = read(CAMERA_INFO, message)
+    if (info.width, info.height) == (width, height) or not info.width or not info.height:
+        return message
+    across, down = width / info.width, height / info.height
+    scale = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
+    info.k = (scale @ info.k.reshape(3, 3)).ravel()
+    info.p = (scale @ info.p.reshape(3, 4)).ravel()
+    roi = info.roi
+    roi.x_offset, roi.width = round(roi.x_offset * across), round(roi.width * across)
+    roi.y_offset, roi.height = round(roi.y_offset * down), round(roi.height * down)
+    info.width, info.height = width, height
+    return bytes(store().serialize_cdr(info, CAMERA_INFO))
+
+
+def _image(message: bytes) -> _Picture:
+    image = read(IMAGE, message)
+    if image.encoding not in ENCODINGS:
+        raise UnfitError(f"image: encoding {image.encoding!r} is not one of pictures: {', '.join(ENCODINGS)}")
+    kind, size = ENCODINGS[image.encoding]
+    return _Picture(Origin(image.header), video.from_rows(rows_of(image, size), image.width, kind), str(image.encoding))
+
+
+def rows_of(image: Any, size: int) -> Pixels:
+    """The bytes of an image, shape (height, step).
+
+    :param size: bytes of a pixel
+    :raises DamagedError: when they do not fit its size
+    :raises UnfitError: for more than ``MAX_PIXELS``
+    """
+    fits = image.width and image.height and image.step >= image.width * size
+    if not fits or len(image.data) < image.step * image.height:
+        raise DamagedError(
+            f"damaged image: {image.width} × {image.height} pixels {image.encoding}, rows of {image.step} bytes, do "
+            f"not fit its {len(image.data)} bytes"
+        )
+    if image.width * image.height > MAX_PIXELS:
+        raise UnfitError(f"image: {image.width} × {image.height} pixels are more than {MAX_PIXELS}")
+    rows: Pixels = image.data[: image.step * image.height].reshape(image.height, image.step)
+    return rows
+
+
+def _compressed(message: bytes) -> _Picture:
+    image = read(COMPRESSED_IMAGE, message)
+    data = bytes(image.data)
+    codec = {b"\xff\xd8": "mjpeg", b"\x89P": "png"}.get(data[:2])
+    if codec is None or "compressedDepth" in image.format:
+        raise UnfitError(f"image: format {image.format!r} is not JPEG or PNG")
+    picture = video.still(codec, data)
+    if "16" in picture.format.name or "48" in picture.format.name or "64" in picture.format.name:
+        raise UnfitError(f"image: a picture of 16 bits for each colour ({picture.format.name})")
+    return _Picture(Origin(image.header), picture, str(image.format))
+
+
+def _mosaic(colours: Pixels, label: str) -> Pixels:
+    """Of each pixel the colour that its place in a Bayer pattern has."""
+    made = np.empty(colours.shape[:2], np.uint8)
+    for place, letter in enumerate(label.removeprefix("bayer_")[:4]):
+        row, column = divmod(place, 2)
+        made[row::2, column::2] = colours[row::2, column::2, "rgb".index(letter)]
+    return made
+
+
+def _jpeg_label(label: str) -> str:
+    """What a compressed image says of itself: as it came, or as image_transport says it."""
+    if "jp" in label:
+        return label
+    return label.replace("png", "jpeg") if "png" in label else f"{label}; jpeg compressed bgr8"
+
+
+def _blocks(width: int, height: int) -> int:
+    return -(-width // BLOCK) * -(-height // BLOCK)
+
+
+def _shown(width: int, height: int, halved: int) -> tuple[int, int]:
+    return -(-width // (1 << halved)), -(-height // (1 << halved))
+
+
+def _even(pixels: int) -> int:
+    return pixels + pixels % 2
