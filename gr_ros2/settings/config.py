@@ -59,7 +59,9 @@ DomainId = Annotated[int, Field(ge=0, le=232)]
 SampleRate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=2**31 - 1)]
-"""Of what DDS, GNU Radio and random generators take as a signed number of 32 bits."""
+"""Of what DDS and GNU Radio take as a signed number of 32 bits."""
+Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
+"""More than a person writes: parts of a run add to the seed of the run."""
 Bytes = Annotated[int, Field(ge=4096, le=2**40)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Decibels = Annotated[float, Field(ge=-500, le=500, allow_inf_nan=False)]
@@ -91,7 +93,7 @@ class Traffic:
 
     source: str = "sim"
     duration_s: Seconds = 15.0
-    seed: Count = 0
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _sim_or_bag(self) -> Traffic:
@@ -462,7 +464,7 @@ class ChannelConfig:
     packet_loss: Annotated[Probability, Field(title="Packet loss (share of packets)")] = 0.0
     burst_loss: BurstLoss | None = None
     outages: tuple[tuple[Seconds, Seconds], ...] = ()
-    seed: Annotated[int, Field(ge=0, le=2**41)] = 0
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _outages_in_order(self) -> ChannelConfig:

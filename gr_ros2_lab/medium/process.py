@@ -41,11 +41,11 @@ from gr_ros2.radio.zmq import HEADER, MAGIC, SAMPLE, Address, OwnAddress, open_s
 from gr_ros2.settings.config import (
     LEVELS,
     STRICT,
-    Count,
     Decibels,
     PacketLen,
     PhyConfig,
     ScenarioChannel,
+    Seed,
     Text,
     Transceiver,
     build,
@@ -106,7 +106,7 @@ class MediumConfig:
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
     channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
     time: Literal["lockstep", "real"] = "lockstep"
-    seed: Count = 0
+    seed: Seed = 0
     conditions: ClassVar = LEVELS
 
     @model_validator(mode="after")

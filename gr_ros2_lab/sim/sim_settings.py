@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.settings.config import Count
+from gr_ros2.settings.config import Seed
 
 Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
 Noise = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
@@ -46,7 +46,7 @@ class SimSettings:
     :param transforms: robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries
     """
 
-    seed: Count = 0
+    seed: Seed = 0
     robots: Annotated[int, Field(ge=1, le=255)] = 2
     size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
     obstacles: Annotated[int, Field(ge=0, le=100)] = 12
