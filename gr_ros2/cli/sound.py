@@ -88,12 +88,9 @@ def said(found: SoundMeasured) -> list[str]:
     if found.echo_s is not None and found.direct_db is not None:
         lines.append(f"echo time (RT60) {found.echo_s:.2f} s, direct sound over echoes {found.direct_db:.0f} dB")
     dry = found.echo_s is None or found.echo_s < _DRY_S
-    lines.append(
-        _expected("sound")
-        if dry
-        else "this room echoes longer than preset sound is made for; take --radio sound with phy lora "
-        "(docs/how-to/sound.md)"
-    )
+    if not dry:
+        lines.append("this room echoes longer than preset sound is made for")
+    lines.append(_expected("sound" if dry else "hall"))
     return lines
 
 

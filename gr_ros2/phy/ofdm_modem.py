@@ -9,6 +9,7 @@ code the payload has.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,10 @@ from gr_ros2.phy.soft import Points
 _FALSE_ALARM = 1e-3
 """Share of noise samples that are examined closely."""
 _ALIKE = 0.2
-"""Threshold of the normalised correlation of the sync words; noise passes once in 10^5 examinations."""
+"""Threshold of the share of the power that arrives over one path; noise passes once in 10^5 examinations."""
+_SPREAD_ALARM = 2e-7
+"""Share of examinations of noise, for each carrier offset tried, in which the carriers of the two sync words are turned
+alike. So a burst is found whose energy no single path holds, as in a room."""
 _SHIFTS = (-4, -2, 0, 2, 4)
 """Carrier offsets that are tried, in addition to the fractional offset that the repeated half symbol gives."""
 _CHUNK = 16
@@ -37,12 +41,11 @@ _FILL_MARK = 0x555
 
 
 class _FramePlace(NamedTuple):
-    """Position of a burst: first sample, carrier offset in radians per sample, and the share of sync words in the
-    power, 0..1."""
+    """Position of a burst: first sample, carrier offset in radians per sample, and whether its sync words are there."""
 
     begin: int
     frequency: float
-    alike: float
+    found: bool
 
 
 class _SymbolClock(NamedTuple):
@@ -125,6 +128,8 @@ class OfdmModem(BurstModem):
         self._turns = turns
         self._repeat = 1 - 2 * int(even[0] % 2)
         """Sign with which the second half of the first sync word repeats the first: its carriers are even or odd."""
+        self._even = even
+        self._together = sqrt(1 - _SPREAD_ALARM ** (1 / (len(even) - 1)))
         self._whole = words.conj().astype(np.complex64)
         self._energy = float((np.abs(words) ** 2).sum())
 
@@ -188,7 +193,7 @@ class OfdmModem(BurstModem):
             ratio = alike[first : first + self._symbol] / (power[first : first + self._symbol] + _TINY)
             best = first + int(np.argmax(ratio))
             place = self._place(samples, best)
-            if place.alike > _ALIKE:
+            if place.found:
                 return Search(max(0, min(first, place.begin)), place.begin)
             at = int(np.searchsorted(above, best + 1))
         return Search(positions)
@@ -251,6 +256,8 @@ class OfdmModem(BurstModem):
             "point_bits": [each.bits for each in constellations],
             "level": self._level,
             "alike": _ALIKE,
+            "together": self._together,
+            "even_count": len(self._even),
             "energy": self._energy,
             "power": self._power,
             "pace_gain": _PACE_GAIN,
@@ -277,7 +284,7 @@ class OfdmModem(BurstModem):
         first = max(0, at + self._prefix - self._back)
         part = samples[first : first + self._symbol + self._size]
         if len(part) < self._symbol + self._size:
-            return _FramePlace(at, frequency, 0.0)
+            return _FramePlace(at, frequency, False)
         part = part * np.exp(-1j * frequency * np.arange(len(part)))
         spectra = np.fft.fft(np.stack((part[: self._size], part[self._symbol :])))
         shift = _SHIFTS[int(np.argmax(np.abs(self._turns @ (spectra[0].conj() * spectra[1]))))]
@@ -287,13 +294,22 @@ class OfdmModem(BurstModem):
             # A carrier shift leaves the rotation of the carriers between the two symbols.
             spectra[1] *= np.exp(-2j * np.pi * shift * self._symbol / self._size)
         gains = spectra * self._whole
+        products = (gains[1] * gains[0].conj())[self._even]
         turn = float(np.angle(np.vdot(gains[0], gains[1])))
         profile = np.abs(np.fft.ifft(gains[0] + gains[1] * np.exp(-1j * turn)))
         peak = int(np.argmax(profile))
         power = float(np.vdot(spectra, spectra).real)
         alike = float((profile[peak] * self._size) ** 2) / max(power * self._energy, _TINY)
+        found = alike > _ALIKE
+        if not found:
+            # The phases alone, so that a tone does not pass for a burst.
+            together = abs((products / (np.abs(products) + _TINY)).sum()) / len(products)
+            found = bool(together > self._together)
+            # The prefix begins with the paths that together hold the most.
+            sums = np.cumsum(np.concatenate(([0], np.tile(profile**2, 2))))
+            peak = int(np.argmax(sums[self._prefix :][: self._size] - sums[: self._size])) + self._back
         late = (peak + self._half) % self._size - self._half
-        return _FramePlace(first - self._prefix + late, frequency + turn / self._symbol, alike)
+        return _FramePlace(first - self._prefix + late, frequency + turn / self._symbol, found)
 
     def _rows(
         self, samples: Samples, clock: _SymbolClock, frequency: float, symbol: int, count: int

@@ -139,6 +139,15 @@ PRESETS: Mapping[str, Preset] = {
         64,
         medium="slots",
     ),
+    "hall": Preset(
+        "audio",
+        "loudspeakers and microphones some metres apart, or where echoes are louder than the direct sound: slow",
+        {"half_duplex": True, "turnaround_s": 0.3},
+        {**_ROOM, "fft_len": 512, "cp_len": 256},
+        64,
+        sample_rate=3e3,
+        medium="slots",
+    ),
     "voice": Preset(
         "audio",
         "the audio socket of a voice radio, FM or SSB, keyed by sound (VOX) unless front_end.ptt says how",

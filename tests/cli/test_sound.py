@@ -43,7 +43,7 @@ def test_a_loudspeaker_that_the_microphone_hears(tmp_path: Path) -> None:
     [
         ({"clipped": 0.2}, "clipped"),
         ({"level_db": -60.0}, "weak"),
-        ({"echo_s": 1.2}, "phy lora"),
+        ({"echo_s": 1.2}, "--radio hall fits"),
         ({"heard": False}, "not heard"),
     ],
 )

@@ -176,6 +176,33 @@ def test_echoes_before_and_after_the_strongest_path(modulation: str) -> None:
     assert deliver(phy, recording, ChannelConfig(snr_db=30, taps=taps, seed=1)) == recording.packets
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_room_in_which_no_path_holds_a_fifth_of_the_energy(seed: int, compiled: bool) -> None:
+    phy = OfdmPhy(64, 3000, payload_modulation="bpsk", fec="cc", fft_len=512, cp_len=256, scramble=True)
+    rng, said = np.random.default_rng(seed), packets(64, 4)
+    pause = np.zeros(phy.gap + 2000, np.complex64)
+    sent = np.concatenate([part for packet in said for part in (pause, phy.modem.modulate(packet))] + [pause])
+    at = np.arange(1200) / 3000  # RT60 of .4 s, and no direct sound
+    room = (rng.normal(size=1200) + 1j * rng.normal(size=1200)) * 10 ** (-3 * at / 0.4)
+    room /= np.linalg.norm(room)
+    assert (np.abs(room) ** 2).max() < 0.2
+    noise = rng.normal(size=(2, len(sent) + 1199)) * np.sqrt(np.mean(np.abs(sent) ** 2) / 2) * 10 ** (-20 / 20)
+    heard = (np.convolve(sent, room) + noise[0] + 1j * noise[1]).astype(np.complex64)
+    receiver = (phy.running_modem if compiled else phy.modem).receiver()
+    came = [found.data for first in range(0, len(heard), 4096) for found in receiver.feed(heard[first : first + 4096])]
+    assert came == said
+
+
+def test_noise_and_tones_are_no_burst() -> None:
+    phy = OfdmPhy(64, 1e6, fft_len=256, cp_len=128)
+    rng, at = np.random.default_rng(1), np.arange(1 << 20)
+    noise = (rng.normal(size=1 << 20) + 1j * rng.normal(size=1 << 20)).astype(np.complex64)
+    tones = sum(np.exp(1j * (step * at + step)) for step in (0.1, 0.73, 2.2, -1.3)) * 10
+    for samples in (noise, noise + tones.astype(np.complex64)):
+        assert phy.running_modem.find(samples).start is None
+
+
 def test_nothing_is_lost_without_noise_wherever_a_packet_begins() -> None:
     """Single packets, each after any length of silence: the stock receiver at a low threshold loses 1 in 3000."""
     phy = OfdmPhy(64, 1e6)

@@ -83,9 +83,7 @@ def test_files_are_compared_without_hearing_the_other_end(tmp_path: Path) -> Non
     swapped = {**uhd, "frequency": 434.4e6, "frequency_rx": 433.2e6}
     assert compared(here, config(2, swapped)) == []
     assert "sends at 433200000.0 Hz" in compared(here, config(2, uhd))[0]
-    wrong = config(
-        1, swapped, packet_len=80, key=key(tmp_path, "other"), phy={"name": "psk", "sample_rate": 1e6}
-    )
+    wrong = config(1, swapped, packet_len=80, key=key(tmp_path, "other"), phy={"name": "psk", "sample_rate": 1e6})
     found = " ".join(compared(here, wrong))
     for said in ("packet_len is 80 there", "phy has other settings", "key ", "both are robot 1"):
         assert said in found

@@ -168,9 +168,7 @@ def accesses(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Access, float]]:
 def test_the_guard_is_what_the_front_end_may_be_late_by(accesses: list[tuple[Access, float]]) -> None:
     (port,) = free_ports(1, socket.SOCK_DGRAM)
     options = {"name": "udp", "listen": f"127.0.0.1:{port}", "send_to": ["127.0.0.1:9"]}
-    link = RobotLink(
-        config(1, options, medium="slots", phy={"name": "modem", "options": {"bit_rate": 9600}})
-    )
+    link = RobotLink(config(1, options, medium="slots", phy={"name": "modem", "options": {"bit_rate": 9600}}))
     try:
         ((access, slot_s),) = accesses
         assert isinstance(access, Slots)

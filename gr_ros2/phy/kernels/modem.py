@@ -47,8 +47,8 @@ KERNELS: dict[str, tuple[int, Fields]] = {
         0,
         _fields(
             int32="shortest longest mcs_count counted size prefix repeat degrees chunk carrier_count data_count "
-            "pilot_count once_count twice_count shift_count",
-            float64="level alike energy power pair_weight word_weight_sum pace_gain memory reach doubt",
+            "pilot_count once_count twice_count shift_count even_count",
+            float64="level alike together energy power pair_weight word_weight_sum pace_gain memory reach doubt",
             int32s="frame_bits point_counts point_bits carriers data pilots once twice shifts",
             complex64s="words known turns whole smooth smooth_words crosswise points",
             float32s="word_weight",

@@ -15,7 +15,8 @@ constexpr double kFar = 1e6;         // samples that no burst can be late
 
 struct Place {
     int64_t begin;
-    double frequency, alike;
+    double frequency;
+    bool found;
 };
 
 struct Clock {
@@ -144,7 +145,7 @@ class Ofdm final : public Modem {
                 }
             }
             const Place place = look(samples, best, s);
-            if (place.alike > p_.alike) return {std::max<int64_t>(0, std::min(first, place.begin)), place.begin};
+            if (place.found) return {std::max<int64_t>(0, std::min(first, place.begin)), place.begin};
             at = best + 1;
         }
         return {positions, kNone};
@@ -332,7 +333,7 @@ class Ofdm final : public Modem {
         double frequency = std::atan2(p_.repeat * im, p_.repeat * re) / half_;
         const int64_t first = at + p_.prefix - back_;
         const int size = p_.size;
-        if (samples.count - first < symbol_ + size) return {at, frequency, 0.0};
+        if (samples.count - first < symbol_ + size) return {at, frequency, false};
         Sample *one = s.first.data(), *two = s.second.data(), *profile = s.profile.data();
         Rotation(0, -frequency).fill(s.rotation.data(), size);
         const Sample between = unit(-frequency * symbol_);
@@ -362,6 +363,7 @@ class Ofdm final : public Modem {
             for (int k = 0; k < size; k++) two[k] = mul(two[k], rest);
         }
         float power = 0;
+        Sample phases = 0;
         re = im = 0;
         for (int k = 0; k < size; k++) {
             power += square(one[k]) + square(two[k]);
@@ -370,6 +372,7 @@ class Ofdm final : public Modem {
             const Sample p = mul_conj(two[k], one[k]);
             re += p.real();
             im += p.imag();
+            if (whole_[k] != Sample()) phases += p / (std::abs(p) + static_cast<float>(kTiny));
         }
         const double angle = std::atan2(im, re);
         const Sample straight = unit(-angle);
@@ -377,10 +380,25 @@ class Ofdm final : public Modem {
         for (int k = 0; k < size; k++) profile[k] = std::conj(one[k] + mul(two[k], straight));
         fft_.run(profile, s.spare.data());
         squares(profile, size, s.heights.data());
-        const int peak = argmax(s.heights.data(), size);
+        int peak = argmax(s.heights.data(), size);
         const double alike = s.heights[peak] / std::max(static_cast<double>(power) * p_.energy, kTiny);
+        bool found = alike > p_.alike;
+        if (!found) {
+            // The phases alone, so that a tone does not pass for a burst.
+            found = std::abs(phases) > p_.together * p_.even_count;
+            // The prefix begins with the paths that together hold the most.
+            double sum = 0, most = -1;
+            for (int k = 0; k < p_.prefix; k++) sum += s.heights[k];
+            for (int k = 0; k < size; k++) {
+                if (sum > most) {
+                    most = sum;
+                    peak = k + back_;
+                }
+                sum += static_cast<double>(s.heights[(k + p_.prefix) % size]) - s.heights[k];
+            }
+        }
         const int late = (peak + half_) % size - half_;
-        return {first - p_.prefix + late, frequency + angle / symbol_, std::isfinite(power) ? alike : 0.0};
+        return {first - p_.prefix + late, frequency + angle / symbol_, found && std::isfinite(power)};
     }
 
     // Used carriers of some of a burst's symbols, into `rows`.
