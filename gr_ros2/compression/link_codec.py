@@ -81,7 +81,6 @@ class LinkCodec:
             self.add(topic)
 
     def add(self, topic: Topic) -> None:
-        """See MessageCodec."""
         key = (topic.type_name, topic.options.codec, topic.options.quantize)
         if key not in self._made:
             self._made[key] = TopicCodec(topic, self._sets, self._max_size)
@@ -101,7 +100,7 @@ class LinkCodec:
         return made
 
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
-        """See MessageCodec. A type that cannot be split is coded as before."""
+        """Use a type's definition from now on. A type that cannot be split is coded as before."""
         tree = tree_of(definitions, type_name)
         if tree is None:
             return
@@ -110,11 +109,9 @@ class LinkCodec:
                 codec.learn(tree)
 
     def announcement(self, topic_id: int) -> str:
-        """See MessageCodec."""
         return self._topics[topic_id].announcement
 
     def lacks(self, topic_id: int, coded: bytes) -> bool:
-        """See MessageCodec."""
         return self._topics[topic_id].lacks(coded)
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
@@ -172,7 +169,6 @@ class TopicCodec:
             self._quantize(self._steps, topic)
 
     def learn(self, tree: Composite) -> None:
-        """See LinkCodec."""
         text = write_structure(tree)
         known = [coders for coders in self._choices if coders.tree is not None and write_structure(coders.tree) == text]
         if known:
@@ -204,11 +200,9 @@ class TopicCodec:
         return made
 
     def lacks(self, coded: bytes) -> bool:
-        """See MessageCodec."""
         return bool(coded) and coded[0] >> 4 == ANNOUNCED and bytes([ANNOUNCED]) + coded[1:3] not in self._held
 
     def encode(self, payload: bytes) -> bytes:
-        """See LinkCodec."""
         payload = self.canonical(payload)
         if self._mode == "none" or len(payload) > self._max_size:
             return b"\0" + payload
@@ -226,7 +220,6 @@ class TopicCodec:
         return coded if len(coded) <= len(payload) else b"\0" + payload
 
     def decode(self, coded: bytes) -> bytes:
-        """See LinkCodec."""
         if not coded:
             raise DamagedError("damaged message: it is empty")
         number, codec = coded[0] >> 4, coded[0] & 15
@@ -255,7 +248,7 @@ class TopicCodec:
         return coders.fields.decode(body, codec == FIELDS_AND_MORE, max_size)
 
     def canonical(self, payload: bytes) -> bytes:
-        """See LinkCodec. A message that the configuration stores uncoded keeps its gaps."""
+        """The message that comes out at the other end. One that the configuration stores uncoded keeps its gaps."""
         if len(payload) > self._max_size:
             return payload
         coders = self._fitting(payload)

@@ -43,11 +43,9 @@ class Aloha:
 
     @property
     def turn_s(self) -> float:
-        """See :class:`gr_ros2.link.access.Access`."""
         return max(self._every, self._airtime)
 
     def departure(self, now: float) -> float:
-        """See :class:`gr_ros2.link.access.Access`."""
         if self._next is None:
             robots = sum(at > now - HEARD * self._airtime for at in self._heard.values())
             missing = math.exp(-2 * LOAD) - self._packets / robots if robots else 1.0
@@ -58,7 +56,7 @@ class Aloha:
         return self._next
 
     def block(self, weight: int = 1) -> bytes | None:  # noqa: ARG002
-        """See :class:`gr_ros2.link.access.Access`. ALOHA says nothing to others."""
+        """No bytes: ALOHA says nothing to others."""
         self._next = None
         return b""
 
@@ -71,7 +69,6 @@ class Aloha:
         trusted: bool = True,
         checked: bool = False,  # noqa: ARG002
     ) -> None:
-        """See :class:`gr_ros2.link.access.Access`."""
         if trusted and src_id != self.src_id:
             self._heard[src_id] = began
             self._packets += 1

@@ -164,11 +164,10 @@ class Slots:
 
     @property
     def turn_s(self) -> float:
-        """See :class:`gr_ros2.link.access.Access`."""
         return self._every * self.clock.slot_s
 
     def departure(self, now: float) -> float:
-        """See :class:`gr_ros2.link.access.Access`. A host that is too late for a slot takes the next one."""
+        """When the next own slot begins, s. A host that is too late for a slot takes the next one."""
         if self._since is None:
             self._since = now
         ready, listened = now + self.lead_s, self._listened
@@ -191,7 +190,6 @@ class Slots:
         return self._since + LISTEN * self.clock.slot_s
 
     def block(self, weight: int = 1) -> bytes | None:
-        """See :class:`gr_ros2.link.access.Access`."""
         self._weight = weight
         if not self._mine:  # asked ahead of the end of its silence: nobody is there whose slots it could take
             self.clock.start(self._listened)
@@ -338,7 +336,7 @@ class Slots:
     def hear(
         self, src_id: int, block: Block | None, began: float, *, trusted: bool = True, checked: bool = False
     ) -> None:
-        """See :class:`gr_ros2.link.access.Access`. Who says nothing about slots cannot be avoided."""
+        """Note a burst. Who says nothing about slots cannot be avoided."""
         if block is None or src_id == self.src_id or not (trusted or checked or not self.clock.agreeing(began)):
             return
         slot = self._placed(src_id, block.slot, began, trusted=trusted, checked=checked)

@@ -151,7 +151,7 @@ class TwoTimes(McapWriter):
         self._sent: list[tuple[int, int]] = []
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
-        """See rosbags; with the hash of the type, as rosbag2 writes it."""
+        """Add a connection as rosbags does, with the hash of its type as rosbag2 writes it."""
         at = self.chunk.bio.tell()
         super().add_connection(connection, offered_qos_profiles)
         settings = BytesIO(self.channels[-1].metadata)

@@ -60,7 +60,7 @@ class FoundEndpoints:
                     yield (*service, reader.is_cyclone)
 
     def witnesses(self, topic: str, type_name: str) -> list[Witness]:
-        """See :meth:`gr_ros2.middleware.services.ServiceGraph.witnesses`."""
+        """The nodes of Cyclone DDS that can describe a type."""
         name, kind = ros_graph.dds_topic(topic), ros_graph.dds_type(type_name)
         hashes: dict[str, set[bytes]] = {}
         services: dict[bytes, list[str]] = {}

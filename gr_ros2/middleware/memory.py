@@ -84,7 +84,7 @@ _graphs_lock = threading.Lock()
 
 
 class MemoryPublisher(Publisher):
-    """See :class:`gr_ros2.middleware.base.Publisher`."""
+    """Hands messages to the subscriptions of its domain."""
 
     def __init__(self, middleware: MemoryMiddleware, topic: str, type_name: str, qos: Qos) -> None:
         self.middleware = middleware
@@ -122,7 +122,7 @@ class MemoryPublisher(Publisher):
 
 
 class MemorySubscription(QueuedSubscription):
-    """See :class:`gr_ros2.middleware.delivery.QueuedSubscription`."""
+    """A queue that publishers of its domain fill."""
 
     def __init__(
         self, middleware: MemoryMiddleware, topic: str, type_name: str, qos: Qos, callback: MessageCallback

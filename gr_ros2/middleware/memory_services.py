@@ -59,7 +59,7 @@ class _MemoryEnd:
 
 
 class MemoryServer(_MemoryEnd, ServiceServer):
-    """See :class:`gr_ros2.middleware.services.ServiceServer`."""
+    """A service within the process."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class MemoryServer(_MemoryEnd, ServiceServer):
 
 
 class MemoryClient(_MemoryEnd, ServiceClient):
-    """See :class:`gr_ros2.middleware.services.ServiceClient`."""
+    """A client within the process."""
 
     def __init__(
         self,

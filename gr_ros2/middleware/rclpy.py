@@ -235,7 +235,7 @@ class RclpyMiddleware(RclpyParticipant):
         return sorted(found, key=lambda info: (info.topic, info.type_name))
 
     def discover_services(self) -> dict[str, str]:
-        """See services. ROS does not tell servers from clients here. Of several types, the first is taken."""
+        """Name and type of each service. ROS tells no servers from clients. Of several types the first is taken."""
         self.check_open()
         nodes = [self._node, *(node for node, _ in tuple(self._shown.values()))]
         own = {service.srv_name for node in nodes for service in node.services}
@@ -244,7 +244,7 @@ class RclpyMiddleware(RclpyParticipant):
         return {name: type_names[0] for name, type_names in found if type_names and name not in own}
 
     def witnesses(self, topic: str, type_name: str) -> list[Witness]:
-        """See services. rclpy gives type hashes since Jazzy."""
+        """Who can describe a type. rclpy gives type hashes since Jazzy."""
         self.check_open()
         node = self._node
         with translated(f"endpoints of {topic} cannot be read"):
@@ -347,7 +347,6 @@ class RclpyMiddleware(RclpyParticipant):
             getattr(self._node, f"destroy_{kind}")(endpoint)
 
     def in_executor(self, work: Callable[[], None]) -> None:
-        """See :meth:`RclpyExecutor.run`."""
         self._executor.run(work)
 
     def forget(self, subscription: _RclpySubscription) -> None:

@@ -82,7 +82,7 @@ class RclpyParticipant(ServiceGraph):
 
 
 class RclpyServer(ServiceServer):
-    """See :class:`gr_ros2.middleware.services.ServiceServer`."""
+    """A service on the graph of rclpy."""
 
     def __init__(
         self, participant: RclpyParticipant, service: str, type_name: str, on_request: RequestCallback, node: str = ""
@@ -121,7 +121,7 @@ class RclpyServer(ServiceServer):
 
 
 class RclpyClient(ServiceClient):
-    """See :class:`gr_ros2.middleware.services.ServiceClient`. ``look`` has to be called again and again."""
+    """A client on the graph of rclpy. ``look`` has to be called again and again."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class RclpyClient(ServiceClient):
         self._endpoint = participant.make("client", self._type, service)
 
     def look(self) -> None:
-        """See whether a server is there. In the executor's thread."""
+        """Look whether a server is there. In the executor's thread."""
         if self._closed:
             return
         available = bool(self._endpoint.service_is_ready())

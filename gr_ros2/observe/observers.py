@@ -185,7 +185,6 @@ class RunObservers(Observers[RunObserver]):
         self.instruments = any(observer.instruments for observer, _ in self._guarded)
 
     def run_started(self, run: LiveRun) -> None:
-        """See :class:`RunObserver`."""
         for observer, guard in self._guarded:
             guard(observer.run_started, run)
 
@@ -196,7 +195,7 @@ class RunObservers(Observers[RunObserver]):
             observer.settle()
 
     def run_ended(self, result: RunResult | None) -> None:
-        """See :class:`RunObserver`. No call follows this one."""
+        """The run is over. No call follows this one."""
         for observer, guard in self._guarded:
             guard.last(observer.run_ended, result)
 

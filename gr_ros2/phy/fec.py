@@ -79,16 +79,13 @@ class GnuRadioDecoders:
     """GNU Radio's decoders. They hold Python's lock while they work."""
 
     def convolutional(self, bits: int) -> Decoder:
-        """See :class:`Decoders`."""
         arguments = (bits, _CONSTRAINT, 2, list(POLYNOMIALS), 0)
         return partial(_work, _fec().cc_decoder.make(*arguments, -1, _fec().CC_TERMINATED, False), size=bits)
 
     def ldpc(self, path: Path, room: int) -> Decoder:
-        """See :class:`Decoders`."""
         return partial(_work, _ldpc_decoder(str(path)), size=room)
 
     def polar(self, size: int, frozen: list[int]) -> Decoder:
-        """See :class:`Decoders`."""
         room = size - len(frozen)
         return partial(_work, _fec().polar_decoder_sc.make(size, room, frozen, [0] * len(frozen)), size=room)
 

@@ -181,7 +181,7 @@ class ReceiverBlock(HierBlock):
         return None
 
     def follow_clock(self, offset: Callable[[], float]) -> None:
-        """See :class:`gr_ros2.phy.base.PacketReceiver`."""
+        """Do nothing: these blocks tell no times of bursts."""
 
     def tap_symbols(self) -> SymbolSource | None:
         """Make the received constellation points visible."""

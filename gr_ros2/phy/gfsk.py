@@ -41,7 +41,7 @@ class GfskOptions(LinearOptions):
 
 
 class GfskModem(LinearModem):
-    """See :class:`GfskOptions`."""
+    """GMSK, received coherently as a sequence of pulses."""
 
     def __init__(self, frames: Frames, options: GfskOptions) -> None:
         super().__init__(frames, 2, options.sps, turn=np.pi / 2)

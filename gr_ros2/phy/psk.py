@@ -33,7 +33,7 @@ class PskOptions(LinearOptions):
 
 
 class PskModem(LinearModem):
-    """See :class:`PskOptions`."""
+    """A single carrier with root-raised cosine pulses."""
 
     def __init__(self, frames: Frames, options: PskOptions) -> None:
         super().__init__(frames, _ORDER[options.modulation], options.sps)

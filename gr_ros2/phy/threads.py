@@ -213,12 +213,10 @@ class KeepsThreadState:
         return ThreadState()
 
     def start(self) -> bool:
-        """See ``gr.block``."""
         self._thread_state.keep()
         return True
 
     def stop(self) -> bool:
-        """See ``gr.block``."""
         self._thread_state.release()
         return True
 

@@ -55,7 +55,7 @@ class FileOptions(FrontEndOptions):
 
 
 class FileFrontEnd(FrontEnd):
-    """See :class:`FileOptions`."""
+    """Bursts into a recording, and a recording as what is received."""
 
     name = "file"
     Options = FileOptions

@@ -42,7 +42,7 @@ class KissOptions(StreamOptions):
 
 
 class KissFrontEnd(StreamFrontEnd):
-    """See :class:`KissOptions`."""
+    """Packets as frames of KISS."""
 
     name = "kiss"
     timing_error_s = 0.1

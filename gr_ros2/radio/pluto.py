@@ -69,7 +69,7 @@ class PlutoOptions(DeviceOptions):
 
 
 class PlutoFrontEnd(DeviceFrontEnd):
-    """See :class:`PlutoOptions` and :class:`DeviceOptions`; ``args`` is the URI, ``ip:192.168.2.1`` or ``usb:``."""
+    """Bursts to and from an ADALM-Pluto."""
 
     name = "pluto"
     Options = PlutoOptions

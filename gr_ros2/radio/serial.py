@@ -29,7 +29,7 @@ class SerialOptions(StreamOptions):
 
 
 class SerialFrontEnd(StreamFrontEnd):
-    """See :class:`SerialOptions`."""
+    """Packets as frames on a serial line."""
 
     name = "serial"
     Options = SerialOptions

@@ -14,7 +14,7 @@ from gr_ros2.radio.front_end import FrontEnd
 
 
 class SimFrontEnd(FrontEnd):
-    """See the module. The channel model belongs to the link; its settings are under ``channel``."""
+    """The transmitter's samples as what is received. The channel model between them belongs to the link."""
 
     name = "sim"
     loops_back = True

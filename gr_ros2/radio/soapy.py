@@ -17,7 +17,7 @@ _CHANNEL = 0
 
 
 class SoapyFrontEnd(DeviceFrontEnd):
-    """See :class:`DeviceOptions`; ``args`` as in ``driver=hackrf,serial=…``."""
+    """Bursts to and from a device of SoapySDR."""
 
     name = "soapy"
     example_args = "driver=hackrf,serial=0123"

@@ -59,7 +59,7 @@ class UdpOptions(SharedAir):
 
 
 class UdpFrontEnd(PacketFrontEnd):
-    """See :class:`UdpOptions`."""
+    """Packets as datagrams."""
 
     name = "udp"
     Options = UdpOptions

@@ -38,7 +38,7 @@ class UhdOptions(DeviceOptions):
 
 
 class UhdFrontEnd(DeviceFrontEnd):
-    """See :class:`UhdOptions` and :class:`DeviceOptions`; ``args`` as in ``type=b200`` or ``addr=192.168.10.2``."""
+    """Bursts to and from a USRP."""
 
     name = "uhd"
     Options = UhdOptions

@@ -153,7 +153,7 @@ class MediumClock:
 
 
 class ZmqFrontEnd(FrontEnd):
-    """See :class:`ZmqOptions`."""
+    """Bursts published to other processes, and those of others."""
 
     name = "zmq"
     Options = ZmqOptions

@@ -533,7 +533,6 @@ class FormatV1:
         return HEADER_LEN + REPAIR_HEADER_LEN + CRC_LEN + sum(payload_lens) + _ENTRY_COST * len(payload_lens)
 
     def layout(self, packet: PacketV1, packet_len: int, size: int | None = None) -> list[Span]:
-        """See :meth:`gr_ros2.wire.format.Format.layout`."""
         header, repair = packet.header, packet.repair
         trailer = TAG_LEN if header.sealed else CRC_LEN
         spans = [Span("head", header.size + (repair.size if repair is not None else 0))]
@@ -549,7 +548,7 @@ class FormatV1:
         return [*spans, Span("pad", max(rest, 0)), Span("crc", trailer)]
 
     def decode(self, data: bytes, packet_len: int) -> PacketV1:
-        """See ``decode`` of this module."""
+        """The packet in these bytes, as ``decode`` of this module reads it."""
         return decode(data, packet_len)
 
 

@@ -74,7 +74,7 @@ class Task:
         raise NotImplementedError
 
     def watch(self, now: float, states: Sequence[State]) -> None:
-        """See where all robots really are; called ten times a second."""
+        """Take note of where all robots really are; called ten times a second."""
 
     def numbers(self) -> dict[str, float | None]:
         """How well it went, for the result."""
@@ -274,11 +274,11 @@ class TaskRobots:
 
     @property
     def over(self) -> bool:
-        """See :class:`Task`."""
+        """Whether the task has ended."""
         return self._task.over
 
     def numbers(self) -> dict[str, float | None]:
-        """See :meth:`Task.numbers`."""
+        """How well all robots did, by name."""
         return self._task.numbers()
 
 

@@ -70,36 +70,28 @@ class EndpointV0:
 
     @property
     def held_bytes(self) -> int:
-        """See :class:`Endpoint`."""
         return 0 if self._receiver is None else self._receiver.held_bytes
 
     def reconfigure(self, **changes: float) -> None:
-        """See :class:`Endpoint`."""
         check_live(changes, self.live_settings)
         self.messages.reconfigure(**changes)
 
     def next_packet(self, now: float) -> SentPacket | None:
-        """See :class:`PacketSide`."""
         return None if self._sender is None else self._sender.next_packet(now)
 
     def next_departure(self, *, credited: bool = False) -> float | None:  # noqa: ARG002 - nothing is due by itself
-        """See :class:`PacketSide`."""
         return None if self._sender is None else self._sender.next_timeout()
 
     def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
-        """See :class:`PacketSide`."""
         return [] if self._receiver is None else self._receiver.receive(arrival, now)
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """See :class:`PacketSide`."""
         return [] if self._receiver is None else self._receiver.handle_timeout(now)
 
     def next_timeout(self) -> float | None:
-        """See :class:`PacketSide`."""
         return None if self._receiver is None else self._receiver.next_timeout()
 
     def unpublished(self, event: Delivered) -> Lost:
-        """See :class:`Endpoint`."""
         assert self._receiver is not None
         return self._receiver.unpublished(event)
 
@@ -111,9 +103,7 @@ class EndpointV0:
         return []
 
     def knows(self, src_id: int) -> bool:
-        """See :class:`Endpoint`."""
         return self._receiver is not None and self._receiver.knows(src_id)
 
     def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:  # noqa: ARG002 - nobody announces any
-        """See :class:`Endpoint`."""
         return {}

@@ -191,7 +191,6 @@ class Sender:
         return False
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:  # noqa: ARG002 - all topics have the same
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         return "fifo", 0.0
 
     def depth(self, topic_id: int) -> int:

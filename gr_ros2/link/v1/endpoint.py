@@ -153,21 +153,17 @@ class EndpointV1:
         self.pace, self.pings = self._sending.pace, self._sending.pings
 
     def submitted(self, topic_id: int, now: float) -> None:
-        """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self._now = now if now > self._now else self._now
         self._hold.submitted(topic_id, now)
 
     def behind(self, now: float) -> bool:
-        """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         return self._access is None and self._sending.behind(now)  # with medium access, messages wait for their slot
 
     @property
     def slow(self) -> bool:
-        """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         return self._access is None and self._sending.slow
 
     def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
-        """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self.answers = self.answers or added
         self._sending.topics_changed(self._now, added=added, asked=asked)
 
@@ -179,16 +175,13 @@ class EndpointV1:
 
     @property
     def urged(self) -> bool:
-        """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         return self._sending.urged
 
     @property
     def held_bytes(self) -> int:
-        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         return sum(neighbour.inbox.held for neighbour in self.neighbours.all.values())
 
     def reconfigure(self, **changes: Any) -> None:
-        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         if (dst_id := changes.pop("dst_id", self.settings.dst_id)) != self.settings.dst_id:
             raise ConfigError(
                 f"dst_id = {dst_id}: another destination needs a restart of the link: repairs combine packets to "
@@ -201,11 +194,9 @@ class EndpointV1:
 
     @property
     def questions(self) -> Pings:
-        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         return self.pings
 
     def peers(self, now: float) -> list[HeardRobot]:
-        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         relaying = self._receiving.relaying
         far = [] if relaying is None else relaying.robots(now, sealed=self.keys.sealed)
         over = {robot.robot for robot in far}
@@ -227,11 +218,9 @@ class EndpointV1:
         ]
 
     def knows(self, src_id: int) -> bool:
-        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         return self._inbox(src_id) is not None
 
     def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:
-        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         inbox = self._inbox(src_id)
         return {} if inbox is None else inbox.announced.topics
 
@@ -243,11 +232,9 @@ class EndpointV1:
         return neighbour.inbox if neighbour is not None and neighbour.proven else None
 
     def unpublished(self, event: Delivered) -> Lost:
-        """See :class:`gr_ros2.link.endpoint.Endpoint`."""
         return self._receiving.unpublished(event)
 
     def next_packet(self, now: float) -> SentPacket | None:
-        """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         self._now = now if now > self._now else self._now
         if not self.answers or not self.pace.may_leave(now):
             return None
@@ -272,7 +259,6 @@ class EndpointV1:
         return block is not None
 
     def next_departure(self, *, credited: bool = False) -> float | None:
-        """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         if (self.pace.out_of_credit and not credited) or not self.answers:
             return None
         if self._access is not None:
@@ -282,15 +268,12 @@ class EndpointV1:
         return self._sending.next_departure(self._now)
 
     def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
-        """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         self._now = now if now > self._now else self._now
         return self._receiving.receive(arrival, now)
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         self._now = max(self._now, now)
         return self._receiving.handle_timeout(now)
 
     def next_timeout(self) -> float | None:
-        """See :class:`gr_ros2.link.endpoint.PacketSide`."""
         return self._receiving.next_timeout()

@@ -133,13 +133,11 @@ class Outbox:
             self._owner.topics_changed(asked=True)
 
     def offer(self, topic_id: int, *, offered: bool) -> None:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         self.sent[topic_id].hidden = not offered
         if self._tabulate():
             self._owner.topics_changed(asked=True)
 
     def follow(self, topic_id: int, publishers: PublisherQos) -> bool:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         before = self.queue(topic_id)
         self.sent[topic_id].follow(publishers)
         self.sent.find_deadlines()
@@ -148,7 +146,6 @@ class Outbox:
         return self.queue(topic_id) != before
 
     def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         before = self.sent[topic_id]
         name, type_name = before.topic.name, before.topic.type_name
         check_live_options(name, before.topic.options, options)
@@ -166,7 +163,6 @@ class Outbox:
         return self.topics, after.topic
 
     def missed(self, topic_id: int, total: int) -> None:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         new = total - self.stats.missed[topic_id]
         if new > 0:
             self.stats.missed[topic_id] = total
@@ -183,7 +179,6 @@ class Outbox:
         *,
         waited_s: float = 0.0,
     ) -> None:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         topic = self.sent.get(topic_id)
         if topic is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
@@ -217,25 +212,20 @@ class Outbox:
         self._admit(topic, message)
 
     def forget_kept(self, topic_id: int) -> None:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         self.kept.forget(topic_id)
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         queue = self.sent[topic_id].queue
         return queue.policy, queue.deadline_s
 
     def depth(self, topic_id: int) -> int:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         depth = self.sent[topic_id].topic.options.queue_depth
         return self._settings.queue_depth if depth == AUTO else depth
 
     def room(self, topic_id: int) -> bool:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         return self.sent[topic_id].queue.room(self.depth(topic_id))
 
     def queued(self) -> dict[int, int]:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`."""
         return {topic.topic.topic_id: len(topic.queue) for topic in self.sent.named()}
 
     @property

@@ -153,11 +153,9 @@ class Pings:
         """When a question or an answer is to leave, s; infinite if none waits."""
 
     def introduce(self, packet_len: int, phy: int, key: int, text: str) -> None:
-        """See :class:`gr_ros2.link.endpoint.Questions`."""
         self.about = About(packet_len, phy, key, text.encode())
 
     def put(self, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
-        """See :class:`gr_ros2.link.endpoint.Questions`."""
         if anew and (before := self.asked.get(robot)) is not None:  # numbers go on, so that no late answer counts
             self.asked[robot] = RoundTrips(before.asked, earlier=before.asked, about=before.about)
         return self.ask(robot, now, wants_about=True).summary()

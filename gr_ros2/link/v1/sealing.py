@@ -78,12 +78,10 @@ class Checksum:
         self._session = session_crc(boot, 0)
 
     def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
-        """See :class:`Trailer`."""
         data = clear + body
         return data + crc(data, self._of(number >> 16))
 
     def open(self, clear: bytes, rest: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
-        """See :class:`Trailer`."""
         body = rest[:-CRC_LEN]
         if crc(clear + body, self._of(number >> 16)) != rest[-CRC_LEN:]:
             raise CrcError("CRC-32 does not match: damaged, or of another start of the sender")
@@ -111,7 +109,6 @@ class Seal:
         self._cipher = AESCCM(subkey(key, src_id, boot), tag_length=TAG_LEN)
 
     def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
-        """See :class:`Trailer`."""
         nonce = _nonce.pack(0, number, repair_id)
         named = without_hop(clear) if clear[0] & ADDRESSED else clear
         if self.encrypts and not plain:
@@ -119,7 +116,6 @@ class Seal:
         return clear + body + self._cipher.encrypt(nonce, b"", named + body)
 
     def open(self, clear: bytes, rest: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
-        """See :class:`Trailer`."""
         nonce = _nonce.pack(0, number, repair_id)
         named = without_hop(clear) if clear[0] & ADDRESSED else clear
         try:

@@ -162,7 +162,6 @@ class SendingSide:
             self.pace.change(settings.packet_rate)
 
     def topics_changed(self, now: float, *, added: bool, asked: bool) -> None:
-        """See :class:`gr_ros2.link.v1.outbox.Owner`."""
         self.hellos.hurry(now)
         if added and self._started and self._repeat_at == inf:
             self._plan_repeat(now)

@@ -37,7 +37,7 @@ class _Checks(ctypes.Structure):
 
 
 class CompiledDecoders:
-    """See :class:`gr_ros2.phy.fec.Decoders`."""
+    """The decoders of :mod:`gr_ros2.phy.fec` in C++, which do not hold Python's lock."""
 
     def convolutional(self, bits: int) -> Decoder:
         polynomials = np.array(POLYNOMIALS, np.int32)
