@@ -315,10 +315,12 @@ class Custody:
         return write_carried(held.taker, message._replace(hops=hops, age=age, waits=waits))
 
     def _way(self, robot: int, came: int, at: float, now: float) -> int | None:
-        """To whom a message is handed: not back to whom it came from, unless that is long ago."""
+        """To whom a message is handed: not back to whom it came from, unless that is long ago; and to nobody before its
+        first report, since it is not known from which packet on it listens."""
 
         def usable(via: int) -> bool:
-            return via in self._peers.all and self._gains.hears(via, now) and (via != came or now > at + STALE_S)
+            reports = via in self._peers.all and self._peers.all[via].newest >= 0
+            return reports and self._gains.hears(via, now) and (via != came or now > at + STALE_S)
 
         return self.routes.over(robot, now, usable)
 
@@ -346,8 +348,8 @@ class Custody:
                 if record is not None and not record.confirmed & peer.bit and held.out.lifetime in record.lifetimes:
                     break
                 held.low += 1
-            if not 0 <= held.last < held.low:
-                continue
+            if not 0 <= held.last < held.low or held.out is None or held.out.begin > peer.settled:
+                continue  # it lacks a part, or waits there for what is missing before it
             if held.own is None:
                 self._passed[held.name] = robot
                 if len(self._passed) > MOST_HELD:

@@ -14,6 +14,7 @@ from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.relayed import Relayed
+from gr_ros2.wire.v1 import QOS_REPAIR, read_header, read_repair_header
 from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_relaying import Line, robot
 
@@ -220,3 +221,28 @@ def test_the_end_of_a_message_is_told_also_if_it_is_of_no_more_use(hops: int) ->
     first.end.messages.submit(1, b"goal again", line.now)
     until(line, 60, lambda: told(first) == [True, False, True])
     until(line, 60, lambda: b"goal again" in line.robots[-1].delivered(1))
+
+
+def test_what_waits_in_order_at_a_robot_that_starts_again_has_not_come() -> None:
+    """All packets of the goals are there but the first, for which they wait, when robot 2 starts again."""
+    line = line_of(robot(1, topics=named(2)), robot(2), loss=0.0)
+    first, last = line.robots
+    missing, receive = first.end.window.packets.newest + 1, last.receive
+
+    def lossy(data: bytes, now: float, began: float | None = None) -> Any:
+        header = read_header(data, 96)
+        lost = header.number == missing if header.qos != QOS_REPAIR else read_repair_header(data, header.size, 96).mask
+        return [] if lost else receive(data, now, began)
+
+    last.receive = lossy  # type: ignore[method-assign]
+    goals = [b"goal %d" % n for n in range(10)]
+    for goal in goals:
+        first.end.messages.submit(1, goal, line.now)
+        line.run(0.5)
+    line.run(2)
+    assert not any(payload.startswith(b"goal") for payload in last.delivered(1))
+    last.start()
+    last.receive = receive  # type: ignore[method-assign]
+    until(line, 90, lambda: len(told(first)) == 10)
+    assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
+    assert told(first) == [True] * 10
