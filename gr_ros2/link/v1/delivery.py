@@ -50,6 +50,9 @@ class DeliveryRules:
         self._own, self._settings = settings.src_id, settings
         self._silent_before = 0
         self._max_age_s, self._max_ages = settings.max_age_s, settings.max_ages
+        self._limited = bool(settings.max_ages) or settings.max_age_s != AUTO
+        """Whether messages have limits also where their topic's table asks for none."""
+        self._relays = settings.relay
         self._commands, self._deadlines = settings.commands, settings.deadlines
         self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
         """Numbers that the robot's packets have reached, and when, s."""
@@ -122,29 +125,34 @@ class DeliveryRules:
 
     def refusal(self, ready: Ready, topic: AnnouncedTopic, now: float) -> Fate | None:
         """Why a message is not delivered; None for one that is, or that is here already."""
-        if not self.is_for_us(topic) and self._own != NOBODY:
+        if topic.dst_id != BROADCAST and self._own not in (topic.dst_id, NOBODY):
             return Fate.NOT_FOR_US
-        withheld_s, deadline_s = self._limits(topic)
-        oldest = self.sealed(ready) if ready.over is None else min(ready.sealed, ready.made)
-        if now - oldest > withheld_s:
-            return Fate.NOT_FRESH
-        if now - ready.made > min(deadline_s, ready.limit_s):
+        if topic.fresh or self._limited:
+            withheld_s, deadline_s = self._limits(topic)
+            oldest = self.sealed(ready) if ready.over is None else min(ready.sealed, ready.made)
+            if now - oldest > withheld_s:
+                return Fate.NOT_FRESH
+            if now - ready.made > deadline_s:
+                return Fate.LATE
+        if now - ready.made > ready.limit_s:
             return Fate.LATE
         before = ready.over is None and ready.order[0] < self._silent_before
         if before and (topic.fresh or not (topic.reliable or topic.latched)):
             return Fate.LATE
-        return passed_over(topic) if self._passed(ready) and (ready.topic_id, ready.order) not in self._over else None
+        if ready.order > self.newest.get(ready.topic_id, _NEVER) or (ready.topic_id, ready.order) in self._over:
+            return None
+        return passed_over(topic) if self._passed(ready) else None
 
     def takes(self, ready: Ready, topic: AnnouncedTopic, now: float) -> bool:
         """Note a message that nothing refuses; returns whether it is new."""
-        if self._passed(ready):
+        if ready.order <= self.newest.get(ready.topic_id, _NEVER) and self._passed(ready):
             return False
         self.newest[ready.topic_id] = ready.order
-        if ready.over is None:
+        if ready.over is not None:
+            self._came[ready.topic_id] = now
+        elif self._relays:
             self._direct[ready.topic_id] = ready.order
             self._came.pop(ready.topic_id, None)
-        else:
-            self._came[ready.topic_id] = now
         if topic.latched:
             mark, marks = crc32(ready.payload), self.marks.get(ready.topic_id, ())
             if mark in marks:
@@ -169,9 +177,7 @@ class DeliveryRules:
         return withheld_s or inf, deadline_s or inf
 
     def _passed(self, ready: Ready) -> bool:
-        """Whether a later message of its topic was delivered."""
-        if ready.order > self.newest.get(ready.topic_id, _NEVER):
-            return False
+        """Whether a message whose order is not the newest of its topic comes after a later one."""
         return ready.over is None or min(ready.made, ready.sealed) <= self._came.get(ready.topic_id, inf) + EXPIRES_S
 
 

@@ -126,7 +126,8 @@ class Inbox:
             self.decoder,
             first,
             settings.hold_s,
-            fits=lambda held: held <= bounds.ordered or held + self._others() <= self._most,
+            sure=bounds.ordered,
+            fits=lambda held: held + self._others() <= self._most,
             room=room,
             give_up_s=give_up_s,
         )
@@ -187,7 +188,7 @@ class Inbox:
 
         :raises PadError: it is longer than bodies of this start are
         """
-        if combined.count(0, self._room) < len(combined) - self._room:
+        if len(combined) > self._room and combined.count(0, self._room) < len(combined) - self._room:
             raise PadError(f"a combination of {len(combined)} bytes, where bodies have {self._room}")
         self.reports.unreported += new
         self.reports.confirms = True
@@ -257,7 +258,8 @@ class Inbox:
 
     def _settle(self) -> None:
         """Deliver the messages that waited for what is here or given up now."""
-        self._release(self.order.settle(self._now))
+        if due := self.order.settle(self._now):
+            self._release(due)
 
     def _release(self, due: Iterable[Ready]) -> None:
         for ready in due:
@@ -280,7 +282,7 @@ class Inbox:
         :param late: it may have reached it long ago
         """
         self._now = now
-        self.order.heard()
+        self.order.over_at = inf
         newest = self.decoder.newest
         if not late:
             silence, self._heard = now - self._heard, now
@@ -335,7 +337,7 @@ class Inbox:
 
     def _arrived(self, ready: Ready) -> None:
         """A message is complete."""
-        ready.made = min(self.deliveries.made(ready, self._now), self.began)
+        ready.made = self.deliveries.made(ready, self.began)
         if ready.topic_id > TABLE_TOPIC:
             if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
                 self.order.wait(ready)
@@ -377,7 +379,7 @@ class Inbox:
     def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""
         self._now = now
-        self.order.over_others(now)
+        self.order.over_at = min(self.order.over_at, now)
         if ready.topic_id == TABLE_TOPIC:
             self._table(ready.payload)
         else:

@@ -262,7 +262,8 @@ class Neighbours:
     def _opened(self, opened: Opened, now: float) -> Opened:
         """Take the proofs in a packet that was opened, and note what it says about its sender."""
         neighbour, number, repair = opened.neighbour, opened.number, opened.repair
-        proofs, gone = neighbour.proofs, neighbour.gone or opened.appeared
+        proofs = neighbour.proofs
+        gone = neighbour.silent or opened.appeared or (neighbour.proves and proofs.proven is None)
         self._packets += 1
         alone = gone and self.alone
         if opened.entries is not None and repair is not None:

@@ -66,7 +66,8 @@ class Order:
     :param decoder: knows which packets are here
     :param first: packets before this number are neither waited for nor needed
     :param hold_s: s that a message waits for an earlier one whose sender gets no reports
-    :param fits: whether messages of so many bytes may wait
+    :param sure: bytes of messages that may always wait
+    :param fits: whether more of them may wait
     :param room: bytes of the longest body
     :param give_up_s: s of silence after which a sender is regarded as gone
     :ivar contents: which topics missing packets can have carried
@@ -74,6 +75,7 @@ class Order:
     :ivar low: every packet before this number is here or given up
     :ivar wanted: every packet before this number is here, or is not repaired any more
     :ivar held: bytes of the messages that wait
+    :ivar over_at: when another robot brought a message for the first time since the sender was heard, s
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class Order:
         first: int,
         hold_s: float,
         *,
+        sure: int,
         fits: Callable[[int], bool],
         room: int,
         give_up_s: float = inf,
@@ -89,14 +92,13 @@ class Order:
         self.told = False
         self.low = self.wanted = first
         self.held = 0
+        self.over_at = inf
         self.contents = GapContents(decoder, room)
         self._passed: dict[int, int] = {}
         """By topic: no missing packet before this number can have carried something of it."""
         self._decoder = decoder
         self._hold_s, self._give_up_s = hold_s, give_up_s
-        self._over_at = inf
-        """When another robot brought a message for the first time since the sender was heard, s."""
-        self._fits = fits
+        self._sure, self._fits = sure, fits
         self._dead = first
         """The sender does not repair packets before this number any more."""
         self._void: set[int] = set()
@@ -128,14 +130,6 @@ class Order:
             self._void = {left_out for left_out in self._void if left_out >= self.wanted}
             self._most_void = 2 * len(self._void) + _VOID
 
-    def heard(self) -> None:
-        """The sender itself was heard."""
-        self._over_at = inf
-
-    def over_others(self, now: float) -> None:
-        """Another robot has brought a message of the sender."""
-        self._over_at = min(self._over_at, now)
-
     def wait(self, ready: Ready) -> None:
         """Keep a message until nothing before it is missing."""
         self.held += len(ready.payload) + _COST
@@ -149,7 +143,7 @@ class Order:
         low = max(self.low, dead if dead <= newest else newest + 1)
         while gaps and gaps[0][2] < floor:
             gaps.popleft()
-        waits = self._fits(self.held) and now < self._over_at + self._give_up_s
+        waits = (self.held <= self._sure or self._fits(self.held)) and now < self.over_at + self._give_up_s
         if not waits:
             low = newest + 1
         elif gaps and not self.told:
@@ -180,7 +174,7 @@ class Order:
         if not any(self._waiting.values()):
             return None
         held = self._gaps[0][0] + self._hold_s if self._gaps and not self.told else inf
-        soonest = min(held, self._over_at + self._give_up_s)
+        soonest = min(held, self.over_at + self._give_up_s)
         return None if soonest == inf else soonest
 
     def beyond(self, number: int) -> list[Ready]:

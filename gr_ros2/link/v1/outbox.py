@@ -257,7 +257,7 @@ class Outbox:
     def _left(self, message: Message, now: float) -> None:
         """A message has left whole."""
         topic = self.sent[message.topic_id]
-        reported = self._peers.confirm(in_order=topic.in_order)
+        reported = bool(self._peers.all) or self._peers.confirm(in_order=topic.in_order)
         topic.lifetimes.left(
             message.lifetime,
             policy=topic.queue.policy,

@@ -102,6 +102,7 @@ class Peers:
     :ivar all: the peers, by robot id
     :ivar loss: share of packets that the peer with the most losses loses, as far as it is known or expected
     :ivar proven: some peer may take packets up to this number for replays
+    :ivar provens: the same of each peer, the highest first
     :ivar in_vain: whether a peer waits for a packet in vain
     :ivar urges: heap of the packets that some peer lacks and for which later messages wait, or may wait soon: whether
         all in it are long, and its number
@@ -116,7 +117,7 @@ class Peers:
         self._interval = _INTERVAL_S * slower
         self._away: dict[int, Peer] = {}
         self.loss = unreported.loss
-        self.proven = 0
+        self.proven, self.provens = 0, [0]
         self.in_vain = False
         self.once: set[int] = set()
         self._packets, self._unreported, self._shared = packets, unreported, shared
@@ -304,11 +305,6 @@ class Peers:
         """Whether a peer that may need a packet may take it for a replay."""
         return any(peer.settled <= number <= peer.proven for peer in self.all.values())
 
-    @property
-    def provens(self) -> list[int]:
-        """Up to which packets peers may take them for replays, the highest first."""
-        return sorted({peer.proven for peer in self.all.values()}, reverse=True) or [0]
-
     def lack(self, packets: list[Sent]) -> bool:
         """Whether a report names one of these packets as lost."""
         return any(record.number in peer.lost for peer in self.all.values() if peer.lost for record in packets)
@@ -330,7 +326,8 @@ class Peers:
     def _note(self) -> None:
         """Take together what is known of the peers; every new packet asks for that."""
         peers = self.all.values()
-        self.proven = max((peer.proven for peer in peers), default=0)
+        self.provens = sorted({peer.proven for peer in peers}, reverse=True) or [0]
+        self.proven = self.provens[0]
         self.in_vain = any(peer.waits >= 0 for peer in peers)
         self.loss = max((peer.loss for peer in peers), default=self._unreported.loss)
 

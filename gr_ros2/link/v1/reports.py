@@ -89,6 +89,10 @@ class Reporter:
         self._missed = False
         """Whether a packet went missing since the last report."""
         self.reported_at = 0.0
+        self._pause_s = self._after(_PAUSE_S)
+        """s after which a report is due, where nobody else shares the channel: it does not change there."""
+        self._most = self._every = _EVERY * (4 if self._rare else 1)
+        """Packets after which a report is due, now and where something is lost."""
         self._slowly = 1.0
         """By how much longer than ``_PAUSE_S`` the next report is put off, because nothing is lost."""
         self._old_turn = False
@@ -122,14 +126,12 @@ class Reporter:
     def due(self, now: float) -> float:
         """When the next report is due, s; infinite if there is nothing to report."""
         if not self.unreported:
-            again = max(_AGAIN_S, self._after(_PAUSE_S))
-            return self.reported_at + again if self._order.told and self._order.held else inf
-        every = _EVERY * (4 if self._rare else 1)
-        most = min(every * self._slowly, max(every, MAP // 2))
+            waits = self._order.held and self._order.told
+            return self.reported_at + max(_AGAIN_S, self._pause_s) if waits else inf
         prompt = (self._missed or (self.tells_snr and self.snr.changed)) and not self._rare and self._unspent >= 1
-        if prompt or self.unreported >= most:
+        if prompt or self.unreported >= self._most:
             return now
-        return self.reported_at + self._after(_PAUSE_S * self._slowly)
+        return self.reported_at + self._pause_s * self._slowly
 
     def _after(self, seconds: float) -> float:
         """s that are as many packets of others on a slow channel."""
@@ -154,7 +156,8 @@ class Reporter:
     def make(self, now: float) -> Report:
         """What has arrived. Reports alternate between the newest part and the oldest part with missing packets."""
         calm = not self._missed and self.loss < CALM and self._arrived > MAP
-        self._slowly = min(self._slowly * _SLOWER, max(_CALM_S / self._after(_PAUSE_S), 1.0)) if calm else 1.0
+        self._slowly = min(self._slowly * _SLOWER, max(_CALM_S / self._pause_s, 1.0)) if calm else 1.0
+        self._most = min(self._every * self._slowly, max(self._every, MAP // 2))
         self.unreported = 0
         self._missed = False
         self._unspent = max(self._unspent - 1, 0.0)

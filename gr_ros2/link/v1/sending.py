@@ -97,8 +97,10 @@ class SendingSide:
         due = reports.due(now)
         if due and reports.overdue:
             return reports.packet(due, now)
-        if (first := self._repair_first(now)) is not None:
-            return first
+        if self._window.pressing and not packing.urgent:
+            first = self.repairs.first(now, waiting=packing.next_timeout(now) <= now)
+            if first is not None:
+                return first
         room = self._writer.room
         if self._relaying is not None and messages.relayed is not None:
             leaves = now if self._writer.leave_at is None else max(now, self._writer.leave_at)
@@ -117,13 +119,6 @@ class SendingSide:
         if due:
             return reports.packet(due, now)
         return reports.asks(now) or self.repairs.spare(now) or reports.early(now)
-
-    def _repair_first(self, now: float) -> SentPacket | None:
-        """A repair that goes before new messages."""
-        packing = self._messages.packing
-        if not self._window.pressing or packing.urgent:
-            return None
-        return self.repairs.first(now, waiting=packing.next_timeout(now) <= now)
 
     def behind(self, now: float) -> bool:
         """Whether messages that wait do so because the computer is too slow."""

@@ -112,12 +112,13 @@ class SentPackets:
 
     def retire(self, now: float) -> None:
         """Forget the oldest packets that are not alive."""
-        records, away = self.records, self.away
-        oldest = self.oldest
+        records, away, here = self.records, self.away, self.everybody
+        oldest, everybody = self.oldest, here | away
         while oldest <= self.newest:
             record = records.get(oldest)
             if record is not None:
-                if (not self._served(record) or record.confirmed & away != away) and record.alive(now):
+                lacking = record.confirmed & everybody != everybody or not (here or record.covered >= 1)
+                if lacking and record.alive(now):
                     break
                 del records[oldest]
             oldest += 1
@@ -125,15 +126,12 @@ class SentPackets:
         needed = self.needed if away and self.needed > oldest else oldest
         while away and needed <= self.newest:
             record = records.get(needed)
-            if record is not None and not self._served(record) and record.alive(now):
-                break
+            if record is not None and record.alive(now):
+                served = record.confirmed & here == here if here else record.covered >= 1
+                if not served:
+                    break
             needed += 1
         self.needed = needed
-
-    def _served(self, record: Sent) -> bool:
-        """Whether nobody who is here needs a packet."""
-        everybody = self.everybody
-        return record.confirmed & everybody == everybody if everybody else record.covered >= 1
 
     def unconfirmed(self, now: float) -> bool:
         """Whether anything is alive."""

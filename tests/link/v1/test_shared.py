@@ -25,7 +25,7 @@ ROOM = 100
 def reporter() -> tuple[SharedReporter, RepairDecoder, Reassembly]:
     decoder = RepairDecoder(ROOM, lambda _: True, 1000)
     reassembly = Reassembly(10_000)
-    order = Order(decoder, 1, 1.0, fits=lambda held: held <= 10_000, room=ROOM)
+    order = Order(decoder, 1, 1.0, sure=10_000, fits=lambda _: False, room=ROOM)
     order.told = True
     return SharedReporter((1, 1), decoder, order, reassembly, Settings(2, shares=True)), decoder, reassembly
 
