@@ -42,6 +42,7 @@ BENCHMARKS = {
     "reopen": "bench.reopen",
     "slow_computer": "bench.slow_computer",
     "compression": "bench.compression",
+    "codecs": "bench.codecs",
     "sweep": "bench.sweep",
     "mac": "bench.mac",
     "cells": "bench.mac",

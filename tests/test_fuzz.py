@@ -67,6 +67,7 @@ COUNTS = {
     "relay": 400,
     "calls": 1_500,
     "compression": 1_000,
+    "codecs": 1_500,
     "structure": 400,
     "type_description": 500,
     "control_socket": 500,
@@ -79,6 +80,10 @@ COUNTS = {
     "wifi": 200,
 }
 """Inputs of a short run; `python -m fuzz.NAME` goes on for as long as it is let."""
+if find_spec("av") is not None:
+    import fuzz.codecs
+
+    HARNESSES["codecs"] = (fuzz.codecs.codecs, fuzz.codecs.corpus)
 if find_spec("bokeh") is not None:
     import fuzz.dashboard
 
@@ -88,7 +93,7 @@ if find_spec("bokeh") is not None:
 @pytest.mark.parametrize(("name", "count"), COUNTS.items())
 def test_a_short_run_finds_nothing(name: str, count: int) -> None:
     if name not in HARNESSES:
-        pytest.skip("needs GNU Radio 3.10 and bokeh: pip install 'gr-ros2[dashboard]'")
+        pytest.skip("needs GNU Radio 3.10, and bokeh or PyAV: pip install 'gr-ros2[dashboard,video]'")
     harness, corpus = HARNESSES[name]
     tried = 0
 

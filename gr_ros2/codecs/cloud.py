@@ -270,7 +270,10 @@ class CloudDecoder:
             raise DamagedError(f"damaged cloud: {len(codes)} voxels instead of {count}")
         points = np.empty((count, step // 4), "<f4")
         places = (octree.cells(codes) + 0.5) * 2**doubled + np.array(lowest)[:, None]
-        points[:, :3] = (places * np.float64(edge)).T
+        with np.errstate(over="ignore"):
+            points[:, :3] = (places * np.float64(edge)).T
+        if not np.isfinite(points[:, :3]).all():
+            raise DamagedError("damaged cloud: points beyond all numbers")
         if channels:
             values = np.cumsum(np.frombuffer(packed, np.uint8).reshape(channels, count), axis=1, dtype=np.uint8)
             if keep == 1:
