@@ -282,6 +282,16 @@ def test_no_module_draws_from_a_global_generator() -> None:
     assert breaking(draws) == {}
 
 
+def test_no_annotation_is_a_bare_class_variable() -> None:
+    """Write ``ClassVar[Any]``: pydantic evaluates annotations, and Python 3.10 cannot evaluate the text ``ClassVar``."""
+
+    def bare(module: str) -> list[int]:
+        found = [node for node in ast.walk(parsed(module)) if isinstance(node, ast.AnnAssign)]
+        return [node.lineno for node in found if dotted(node.annotation) == "ClassVar"]
+
+    assert breaking(bare) == {}
+
+
 def test_every_module_says_what_it_is() -> None:
     assert breaking(lambda module: parsed(module).body and not ast.get_docstring(parsed(module))) == {}
 

@@ -109,7 +109,7 @@ class AirtimeConfig:
         Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Longest time without a pause (s)")
     ] = AUTO
     listen_before_send: bool = False
-    conditions: ClassVar = (
+    conditions: ClassVar[Any] = (
         ActsWhere(
             ("window_s",),
             lambda airtime: airtime.duty_cycle != AUTO or airtime.of_band.duty_cycle < 1,

@@ -174,7 +174,7 @@ class TopicOptions:
     to: Annotated[Annotated[int, Field(ge=0, le=254)] | Auto, OnlyIn(1), OnlyAt("source")] = AUTO
     codec: Annotated[str, OnlyAt("source")] = AUTO
     quantize: Annotated[str, OnlyAt("source")] = ""
-    conditions: ClassVar = (
+    conditions: ClassVar[Any] = (
         ActsWhere(
             ("queue_depth",),
             lambda topic: topic.queue != "latest",
@@ -215,7 +215,7 @@ class EndConfig(Agreed):
     dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     debug: Annotated[bool, Field(title="Debug log")] = False
-    end: ClassVar = ""
+    end: ClassVar[Any] = ""
     """``source`` or ``sink``."""
     conditions: ClassVar[tuple[ActsWhere, ...]] = (
         ActsWhere(
@@ -292,8 +292,8 @@ class SourceConfig(EndConfig):
     compression: bool | Auto = AUTO
     repair: Annotated[Repairs | Auto, OnlyIn(1)] = AUTO
     expected_loss: Annotated[float, OnlyIn(1), Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
-    end: ClassVar = "source"
-    conditions: ClassVar = (
+    end: ClassVar[Any] = "source"
+    conditions: ClassVar[Any] = (
         ActsWhere(
             ("dictionaries", "topic_options.*.codec", "topic_options.*.quantize"),
             lambda source: source.compresses,
@@ -383,8 +383,8 @@ class SinkConfig(EndConfig):
     use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
     frame_prefix: FrameForm = ""
     merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
-    end: ClassVar = "sink"
-    conditions: ClassVar = (
+    end: ClassVar[Any] = "sink"
+    conditions: ClassVar[Any] = (
         ActsWhere(
             ("max_age_s",), lambda sink: bool(sink.key), "only sealed messages have an age; set key, or leave it out"
         ),
@@ -529,7 +529,7 @@ class ScenarioChannel(Transceiver, ChannelConfig):
     tx_power_dbm: Decibels = 20.0
     noise_figure_db: Decibels = 6.0
     carrier_hz: Annotated[float, Field(ge=1e3, le=1e12)] = 2.4e9
-    conditions: ClassVar = (
+    conditions: ClassVar[Any] = (
         ActsWhere(
             ("model", "exponent", "height_m", "walls_db", "shadowing_db", "decorrelation_m", "carrier_hz"),
             lambda channel: channel.from_positions,
@@ -609,7 +609,7 @@ class PhyConfig:
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
     kernels: Kernels = AUTO
     options: dict[str, Any] = Field(default_factory=dict)
-    conditions: ClassVar = (
+    conditions: ClassVar[Any] = (
         ActsWhere(
             ("headroom",),
             lambda phy: phy.sample_rate == AUTO,

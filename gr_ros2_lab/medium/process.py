@@ -107,7 +107,7 @@ class MediumConfig:
     channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
     time: Literal["lockstep", "real"] = "lockstep"
     seed: Seed = 0
-    conditions: ClassVar = LEVELS
+    conditions: ClassVar[Any] = LEVELS
 
     @model_validator(mode="after")
     def _fits(self) -> MediumConfig:

@@ -111,7 +111,7 @@ class Scenario(Experiment, Traffic, AnyLink):
     controller: Literal["task", "ros"] = "task"
     localhost_only: bool | Auto = True
     own_domains: bool = True
-    conditions: ClassVar = (
+    conditions: ClassVar[Any] = (
         ActsWhere(
             ("bag_speed",),
             lambda scenario: scenario.source != "sim",
