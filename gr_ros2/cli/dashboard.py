@@ -110,7 +110,9 @@ def _make(address: str, port: int) -> Dashboard:
             from gr_ros2.dashboard.server import Dashboard
     except ModuleNotFoundError as error:
         package = (error.name or "bokeh").split(".")[0]
-        raise BackendMissingError(f"the dashboard needs {package}: pip install 'gr-ros2[dashboard]'") from error
+        raise BackendMissingError(
+            f"the dashboard needs {package}: apt install gr-ros2-lab, or pip install 'gr-ros2[dashboard]'"
+        ) from error
     logging.getLogger("bokeh.protocol").setLevel(logging.CRITICAL)  # it prints invalid messages of viewers
     for name in ("bokeh", "tornado"):  # they warn of every viewer that leaves
         logging.getLogger(name).setLevel(logging.ERROR)
