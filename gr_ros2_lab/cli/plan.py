@@ -80,7 +80,8 @@ def _tell(planner: Planner, advise: bool) -> None:
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=_WIDTH)
-    forecast = planner.forecast()
+    with console.status("the link is simulated"):
+        forecast = planner.forecast()
     phy = planner.phy
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     console.print(
@@ -105,13 +106,16 @@ def _tell(planner: Planner, advise: bool) -> None:
         )
     if not advise:
         return
-    if cuts := planner.cuts():
+    with console.status("cuts are tried"):
+        cuts = planner.cuts()
+    if cuts:
         console.print("To make it fit:", soft_wrap=True)
         for cut in cuts:
             console.print(f"  {_cut(cut)}", soft_wrap=True)
         settings = " ".join(f"--set {quote(setting)}" for setting in cuts[-1].settings)
         console.print(f"As settings: {settings}", soft_wrap=True, markup=False)
-    found = [advice for advice in planner.advice() if not cuts or "packet_len" not in advice.setting]
+    with console.status("changes are tried") as status:
+        found = planner.advice(not cuts, lambda done, of: status.update(f"changes are tried: {done} of {of}"))
     for advice in found[:_ADVICE]:
         console.print(_line(advice), soft_wrap=True)
     if not found and not cuts:

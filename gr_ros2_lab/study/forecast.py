@@ -7,17 +7,22 @@ the forecast it is based on.
 
 from __future__ import annotations
 
+import os
+import signal
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
+from multiprocessing import get_context
 from statistics import fmean
 from typing import Any, get_args
 
 import numpy as np
 
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.airtime_limit import sustained
@@ -254,14 +259,18 @@ class Planner:
                 self._rows[name], self._weights[name] = self.registry[topic_id].name, options[topic_id].options.weight
         self._remembering: _Remembering | None = None
 
+    @cached_property
+    def _as_it_is(self) -> Forecast:
+        return self._forecast(self.scenario)
+
+    def forecast(self) -> Forecast:
+        """The scenario as it is."""
+        return self._as_it_is
+
     @property
     def task(self) -> str:
         """What the robots of the scenario do on what they hear, which no forecast tries; '' where they do nothing."""
         return self._whole.task
-
-    def forecast(self) -> Forecast:
-        """The scenario as it is."""
-        return self._forecast(self.scenario)
 
     def range_m(self, pdr: float) -> float | None:
         """Distance up to which a share of the packets arrives, without walls, shadowing and others on the channel.
@@ -276,16 +285,26 @@ class Planner:
         snrs_db = np.arange(curve.low_db, curve.high_db, 0.1)
         return around.range_m(float(snrs_db[np.argmax(curve.pdr(snrs_db) >= pdr)]))
 
-    def advice(self) -> list[Advice]:
+    def advice(
+        self, lengths: bool = True, tell: Callable[[int, int], object] = lambda _done, _of: None
+    ) -> list[Advice]:
         """Single changes that make topics younger or save airtime. Changes that make no topic worse come first; within
         each group those after which more arrives, then the best.
 
         Each change is tried on the first seconds of the traffic, and compared with the present settings on the same
         seconds.
+
+        :param lengths: whether other packet lengths are tried
+        :param tell: called with the number of forecasts made, and that of all of them
         """
         base = replace(self.scenario, duration_s=min(self.scenario.duration_s or TRIAL_S, TRIAL_S))
-        now = self._forecast(base)
-        tried = [self._compared(setting, now, self._forecast(variant)) for setting, variant in self._variants(base)]
+        settings, variants = zip(("", base), *self._variants(base, lengths), strict=True)
+        made: list[Forecast] = []
+        for forecast in _on_all_processors(self._forecast, variants):
+            made.append(forecast)
+            tell(len(made), len(variants))
+        now, *others = made
+        tried = [self._compared(setting, now, then) for setting, then in zip(settings[1:], others, strict=True)]
         proposed = [advice for advice in tried if advice.worth_it]
         return sorted(proposed, key=lambda advice: (not advice.harmless, -advice.more, -advice.gain, advice.used[1]))
 
@@ -303,13 +322,13 @@ class Planner:
         )
         return Advice(setting, then, (now.used, then.used), effects)
 
-    def _variants(self, base: Scenario) -> Iterator[tuple[str, Scenario]]:
+    def _variants(self, base: Scenario, lengths: bool) -> Iterator[tuple[str, Scenario]]:
         source = base.ros_source
         if not source.compresses:
             yield "ros_source.compression=true", _sending(base, lambda own: replace(own, compression=True))
         if source.packet_rate == 0:
             yield "ros_source.packet_rate=auto", _sending(base, lambda own: replace(own, packet_rate=AUTO))
-        for packet_len in self._packet_lens():
+        for packet_len in self._packet_lens() if lengths else ():
             yield f"packet_len={packet_len}", _with_packet_len(base, packet_len)
         if base.duplex == "half" and len(sources_of(base.all_robots)) > 1 and base.medium == "exclusive":
             yield "medium=slots", replace(base, medium="slots")
@@ -339,7 +358,7 @@ class Planner:
         messages, every other one is limited to its share.
         """
         forecast = self.forecast()
-        cuts: list[Cut] = []
+        steps: list[tuple[Scenario, Cut]] = []
         offered, loads = self._demand(forecast)
         cost = {row: loads[row] / hz for row, hz in offered.items()}
         load = forecast.load
@@ -347,19 +366,21 @@ class Planner:
             if load <= 1:
                 break
             rates = self._fair_rates({name: (cost[name] * hz, hz) for name, hz in offered.items()})
-            applied = list(
+            steps = list(
                 self._applied({name: rates[name] for name in sorted(rates, key=lambda n: -cost[n] * offered[n])})
             )
-            if not applied:
+            if not steps:
                 break
             # A message costs more where fewer others share its packets.
-            cuts, last = [cut for cut, _ in applied], applied[-1][1]
+            last = self._forecast(steps[-1][0])
             load = last.load
             there, loads = self._demand(last)  # with what found no place before
             offered = there | offered
             kept = {row: own / (rates.get(row) or offered[row]) for row, own in loads.items()}
             cost |= {name: max(cost.get(name, 0.0), own) for name, own in kept.items()}
-        return cuts
+        between = _on_all_processors(self._forecast, [scenario for scenario, _ in steps[:-1]])
+        then = [*(forecast.load for forecast in between), load]
+        return [replace(cut, load=after) for (_, cut), after in zip(steps, then, strict=False)]
 
     def _demand(self, forecast: Forecast) -> tuple[dict[str, float], dict[str, float]]:
         """Messages/s that a robot offers, and the load of its channel, by rows of the registry."""
@@ -390,8 +411,8 @@ class Planner:
                 return {**dict.fromkeys(topics.keys() - kept.keys(), 0.0), **{n: hz for n, hz in rates.items() if hz}}
             del kept[max(tiny, key=lambda name: kept[name][0])]
 
-    def _applied(self, rates: Mapping[str, float]) -> Iterator[tuple[Cut, Forecast]]:
-        """Each cut, forecast together with those before it."""
+    def _applied(self, rates: Mapping[str, float]) -> Iterator[tuple[Scenario, Cut]]:
+        """Each cut, its load not known yet, and the scenario with it and those before it."""
         scenario = self.scenario
         without: tuple[str, ...] = ()
         limited: list[str] = []
@@ -405,10 +426,9 @@ class Planner:
                 if not all(left):
                     return
                 without = (f"ros_source.topics=[{', '.join(left[0])}]",)
-            forecast = self._forecast(scenario)
             names = [name for name, other in self._rows.items() if other == row]
             topic = names[0] if len(names) == 1 else f"{row} of every robot"
-            yield Cut(topic, rate_hz, (*without, *limited), forecast.load), forecast
+            yield scenario, Cut(topic, rate_hz, (*without, *limited), np.nan)
 
     def _without(self, source: SourceConfig, *, row: str) -> SourceConfig:
         left = (topic.name for topic in self.registry.chosen(source.topics))
@@ -556,6 +576,37 @@ class _Remembering:
         if payload is None:
             payload = self._decoded[topic_id, coded] = self._codec.decode(topic_id, coded)
         return payload
+
+
+def _on_all_processors(work: Callable[[Scenario], Forecast], scenarios: Sequence[Scenario]) -> Iterator[Forecast]:
+    """The same as ``map``, by forked processes: each has all that this one has loaded and coded.
+
+    :raises RunError: for a process that was ended from outside
+    """
+    processors = min(len(os.sched_getaffinity(0)), len(scenarios))
+    if processors < 2:
+        yield from map(work, scenarios)
+        return
+    pool = ProcessPoolExecutor(processors, get_context("fork"), _begin_process, (work,))
+    try:
+        yield from pool.map(_process, scenarios)
+    except BrokenProcessPool as error:
+        raise RunError("a process that made a forecast was ended; free memory, and try again") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_process(work: Callable[[Scenario], Forecast]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the process that waits ends the others
+    _work.append(work)
+
+
+_work: list[Callable[[Scenario], Forecast]] = []
+"""What a forked process is for."""
+
+
+def _process(scenario: Scenario) -> Forecast:
+    return _work[0](scenario)
 
 
 def _sending(scenario: Scenario, change: Callable[[SourceConfig], SourceConfig]) -> Scenario:

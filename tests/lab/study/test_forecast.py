@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 
 import numpy as np
@@ -187,6 +188,16 @@ def test_nothing_is_called_better_that_makes_more_topics_older_than_younger(
         younger, older = ([e for e in advice.effects if getattr(e, word)] for word in ("younger", "older"))
         assert sum(e.weight for e in older) < sum(e.weight for e in younger) or advice.harmless
     assert [advice.harmless for advice in proposed] == sorted((advice.harmless for advice in proposed), reverse=True)
+
+
+def test_several_processes_say_what_one_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = []
+    for processors in (1, 3):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, many=processors: set(range(many)))
+        plan, told = planner("narrow-ofdm-paced", duration=1.0), []
+        said.append((plan.cuts(), plan.advice(tell=lambda *done, told=told: told.append(done))))
+        assert told == [(done, len(told)) for done in range(1, len(told) + 1)] != []
+    assert said[0] == said[1] and all(said[0])
 
 
 def test_a_planned_packet_length_fits_messages_stamped_by_the_wall_clock() -> None:
