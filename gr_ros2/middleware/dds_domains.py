@@ -12,7 +12,7 @@ import os
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
-from xml.sax.saxutils import quoteattr
+from html import escape
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import cdr_dds
@@ -57,7 +57,7 @@ def configuration(options: DiscoveryOptions, participants: int, environment: Map
 
 
 def _discovery(options: DiscoveryOptions, participants: int) -> str:
-    peers = "".join(f"<Peer Address={quoteattr(peer)} {_NEVER_FORGET}/>" for peer in options.peers)
+    peers = "".join(f"<Peer Address='{escape(peer)}' {_NEVER_FORGET}/>" for peer in options.peers)
     interval = _ASK_AGAIN if peers else ""
     if options.range == "OFF":
         general = "<AllowMulticast>false</AllowMulticast>"

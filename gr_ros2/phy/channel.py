@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from gnuradio import channels, gr
+from gnuradio import gr
 
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy.base import Phy
@@ -50,6 +50,8 @@ class Channel(gr.hier_block2):  # type: ignore[misc]
     """
 
     def __init__(self, config: ChannelConfig, phy: Phy) -> None:
+        from gnuradio import channels  # here: 8 MB that a robot's link does not need
+
         super().__init__(
             "gr_ros2_channel", gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(1, 1, gr.sizeof_gr_complex)
         )
@@ -90,6 +92,8 @@ class Channel(gr.hier_block2):  # type: ignore[misc]
 
 def _fading(config: ChannelConfig, sample_rate: float) -> Any:
     """A block in which every tap that is not zero fades independently."""
+    from gnuradio import channels
+
     shift, seed = config.doppler_hz / sample_rate, config.seed * _FADING_SEEDS % _LARGEST_SEED
     delays = [float(delay) for delay, tap in enumerate(config.taps) if tap]
     mags = [abs(tap) for tap in config.taps if tap]

@@ -18,11 +18,6 @@ from collections.abc import Sequence
 from struct import Struct
 from typing import Literal, Protocol
 
-from cryptography.exceptions import InvalidTag
-from cryptography.hazmat.primitives.ciphers.aead import AESCCM
-from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.hazmat.primitives.kdf.hkdf import HKDF
-
 from gr_ros2.core.errors import ConfigError, CrcError, TagError
 from gr_ros2.state.keys import KEY_LEN
 from gr_ros2.wire.v1 import ADDRESSED, CRC_LEN, HEADER_LEN, TAG_LEN, crc, session_crc
@@ -105,7 +100,11 @@ class Seal:
     size = TAG_LEN
 
     def __init__(self, key: bytes, src_id: int, boot: int, *, encrypt: bool) -> None:
+        from cryptography.exceptions import InvalidTag  # here: 8 MB that a link without a key does not need
+        from cryptography.hazmat.primitives.ciphers.aead import AESCCM
+
         self.encrypts = encrypt
+        self._forged = InvalidTag
         self._cipher = AESCCM(subkey(key, src_id, boot), tag_length=TAG_LEN)
 
     def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:
@@ -123,7 +122,7 @@ class Seal:
                 return self._cipher.decrypt(nonce, rest, named)
             body = rest[:-TAG_LEN]
             self._cipher.decrypt(nonce, rest[-TAG_LEN:], named + body)
-        except InvalidTag:
+        except self._forged:
             raise TagError("the tag does not match: damaged, forged, or of another start of the sender") from None
         return body
 
@@ -135,6 +134,9 @@ def without_hop(clear: bytes) -> bytes:
 
 def subkey(key: bytes, src_id: int, boot: int) -> bytes:
     """The key of one start of one robot: HKDF-SHA256 with salt ``gr-ros2 version 1``, and src_id and boot as info."""
+    from cryptography.hazmat.primitives.hashes import SHA256
+    from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
     return HKDF(SHA256(), _SUBKEY_LEN, _SALT, _info.pack(src_id, boot)).derive(key)
 
 
