@@ -60,7 +60,7 @@ class Peer:
     prompt: bool = False
     """Whether it reports every packet, so soon that it is better to wait for a report than to expect losses."""
     waits: int = -1
-    """The oldest packet that the last report misses and that the sender does not repair any more; -1 for none."""
+    """The oldest packet that reports miss and that the sender does not repair any more; -1 for none."""
     waits_since: float = inf
     """Time in s since which reports miss such packets."""
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
@@ -219,7 +219,8 @@ class Peers:
             peer.lost.clear()  # what it was expected to lack
         self._note_times(peer, number, loss, now)
         records, bit, delay = self._packets.records, peer.bit, peer.delay
-        peer.waits = -1
+        if settled or peer.waits > number - MAP:  # a report of newer packets says nothing about it
+            peer.waits = -1
         if settled:
             lacks = ~arrived & (1 << MAP) - 1
             needs = number - lacks.bit_length() + 1
@@ -228,6 +229,7 @@ class Peers:
                 peer.lost.clear()
         before = number if self._shared is None else self._shared.waited_for(now, self._period)
         missing: list[Sent] = []
+        waits = [peer.waits] if peer.waits >= 0 else []
         for back in range(MAP):
             record = records.get(number - back)
             if arrived >> back & 1:
@@ -236,12 +238,13 @@ class Peers:
                     peer.lost.discard(record.number)
             elif record is None or not record.alive(now):
                 if 0 < number - back <= before:
-                    peer.waits = number - back
+                    waits.append(number - back)
             elif record.confirmed & bit:
                 continue
             elif now - record.at >= delay:
                 missing.append(record)
         self._lacks(peer, missing)
+        peer.waits = min(waits, default=-1)
         peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
         self._note()
         if settled:

@@ -247,3 +247,17 @@ def test_new_messages_cross_while_those_of_a_long_outage_are_repaired(loss: floa
     talk.air.run(60)
     for topic, said in talk.reliable(1):
         assert talk.got(other, 1, topic) == said
+
+
+def test_a_full_link_says_after_an_outage_what_it_does_not_repair() -> None:
+    """Reports name the newest packets and the oldest missing ones in turn: the former do not end the wait for these."""
+    one, other = Robot(1, registry(goal=TopicOptions(), odom=TopicOptions(queue="latest"))), Robot(2)
+    air, goals = Air(one, other), []
+    air.lost = lambda *_: 3 <= air.now < 9
+    for slot in range(1275):
+        one.end.messages.submit(1, bytes(62), air.now)  # more than a packet in every slot
+        if slot % 20 == 0:
+            goals.append(b"%d" % slot)
+            one.end.messages.submit(0, goals[-1], air.now)
+        air.step()
+    assert [text for text in other.delivered() if len(text) < 62] == goals
