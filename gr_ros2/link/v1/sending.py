@@ -97,10 +97,9 @@ class SendingSide:
         due = reports.due(now)
         if due and reports.overdue:
             return reports.packet(due, now)
-        if self._window.pressing and not packing.urgent:
-            first = self.repairs.first(now, waiting=packing.next_timeout(now) <= now)
-            if first is not None:
-                return first
+        first = self._window.pressing and not packing.urgent
+        if first and (repair := self.repairs.first(now, waiting=packing.next_timeout(now) <= now)) is not None:
+            return repair
         room = self._writer.room
         if self._relaying is not None and messages.relayed is not None:
             leaves = now if self._writer.leave_at is None else max(now, self._writer.leave_at)
