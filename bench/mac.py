@@ -40,7 +40,7 @@ def slots(number: int, rng: random.Random) -> Slots:
 
 
 def aloha(number: int, rng: random.Random) -> Aloha:
-    return Aloha(number, AIRTIME_S, rng)
+    return Aloha(number, AIRTIME_S, rng, period_s=0.1)
 
 
 def line(robots: int, reach: int) -> Graph:

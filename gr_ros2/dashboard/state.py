@@ -35,6 +35,7 @@ from gr_ros2.link.events import (
     SentPacket,
 )
 from gr_ros2.link.fates import Fate, arrived
+from gr_ros2.link.lateness import LATE_S
 from gr_ros2.link.tracker import Tracked, Tracker
 from gr_ros2.observe.latency import Latency, latency, latency_cdf
 from gr_ros2.observe.positions import PositionReader, position_reader
@@ -49,8 +50,6 @@ UNDER_WAY = 4096
 """Most messages of a source that wait for their delivery. The oldest is forgotten first and then has no latency."""
 PACKETS_SHOWN = 12
 
-LATE_S = 0.05
-"""s. A computer that is late by this much does not keep up, see :mod:`gr_ros2.link.lateness`."""
 _SILENT_S = 5.0
 """s without a packet after which a link is down."""
 _GOOD = 0.9

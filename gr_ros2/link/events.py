@@ -65,7 +65,7 @@ class Received(NamedTuple):
     @property
     def identity(self) -> PacketId:
         """Its name. It is made when somebody asks: a value more for each packet costs an endpoint 1 %."""
-        return PacketId(*self[2:6])
+        return PacketId(self.src_id, self.boot, self.number, self.repair_id)
 
 
 class Rejected(NamedTuple):
@@ -230,7 +230,7 @@ class SentPacket(NamedTuple):
     @property
     def identity(self) -> PacketId:
         """Its name, see :class:`Received`."""
-        return PacketId(*self[2:6])
+        return PacketId(self.src_id, self.boot, self.number, self.repair_id)
 
 
 SenderEvent = Accepted | Refused | Missed | Ended | SentPacket

@@ -32,17 +32,20 @@ ERROR_DB = 1.0
 CORRECTION_DB_S = 3.0
 """dB of correction per s, for a loss of 1 where 0 was expected."""
 FORGET_S = 2.0
-"""s in which the correction falls to 1/e: the SNR is trusted again in the end. With the speed above it limits the
+"""s in which the correction falls to 1/e: the SNR is trusted again in the end. With ``CORRECTION_DB_S`` it limits the
 correction to 6 dB."""
 GAPS = 4.0
 """Usual times between two reports after which a robot counts as silent, if it should have reported."""
-LEAST_SILENT_S, MOST_SILENT_S = 0.04, 1.0
-"""The least that this is, s, and the time after which no report is trusted."""
+LEAST_SILENT_S = 0.04
+"""s after which a robot counts as silent at the earliest."""
+MOST_SILENT_S = 1.0
+"""s after which no report is trusted."""
 UNANSWERED = 12
 """Packets to a robot since its last report, from which on it should have reported."""
 SMOOTHING = 0.125
 """Share of what is new in the averages of the time between reports and of the rate of change."""
 _STEEPEST = 50.0
+"""Largest exponent of the odds; beyond it the share that arrives is 0 or 1."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class Aloha:
     """
 
     def __init__(
-        self, src_id: int, airtime_s: float, rng: random.Random, *, period_s: float = 0.1, lead_s: float = 0.0
+        self, src_id: int, airtime_s: float, rng: random.Random, *, period_s: float, lead_s: float = 0.0
     ) -> None:
         self.src_id, self.lead_s = src_id, lead_s
         self._airtime, self._period, self._rng = airtime_s, period_s, rng

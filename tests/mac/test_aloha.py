@@ -13,7 +13,7 @@ AIRTIME = 1 / 75
 
 def rate(heard_per_robot: float, robots: int) -> float:
     """Packets per s of a robot that hears each of some robots so often per packet of its own."""
-    made, rng = Aloha(0, AIRTIME, random.Random(1)), random.Random(2)
+    made, rng = Aloha(0, AIRTIME, random.Random(1), period_s=0.1), random.Random(2)
     now, sent = 0.0, 0
     while now < 300.0:
         now = made.departure(now)

@@ -27,7 +27,7 @@ def slots(number: int, rng: random.Random) -> Slots:
 
 
 def aloha(number: int, rng: random.Random) -> Aloha:
-    return Aloha(number, AIRTIME, rng)
+    return Aloha(number, AIRTIME, rng, period_s=0.1)
 
 
 def cell(robots: int, config: SwarmConfig, **times: float) -> Swarm:

@@ -39,13 +39,18 @@ STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
 """Times in s after the start at which hellos are sent."""
 HELLO_BYTES_S = 50.0
 """Bytes/s that hellos take, as far as the interval stays between ``OFTEN_S`` and ``SELDOM_S``."""
-OFTEN_S, SELDOM_S = 1.0, 2.0
+OFTEN_S = 1.0
+"""s between two hellos at least, once they are regular."""
+SELDOM_S = 2.0
+"""s between two hellos at most, while others are heard."""
 LONE_S = 10.0
 """Most s between two hellos of a robot that hears nobody: the time doubles with each hello, as in Trickle (RFC 6206). A
 robot that starts is met at once, by its own hellos."""
-EAGER_S, EAGER = 0.1, 20
-"""s between hellos, and number of them, while another robot has not proven yet that it heard this start: until then its
-messages are not delivered."""
+EAGER_S = 0.1
+"""s between hellos while another robot has not proven yet that it heard this start: until then its messages are not
+delivered."""
+EAGER = 20
+"""Number of these hellos."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
 

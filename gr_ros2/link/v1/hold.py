@@ -12,8 +12,8 @@ one way.
 - repairs are owed: each new packet that leaves adds a share that covers the losses, and each repair subtracts one. On a
   link where no repair fits between two messages, repairs go at this rate;
 - waiting does not help. Where the PHY has slots of its own, a message waits for the end of a slot whether a repair is
-  in it or not. After two waits in a row that gained nothing, some repairs go without waiting, and more after each
-  further one.
+  in it or not. After two waits in a row that gained nothing (one, before any has gained something), some repairs go
+  without waiting, and more after each further one.
 
 Invariant: a wait lasts two airtimes at most.
 """

@@ -36,7 +36,7 @@ from gr_ros2.wire.v1 import (
 )
 
 HOP = 1
-"""Hop count of addressed packets: nothing relays them yet."""
+"""Hop count of addressed packets: robots send messages on, not packets."""
 
 
 class PacketWriter:
