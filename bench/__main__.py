@@ -43,6 +43,7 @@ BENCHMARKS = {
     "slow_computer": "bench.slow_computer",
     "compression": "bench.compression",
     "codecs": "bench.codecs",
+    "cameras": "bench.cameras",
     "sweep": "bench.sweep",
     "mac": "bench.mac",
     "cells": "bench.mac",

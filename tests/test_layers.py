@@ -283,7 +283,7 @@ def test_no_module_draws_from_a_global_generator() -> None:
 
 
 def test_no_annotation_is_a_bare_class_variable() -> None:
-    """Write ``ClassVar[Any]``: pydantic evaluates annotations, and Python 3.10 cannot evaluate the text ``ClassVar``."""
+    """Write ``ClassVar[Any]``: pydantic evaluates annotations, and Python 3.10 refuses the text ``ClassVar``."""
 
     def bare(module: str) -> list[int]:
         found = [node for node in ast.walk(parsed(module)) if isinstance(node, ast.AnnAssign)]

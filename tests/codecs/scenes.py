@@ -163,9 +163,9 @@ def _walls() -> Array:
     return made
 
 
-def view(number: int, width: int = 640, height: int = 480) -> Array:
+def view(number: float, width: int = 640, height: int = 480) -> Array:
     """What a camera sees that pans and zooms over walls while something moves: uint8 RGB with noise of the sensor."""
-    rng = np.random.default_rng([11, number])
+    rng = np.random.default_rng([11, round(2 * number)])
     turn = number / 15
     zoom = 1.1 + 0.15 * np.sin(0.7 * turn)
     middle_x, middle_y = 800 + 330 * np.sin(0.5 * turn), 450 + 120 * np.sin(0.83 * turn)
