@@ -91,8 +91,9 @@ class Reporter:
         self.reported_at = 0.0
         self._pause_s = self._after(_PAUSE_S)
         """s after which a report is due, where nobody else shares the channel: it does not change there."""
-        self._most = self._every = _EVERY * (4 if self._rare else 1)
-        """Packets after which a report is due, now and where something is lost."""
+        self._every = _EVERY * (4 if self._rare else 1)
+        self._most: float = self._every
+        """Packets after which a report is due now; more than ``_every`` where nothing is lost."""
         self._slowly = 1.0
         """By how much longer than ``_PAUSE_S`` the next report is put off, because nothing is lost."""
         self._old_turn = False
