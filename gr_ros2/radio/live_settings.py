@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, shortened
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.settings.config import TopicOptions
 
@@ -49,7 +49,7 @@ class LiveSettings:
         place = _of_topic(name)
         if place is None:
             self._setters[name](value)
-            return f"{name} = {value}"
+            return shortened(f"{name} = {value}")
         topic, option = place
         given = self._source.config.topic_options
         known = next((other for other in given if other.lstrip("/") == topic.lstrip("/")), topic)
@@ -57,7 +57,7 @@ class LiveSettings:
         changed = {**{each.name: getattr(before, each.name) for each in fields(TopicOptions)}, option: value}
         self._source.set_topic_options({**given, known: changed})
         sent = {topic.name.lstrip("/") for topic in self._source.subscriptions.subscribed.values()}
-        return f"{name} = {value}" + ("" if topic.lstrip("/") in sent else f"; no topic {topic} is sent now")
+        return shortened(f"{name} = {value}") + ("" if topic.lstrip("/") in sent else f"; no topic {topic} is sent now")
 
 
 def _of_topic(name: str) -> tuple[str, str] | None:

@@ -102,6 +102,7 @@ def test_what_can_change_is_what_the_version_says(tmp_path: Path, version: int) 
         assert {name for name in ours if f"ros_source.{name}" in said} == ours
         assert ("dst_id" in said, "TOPIC.to" in said) == (version == 0, version == 1)
         assert live.change("ros_source.queue_depth", 7) == "ros_source.queue_depth = 7"
+        assert live.change("ros_source.queue_depth", "7\n") == "ros_source.queue_depth = 7"
         assert source.config.queue_depth == 7
         with pytest.raises(ConfigError, match="queue_depth = -1"):
             live.change("ros_source.queue_depth", -1)
