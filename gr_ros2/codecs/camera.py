@@ -74,7 +74,7 @@ _FORM = 1
 
 @dataclass(frozen=True)
 class CameraCodec:
-    """See Codec.
+    """Pictures as H.264 within a budget.
 
     :param size: 'auto', 'full', or the most pixels as '320x240'
     :param output: 'same', or the type that comes out: CompressedImage, CompressedVideo or FFMPEGPacket
@@ -91,16 +91,13 @@ class CameraCodec:
             raise ConfigError(f"camera: output_type is {self.output_type!r}; it takes same, {', '.join(OUTPUTS)}")
 
     def encoder(self) -> CameraEncoder:
-        """See Codec."""
         return CameraEncoder(self)
 
     def decoder(self, max_size: int = MAX_SIZE) -> CameraDecoder:
-        """See Codec."""
         return CameraDecoder(self, max_size)
 
     @property
     def output(self) -> str:
-        """See Codec."""
         return OUTPUTS.get(self.output_type, self.type_name)
 
 
@@ -113,7 +110,7 @@ class _Picture(NamedTuple):
 
 
 class CameraEncoder:
-    """See Encoder."""
+    """Pictures to frames."""
 
     def __init__(self, options: CameraCodec) -> None:
         self._options = options
@@ -124,7 +121,6 @@ class CameraEncoder:
         self._of = (0, 0)
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:
-        """See Encoder."""
         picture = _compressed(message) if self._options.type_name == COMPRESSED_IMAGE else _image(message)
         width, height = picture.frame.width, picture.frame.height
         if budget is None:
@@ -141,7 +137,7 @@ class CameraEncoder:
         return self._video.encode(coded, head, picture.origin.stamp(), budget, key)._replace(said=said)
 
     def confirmed(self, name: int) -> None:
-        """See Encoder."""
+        """Do nothing: no frame needs a confirmed one."""
 
     def _halvings(self, width: int, height: int, budget: int, key: bool) -> int:
         """How often each side is halved."""
@@ -174,7 +170,7 @@ class CameraEncoder:
 
 
 class CameraDecoder:
-    """See Decoder."""
+    """Frames back to messages."""
 
     def __init__(self, options: CameraCodec, max_size: int) -> None:
         self._options, self._max_size = options, max_size
@@ -182,7 +178,6 @@ class CameraDecoder:
         self._resize = VideoReformatter()
 
     def decode(self, data: bytes) -> bytes:
-        """See Decoder."""
         output = self._options.output
         head, side, h264, picture, key = self._video.read(data, output not in (VIDEO, PACKET))
         width, at = read_varint(head)

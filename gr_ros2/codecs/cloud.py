@@ -43,7 +43,7 @@ _FAST = 1
 
 @dataclass(frozen=True)
 class CloudCodec:
-    """See Codec.
+    """Clouds as an octree of voxels, or exactly.
 
     :param voxel: edge of a voxel, m; 0 = exact
     :param range: m from the origin of the cloud's frame; points beyond are left out, of voxels only
@@ -64,16 +64,13 @@ class CloudCodec:
             raise ConfigError(f"cloud: keep is {self.keep!r}; it takes intensity, rgb, or '' for neither")
 
     def encoder(self) -> CloudEncoder:
-        """See Codec."""
         return CloudEncoder(self)
 
     def decoder(self, max_size: int = MAX_SIZE) -> CloudDecoder:
-        """See Codec."""
         return CloudDecoder(max_size)
 
     @property
     def output(self) -> str:
-        """See Codec."""
         return CLOUD
 
 
@@ -96,14 +93,14 @@ class _Voxels(NamedTuple):
 
 
 class CloudEncoder:
-    """See Encoder."""
+    """Clouds to frames."""
 
     def __init__(self, options: CloudCodec) -> None:
         self._options = options
         self._packer, self._fast = Packer(), Packer(_FAST)
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:  # noqa: ARG002
-        """See Encoder. Voxels become larger, by factors of two, until the frame is within the budget."""
+        """The frame of a cloud. Voxels become larger, by factors of two, until the frame is within the budget."""
         cloud = read(CLOUD, message)
         _check(cloud)
         if not self._options.voxel:
@@ -127,7 +124,7 @@ class CloudEncoder:
         return frame(_VOXELS, body, said=said)
 
     def confirmed(self, name: int) -> None:
-        """See Encoder."""
+        """Do nothing: no frame needs a confirmed one."""
 
     def _voxels(self, points: Whole, kept: Whole | None) -> _Voxels:
         places = np.floor(points / self._options.voxel)
@@ -202,13 +199,12 @@ _NO_VALUES: tuple[Any, ...] = (np.zeros((0, 0), np.uint8), 0.0, 0.0)
 
 
 class CloudDecoder:
-    """See Decoder."""
+    """Frames back to messages."""
 
     def __init__(self, max_size: int) -> None:
         self._packer, self._max_size = Packer(), max_size
 
     def decode(self, data: bytes) -> bytes:
-        """See Decoder."""
         form, before, body = opened(data)
         if before is not None or form > _VOXELS:
             raise DamagedError(f"damaged cloud: no form {form}")

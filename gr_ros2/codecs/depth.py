@@ -69,7 +69,7 @@ _GREATEST = 254
 
 @dataclass(frozen=True)
 class DepthCodec:
-    """See Codec.
+    """Depth as inverse distances within a budget.
 
     :param mode: 'auto' is video within a budget and 10 bits without one; 8, 10 or 12 bits; 'exact'
     :param near, far: m; 0 = found from the images
@@ -87,16 +87,13 @@ class DepthCodec:
             raise ConfigError(f"depth: near is {self.near} and far {self.far}; give distances in m, or 0 for automatic")
 
     def encoder(self) -> DepthEncoder:
-        """See Codec."""
         return DepthEncoder(self)
 
     def decoder(self, max_size: int = MAX_SIZE) -> DepthDecoder:
-        """See Codec."""
         return DepthDecoder(self, max_size)
 
     @property
     def output(self) -> str:
-        """See Codec."""
         return self.type_name
 
 
@@ -111,7 +108,7 @@ class _Depth(NamedTuple):
 
 
 class DepthEncoder:
-    """See Encoder."""
+    """Depth to frames."""
 
     def __init__(self, options: DepthCodec) -> None:
         self._options = options
@@ -120,7 +117,6 @@ class DepthEncoder:
         self._range = (0.0, 0.0)
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:
-        """See Encoder."""
         mode = str(self._options.mode)
         if mode == EXACT:
             raise UnfitError("")
@@ -143,7 +139,7 @@ class DepthEncoder:
         return frame(_BITS, body, said=f"{said} in {bits} bits")
 
     def confirmed(self, name: int) -> None:
-        """See Encoder."""
+        """Do nothing: no frame needs a confirmed one."""
 
     def _distances(self, metres: Values, mask: Values, key: bool) -> tuple[float, float]:
         """The nearest and the farthest distance of the steps, m, as float32 has them."""
@@ -162,7 +158,7 @@ class DepthEncoder:
 
 
 class DepthDecoder:
-    """See Decoder."""
+    """Frames back to messages."""
 
     def __init__(self, options: DepthCodec, max_size: int) -> None:
         self._options, self._max_size = options, max_size
@@ -171,7 +167,6 @@ class DepthDecoder:
         self._packer = Packer()
 
     def decode(self, data: bytes) -> bytes:
-        """See Decoder."""
         form, before, body = opened(data)
         try:
             if form == _VIDEO:

@@ -53,26 +53,23 @@ class _Grid(NamedTuple):
 
 @dataclass(frozen=True)
 class GridCodec:
-    """See Codec; it has no options."""
+    """Maps as what has changed. It has no options."""
 
     type_name: str
 
     def encoder(self) -> GridEncoder:
-        """See Codec."""
         return GridEncoder()
 
     def decoder(self, max_size: int = MAX_SIZE) -> GridDecoder:
-        """See Codec."""
         return GridDecoder(max_size)
 
     @property
     def output(self) -> str:
-        """See Codec."""
         return GRID
 
 
 class GridEncoder:
-    """See Encoder."""
+    """Maps to frames."""
 
     def __init__(self) -> None:
         self._packer = Packer()
@@ -80,7 +77,6 @@ class GridEncoder:
         self._base: tuple[int, _Grid] | None = None
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:  # noqa: ARG002
-        """See Encoder."""
         grid = _split(message)
         coded = frame(_WHOLE, self._packer.pack(message))
         if key:
@@ -95,7 +91,6 @@ class GridEncoder:
         return coded
 
     def confirmed(self, name: int) -> None:
-        """See Encoder."""
         if name in self._sent:
             self._base = (name, self._sent[name])
             while next(iter(self._sent)) != name:
@@ -121,7 +116,7 @@ class GridEncoder:
 
 
 class GridDecoder:
-    """See Decoder."""
+    """Frames back to messages."""
 
     def __init__(self, max_size: int) -> None:
         self._packer, self._max_size = Packer(), max_size
@@ -129,7 +124,6 @@ class GridDecoder:
         self._base: tuple[int, _Grid] | None = None
 
     def decode(self, data: bytes) -> bytes:
-        """See Decoder."""
         form, before, body = opened(data)
         if form > _CHANGES or (form == _CHANGES) != (before is not None):
             raise DamagedError(f"damaged grid: no form {form}")

@@ -119,14 +119,13 @@ def configured(name: str, type_name: str, options: Mapping[str, Any] | str) -> C
 
 
 class TopicEncoder:
-    """See Encoder; it raises no UnfitError."""
+    """The messages of one topic to frames of the codecs of its types. It raises no UnfitError."""
 
     def __init__(self, topic: CodedTopic) -> None:
         self._made: dict[int, Encoder] = {n: codec.encoder() for n, codec in topic.codecs.items()}
         self._missing = topic.missing
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:
-        """See Encoder."""
         said = self._missing
         for number, encoder in self._made.items():
             try:
@@ -138,20 +137,18 @@ class TopicEncoder:
         raise AssertionError("the exact codec takes every message")
 
     def confirmed(self, name: int) -> None:
-        """See Encoder."""
         for encoder in self._made.values():
             encoder.confirmed(name)
 
 
 class TopicDecoder:
-    """See Decoder. Its memory is that of one decoder of each codec of the topic."""
+    """Frames back to messages. Its memory is that of one decoder of each codec of the topic."""
 
     def __init__(self, topic: CodedTopic, max_size: int) -> None:
         self._topic, self._max_size = topic, max_size
         self._made: dict[int, Decoder] = {}
 
     def decode(self, data: bytes) -> bytes:
-        """See Decoder."""
         number = data[0] if data else 0
         if not data or number not in self._topic.codecs:
             raise DamagedError(f"damaged frame: no codec {number} for {self._topic.type_name}")
