@@ -38,6 +38,7 @@ BENCHMARKS = {
     "rates": "bench.phys",
     "drive": "bench.phys",
     "beside": "bench.phys",
+    "start": "bench.start",
     "stop": "bench.stop",
     "reopen": "bench.reopen",
     "slow_computer": "bench.slow_computer",
