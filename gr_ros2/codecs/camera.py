@@ -40,6 +40,7 @@ from gr_ros2.compression.zstd_frames import read_varint
 from gr_ros2.core.errors import ConfigError, DamagedError, UnfitError
 from gr_ros2.wire import varint
 
+_BAYER = "bayer"
 LEAST_PER_BLOCK = 3
 """Bytes."""
 ENCODINGS = {
@@ -102,10 +103,14 @@ class CameraCodec:
 
 
 class _Picture(NamedTuple):
-    """:param label: encoding, or format of a compressed image"""
+    """:param frame: the picture, and at most a row and a column more where they are odd
+    :param label: encoding, or format of a compressed image
+    """
 
     origin: Origin
     frame: av.VideoFrame
+    width: int
+    height: int
     label: str
 
 
@@ -122,13 +127,13 @@ class CameraEncoder:
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:
         picture = _compressed(message) if self._options.type_name == COMPRESSED_IMAGE else _image(message)
-        width, height = picture.frame.width, picture.frame.height
+        width, height = picture.width, picture.height
         if budget is None:
             budget = _USUAL_PER_BLOCK * _blocks(width, height)
         halved = self._halvings(width, height, budget, key)
         shown = _shown(width, height, halved)
         frame = picture.frame
-        if frame.format.name.startswith("bayer") and halved:
+        if frame.format.name.startswith(_BAYER):
             frame = self._resize.reformat(frame, format="rgb24")
         coded = self._resize.reformat(frame, _even(shown[0]), _even(shown[1]), "yuv420p", interpolation="AREA")
         head = b"".join([*map(varint, shown), text(picture.label), text(picture.origin.frame_id)])
@@ -210,7 +215,7 @@ class CameraDecoder:
         kind, size = ENCODINGS[label]
         if width * height * size > self._max_size:
             raise DamagedError(f"damaged video: {width} × {height} pixels, at most {self._max_size} bytes are accepted")
-        if not kind.startswith("bayer"):
+        if not kind.startswith(_BAYER):
             return video.to_rows(self._resize.reformat(picture, width, height, kind), width * size)
         colours = video.to_rows(self._resize.reformat(picture, width, height, "rgb24"), 3 * width)
         return _mosaic(colours.reshape(height, width, 3), label)
@@ -248,7 +253,11 @@ def _image(message: bytes) -> _Picture:
     if image.encoding not in ENCODINGS:
         raise UnfitError(f"image: encoding {image.encoding!r} is not one of pictures: {', '.join(ENCODINGS)}")
     kind, size = ENCODINGS[image.encoding]
-    return _Picture(Origin(image.header), video.from_rows(rows_of(image, size), image.width, kind), str(image.encoding))
+    rows, width = rows_of(image, size), image.width
+    if kind.startswith(_BAYER):
+        rows, width = _whole_patterns(rows[:, :width]), _even(width)
+    picture = video.from_rows(rows, width, kind)
+    return _Picture(Origin(image.header), picture, image.width, image.height, str(image.encoding))
 
 
 def rows_of(image: Any, size: int) -> Pixels:
@@ -279,7 +288,19 @@ def _compressed(message: bytes) -> _Picture:
     picture = video.still(codec, data)
     if "16" in picture.format.name or "48" in picture.format.name or "64" in picture.format.name:
         raise UnfitError(f"image: a picture of 16 bits for each colour ({picture.format.name})")
-    return _Picture(Origin(image.header), picture, str(image.format))
+    return _Picture(Origin(image.header), picture, picture.width, picture.height, str(image.format))
+
+
+def _whole_patterns(rows: Pixels) -> Pixels:
+    """A Bayer image whose sides are even: FFmpeg's converter ends the process at an odd one.
+
+    :raises UnfitError: for an image that is too small for a pattern
+    """
+    height, width = rows.shape
+    if min(height, width) < 2:
+        raise UnfitError(f"image: {width} × {height} pixels are no Bayer pattern")
+    # Mirrored at the last pixel, so that the new one has the colour that the pattern has there.
+    return np.pad(rows, ((0, height % 2), (0, width % 2)), mode="reflect")
 
 
 def _mosaic(colours: Pixels, label: str) -> Pixels:

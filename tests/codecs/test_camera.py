@@ -73,6 +73,18 @@ def test_odd_sizes_stay(encoding: str) -> None:
     assert psnr(out.data.reshape(rows.shape), rows) > 18
 
 
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(sorted(ENCODINGS)), st.integers(1, 70), st.integers(1, 70), st.integers(30, 4000))
+def test_images_of_any_size_come_out_in_it(encoding: str, width: int, height: int, budget: int) -> None:
+    """FFmpeg's converter would end the process for a Bayer image with an odd side."""
+    width += width % 2 if ENCODINGS[encoding][1] == 2 else 0
+    pixels = np.random.default_rng(1).integers(0, 256, (height, width, ENCODINGS[encoding][1]), np.uint8)
+    message = image(pixels, encoding)
+    topic = CodedTopic(IMAGE, {"camera": {"size": "full"}})
+    out = read(IMAGE, topic.decoder().decode(topic.encoder().encode(message, budget).data))
+    assert (out.width, out.height, out.encoding, len(out.data)) == (width, height, encoding, pixels.size)
+
+
 @pytest.mark.parametrize("encoding", ["rgb16", "16UC3", "yuv420", "", "bayer_rggb16"])
 def test_an_unknown_encoding_passes_exactly_and_is_named(encoding: str) -> None:
     message = image(view(0, 16, 8), encoding)

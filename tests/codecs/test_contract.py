@@ -90,6 +90,38 @@ def test_a_frame_without_the_one_that_it_needs_is_not_shown(sample: Sample) -> N
 
 
 @samples
+def test_whatever_is_lost_doubled_or_late_what_is_shown_is_what_was_sent(sample: Sample) -> None:
+    """With joiners, and with restarts of the sender, whose frames are of another chain."""
+    rng = random.Random(4)
+    sent: list[tuple[bytes, bytes]] = []
+    for _ in range(3):
+        perfect, encoder = sample.topic().decoder(MAX_SIZE), sample.topic().encoder()
+        for number, message in enumerate(sample.messages() * 3):
+            frame = encoder.encode(message, sample.budget, key=number % 7 == 6)
+            sent.append((frame.data, perfect.decode(frame.data)))
+            if number % 2:
+                encoder.confirmed(frame.name)
+    shown = missing = 0
+    for _ in range(12):
+        decoder = sample.topic().decoder(MAX_SIZE)
+        loss = rng.choice((0.05, 0.3))
+        frames = [frame for frame in sent[rng.randrange(len(sent)) :] if rng.random() > loss]
+        for place in range(len(frames) - 1):
+            if rng.random() < 0.1:
+                frames[place], frames[place + 1] = frames[place + 1], frames[place]
+            elif rng.random() < 0.1:
+                frames[place + 1] = frames[place]
+        for data, message in frames:
+            try:
+                assert decoder.decode(data) == message
+                shown += 1
+            except MissingFrameError:
+                missing += 1
+    assert shown
+    assert missing or all(encoder.encode(message).before is None for message in sample.messages())
+
+
+@samples
 def test_messages_that_are_not_of_the_type_are_damaged_and_the_next_passes(sample: Sample) -> None:
     encoder = sample.topic().encoder()
     for message in sample.messages():
