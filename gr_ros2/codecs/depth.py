@@ -52,6 +52,8 @@ NEAREST_M = 0.1
 """No sensor of depth measures nearer; a number that is smaller would spoil the steps of all others."""
 _LEFT_OUT = 0.001
 """Part of the pixels that may lie outside the two distances of an automatic choice at either end."""
+_FARTHEST_M = 1e30
+"""m; the ends of a frame's distances are apart up to here, as float32 has them."""
 _MARGIN = 1.15
 """A chain of frames keeps its distances until more than ``_OUTSIDE`` of the pixels lie outside them; room for some."""
 _OUTSIDE = 0.005
@@ -151,9 +153,9 @@ class DepthEncoder:
         near, far = self._range
         outside = np.searchsorted(sample, near) + len(sample) - np.searchsorted(sample, far, "right")
         if key or not near or outside > _OUTSIDE * len(sample):
-            near = self._options.near or max(NEAREST_M, low / _MARGIN)
+            near = min(self._options.near or max(NEAREST_M, low / _MARGIN), _FARTHEST_M / 2)
             far = max(self._options.far or high * _MARGIN, near * 1.01)
-            self._range = _RANGE.unpack(_RANGE.pack(near, min(far, 1e30)))
+            self._range = _RANGE.unpack(_RANGE.pack(near, min(far, _FARTHEST_M)))
         return self._range
 
 

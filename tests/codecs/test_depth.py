@@ -144,6 +144,13 @@ def test_a_wrong_option_is_named(options: dict[str, Any], text: str) -> None:
         CodedTopic(IMAGE, {"depth": options})
 
 
+@pytest.mark.parametrize("metres", [1.15e30, 1.1500001306413817e30, 3e38])
+def test_what_no_sensor_measures_comes_out_as_a_distance(metres: float) -> None:
+    for budget in (None, 300):
+        out, _ = through(image(np.full((4, 4), metres, np.float32), "32FC1"), budget=budget)
+        assert np.isfinite(out.data.view("<f4")).all()
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 9), st.integers(1, 9), st.data())
 def test_any_numbers_come_out_in_their_size(width: int, height: int, data: st.DataObject) -> None:
