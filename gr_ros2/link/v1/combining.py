@@ -74,6 +74,19 @@ class Combining:
         first, last = max(number - half, packets.oldest), min(number + half, packets.newest)
         return packets.live(first, last, now)[::-1]
 
+    def fitting(self, window: list[Sent], number: int) -> list[Sent]:
+        """The part of a window whose mask fits beside the bodies: the oldest part that reaches a number; the newest
+        part if that is -1. What a repair names beside it that is not alive would have to be repaired too.
+        """
+        if not window or window[0].number - window[-1].number < len(window):
+            return window
+        size = max(8 * (self._room - max(len(record.body) for record in window)), 1)
+        newest = window[0].number
+        if number >= 0:
+            reached = min((record.number for record in window if record.number >= number), default=newest)
+            newest = min(newest, max(window[-1].number + size - 1, reached))
+        return [record for record in window if newest - size < record.number <= newest]
+
     def combine(self, window: list[Sent], provens: Sequence[int], now: float) -> tuple[Repair, list[Sent]] | None:
         """The combination of a window, and the packets that it combines: all in its span if a mask does not fit beside
         the bodies. None if none can be sent.

@@ -26,10 +26,11 @@ class Lifetime:
     """How long a message is worth repairing.
 
     :param expires: time in s at which it is of no more use
-    :param in_order: whether later messages wait for it
+    :param in_order: whether later messages wait for it; on a channel that many share, also the table of topics
     :param long: whether it takes many packets, so that others go before it
     :param awaited: whether a later message of its topic waits already
     :param left: whether it has left whole
+    :param fresh: whether the next message of its topic is its repair on a channel that many share
     """
 
     expires: float = inf
@@ -37,6 +38,7 @@ class Lifetime:
     long: bool = False
     awaited: bool = False
     left: bool = False
+    fresh: bool = False
 
     def end(self) -> None:
         """It was replaced by a newer message, or needs no repair."""

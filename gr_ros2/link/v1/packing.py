@@ -26,7 +26,7 @@ from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import SentTopics
 from gr_ros2.wire import QOS_LATENCY
-from gr_ros2.wire.v1 import CARRIED_TOPIC, EntryV1, Part, fit
+from gr_ros2.wire.v1 import CARRIED_TOPIC, TABLE_TOPIC, EntryV1, Part, fit
 
 SHARE = 2
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
@@ -164,7 +164,9 @@ class Packing:
             if not message.index:
                 message.begin, message.place = number, place
                 lifetime.expires = message.expires
-                lifetime.in_order, lifetime.long = topic.in_order, self._long(message)
+                lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
+                lifetime.long = self._long(message)
+                lifetime.fresh = not (lifetime.in_order or topic.kept or topic_id > TABLE_TOPIC)
                 topic.queue.started(now)
             if message.submitted < since and not topic.topic.options.max_rate:
                 since = message.submitted

@@ -258,8 +258,6 @@ class Peers:
 
     def _lacks(self, peer: Peer, missing: list[Sent]) -> None:
         """A report names these packets, the newest first, as lost."""
-        if self._shared is not None:
-            self._shared.lacks(missing)
         for record in missing:
             if record.number not in peer.lost:
                 peer.lost.add(record.number)

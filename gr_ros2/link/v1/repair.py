@@ -176,11 +176,12 @@ class RepairWindow:
         return self._combination(window, now) if window else None
 
     def _of_all(self, now: float, lost: int) -> list[Sent]:
-        """The window of a combination of all that is alive, around a packet unless that is -1."""
+        """The window of a combination of all that is worth one, around a packet unless that is -1."""
         assert self._shared is not None
-        self._shared.combined()
+        window = self._combining.fitting(self._shared.window(now, lost), lost)
+        self._shared.combined(window, now)
         self.peers.told()
-        return self._shared.window(now, lost)
+        return window
 
     def _bring(self, record: Sent, now: float) -> Sent | Repair | None:
         """What brings a packet back that peers lack."""

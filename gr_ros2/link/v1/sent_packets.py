@@ -27,7 +27,6 @@ class Sent:
 
     :param at: when it was last sent, s
     :param confirmed: one bit per peer
-    :param combined: number of combinations for all peers that it is in, on a shared channel
     :param covered: number of repairs of it while nobody reported, divided by the number that is enough
     """
 
@@ -38,7 +37,6 @@ class Sent:
     at: float
     confirmed: int = 0
     covered: float = 0.0
-    combined: int = 0
 
     @property
     def in_order(self) -> bool:
@@ -51,6 +49,10 @@ class Sent:
             if now < lifetime.expires:
                 return True
         return False
+
+    def lasts(self, now: float) -> bool:
+        """Whether a message in it is worth something that the next message of its topic does not replace."""
+        return any(now < lifetime.expires and not lifetime.fresh for lifetime in self.lifetimes)
 
 
 class SentPackets:

@@ -3,6 +3,7 @@
 A robot's turn comes seldom there, and something new always waits. So no slot is idle, and repairs of messages in order
 go before new messages, never two in a row. As soon as such a message has left, a combination of it follows where losses
 are to be expected. Each further one that reports call for brings back one packet to every peer, whichever that lacks.
+Packets of which the next message is the repair are left out: who lost one could use no combination with it.
 """
 
 from __future__ import annotations
@@ -70,13 +71,18 @@ class SharedRepairs:
         """
         return not self.within and (self._since > 0 or idle)
 
-    def combined(self) -> None:
-        """A combination leaves."""
+    def combined(self, window: list[Sent], now: float) -> None:
+        """A combination of these packets leaves."""
         self._since = 0
         self._owed = max(self._owed - 1, 0.0)
+        if not window or window[-1].number == self._packets.oldest:
+            self._told_at = now
+        for record in window:
+            record.at = now
 
     def window(self, now: float, lost: int) -> list[Sent]:
-        """All that is alive up to the newest packet in order, newest first; what is around a packet that is older.
+        """All that is worth a combination up to the newest packet in order, newest first; what is around a packet that
+        is older.
 
         :param lost: that packet; -1 for none
         """
@@ -86,12 +92,7 @@ class SharedRepairs:
         ordered = self._ordered if lost < 0 else min(self._ordered, max(lost, packets.oldest) + MAX_WINDOW // 2)
         for newest in (ordered, packets.newest):  # where all in order is confirmed, it says at least that
             first = max(packets.oldest, newest - MAX_WINDOW + 1)
-            window = window or packets.live(first, newest, now)[::-1]
-        if not window or window[-1].number == packets.oldest:
-            self._told_at = now
-        for record in window:
-            record.at = now
-            record.combined += 1
+            window = window or [record for record in packets.live(first, newest, now)[::-1] if record.lasts(now)]
         return window
 
     def waited_for(self, now: float, period: float) -> int:
@@ -101,14 +102,6 @@ class SharedRepairs:
         :param period: mean time between two new packets, s
         """
         return 0 if self.within or now < self._told_at + TOLD * period else self._ordered - 1
-
-    @staticmethod
-    def lacks(missing: list[Sent]) -> None:
-        """Leave out of the packets that a peer misses, newest first, as many as it may have combinations, which do not
-        show in a report: all but one of these, since it may have lost one, and never the newest."""
-        if missing:
-            had = max(record.combined for record in missing)
-            del missing[max(len(missing) - had + 1, 1) :]
 
 
 def newest_of(window: Iterable[Sent], lost: set[int]) -> int | None:

@@ -60,6 +60,21 @@ def test_a_relayed_message_neither_overtakes_nor_delays_what_repair_brings(loss:
     assert whole(everybody, goals)
 
 
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_short_packets_that_relay_leave_turns_for_repairs(mode: SealMode) -> None:
+    """A mask of a repair fits beside them for 64 packets at most, and two of three packets are not worth a repair."""
+    everybody = Cell(*(robot(src_id, mode, TOPICS, packet_len=64) for src_id in (1, 2, 3, 4)), loss=0.3)
+    everybody.invariant.bound = 250
+    everybody.run(5)
+    goals = [b"goal %29d" % n for n in range(40)]
+    for goal in goals:
+        for one in everybody.robots:
+            one.end.messages.submit(1, goal, everybody.now)
+        everybody.run(0.8)
+    everybody.run(20)
+    assert whole(everybody, goals)
+
+
 def one_way_first(now: float, one: int, other: int) -> bool:
     """Robot 3 is heard by others again 3 s before it hears them."""
     return (one == 2 and 10 <= now < 17) or (other == 2 and 10 <= now < 14)
