@@ -81,6 +81,8 @@ def _tell(planner: Planner, advise: bool) -> None:
     if not console.is_terminal:
         console = Console(highlight=False, width=_WIDTH)
     with console.status("the link is simulated"):
+        if advise:
+            planner.begin()
         forecast = planner.forecast()
     phy = planner.phy
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""

@@ -10,11 +10,11 @@ from __future__ import annotations
 import os
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import chain
 from multiprocessing import get_context
 from statistics import fmean
@@ -258,14 +258,19 @@ class Planner:
             for name, topic_id in source_names(source, self.registry).items():
                 self._rows[name], self._weights[name] = self.registry[topic_id].name, options[topic_id].options.weight
         self._remembering: _Remembering | None = None
+        self._now: Forecast | None = None
+        self._begun: Generator[Forecast, None, None] | None = None
 
-    @cached_property
-    def _as_it_is(self) -> Forecast:
-        return self._forecast(self.scenario)
+    def begin(self) -> None:
+        """Have other processes try all changes from the first :meth:`forecast` on, for :meth:`advice`."""
+        scenarios = [scenario for _, scenario in self._trials()]
+        self._begun = _on_all_processors(self._forecast, [self.scenario, *scenarios])
 
     def forecast(self) -> Forecast:
         """The scenario as it is."""
-        return self._as_it_is
+        if self._now is None:
+            self._now = self._forecast(self.scenario) if self._begun is None else next(self._begun)
+        return self._now
 
     @property
     def task(self) -> str:
@@ -297,14 +302,18 @@ class Planner:
         :param lengths: whether other packet lengths are tried
         :param tell: called with the number of forecasts made, and that of all of them
         """
-        base = replace(self.scenario, duration_s=min(self.scenario.duration_s or TRIAL_S, TRIAL_S))
-        settings, variants = zip(("", base), *self._variants(base, lengths), strict=True)
+        self.forecast()
+        trials = [(setting, scenario) for setting, scenario in self._trials() if lengths or "packet_len" not in setting]
+        forecasts = self._begun or _on_all_processors(self._forecast, [scenario for _, scenario in trials])
         made: list[Forecast] = []
-        for forecast in _on_all_processors(self._forecast, variants):
+        for _, forecast in zip(trials, forecasts, strict=False):  # lengths come last
             made.append(forecast)
-            tell(len(made), len(variants))
-        now, *others = made
-        tried = [self._compared(setting, now, then) for setting, then in zip(settings[1:], others, strict=True)]
+            tell(len(made), len(trials))
+        forecasts.close()
+        self._begun = None
+        tried = [
+            self._compared(setting, made[0], then) for (setting, _), then in zip(trials[1:], made[1:], strict=True)
+        ]
         proposed = [advice for advice in tried if advice.worth_it]
         return sorted(proposed, key=lambda advice: (not advice.harmless, -advice.more, -advice.gain, advice.used[1]))
 
@@ -322,16 +331,19 @@ class Planner:
         )
         return Advice(setting, then, (now.used, then.used), effects)
 
-    def _variants(self, base: Scenario, lengths: bool) -> Iterator[tuple[str, Scenario]]:
+    def _trials(self) -> Iterator[tuple[str, Scenario]]:
+        """The first seconds as they are, and with each change; the settings that make it."""
+        base = replace(self.scenario, duration_s=min(self.scenario.duration_s or TRIAL_S, TRIAL_S))
+        yield "", base
         source = base.ros_source
         if not source.compresses:
             yield "ros_source.compression=true", _sending(base, lambda own: replace(own, compression=True))
         if source.packet_rate == 0:
             yield "ros_source.packet_rate=auto", _sending(base, lambda own: replace(own, packet_rate=AUTO))
-        for packet_len in self._packet_lens() if lengths else ():
-            yield f"packet_len={packet_len}", _with_packet_len(base, packet_len)
         if base.duplex == "half" and len(sources_of(base.all_robots)) > 1 and base.medium == "exclusive":
             yield "medium=slots", replace(base, medium="slots")
+        for packet_len in self._packet_lens():
+            yield f"packet_len={packet_len}", _with_packet_len(base, packet_len)
 
     def _packet_lens(self) -> list[int]:
         """Packet lengths such that the messages of one of the topics fit into one packet, or into a few equal parts."""
@@ -578,7 +590,9 @@ class _Remembering:
         return payload
 
 
-def _on_all_processors(work: Callable[[Scenario], Forecast], scenarios: Sequence[Scenario]) -> Iterator[Forecast]:
+def _on_all_processors(
+    work: Callable[[Scenario], Forecast], scenarios: Sequence[Scenario]
+) -> Generator[Forecast, None, None]:
     """The same as ``map``, by forked processes: each has all that this one has loaded and coded.
 
     :raises RunError: for a process that was ended from outside

@@ -195,6 +195,8 @@ def test_several_processes_say_what_one_says(monkeypatch: pytest.MonkeyPatch) ->
     for processors in (1, 3):
         monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, many=processors: set(range(many)))
         plan, told = planner("narrow-ofdm-paced", duration=1.0), []
+        if processors > 1:
+            plan.begin()
         said.append((plan.cuts(), plan.advice(tell=lambda *done, told=told: told.append(done))))
         assert told == [(done, len(told)) for done in range(1, len(told) + 1)] != []
     assert said[0] == said[1] and all(said[0])
