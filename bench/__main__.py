@@ -14,6 +14,7 @@ from rich.console import Console
 from bench.rows import Row, table
 
 BENCHMARKS = {
+    "gate": "bench.gate",
     "codec": "bench.codec",
     "repair": "bench.repair",
     "repair_backlog": "bench.repair_backlog",
@@ -61,7 +62,7 @@ BENCHMARKS = {
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
-    *("rate_rules", "cells", "hidden", "changes", "scale", "crowd", "energy"),
+    *("gate", "rate_rules", "cells", "hidden", "changes", "scale", "crowd", "energy"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

@@ -6,7 +6,8 @@ import pytest
 
 pytest.importorskip("gnuradio")
 
-from bench import port
+from bench import gate, port
+from bench.rows import Row
 
 
 def test_messages_of_the_port_leave_in_the_packets_that_the_row_names(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -20,3 +21,20 @@ def test_a_row_whose_packets_were_compressed_away_ends_the_bench(monkeypatch: py
     monkeypatch.setattr(port, "AS_IT_IS", {})
     with pytest.raises(SystemExit, match="100 messages of 15 packets arrived in"):
         port.blocks_rate(port.ODOMETRY_BYTES, 15)
+
+
+def test_the_gate_misses_what_has_become_twice_as_bad(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = [
+        Row("share", 0.4, sense="≥", target=0.9),
+        Row("cost", 21.0, sense="≤", target=10.0),
+        Row("altered", 1.0, sense="=", target=0.0),
+        Row("a little slower", 15.0, sense="≤", target=10.0),
+        Row("a figure", 1.0),
+    ]
+    monkeypatch.setattr(gate, "_QUICK", (lambda: told,))
+    assert [(row.what, row.met) for row in gate.gate()] == [
+        ("share", False),
+        ("cost", False),
+        ("altered", False),
+        ("a little slower", True),
+    ]
