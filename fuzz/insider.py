@@ -205,8 +205,7 @@ def _parts(script: Script, robot: Robot, room: int) -> list[v1.EntryV1]:
         if script.byte() % 4 or not payload:
             parts.append(v1.Part(topic_id, payload[: room - 3], coded=coded))
         else:
-            offset = script.number()
-            back = script.number() if offset else 0
+            offset, back = script.pick(((0, script.number()), (script.number(), script.number())))
             parts.append(v1.Part(topic_id, payload[:40], back, offset, script.byte() & 1 > 0, coded))
         if script.byte() % 4 == 0:
             parts.append(_control(script, b"echo"))
@@ -214,7 +213,7 @@ def _parts(script: Script, robot: Robot, room: int) -> list[v1.EntryV1]:
 
 
 def _table(script: Script) -> bytes:
-    rows = [row for row in _ROWS if script.byte() & 3]
+    rows = [script.pick((row, row, AnnouncedTopic(row.topic_id, "", ""))) for row in _ROWS if script.byte() & 3]
     return write_table(rows) + script.bytes(3) * (script.byte() % 8 == 0)
 
 

@@ -212,6 +212,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "message_loss_est": stats.message_loss_est,
                 "silence_s": {src_id: self._clock() - at for src_id, at in self._heard.items()},
                 "held_bytes": self._end.held_bytes,
+                "no_table": [peer.robot for peer in self._end.peers(self._clock()) if peer.no_table],
                 "latency_clock": "stamp_sim" if self.config.use_sim_time else "stamp_wall",
                 "middleware": dict(self.middleware.counters),
             }

@@ -11,7 +11,7 @@ them before any observer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import inf
 from typing import Any, Protocol
@@ -191,6 +191,7 @@ class HeardRobot:
     :param hops: robots that have sent its newest message on; 0 where it is heard itself
     :param over: where it is not heard: the neighbour over which it is reached, None if no way is known
     :param doubled: two robots send under its number, or a recording of an earlier start is on the air
+    :param no_table: it has topics, and it is not known which: nothing of its table has come for long
     """
 
     robot: int
@@ -205,6 +206,16 @@ class HeardRobot:
     hops: int = 0
     over: int | None = None
     doubled: bool = False
+    no_table: bool = False
+
+
+def without_table(robots: Iterable[int]) -> list[str]:
+    """One line for each robot of which no table of topics came, and what to do."""
+    return [
+        f"no table of topics of robot {robot} arrived, so nothing of it comes out: too many packets are lost, or the "
+        "channel has no room for it; send less (max_rate, topics), set repair: auto, or let a receiver report"
+        for robot in robots
+    ]
 
 
 class Questions(Protocol):

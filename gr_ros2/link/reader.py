@@ -53,7 +53,7 @@ class Dissection:
     :param entries: entries of a source or control packet, as far as they can be read
     :param combined: linear combination of a repair
     :param hidden: bytes of a body that is encrypted and was not opened
-    :param announced: the table of topics that is complete with this packet
+    :param announced: the rows of its sender's table of topics that it completes and that were not known yet
     """
 
     header: Header
@@ -237,8 +237,8 @@ class Reader:
                 known.newest = max(known.newest, number)
 
     def _announced(self, src_id: int, number: int, entries: Sequence[EntryV1]) -> tuple[AnnouncedTopic, ...]:
-        """The table of topics, if it has become complete and was not known yet."""
-        found: tuple[AnnouncedTopic, ...] = ()
+        """The topics that a robot has announced, if this packet completes rows that were not known yet."""
+        rows: list[AnnouncedTopic] = []
         for place, part in enumerate(entries):
             if not isinstance(part, Part) or part.topic_id != TABLE_TOPIC:
                 continue
@@ -247,11 +247,10 @@ class Reader:
             table.overflowing()
             payload = whole and whole.payload()
             if payload:
-                found = read_table(payload)
-        topics = {topic.topic_id: topic for topic in found}
-        if not found or self.topics.get(src_id) == topics:
-            return ()
-        self.topics[src_id] = topics
+                rows += read_table(payload)
+        topics = self.topics.setdefault(src_id, {})
+        found = tuple(row for row in rows if topics.get(row.topic_id) != row)
+        topics.update({row.topic_id: row for row in found})
         return found
 
 

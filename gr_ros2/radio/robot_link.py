@@ -17,6 +17,7 @@ from typing import Any
 from gr_ros2.core.errors import RadioError
 from gr_ros2.core.watch import Watch
 from gr_ros2.link.airtime_limit import AirtimeLimit
+from gr_ros2.link.endpoint import without_table
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
@@ -288,7 +289,8 @@ class RobotLink(Flowgraph):
     def findings(self) -> list[str]:
         """What a person should know about this link and its surroundings: one line each, mostly none."""
         now, own = self._clock(), self.config.ros_source.src_id()
-        robots = [peer["robot"] for peer in peers(self.end, now)]
+        heard = peers(self.end, now)
+        robots = [peer["robot"] for peer in heard]
         here, there = self.source.middleware, self.sink.middleware
         names = {info.topic for graph in {here, there} for info in graph.discover() if info.publishers}
         services = here.discover_services() if isinstance(here, ServiceGraph) else ()
@@ -297,6 +299,7 @@ class RobotLink(Flowgraph):
             shortcut([*names, *services], own, robots),
             foreign(names, self.sink.stats()["topics"]),
             *self.same_numbers(),
+            *without_table(peer["robot"] for peer in heard if peer["no_table"]),
             full if self._ros.shares else None,
         ]
         with self.end.lock:

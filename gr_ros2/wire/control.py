@@ -44,7 +44,7 @@ class Hello(NamedTuple):
         random bits
     :param turns: how often the 16-bit packet number has wrapped around, 0..2^32-1
     :param capabilities: ``CAN_HEAR``, ``ENCRYPTS``, ``REPORTED`` and ``WANTS_PROOF``; other bits are ignored
-    :param digest: CRC-32 of the robot's table of topics, 0 if it has none
+    :param digest: sum of the marks of the rows in the robot's table of topics, 0 if it has none
     :param marks: (topic id, CRC-32 of the message as transmitted) of messages kept for robots that join late
     """
 

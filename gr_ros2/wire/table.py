@@ -1,13 +1,14 @@
-"""The table of topics that a robot announces: a message of version 1 on topic ``TABLE_TOPIC``.
+"""The table of topics that a robot announces: rows in messages of version 1 on topic ``TABLE_TOPIC``.
 
 Invariants: ``read_table`` raises nothing but a named WireError; ``read_table(write_table(topics)) == topics``; equal
-tables have equal bytes, so a receiver can tell from their CRC-32 whether it has the newest.
+rows have equal bytes, so a receiver can tell from the sum of their marks whether it has the newest of each.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import NamedTuple
+from zlib import crc32
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError, VersionError
 from gr_ros2.wire.format import BROADCAST, QOS_NAMES
@@ -21,7 +22,8 @@ class AnnouncedTopic(NamedTuple):
     """One topic.
 
     :param topic_id: 0..239
-    :param name: as registered, relative to the robot's namespace or absolute with leading slash
+    :param name: as registered, relative to the robot's namespace or absolute with leading slash; '' for a topic that is
+        not offered any more
     :param type_name: ``package/msg/Type``
     :param qos: 0 default, 1 latency, 2 bulk
     :param reliable: its publishers are reliable: messages are delivered in their order
@@ -43,8 +45,15 @@ class AnnouncedTopic(NamedTuple):
     fresh: bool = False
     dst_id: int = BROADCAST
 
+    @property
+    def mark(self) -> int:
+        """CRC-32 of a table of this row alone. The sum of those of all rows, mod 2^32, tells two tables apart."""
+        return crc32(write_table((self,)))
+
     def describe(self) -> str:
         """The topic in words."""
+        if not self.name:
+            return f"topic {self.topic_id}: not offered any more"
         words = [f"topic {self.topic_id}: {self.name} {self.type_name}, {QOS_NAMES[self.qos]}"]
         words += ["reliable"] * self.reliable + ["latched"] * self.latched + ["of no use when old"] * self.fresh
         words += [f"depth {self.depth}"] * (self.depth > 0) + [f"codec {self.codec}"] * bool(self.codec)

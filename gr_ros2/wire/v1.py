@@ -116,7 +116,7 @@ class Part(NamedTuple):
 
     :param topic_id: 0..239, 240 for the table of topics, 241 and 242 for messages of other robots
     :param payload: these bytes of the message
-    :param back: how many source packets ago the message began
+    :param back: how many source packets ago the message began; of one that is sent again, when it was first sent
     :param offset: where in the message the payload stands, bytes
     :param last: whether the message ends with it
     :param coded: whether the message is coded (compressed); its first byte then says how
@@ -135,15 +135,20 @@ class Part(NamedTuple):
         return self.back
 
     @property
+    def whole(self) -> bool:
+        """Whether it is a message, and no fragment."""
+        return self.last and not (self.offset or self.back)
+
+    @property
     def label(self) -> str:
         """``[whole]``, or ``-back[offset..end)``; ``]`` instead of ``)`` where the message ends."""
-        if self.last and not self.offset:
+        if self.whole:
             return "[whole]"
         return f"-{self.back}[{self.offset}..{self.offset + len(self.payload)}{']' if self.last else ')'}"
 
     def describe(self) -> str:
         """The same as ``label``, in words."""
-        if self.last and not self.offset:
+        if self.whole:
             return "whole"
         end = ", its last" if self.last else ""
         return f"began {self.back} packets ago, bytes from {self.offset} on{end}"
@@ -281,12 +286,12 @@ def fit(room: int, remaining: int, back: int, offset: int) -> tuple[int, int]:
 
     :param room: bytes free
     :param remaining: bytes of the message not yet sent
-    :param back: source packets since it began; without meaning at offset 0
+    :param back: source packets since it began, 0 where it begins
     :param offset: bytes of it already sent
     :return: bytes of payload (-1 if nothing fits) and bytes of the entry. A fragment that is not the last one fills the
         body.
     """
-    head = 2 + (_varint_len(back) + _varint_len(offset) if offset else 0)
+    head = 2 + (_varint_len(back) + _varint_len(offset) if offset or back else 0)
     if remaining < room - head:
         return remaining, head + (not 0 < remaining <= _SHORT) + remaining
     most = min(room - head, remaining)
@@ -344,7 +349,7 @@ def read_body(body: bytes, room: int) -> list[EntryV1]:
         if kind >= _MIDDLE:
             back, position = _read_varint(body, position, end)
             offset, position = _read_varint(body, position, end)
-            if not offset:
+            if not (offset or back):
                 raise EntryKindError("a later fragment at the begin of its message")
         stop = end if length < 0 else position + length
         if stop > end or position > stop:
@@ -364,14 +369,15 @@ def read_body(body: bytes, room: int) -> list[EntryV1]:
 def _write_part(part: Part, room: int) -> bytes:
     topic_id, payload, back, offset, last, coded = part
     size = len(payload)
-    kind = (_LAST if last else _MIDDLE) if offset else (_WHOLE if last else _FIRST)
+    later = offset or back
+    kind = (_LAST if last else _MIDDLE) if later else (_WHOLE if last else _FIRST)
     if not 0 <= topic_id <= CARRIED_TOPIC:
         raise EncodeError(f"topic id {topic_id} is not in 0..{CARRIED_TOPIC}")
-    if not 0 <= offset <= MAX_MESSAGE - size or not 0 <= back <= MAX_BACK or (back and not offset):
+    if not 0 <= offset <= MAX_MESSAGE - size or not 0 <= back <= MAX_BACK:
         raise EncodeError(f"a fragment {back} packets and {offset} bytes after the begin of its message, {size} long")
     if kind and not size:
         raise EncodeError("a fragment has at least one byte")
-    place = varint(back) + varint(offset) if offset else b""
+    place = varint(back) + varint(offset) if later else b""
     flags = kind << 6 | coded * _CODED
     if 2 + len(place) + size == room:
         return bytes((topic_id + 1, flags | _FILL)) + place + payload

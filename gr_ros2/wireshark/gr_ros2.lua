@@ -79,7 +79,7 @@ local f = {
     hello_encrypts = ProtoField.bool("gr_ros2.hello.encrypts", "Encrypts", 8, nil, 0x02),
     hello_reported = ProtoField.bool("gr_ros2.hello.reported", "Gets reports", 8, nil, 0x04),
     hello_wants_proof = ProtoField.bool("gr_ros2.hello.wants_proof", "Wants proof", 8, nil, 0x08),
-    hello_digest = ProtoField.uint32("gr_ros2.hello.digest", "CRC-32 of the table of topics", base.HEX),
+    hello_digest = ProtoField.uint32("gr_ros2.hello.digest", "digest of the table of topics", base.HEX),
     hello_topic_id = ProtoField.uint8("gr_ros2.hello.topic_id", "Kept for late joiners, topic id"),
     hello_mark = ProtoField.uint32("gr_ros2.hello.mark", "CRC-32 of that message", base.HEX),
     ask_src_id = ProtoField.uint8("gr_ros2.ask.src_id", "Asks robot"),
@@ -509,17 +509,21 @@ local function read_table(bytes)
     return rows
 end
 
--- Keep a fragment of a robot's table of topics; its rows once all fragments are here.
+-- Keep a fragment of a row of a robot's table of topics; the row once all of it is here. What is sent again may be cut
+-- elsewhere.
 local function keep_fragment(src, begin, offset, last, bytes)
     tables[src] = tables[src] or {}
     local parts = tables[src][begin] or {}
     tables[src][begin] = parts
-    parts[offset] = bytes
+    parts[#parts + 1] = { from = offset, to = offset + bytes:len(), bytes = bytes }
     parts.total = last and offset + bytes:len() or parts.total
+    table.sort(parts, function(one, other) return one.from < other.from end)
     local whole, at = ByteArray.new(), 0
-    while parts[at] and parts[at]:len() > 0 do
-        whole:append(parts[at])
-        at = at + parts[at]:len()
+    for _, part in ipairs(parts) do
+        if part.from <= at and part.to > at then
+            whole:append(part.bytes:subset(at - part.from, part.to - at))
+            at = part.to
+        end
     end
     if at ~= parts.total then
         return nil
@@ -531,7 +535,7 @@ end
 local function show_table(tree, range, rows)
     for _, row in ipairs(rows) do
         local item = tree:add(f.table_topic_id, range, row.id)
-        item:append_text(string.format(": %s, %s", row.name, row.kind))
+        item:append_text(row.name == "" and ": not offered any more" or string.format(": %s, %s", row.name, row.kind))
         item:add(f.table_name, range, row.name):set_generated()
         item:add(f.table_type, range, row.kind):set_generated()
         item:add(f.table_codec, range, row.codec):set_generated()
@@ -626,7 +630,7 @@ local function dissect_part(buffer, tree, packet, at, limit)
         end
         entry:add(f.offset, buffer(at, next_at - at), offset)
         at = next_at
-        if offset == 0 then
+        if offset == 0 and back == 0 then
             return refuse(refused.kind)
         end
     end
@@ -643,21 +647,21 @@ local function dissect_part(buffer, tree, packet, at, limit)
     if after > at then
         entry:add(f.payload, buffer(at, after - at))
     end
-    if id >= RELAYED_TOPIC and offset == 0 then
+    if id >= RELAYED_TOPIC and offset == 0 and back == 0 then
         dissect_relayed(buffer, entry, id, at, after)
     end
     if id == TABLE_TOPIC and packet.first_time and after > at then
-        packet.frame.rows = keep_fragment(
+        local rows = keep_fragment(
             packet.src, packet.number - back, offset, place % 3 == 0, buffer(at, after - at):bytes())
-        if packet.frame.rows then
-            announced[packet.src] = {}
-            for _, found in ipairs(packet.frame.rows) do
-                announced[packet.src][found.id] = found
-            end
+        packet.frame.rows = packet.frame.rows or {}
+        packet.frame.rows[begin] = rows
+        announced[packet.src] = announced[packet.src] or {}
+        for _, row in ipairs(rows or {}) do
+            announced[packet.src][row.id] = row.name ~= "" and row or nil
         end
     end
-    if id == TABLE_TOPIC and packet.frame.rows then
-        show_table(entry, buffer(begin, after - begin), packet.frame.rows)
+    if id == TABLE_TOPIC and packet.frame.rows and packet.frame.rows[begin] then
+        show_table(entry, buffer(begin, after - begin), packet.frame.rows[begin])
     end
     return after, string.format("%s[%s]", name, PLACES[place]:match("^%w+"))
 end

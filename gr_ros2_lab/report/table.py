@@ -12,6 +12,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from gr_ros2.link.endpoint import without_table
 from gr_ros2.link.fates import Fate
 from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.result import Result, air_uses
@@ -183,6 +184,9 @@ def notes(result: Result) -> list[str]:
         for topic in result.topics
         if topic.left_out_sent or topic.left_out_received
     ]
+    counters = result.counters
+    counted = [counters, counters.get("back", {}), *counters.get("robots", ())]
+    lines += without_table({robot: None for one in counted for robot in one.get("sink", {}).get("no_table", ())})
     lines += result.incomplete
     if result.interrupted:
         lines.append(f"stopped after {result.duration_s:.1f} s")

@@ -126,7 +126,8 @@ def _counters(run: Simulation, number: int, names: Mapping[str, int]) -> dict[st
     :param names: topic ids by name
     """
     receiver = hearer_of(run.around, number)
-    sent, got = run.robots[number].endpoint.sent, run.robots[receiver].endpoint.received
+    sent, end = run.robots[number].endpoint.sent, run.robots[receiver].endpoint
+    got = end.received
     lost = run.medium.lost[number, receiver]
     return {
         "source": {
@@ -150,6 +151,7 @@ def _counters(run: Simulation, number: int, names: Mapping[str, int]) -> dict[st
             "repeats": got.repeats,
             "packet_loss_est": got.packet_loss_est,
             "message_loss_est": got.message_loss_est,
+            "no_table": [peer.robot for peer in end.peers(run.duration_s) if peer.no_table],
         },
         "channel": {"phy": 0, **lost},
     }

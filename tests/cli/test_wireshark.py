@@ -202,8 +202,8 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
         assert [one.replace(":", "") for one in values(tree, "gr_ros2.payload")] == [
             entry["payload"] for entry in parts if entry["payload"]
         ]
-        assert numbers("offset") == [entry["offset"] for entry in parts if entry["offset"]]
-        assert numbers("back") == [entry["back"] for entry in parts if entry["offset"]]
+        assert numbers("offset") == [entry["offset"] for entry in parts if entry["offset"] or entry["back"]]
+        assert numbers("back") == [entry["back"] for entry in parts if entry["offset"] or entry["back"]]
         assert numbers("coded") == [entry["coded"] for entry in parts]
         for name, of_kind in CONTROLS.items():
             said = [entry for entry in entries if name in entry]

@@ -132,7 +132,7 @@ def read_body(body: bytes, room: int) -> list[dict[str, object]]:
         if which >= 2:
             back, at = varint(body, at, end)
             offset, at = varint(body, at, end)
-            if not offset:
+            if not (offset or back):
                 raise Refused("entry_kind")
         stop = end if fills else at + length
         if stop > end:
@@ -405,28 +405,71 @@ def solve(known: dict[int, bytes], repairs: list[tuple[int, list[int], bytes]], 
 
 
 def messages(bodies: dict[int, bytes], room: int) -> dict[tuple[int, int, int], bytes]:
-    """Whole messages by (topic id, packet in which they began, place among its entries)."""
+    """Whole messages by (topic id, packet in which they began, place among its entries). Where the begin is known only
+    of a message that was sent again, these are those of its newest fragment."""
     whole: dict[tuple[int, int, int], bytes] = {}
-    parts: dict[tuple[int, int], dict[int, tuple[bytes, bool, int]]] = {}
+    parts: dict[tuple[int, int], list[tuple[int, bytes, bool, tuple[int, int], bool]]] = {}
     for number, body in bodies.items():
         for place, entry in enumerate(read_body(body.ljust(room, b"\0"), room)):
             if "topic_id" not in entry:
                 continue
             topic, back, offset = (int(str(entry[name])) for name in ("topic_id", "back", "offset"))
             payload, last = bytes.fromhex(str(entry["payload"])), bool(entry["last"])
-            if last and not offset:
+            if last and not offset and not back:
                 whole[topic, number, place] = payload
             else:
-                parts.setdefault((topic, number - back), {})[offset] = (payload, last, place)
-    for (topic, begin), pieces in parts.items():
-        payload, place, last = b"", 0, False
-        while len(payload) in pieces and not last:
-            piece, last, at = pieces[len(payload)]
-            place = place if payload else at
-            payload += piece
-        if last:
-            whole[topic, begin, place] = payload
+                first = not offset and not back
+                parts.setdefault((topic, number - back), []).append((offset, payload, last, (number, place), first))
+    for (topic, _), pieces in parts.items():
+        data = {at: byte for offset, piece, *_ in pieces for at, byte in enumerate(piece, offset)}
+        ends = [offset + len(piece) for offset, piece, last, *_ in pieces if last]
+        if ends and sorted(data) == list(range(ends[0])):
+            order = next((at for *_, at, first in pieces if first), max(at for *_, at, _ in pieces))
+            whole[topic, order[0], order[1]] = bytes(data[at] for at in range(ends[0]))
     return whole
+
+
+def read_table(data: bytes) -> list[dict[str, object]]:
+    """The rows in a message of topic 240."""
+    if data[:1] != b"\1":
+        raise Refused("version")
+    rows: list[dict[str, object]] = []
+    at = 1
+    while at < len(data):
+        if at + 4 > len(data):
+            raise Refused("entry_bounds")
+        topic_id, flags, depth = data[at : at + 3]
+        at, to = at + 3, 255
+        if flags & 32:
+            at, to = at + 1, data[at]
+            if to == 255:
+                raise Refused("entry_kind")
+        texts: list[str] = []
+        for _ in range(3):
+            if at >= len(data) or at + 1 + data[at] > len(data):
+                raise Refused("entry_bounds")
+            try:
+                texts.append(data[at + 1 : at + 1 + data[at]].decode())
+            except UnicodeDecodeError as error:
+                raise Refused("entry_kind") from error
+            at += 1 + data[at]
+        if topic_id >= 240 or flags >= 64 or flags % 4 == 3 or topic_id in [row["topic_id"] for row in rows]:
+            raise Refused("entry_kind")
+        row: dict[str, object] = {"topic_id": topic_id, "name": texts[0], "type_name": texts[1], "qos": flags % 4}
+        row |= {"reliable": bool(flags & 4), "latched": bool(flags & 8), "depth": depth, "codec": texts[2]}
+        rows.append(row | {"fresh": bool(flags & 16), "dst_id": to})
+    return rows
+
+
+def known_rows(messages: list[bytes]) -> tuple[dict[object, dict[str, object]], int]:
+    """The newest row of each topic of these messages, and what a hello says when these are all."""
+    rows, marks = {}, {}
+    for message in messages:
+        for row in read_table(message):
+            rows[row["topic_id"]] = row
+            if len(read_table(message)) == 1:  # a sender writes one row per message
+                marks[row["topic_id"]] = crc32(message)
+    return rows, sum(marks.values()) % 2**32
 
 
 def delivered(received: list[bytes]) -> list[bytes]:

@@ -13,11 +13,13 @@ import pytest
 
 from gr_ros2.core.errors import WireError
 from gr_ros2.link.events import Delivered
+from gr_ros2.link.v1.announced import AnnouncedTopics
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.gf256 import coefficient
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.outcomes import Outcomes
+from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode, subkey
 from gr_ros2.wire import v1
 from gr_ros2.wire.mac_block import read_block
@@ -151,7 +153,7 @@ def test_kept_messages() -> None:
         outcomes=outcomes,
         control=lambda _: None,
     )
-    inbox.announced.take(write_table((AnnouncedTopic(0, "map", "std_msgs/msg/String", latched=True),)))
+    inbox.announced.take(write_table((AnnouncedTopic(0, "map", "std_msgs/msg/String", latched=True),)), (0, 0))
     for number, payload in enumerate(received, 1):
         part = v1.Part(0, payload)
         inbox.source(number, v1.write_body([part], 40), [part], 0, 0.0)
@@ -243,7 +245,36 @@ def test_the_vectors_are_what_their_tool_writes() -> None:
 
 def test_tables() -> None:
     for case in VECTORS["tables"]:
-        assert read_table(bytes.fromhex(case["hex"])) == tuple(AnnouncedTopic(**row) for row in case["rows"])
+        data = bytes.fromhex(case["hex"])
+        assert read_table(data) == tuple(AnnouncedTopic(**row) for row in case["rows"])
+        assert second.read_table(data) == case["rows"]
+
+
+def test_rows_add_up_to_a_table() -> None:
+    case = VECTORS["announced"]
+    messages = [bytes.fromhex(text) for text in case["messages"]]
+    known = AnnouncedTopics(None, 0)
+    for number, message in enumerate(messages):
+        known.take(message, (number, 0))
+    assert known.take(messages[0], (0, 0)) is None, "an older row"
+    assert [row._asdict() for row in known.topics.values()] == case["rows"]
+    rows, digest = second.known_rows(messages)
+    assert [row for row in rows.values() if row["name"]] == case["rows"]
+    assert known.digest == digest == case["digest"]
+
+
+def test_fragments_of_a_message_that_is_sent_again_add_up() -> None:
+    case = VECTORS["sent_again"]
+    bodies = {int(number): bytes.fromhex(body) for number, body in case["bodies"].items()}
+    topic_id, message = case["topic_id"], bytes.fromhex(case["message"])
+    assert second.messages(bodies, case["room"]) == {(topic_id, 5, 0): message}
+    assert second.messages({n: body for n, body in bodies.items() if n != 23}, case["room"]) == {}
+    reassembly, found = Reassembly(4096), []
+    for number, body in bodies.items():
+        (part,) = v1.read_body(body, case["room"])
+        assert isinstance(part, v1.Part)
+        found.append(reassembly.add(part, number, 0, repaired=False, now=0.0))
+    assert [whole and whole.payload() for whole in found] == [None] * 4 + [message]
 
 
 @pytest.mark.parametrize("mode", ["none", "authenticate", "encrypt"])

@@ -1,24 +1,28 @@
 """The topics that one robot has announced, and the messages that wait for the announcement.
 
-A message can be delivered only if the table of topics names its topic and how it is coded. Messages that arrive before
-the table are kept, within bounds.
+A message can be delivered only if a row of the table of topics names its topic and how it is coded. Rows come one by
+one; messages that arrive before theirs are kept, within bounds.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from zlib import crc32
+from math import inf
 
 from gr_ros2.core.errors import CodecError
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.wire.relayed import Relayed
-from gr_ros2.wire.table import AnnouncedTopic, read_table
+from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 
 _WAITING = 256
 """Number of messages of unknown topics, or coded in an unknown way, that are kept until the table arrives."""
+
+
+ARRIVING_S = 1.0
+"""s for which more of what a robot sends again is waited for before it is asked for it."""
 
 
 class AnnouncedTopics:
@@ -26,8 +30,9 @@ class AnnouncedTopics:
 
     :param decoder_for: makes the decoder for its messages from its table of topics
     :param most: bytes of messages that may wait for the table
-    :ivar topics: by topic id
-    :ivar digest: CRC-32 of the table that is known
+    :ivar topics: those that are offered, by topic id
+    :ivar digest: sum of the marks of the rows that are known
+    :ivar newest: number of the packet that brought the newest row, and when, s
     """
 
     def __init__(
@@ -37,6 +42,10 @@ class AnnouncedTopics:
     ) -> None:
         self.topics: dict[int, AnnouncedTopic] = {}
         self.digest = 0
+        self.newest = (-1, -inf)
+        self._rows: dict[int, AnnouncedTopic] = {}
+        self._orders: dict[int, tuple[int, int]] = {}
+        """The order of the newest row of each topic that the robot's own packets brought."""
         self._decoder_for = decoder_for
         self._codec: MessageCodec | None = None
         self._waiting: deque[Ready] = deque()
@@ -67,20 +76,37 @@ class AnnouncedTopics:
             self._bytes -= len(given_up[-1].payload)
         return given_up
 
-    def take(self, table: bytes) -> tuple[AnnouncedTopic, ...] | None:
-        """Take over a table; returns its topics, None if it is known already.
+    def take(self, table: bytes, order: tuple[int, int], *, direct: bool = True) -> tuple[AnnouncedTopic, ...] | None:
+        """Take over the rows of a table that are newer than those that are known; returns all topics, None if nothing
+        has changed.
 
+        :param order: of the message that it is
+        :param direct: it comes from the robot itself: whatever others say, only its own rows are older or newer
         :raises WireError: it cannot be read
         """
-        topics = read_table(table)
-        digest = crc32(table)
-        if digest == self.digest:
+        rows = [row for row in read_table(table) if order >= self._orders.get(row.topic_id, order)]
+        if direct:
+            self._orders.update(dict.fromkeys((row.topic_id for row in rows), order))
+        changed = {row.topic_id: row for row in rows if row != self._rows.get(row.topic_id)}
+        if not changed:
             return None
-        self.digest = digest
+        self._rows.update(changed)
+        self.digest = sum(row.mark for row in self._rows.values()) & 0xFFFF_FFFF
+        topics = tuple(row for _, row in sorted(self._rows.items()) if row.name)
         self.topics = {topic.topic_id: topic for topic in topics}
         if self._decoder_for is not None:
             self._codec = self._decoder_for(topics)
         return topics
+
+    @property
+    def table(self) -> bytes:
+        """The rows that are known."""
+        return write_table(row for _, row in sorted(self._rows.items()))
+
+    def lacks(self, digest: int, number: int, now: float) -> bool:
+        """Whether rows of a table, named in a hello at a packet number, are neither here nor arriving."""
+        newest, at = self.newest
+        return digest != self.digest and newest <= number and at <= now - ARRIVING_S
 
     def waiting(self) -> list[Ready]:
         """The messages that have waited for a table, in order; they are returned once."""

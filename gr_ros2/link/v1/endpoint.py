@@ -163,9 +163,9 @@ class EndpointV1:
     def slow(self) -> bool:
         return self._access is None and self._sending.slow
 
-    def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
-        self.answers = self.answers or added
-        self._sending.topics_changed(self._now, added=added, asked=asked)
+    def topics_changed(self) -> None:
+        self.answers = True
+        self._sending.topics_changed(self._now)
 
     @property
     def idle(self) -> bool:
@@ -212,6 +212,7 @@ class EndpointV1:
                 self.received.missed[neighbour.src_id],
                 len(neighbour.inbox.announced.topics),
                 doubled=self.neighbours.doubled(neighbour.src_id, now),
+                no_table=self.neighbours.lacks_table(neighbour, now),
             )
             for neighbour in self.neighbours.all.values()
             if neighbour.src_id not in over and (neighbour.proven or self.neighbours.doubled(neighbour.src_id, now))

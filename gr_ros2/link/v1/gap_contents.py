@@ -52,7 +52,7 @@ class GapContents:
     def _look(self, before: int, after: int) -> None:
         """Compare the fragments of two known packets, between which all are missing."""
         ends = {
-            (part.topic_id, before - part.back * (part.offset > 0)): part.offset + len(part.payload)
+            (part.topic_id, before - part.back): part.offset + len(part.payload)
             for part in self._parts(before)
             if not part.last
         }

@@ -44,8 +44,8 @@ OFTEN_S = 1.0
 SELDOM_S = 2.0
 """s between two hellos at most, while others are heard."""
 LONE_S = 10.0
-"""Most s between two hellos of a robot that hears nobody: the time doubles with each hello, as in Trickle (RFC 6206). A
-robot that starts is met at once, by its own hellos."""
+"""Most s between two hellos of a robot that hears nobody and says nothing: the time doubles with each hello, as in
+Trickle (RFC 6206). A robot that starts is met at once, by its own hellos."""
 EAGER_S = 0.1
 """s between hellos while another robot has not proven yet that it heard this start: until then its messages are not
 delivered."""
@@ -85,6 +85,8 @@ class Hellos:
         self._answering = False
         self.due = -inf
         """When the next hello is due, s."""
+        self.talks = False
+        """Whether messages have left since the last hello."""
 
     def start(self, now: float) -> None:
         """The first packet may be sent now."""
@@ -127,8 +129,9 @@ class Hellos:
 
     @property
     def lone(self) -> bool:
-        """Whether nothing of any robot comes, though it could."""
-        return self._settings.hears and all(neighbour.silent for neighbour in self._neighbours.all.values())
+        """Whether nothing of any robot comes, though it could, and nothing is said for robots that only listen."""
+        heard = any(not neighbour.silent for neighbour in self._neighbours.all.values())
+        return self._settings.hears and not self.talks and not heard
 
     @property
     def _period(self) -> float:

@@ -18,7 +18,7 @@ from gr_ros2.core.errors import CodecError, PadError, WireError
 from gr_ros2.link.events import Announced, Delivered, Lost
 from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.v1.announced import AnnouncedTopics
+from gr_ros2.link.v1.announced import ARRIVING_S, AnnouncedTopics
 from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
 from gr_ros2.link.v1.delivery import DeliveryRules, passed_over
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -249,12 +249,15 @@ class Inbox:
             self._give_up([ready], self.announced.unknown(ready))
 
     def lacks(self, mark: tuple[int, int], number: int, now: float) -> bool:
-        """Whether a latched message, named in a hello at a packet number, is neither here, nor a newer one of its
-        topic, nor arriving."""
+        """Whether a latched message or the table, named in a hello at a packet number, is neither here, nor a newer one
+        of its topic, nor arriving."""
+        growing = self._reassembly.growing(mark[0], now - ARRIVING_S)
+        if mark[0] == TABLE_TOPIC:
+            return self.announced.lacks(mark[1], number, now) and not growing
         topic = self.announced.topics.get(mark[0])
         if topic is not None and not self.deliveries.is_for_us(topic):
             return False
-        return self.deliveries.lacks(mark, number) and not self._reassembly.growing(mark[0], now - 1.0)
+        return self.deliveries.lacks(mark, number) and not growing
 
     def _settle(self) -> None:
         """Deliver the messages that waited for what is here or given up now."""
@@ -313,14 +316,13 @@ class Inbox:
             topic = self.announced.topics.get(entry.topic_id)
             if topic is None or topic.reliable or topic.latched:
                 self.reports.confirms = True
-            if entry.last and not entry.offset:
+            if entry.whole:
                 self._arrived(Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired))
             else:
                 self._fragment(entry, number, place, qos, repaired=repaired)
 
     def _fragment(self, part: Part, number: int, place: int, qos: int, *, repaired: bool) -> None:
-        begin = number - part.back
-        if begin < self.deliveries.newest.get(part.topic_id, (0, 0))[0] or begin < 0:
+        if (number, place) < self.deliveries.newest.get(part.topic_id, (0, 0)) or number < part.back:
             self._stats.dropped["overtaken"] += 1
             return
         whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
@@ -332,8 +334,7 @@ class Inbox:
         if payload is None:
             self._lose(whole, Fate.DAMAGED)
             return
-        order = (whole.begin, whole.place)
-        self._arrived(Ready(whole.topic_id, order, payload, qos, whole.coded, whole.repaired))
+        self._arrived(Ready(whole.topic_id, whole.order, payload, qos, whole.coded, whole.repaired))
 
     def _arrived(self, ready: Ready) -> None:
         """A message is complete."""
@@ -344,14 +345,14 @@ class Inbox:
             else:
                 self._of_another(ready)
             return
+        if ready.topic_id == TABLE_TOPIC:
+            self.announced.newest = max(ready.order[0], self.announced.newest[0]), self._now
+            self._table(ready.payload, ready.order)
+            ready.payload = self.announced.table
         if self._relaying is not None:
             self._relaying.direct(self.src_id, self.boot, ready, self._now)
-        if ready.topic_id == TABLE_TOPIC:
-            newest = self.deliveries.newest
-            newest[TABLE_TOPIC] = max(ready.order, newest.get(TABLE_TOPIC, ready.order))
-            self._table(ready.payload)
-            return
-        self._known(ready)
+        if ready.topic_id != TABLE_TOPIC:
+            self._known(ready)
 
     def _known(self, ready: Ready) -> None:
         """Deliver a message as soon as its topic is known. One of a reliable topic waits for those before it, unless
@@ -381,7 +382,7 @@ class Inbox:
         self._now = now
         self.order.over_at = min(self.order.over_at, now)
         if ready.topic_id == TABLE_TOPIC:
-            self._table(ready.payload)
+            self._table(ready.payload, ready.order, direct=False)
         else:
             self.deliveries.came_over(ready)
             self._known(ready)
@@ -437,16 +438,16 @@ class Inbox:
             )
         )
 
-    def _table(self, payload: bytes) -> None:
+    def _table(self, payload: bytes, order: tuple[int, int], *, direct: bool = True) -> None:
         try:
-            topics = self.announced.take(payload)
+            topics = self.announced.take(payload, order, direct=direct)
         except WireError:
             self._stats.dropped["bad_table"] += 1
             return
         if topics is None:
             return
         for ready in self.order.without({*self.announced.topics, CARRIED_TOPIC}):
-            self._await_table(ready)  # an older table, which came over others, lacks topics of the newest one
+            self._await_table(ready)  # its topic is not offered any more
         self._outcomes.events.append(Announced(self.src_id, topics))
         for ready in self.announced.waiting():
             self._known(ready)

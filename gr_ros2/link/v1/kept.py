@@ -1,6 +1,7 @@
-"""The messages that a robot keeps for others that join late, and its table of topics.
+"""The messages that a robot keeps for others that join late, and its table of topics, one message per row.
 
-A robot that lacks one asks for it; hellos name them. While no robot reports, they are repeated.
+A robot that lacks one asks for it; hellos name them. While no robot reports, they are repeated. Fragments of a repeat
+complete those that came before.
 
 Invariants: a message is named in hellos only after the receivers had time to get it when it was first sent; however
 many ask, and whoever they are, each message takes a bounded share of the time.
@@ -9,7 +10,7 @@ many ask, and whoever they are, each message takes a bounded share of the time.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from math import inf
 from zlib import crc32
@@ -17,8 +18,9 @@ from zlib import crc32
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.message import Message
+from gr_ros2.link.v1.packing import ENTRY
 from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
-from gr_ros2.wire import QOS_BULK
+from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.table import AnnouncedTopic, write_table
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
@@ -48,6 +50,8 @@ class _Kept:
     """Time in s from which on hellos name it."""
     until: float = inf
     """Time in s until which it is sent again."""
+    begin: int = 0
+    """The packet in which its first fragment left for the first time; 0 if it left whole."""
 
 
 class KeptMessages:
@@ -55,7 +59,7 @@ class KeptMessages:
 
     :param room: bytes of the longest body
     :param admit: puts a message into the queue of its topic
-    :ivar digest: CRC-32 of the table; 0 if there is nothing to announce
+    :ivar digest: sum of the marks of the table's rows; 0 if there is nothing to announce
     """
 
     def __init__(
@@ -70,6 +74,8 @@ class KeptMessages:
         self._topics, self._room, self._settings = topics, room, settings
         self._stats, self._admit = stats, admit
         self._kept: dict[int, deque[_Kept]] = {}
+        self._rows: dict[int, _Kept] = {}
+        """The rows of the table by topic id."""
         self._answers: dict[int, tuple[float, float]] = {}
         """How often messages of each topic may be sent again because somebody asks, at a time in s."""
         self._took: dict[int, float] = {}
@@ -85,13 +91,21 @@ class KeptMessages:
         kept.append(_Kept(message.serial, message.payload, message.coded, crc32(message.payload), until=until))
 
     def tabulate(self, rows: Sequence[AnnouncedTopic]) -> bool:
-        """Keep the table of topics; returns whether it has changed."""
-        if not rows and not self.digest:
-            return False
-        table, before = write_table(rows), self.digest
-        self.digest = crc32(table)
-        self._kept[TABLE_TOPIC] = deque([_Kept(-1, table, False, self.digest)])
-        return self.digest != before
+        """Keep the rows of the table of topics; returns whether one has changed."""
+        table = {topic_id: AnnouncedTopic(topic_id, "", "") for topic_id in self._rows}
+        table |= {row.topic_id: row for row in rows}
+        written = {topic_id: write_table((row,)) for topic_id, row in table.items()}
+        before = {topic_id: kept.payload for topic_id, kept in self._rows.items()}
+        for topic_id, row in written.items():
+            if row != before.get(topic_id):
+                self._rows[topic_id] = _Kept(-1, row, False, crc32(row))
+        self.digest = sum(kept.mark for kept in self._rows.values()) & 0xFFFF_FFFF
+        return written != before
+
+    @property
+    def table_packets(self) -> float:
+        """Packets that the table of topics takes."""
+        return sum(len(kept.payload) + ENTRY for kept in self._rows.values()) / self._room
 
     def forget(self, topic_id: int) -> None:
         """Keep none of the messages of a topic so far."""
@@ -99,7 +113,7 @@ class KeptMessages:
 
     def asked(self, topic_id: int, now: float) -> bool:
         """A robot asks for the kept message of a topic; returns whether that is not too often."""
-        if topic_id not in self._kept:
+        if not self._of(topic_id):
             return True
         pause = max(PAUSE_S * self._settings.slower, PAUSE * self._took.get(topic_id, 0.0))
         left, at = self._answers.get(topic_id, (ANSWERS, now))
@@ -110,33 +124,59 @@ class KeptMessages:
             return True
         return False
 
-    def ask(self, topic_id: int, now: float) -> bool:
+    def tell(self, now: float) -> None:
+        """Send the rows of the table that have not left yet, and none of before."""
+        queue, rows = self._topics[TABLE_TOPIC].queue, {row.payload: row for row in self._rows.values()}
+        for message in [message for message in queue if not message.started and message.payload not in rows]:
+            queue.remove(message)
+        waiting = {message.payload for message in queue}
+        new = [row for row in rows.values() if row.named == inf and row.payload not in waiting]
+        self._send_rows(new, self._table_qos, now)
+
+    def ask(self, topic_id: int, now: float, *, fills: bool = False) -> bool:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already; returns
-        whether it is sent."""
+        whether it is sent.
+
+        :param fills: the table takes only room that nothing else needs
+        """
         self._starting_until = min(self._starting_until, now + STARTING_S * self._settings.slower)
         topic = self._topics.get(topic_id)
-        if topic is None or any(message.repeat for message in topic.queue):
+        if topic is None:
             return False
+        if topic_id == TABLE_TOPIC and not fills:
+            for message in topic.queue:
+                message.qos = self._table_qos
+        if any(message.repeat for message in topic.queue):
+            return False
+        if topic_id == TABLE_TOPIC:
+            self._send_rows(self._rows.values(), QOS_BULK if fills else self._table_qos, now)
+            return True
+        qos = QOS_BULK if topic.latched else topic.qos
         for kept in self._kept.get(topic_id, ()):
             if now > kept.until:
                 continue
-            if topic_id == TABLE_TOPIC:
-                # Nothing is delivered without the table. A long table does not delay urgent messages.
-                qos = 1 if len(kept.payload) <= TABLE_FIRST * self._room else 0
-                topic.queue.append(Message(kept.serial, TABLE_TOPIC, kept.payload, qos, now, repeat=True))
-            else:
-                qos = QOS_BULK if topic.latched else topic.qos
-                again = Message(
-                    kept.serial, topic_id, kept.payload, qos, now, topic.weight, repeat=True, coded=kept.coded
-                )
-                again.dst_id = topic.dst_id
-                self._admit(topic, again)
+            again = Message(kept.serial, topic_id, kept.payload, qos, now, topic.weight, repeat=True, coded=kept.coded)
+            again.begin, again.dst_id = kept.begin, topic.dst_id
+            self._admit(topic, again)
             self._stats.repeats += 1
         return True
 
+    @property
+    def _table_qos(self) -> int:
+        # Nothing is delivered without the table. A long one does not delay urgent messages.
+        return QOS_LATENCY if self.table_packets <= TABLE_FIRST else QOS_DEFAULT
+
+    def _send_rows(self, rows: Collection[_Kept], qos: int, now: float) -> None:
+        queue = self._topics[TABLE_TOPIC].queue
+        queue.extend(Message(-1, TABLE_TOPIC, row.payload, qos, now, repeat=True, begin=row.begin) for row in rows)
+        self._stats.repeats += len(rows)
+
+    def _of(self, topic_id: int) -> Collection[_Kept]:
+        return self._rows.values() if topic_id == TABLE_TOPIC else self._kept.get(topic_id, ())
+
     def announce(self, now: float) -> None:
         """Send all kept messages, for robots that cannot ask."""
-        for topic_id in self._kept:
+        for topic_id in (TABLE_TOPIC, *self._kept):
             if not self._topics[topic_id].queue:
                 self.ask(topic_id, now)
 
@@ -148,7 +188,7 @@ class KeptMessages:
         return [
             (topic_id, messages[-1].mark)
             for topic_id, messages in self._kept.items()
-            if topic_id != TABLE_TOPIC and messages[-1].named <= now <= messages[-1].until
+            if messages[-1].named <= now <= messages[-1].until
         ]
 
     def left(self, message: Message, now: float, *, reported: bool) -> None:
@@ -156,13 +196,14 @@ class KeptMessages:
 
         :param reported: whether receivers report that they have it
         """
-        if message.topic_id not in self._kept:
+        if not (of := self._of(message.topic_id)):
             return
         if message.repeat:
             self._took[message.topic_id] = now - message.submitted
-        for kept in self._kept[message.topic_id]:
-            if kept.payload is message.payload and kept.named == inf:
-                kept.named = now + SETTLING_S * self._settings.slower
+        for kept in of:
+            if kept.payload is message.payload:
+                kept.named = min(kept.named, now + SETTLING_S * self._settings.slower)
+                kept.begin = message.begin if message.index > 1 else kept.begin
         if not reported:
             # Later the table is sent again, and is small; at the start, nothing can be delivered without it.
             lifetime, waited = message.lifetime, now - message.submitted

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from gr_ros2.link.queues import Outgoing
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
-from gr_ros2.wire.v1 import BROADCAST
+from gr_ros2.wire.v1 import BROADCAST, MAX_BACK
 
 
 @dataclass(slots=True, eq=False)
 class Message(Outgoing):
-    """A message to be sent. ``begin``: packet in which it began; ``place``: its place among the entries there.
+    """A message to be sent. ``begin``: packet in which it began, or began when it was first sent in fragments;
+    ``place``: its place among the entries there, -1 for one that is sent again.
 
     :param dst_id: the robot for which it is, 255 for all
     :param carried: its topic and key at the robot that made it, while it is carried over others
@@ -24,3 +25,8 @@ class Message(Outgoing):
     coded: bool = False
     dst_id: int = BROADCAST
     carried: tuple[int, Key] | None = None
+
+    def back(self, number: int) -> int:
+        """How many packets before this one it began; 0 if it begins there."""
+        back = number - self.begin
+        return back if self.begin and (self.started or back <= MAX_BACK // 2) else 0

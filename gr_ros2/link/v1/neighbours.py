@@ -65,6 +65,8 @@ _NUMBERS_KEPT = 512
 _HANDSHAKE = 8
 """Packets of each robot that is heard, after which one that has proven nothing is taken for a recording: its hello, the
 answers of the others, and its answer to these."""
+_TABLE_S = 3.0
+"""s for which the table of a robot that is heard may be under way."""
 _DOUBLED_S = 60.0
 """s for which a robot is said to be two after both were last there."""
 _MOST = 1 << 48
@@ -317,6 +319,11 @@ class Neighbours:
         """Whether two robots send under this number: both were there lately, in turns. A robot that restarts never
         comes back as it was before."""
         return now < self._doubled.get(src_id, -inf) + _DOUBLED_S
+
+    def lacks_table(self, neighbour: Neighbour, now: float) -> bool:
+        """Whether a robot has topics, and nothing of its table has come although it has been heard for long."""
+        waits = now - self._met_at[neighbour.src_id] > _TABLE_S * self._settings.slower
+        return waits and neighbour.hello.digest != 0 and not neighbour.inbox.announced.digest
 
     def heard(self, newest: int) -> list[Heard]:
         """What proves to other robots that they were heard.

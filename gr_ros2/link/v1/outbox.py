@@ -50,12 +50,8 @@ class Owner(Protocol):
     def slow(self) -> bool:
         """Whether the computer was too slow lately, whatever waits now."""
 
-    def topics_changed(self, *, added: bool = False, asked: bool = False) -> None:
-        """The table of topics has changed.
-
-        :param added: by further topics
-        :param asked: the table has to be sent, although no robot asks
-        """
+    def topics_changed(self) -> None:
+        """The table of topics has changed."""
 
 
 class Outbox:
@@ -111,8 +107,7 @@ class Outbox:
             self._tabulate()
 
     def add(self, topics: Sequence[NewTopic]) -> Registry:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one learn of them from the next
-        hello."""
+        """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one are told."""
         together = (Registry.empty() if self.topics is None else self.topics).extended(topics)
         added = together[-len(topics) :] if topics else ()
         if self._codec is not None:
@@ -121,7 +116,7 @@ class Outbox:
         self.topics = together
         self.sent.add(added)
         self._tabulate()
-        self._owner.topics_changed(added=True)
+        self._owner.topics_changed()
         return together
 
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
@@ -130,12 +125,12 @@ class Outbox:
             return
         self._codec.learn(type_name, definitions)
         if self._tabulate():
-            self._owner.topics_changed(asked=True)
+            self._owner.topics_changed()
 
     def offer(self, topic_id: int, *, offered: bool) -> None:
         self.sent[topic_id].hidden = not offered
         if self._tabulate():
-            self._owner.topics_changed(asked=True)
+            self._owner.topics_changed()
 
     def follow(self, topic_id: int, publishers: PublisherQos) -> bool:
         before = self.queue(topic_id)
@@ -158,7 +153,7 @@ class Outbox:
         after.change(options)
         self.sent.find_deadlines()
         if self._tabulate() or after is not before:
-            self._owner.topics_changed(asked=True)
+            self._owner.topics_changed()
         assert self.topics is not None
         return self.topics, after.topic
 
@@ -231,7 +226,8 @@ class Outbox:
     @property
     def idle(self) -> bool:
         """Whether nothing waits."""
-        return not any(topic.queue for topic_id, topic in self.sent.items() if topic_id != RELAYED_TOPIC)
+        passed = (RELAYED_TOPIC, TABLE_TOPIC) if self.packing.fills else (RELAYED_TOPIC,)
+        return not any(topic.queue for topic_id, topic in self.sent.items() if topic_id not in passed)
 
     def reconfigure(self, settings: Settings) -> None:
         """Use other settings from now on."""
@@ -263,7 +259,7 @@ class Outbox:
             policy=topic.queue.policy,
             depth=topic.publishers.depth,
             reported=reported,
-            waited_for=now + WORTH * self._settings.hold_s,
+            waited_for=inf if message.repeat else now + WORTH * self._settings.hold_s,
         )
         self.kept.left(message, now, reported=reported)
         if message.topic_id == RELAYED_TOPIC:

@@ -25,7 +25,7 @@ from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import SentTopics
-from gr_ros2.wire import QOS_LATENCY
+from gr_ros2.wire import QOS_BULK, QOS_LATENCY
 from gr_ros2.wire.v1 import CARRIED_TOPIC, TABLE_TOPIC, EntryV1, Part, fit
 
 SHARE = 2
@@ -82,14 +82,17 @@ class Packing:
         """Messages that may continue or start now, by topic."""
         self._holder = -1
 
-    def fill(self, number: int, room: int, now: float) -> Filling | None:
+    def fill(self, number: int, room: int, now: float, *, spare: bool = False) -> Filling | None:
         """Take what goes into the next source packet.
 
         :param number: number of that packet
         :param room: bytes that its body may have
+        :param spare: nothing else needs the packet
         :return: None if nothing may be sent
         """
         heap = self._heap(now)
+        if self.fills and not spare and len(self._open) == 1:
+            return None
         if not heap:
             return None
         picks: list[tuple[Message, int]] = []
@@ -99,27 +102,34 @@ class Packing:
             queue = self._open[topic_id]
             message = queue[position]
             remaining = message.remaining
-            taken, size = fit(room - used, remaining, number - message.begin, message.offset)
+            taken, size = fit(room - used, remaining, message.back(number), message.offset)
             if taken < 0 or not (taken == remaining or _may_cut(message, taken, used, room)):
                 continue
             picks.append((message, taken))
             used += size
             if taken == remaining and position + 1 < len(queue):
                 following = queue[position + 1]
-                worth = value(following, message.submitted, ENTRY)
+                before = self._topics[topic_id].newest if following.repeat else message.submitted
+                worth = value(following, before, ENTRY)
                 heappush(heap, (self._rank(following), -worth, topic_id, position + 1))
         if not picks:
             return None
         return self._take(picks, number, used, now)
 
     def next_timeout(self, now: float) -> float:
-        """When ``fill`` may have something, s; inf if nothing waits."""
-        soonest = inf
-        for topic in self._topics.values():
-            if topic.queue:
+        """When ``fill`` may have something, s; inf if nothing waits. What ``fills`` does not count."""
+        soonest, fills = inf, self.fills
+        for topic_id, topic in self._topics.items():
+            if topic.queue and not (fills and topic_id == TABLE_TOPIC):
                 opens = topic.queue.opens(now)
                 soonest = min(soonest, opens if opens < inf else now)
         return soonest
+
+    @property
+    def fills(self) -> bool:
+        """Whether rows of the table wait for room that nothing else needs."""
+        table = self._topics.get(TABLE_TOPIC)
+        return table is not None and len(table.queue) > 0 and table.queue[0].qos == QOS_BULK
 
     @property
     def urgent(self) -> bool:
@@ -160,9 +170,9 @@ class Packing:
         stats, qos, since = self._stats, picks[0][0].qos, inf
         for place, (message, taken) in enumerate(picks):
             topic_id, offset, lifetime = message.topic_id, message.offset, message.lifetime
-            topic = self._topics[topic_id]
+            topic, back = self._topics[topic_id], message.back(number)
             if not message.index:
-                message.begin, message.place = number, place
+                message.begin, message.place = number - back, -1 if back else place
                 lifetime.expires = message.expires
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
                 lifetime.long = self._long(message)
@@ -172,10 +182,11 @@ class Packing:
                 since = message.submitted
             lifetime.awaited = len(topic.queue) > 1
             payload = message.take(taken)
-            last, begin = message.offset == len(message.payload), message.begin
+            last = message.offset == len(message.payload)
             on_air = min(topic_id, CARRIED_TOPIC)
-            parts.append(Part(on_air, payload, number - begin if offset else 0, offset, last, message.coded))
-            of, key = message.carried or (topic_id, Key(self._boot, begin, message.place))
+            parts.append(Part(on_air, payload, back, offset, last, message.coded))
+            named = (number, place) if message.place < 0 else (message.begin, message.place)
+            of, key = message.carried or (topic_id, Key(self._boot, *named))
             total = message.index if last else 0
             sent.append(SentEntry(message.serial, of, key, message.index - 1, total, message.repeat))
             lifetimes.append(lifetime)
@@ -185,7 +196,8 @@ class Packing:
             if last:
                 lifetime.left = True
                 topic.queue.popleft()
-                topic.newest = max(topic.newest, message.submitted)
+                if not (topic.queue and topic.queue[0].repeat):  # what is repeated together is worth the same
+                    topic.newest = max(topic.newest, message.submitted)
                 stats.sent[of] += not message.repeat
                 self._left(message, now)
         # On a shared channel a topic that goes along in a packet has had a turn: fresh messages are in every packet.

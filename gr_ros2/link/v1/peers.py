@@ -219,8 +219,6 @@ class Peers:
             peer.lost.clear()  # what it was expected to lack
         self._note_times(peer, number, loss, now)
         records, bit, delay = self._packets.records, peer.bit, peer.delay
-        if settled or peer.waits > number - MAP:  # a report of newer packets says nothing about it
-            peer.waits = -1
         if settled:
             lacks = ~arrived & (1 << MAP) - 1
             needs = number - lacks.bit_length() + 1
@@ -229,7 +227,8 @@ class Peers:
                 peer.lost.clear()
         before = number if self._shared is None else self._shared.waited_for(now, self._period)
         missing: list[Sent] = []
-        waits = [peer.waits] if peer.waits >= 0 else []
+        # A report of newer packets says nothing about an older one.
+        waits = [peer.waits] * (not settled and 0 <= peer.waits <= number - MAP)
         for back in range(MAP):
             record = records.get(number - back)
             if arrived >> back & 1:

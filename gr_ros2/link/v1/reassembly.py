@@ -1,7 +1,9 @@
 """Joins the fragments of one sender to messages.
 
 A fragment names its message by the packet in which the message began, and gives its offset in the message. Packet
-numbers are full numbers here, of one start of the sender, so two messages cannot be confused.
+numbers are full numbers here, of one start of the sender, so two messages cannot be confused. When a message is sent
+again, its fragments name the packet in which it began at first, and may be cut elsewhere: what is here already is left
+out.
 
 Invariants: memory grows with what has arrived, never with what was announced; the memory held, bookkeeping included,
 is bounded, and the message longest without a new fragment is given up first; work per fragment does not grow with the
@@ -10,6 +12,7 @@ number of incomplete messages.
 
 from __future__ import annotations
 
+from bisect import bisect_right, insort
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,7 +30,8 @@ _FEW = 64
 class PartialMessage:
     """A message of which a part is missing.
 
-    :param newest: packet of its newest fragment
+    :param starts: offsets of its pieces, in order
+    :param newest: packet of its newest fragment, and its place among the entries there
     :param place: its place among the entries of the packet in which it began; -1 until that packet is here
     """
 
@@ -36,17 +40,37 @@ class PartialMessage:
     coded: bool
     last: float
     pieces: dict[int, bytes] = field(default_factory=dict)
+    starts: list[int] = field(default_factory=list)
     size: int = 0
     total: int = -1
-    newest: int = -1
+    newest: tuple[int, int] = (-1, -1)
     place: int = -1
     repaired: bool = False
+
+    @property
+    def order(self) -> tuple[int, int]:
+        """Its place among the messages of its topic: where it began or, where that is only known of a repeat, where the
+        newest fragment stands."""
+        return (self.begin, self.place) if self.place >= 0 else self.newest
+
+    def missing(self, offset: int, payload: bytes) -> list[tuple[int, bytes]]:
+        """What of a fragment is not here yet, in pieces with their offsets."""
+        starts, end, found = self.starts, offset + len(payload), []
+        at = bisect_right(starts, offset)
+        begin = max(offset, starts[at - 1] + len(self.pieces[starts[at - 1]])) if at else offset
+        while begin < end:
+            stop = min(end, starts[at]) if at < len(starts) else end
+            if begin < stop:
+                found.append((begin, payload[begin - offset : stop - offset]))
+            begin = stop if stop == end else stop + len(self.pieces[stop])
+            at += 1
+        return found
 
     def payload(self) -> bytes | None:
         """The message; None if its fragments do not join."""
         parts = []
         offset = 0
-        for start in sorted(self.pieces):
+        for start in self.starts:
             if start != offset:
                 return None
             parts.append(self.pieces[start])
@@ -96,19 +120,19 @@ class Reassembly:
         else:
             self._partials.move_to_end(name)
         partial.last = now
-        partial.newest = max(partial.newest, number)
+        partial.newest = max(partial.newest, (number, place))
         self._grown[part.topic_id] = partial
         partial.repaired |= repaired
-        if part.offset in partial.pieces:
-            return None
-        partial.pieces[part.offset] = part.payload
-        partial.size += len(part.payload)
-        self._held += len(part.payload) + _FRAGMENT_COST
-        if not part.offset:
+        for offset, payload in partial.missing(part.offset, part.payload):
+            partial.pieces[offset] = payload
+            insort(partial.starts, offset)
+            partial.size += len(payload)
+            self._held += len(payload) + _FRAGMENT_COST
+        if not (part.offset or part.back):
             partial.place = place
         if part.last:
             partial.total = part.offset + len(part.payload)
-        if partial.size != partial.total or partial.place < 0:
+        if partial.size != partial.total:
             return None
         self._release(partial)
         return partial
@@ -157,7 +181,7 @@ class Reassembly:
 
         :param known: the packets that are here
         """
-        return any(partial.total >= 0 or partial.newest < known.newest for partial in self._partials.values())
+        return any(partial.total >= 0 or partial.newest[0] < known.newest for partial in self._partials.values())
 
     def growing(self, topic_id: int, since: float) -> bool:
         """Whether a message of a topic has had a fragment since a time."""

@@ -85,8 +85,13 @@ class RepairSlots:
             return self._tell(over, now)
         return self._repair(now)
 
-    def next(self, now: float) -> float:
-        """When ``spare`` may have something, s; inf for never."""
+    def next(self, now: float, *, waiting: bool = False) -> float:
+        """When ``spare`` may have something, s; inf for never.
+
+        :param waiting: something else waits for such a slot
+        """
+        if waiting:
+            return max(self.waits_until, now)
         if self.mode == "off" or not self._window.packets.wanted(now):
             return inf
         return max(self.waits_until, now if self.mode == "idle" else self._next_look(now))
@@ -100,7 +105,7 @@ class RepairSlots:
 
     def _repair(self, now: float) -> SentPacket | None:
         self.waits_until = -inf
-        chosen = self._window.next(now, self._held)
+        chosen = self._window.next(now, self.held)
         held = self.waits_until > now
         self._calm_since = now if chosen is None and not held else -inf
         self._calm_number = self._window.packets.newest
@@ -119,8 +124,8 @@ class RepairSlots:
             return now
         return min(now + _POLL_S, window.thrift.next_doubt(since))
 
-    def _held(self, now: float) -> bool:
-        """Whether a repair that could leave now waits for a new message."""
+    def held(self, now: float) -> bool:
+        """Whether what could leave now waits for a new message."""
         airtime = self._pace.interval
         self.waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime)
         return self.waits_until > now

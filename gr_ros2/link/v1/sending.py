@@ -21,6 +21,7 @@ from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.repair_slots import RepairSlots
 from gr_ros2.link.v1.report_slots import ReportSlots
+from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.link.v1.writer import PacketWriter
 from gr_ros2.relay.gain import TOLD
@@ -30,6 +31,10 @@ from gr_ros2.wire.v1 import TABLE_TOPIC
 MOST_REPEATS = 32
 """Most ``repeat_s`` from one repeat of the kept messages to the next, while nobody is heard though somebody could be:
 the time doubles with each repeat, as in Trickle (RFC 6206). A robot that comes then asks for them."""
+
+TABLE_SHARE = 0.1
+"""Part of the air that the table of topics takes at most where it follows every hello, since nobody reports. It comes
+every ``repeat_s`` in any case."""
 
 
 class SendingSide:
@@ -71,9 +76,10 @@ class SendingSide:
         self._writer = writer
         self._started = False
         self._hello_number = -1
+        self._said = 0
         self._repeat_at = inf
         self._repeats = 1
-        self._beacon_at = -inf
+        self._beacon_at = self._table_at = -inf
 
     def packet(self, now: float) -> SentPacket | None:
         """The next packet, None if there is nothing to send."""
@@ -100,24 +106,38 @@ class SendingSide:
         first = self._window.pressing and not packing.urgent
         if first and (repair := self.repairs.first(now, waiting=packing.next_timeout(now) <= now)) is not None:
             return repair
-        room = self._writer.room
         if self._relaying is not None and messages.relayed is not None:
             leaves = now if self._writer.leave_at is None else max(now, self._writer.leave_at)
             self._relaying.offer(messages.relayed, now, leaves)
             self._relaying.custody.offer(now, leaves)
-            room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
-        filling = packing.fill(self._window.packets.newest + 1, room - reports.reserved, now)
-        if filling is not None:
-            self._slowness.waited(filling.since, now)
-            reports.add(filling.parts, room - filling.used, due, now)
-            if self._relaying is not None:
-                filling.parts += self._relaying.gains.tells()
-            return self._writer.source(filling.parts, filling.lifetimes, filling.qos, filling.sent, now)
+        if (sent := self._fill(due, now)) is not None:
+            return sent
         if now >= hellos.due:  # it let messages go first, and none of them is worth sending any more
             return self._hello(now)
         if due:
             return reports.packet(due, now)
-        return reports.asks(now) or self.repairs.spare(now) or reports.early(now)
+        return reports.asks(now) or self.repairs.spare(now) or self._rows(now) or reports.early(now)
+
+    def _rows(self, now: float) -> SentPacket | None:
+        """Rows of the table in a packet that nothing else needs."""
+        wait = not self._messages.packing.fills or self.repairs.held(now)
+        return None if wait else self._fill([], now, spare=True)
+
+    def _fill(self, due: list[Reporter], now: float, *, spare: bool = False) -> SentPacket | None:
+        """A packet with messages."""
+        room, reports = self._writer.room, self.reports
+        if self._relaying is not None:
+            room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
+        number = self._window.packets.newest + 1
+        filling = self._messages.packing.fill(number, room - reports.reserved, now, spare=spare)
+        if filling is None:
+            return None
+        self._slowness.waited(filling.since, now)
+        reports.add(filling.parts, room - filling.used, due, now)
+        if self._relaying is not None:
+            filling.parts += self._relaying.gains.tells()
+        lifetimes = () if spare else filling.lifetimes
+        return self._writer.source(filling.parts, lifetimes, filling.qos, filling.sent, now)
 
     def behind(self, now: float) -> bool:
         """Whether messages that wait do so because the computer is too slow."""
@@ -136,7 +156,7 @@ class SendingSide:
         if leaving > now:
             leaving = min(leaving, self.hellos.due, self.pings.due, self._repeat_at, self.reports.next(now))
         if leaving > now:
-            leaving = min(leaving, self.repairs.next(now))
+            leaving = min(leaving, self.repairs.next(now, waiting=self._messages.packing.fills))
         return max(leaving, self.pace.slot)
 
     def met(self, now: float) -> None:
@@ -155,12 +175,12 @@ class SendingSide:
         if settings.packet_rate != before.packet_rate:
             self.pace.change(settings.packet_rate)
 
-    def topics_changed(self, now: float, *, added: bool, asked: bool) -> None:
+    def topics_changed(self, now: float) -> None:
         self.hellos.hurry(now)
-        if added and self._started and self._repeat_at == inf:
-            self._plan_repeat(now)
-        if asked and self._started:
-            self._messages.kept.ask(TABLE_TOPIC, now)
+        if self._started:
+            self._messages.kept.tell(now)
+            if self._repeat_at == inf:
+                self._plan_repeat(now)
 
     def _alone(self, now: float) -> bool:
         """Whether nobody has been heard for so long that only beacons leave."""
@@ -200,8 +220,13 @@ class SendingSide:
             # A receiver that restarts takes nothing below the number that it had stored.
             return self._writer.source([], (), 0, (), now)
         self._hello_number = newest
-        if self.hellos.starting and not window.peers:
-            kept.ask(TABLE_TOPIC, now)  # no report says whether it has arrived
+        said = self._messages.stats.sent.total()
+        self.hellos.talks, self._said = said > self._said, said
+        starting = self.hellos.starting
+        often = starting or (now >= self._table_at and not self.hellos.lone)
+        if often and not window.peers and kept.digest:  # no report says whether it has arrived
+            self._table_at = now + kept.table_packets * self.pace.interval / TABLE_SHARE
+            kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
         sent = self._writer.control(entries, "hello", now, clear=isinstance(entries[0], Hello))
         self._neighbours.own_hellos.said(sent.data, now)

@@ -24,7 +24,7 @@ LONG_CARRIED = CARRIED_TOPIC + 1
 
 @dataclass(slots=True, eq=False)
 class SentTopic:
-    """One topic, or the table of topics.
+    """One topic, or the rows of the table of topics.
 
     :param qos: QoS class of its messages
     :param latched: whether its newest messages are kept for robots that join late, however old they are
@@ -152,9 +152,9 @@ class SentTopics(dict[int, SentTopic]):
             )
         if TABLE_TOPIC not in self:
             table = Topic(TABLE_TOPIC, "", "")
-            self[TABLE_TOPIC] = SentTopic(
-                table, TopicQueue("latest"), qos_class(table.options), table.options.weight, table.latched
-            )
+            queue, qos = TopicQueue[Message]("fifo"), qos_class(table.options)
+            rows = PublisherQos(reliable=False)  # each is of use by itself
+            self[TABLE_TOPIC] = SentTopic(table, queue, qos, 1.0, latched=False, publishers=rows)
         self.find_deadlines()
 
     def relay(self) -> SentTopic:

@@ -58,6 +58,10 @@ def test_notes_say_what_must_not_be_missed(result: Result) -> None:
     bad = replace(result, topics=(replace(result.topics[0], corrupt=2),), interrupted=True)
     assert "2 messages arrived altered" in notes(bad)[0]
     assert "stopped after 15.0 s" in notes(bad)[-1]
+    deaf = replace(result, counters={"sink": {"no_table": [1]}, "robots": [{"sink": {"no_table": [1, 3]}}]})
+    said = [line for line in notes(deaf) if "no table of topics" in line]
+    assert [line.split(" arrived")[0][-7:] for line in said] == ["robot 1", "robot 3"]
+    assert "set repair: auto" in said[0]
 
 
 def test_the_papers_own_line_stands_above_ours(result: Result) -> None:

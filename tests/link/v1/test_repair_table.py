@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from statistics import mean
 from typing import Any
 
 import pytest
@@ -45,8 +46,8 @@ def test_thrifty() -> None:
 
 @pytest.mark.parametrize(("back", "least"), [(None, 0.97), (0.2, 0.995)])
 def test_a_link_with_few_idle_slots(back: float | None, least: float) -> None:
-    """55 messages/s on 75 packets/s."""
-    assert run(hz=BUSY_HZ, loss=0.2, back=back, seed=SEED).pdr[0] >= least
+    """55 messages/s on 75 packets/s. One run differs from the next by 2 %."""
+    assert mean(run(hz=BUSY_HZ, loss=0.2, back=back, seed=seed).pdr[0] for seed in range(4)) >= least
 
 
 @pytest.mark.parametrize("receivers", [1, 5])
