@@ -42,9 +42,10 @@ ARRIVALS = 16
 """Numbers of a stream from whose times its period follows."""
 TOLD = 2
 """Streams of which a packet tells the newest number."""
-EXPIRES_S = 15.0
+EXPIRES_S = 60.0
 """s for which a number refuses lower ones: what was made later than that after it came is newer, or the number was
-false. A message may be much younger than its age says, but it was made before it came."""
+false. A message may be much younger than its age says, but it was made before it came; and as much older as packets can
+be held back by who has no key."""
 EVEN = 4
 """Robots of a line or a grid have up to 4 messages of equal worth, one that joins two groups 6. Among robots that all
 have much to relay, weights gain nothing and take the slots out of their order."""
@@ -236,7 +237,7 @@ class Gains:
             state.has.clear()
         state.newest, state.came = number, now
         arrivals = state.arrivals
-        arrivals.append((number, max(made, now - EXPIRES_S)))
+        arrivals.append((number, max(made, now - UNKNOWN_S)))
         (first, since), (_, at) = arrivals[0], arrivals[-1]
         if number > first and at > since:
             state.period = (at - since) / (number - first)

@@ -56,7 +56,7 @@ class DeliveryRules:
         self._commands, self._deadlines = settings.commands, settings.deadlines
         self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
         """Numbers that the robot's packets have reached, and when, s."""
-        self._over: deque[tuple[int, tuple[int, int]]] = deque(maxlen=_OVER)
+        self._over: dict[tuple[int, tuple[int, int]], None] = {}
         """Messages that came over other robots, by topic id and order: they may come again."""
         self._came: dict[int, float] = {}
         """When the newest message of a topic came, s, where it came over others."""
@@ -76,9 +76,15 @@ class DeliveryRules:
                 before = at
                 break
             after = at
-        if not ready.repaired:
-            return after
-        return before if self.sealed_after is None else max(before, self.sealed_after(number))
+        made = before if ready.repaired else after
+        if ready.repaired and self.sealed_after is not None:
+            made = max(made, self.sealed_after(number))
+        return made if made < now else now
+
+    @property
+    def withheld_s(self) -> float:
+        """s for which packets may be held back before what they bring of other robots is refused."""
+        return MAX_AGE_S * self._settings.slower
 
     def sealed(self, ready: Ready) -> float:
         """Time in s after which a message of this robot was sealed; infinite where that needs no proof."""
@@ -95,7 +101,9 @@ class DeliveryRules:
             if self._came.get(topic_id, -inf) > since:
                 doubted = True
                 continue
-            over = (order for of, order in self._over if of == topic_id and order[0] <= number)
+            for false in [(of, order) for of, order in self._over if of == topic_id and order[0] > number]:
+                del self._over[false]
+            over = (order for of, order in self._over if of == topic_id)
             self.newest[topic_id] = max(self._direct.get(topic_id, _NEVER), max(over, default=_NEVER))
             self._came.pop(topic_id, None)
         return not doubted
@@ -104,15 +112,21 @@ class DeliveryRules:
         """The robot was silent for long before its packets reached a number: what comes of earlier ones is that old."""
         self._silent_before = number
 
-    def came_over(self, ready: Ready) -> None:
-        """A message has come over another robot."""
-        self._over.append((ready.topic_id, ready.order))
+    def came_over(self, ready: Ready) -> bool:
+        """A message has come over another robot; returns whether it is not known to have come so before."""
+        name = ready.topic_id, ready.order
+        if name in self._over:
+            return False
+        self._over[name] = None
+        if len(self._over) > _OVER:
+            del self._over[next(iter(self._over))]
+        return True
 
     def adopt(self, far: DeliveryRules) -> None:
         """Go on from what has come over other robots."""
         self.newest.update(far.newest)
         self._came.update(far._came)
-        self._over.extend(far._over)
+        self._over.update(far._over)
 
     def lacks(self, mark: tuple[int, int], number: int) -> bool:
         """Whether a latched message, named at a packet number, is not here, nor a newer one of its topic."""
@@ -170,7 +184,7 @@ class DeliveryRules:
         name = topic.name.lstrip("/")
         withheld_s = self._max_ages.get(name, self._max_age_s)
         if withheld_s == AUTO:
-            withheld_s = MAX_AGE_S * self._settings.slower if topic.fresh else 0.0
+            withheld_s = self.withheld_s if topic.fresh else 0.0
         deadline_s = self._deadlines.get(name, 0.0) if topic.fresh else 0.0
         if topic.fresh and name not in self._deadlines and is_command(name, topic.type_name, self._commands):
             deadline_s = COMMAND_DEADLINE_S

@@ -31,7 +31,7 @@ from gr_ros2.link.v1.reports import Reporter, SharedReporter
 from gr_ros2.link.v1.sent_packets import SPAN
 from gr_ros2.wire.control import Control
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import CARRIED_TOPIC, TABLE_TOPIC, EntryV1, Part, read_body
+from gr_ros2.wire.v1 import CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC, EntryV1, Part, read_body
 
 _PACKET_COST, _EQUATION_COST = 250, 350
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
@@ -375,6 +375,9 @@ class Inbox:
             self._stats.dropped["relayed"] += 1
             return
         ready.sealed = self.deliveries.sealed(ready)
+        if ready.topic_id == RELAYED_TOPIC and self._now - ready.sealed > self.deliveries.withheld_s:
+            self._stats.dropped["withheld"] += 1
+            return
         self._relaying.receive(self.src_id, ready, self._now)
 
     def relayed(self, ready: Ready, now: float) -> None:
@@ -384,7 +387,9 @@ class Inbox:
         if ready.topic_id == TABLE_TOPIC:
             self._table(ready.payload, ready.order, direct=False)
         else:
-            self.deliveries.came_over(ready)
+            if not self.deliveries.came_over(ready):
+                self._stats.repeats += 1
+                return
             self._known(ready)
         self._settle()
 

@@ -9,6 +9,7 @@ from gr_ros2.link.v1.delivery import DeliveryRules
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.relay.gain import EXPIRES_S
 from gr_ros2.relay.routes import STALE_S, Routes
 from gr_ros2.wire.relayed import Relayed, write_relayed
 from gr_ros2.wire.v1 import RELAYED_TOPIC
@@ -78,3 +79,33 @@ def test_a_late_message_tells_no_way() -> None:
     assert routes.over(1, 100.0 + STALE_S, lambda _: True) == 2
     routes.note(1, 3, 1, 100.0 - STALE_S)
     assert routes.over(1, 101.0, lambda via: via == 3) is None
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_a_relay_is_brought_twice_comes_out_once_whatever_its_age(mode: SealMode) -> None:
+    everybody, _ = behind(mode)
+    one, _, three = everybody.robots
+    number, much_later = one.end.window.packets.newest, everybody.now + 2 * EXPIRES_S
+    assert over(three, one, number, b"newest", everybody.now) == [b"newest"]
+    assert over(three, one, number, b"newest", much_later) == []
+
+
+def test_a_packet_that_was_held_back_brings_nothing_of_others() -> None:
+    """Who has no key records what robot 3 does not hear, and plays it when robot 2 is out of reach."""
+    everybody = cell("encrypt", 0.0)
+    one, two, three = everybody.robots
+    everybody.apart = lambda one, other: {one, other} == {0, 2}
+    everybody.run(15)
+    held: list[bytes] = []
+    slot = two.slot
+    two.slot = lambda now: held.append(data) or data if (data := slot(now)) is not None else None  # type: ignore[method-assign,func-returns-value]
+    everybody.apart = lambda one, other: 2 in (one, other)
+    everybody.run(3)
+    two.slot = slot  # type: ignore[method-assign]
+    everybody.run(30)
+    before = len(three.delivered(1))
+    for data in held:
+        three.receive(data, everybody.now, everybody.now)
+    assert three.end.received.dropped["withheld"]
+    assert len(three.delivered(1)) == before
+    assert len(three.delivered(2)) > 0 and one.delivered(2)

@@ -8,7 +8,6 @@ from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.relay.routes import STALE_S
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.relayed import Relayed, write_relayed
@@ -19,7 +18,15 @@ from tests.link.v1.test_ages import MODES, absent, relaying_of
 from tests.link.v1.test_relaying import Line, robot
 
 LAST_NUMBER, LAST_BOOT = 2**32 - 1, 2**64 - 1
+EXPIRES_S = 15.0
 ROW = AnnouncedTopic(0, "odom", "std_msgs/msg/String", 1, False, False, 1, "", False, 255)
+
+
+@pytest.fixture
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was false expires after 15 s."""
+    for module in ("relay.gain", "link.v1.delivery", "link.v1.relaying"):
+        monkeypatch.setattr(f"gr_ros2.{module}.EXPIRES_S", EXPIRES_S)
 
 
 def says(insider: Robot, false: Relayed, now: float) -> None:
@@ -71,11 +78,11 @@ def test_a_false_number_does_not_silence_a_robot_that_is_heard(mode: SealMode, r
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_false_number_silences_a_robot_over_hops_for_a_while_only(mode: SealMode) -> None:
+def test_a_false_number_silences_a_robot_over_hops_for_a_while_only(mode: SealMode, soon: None) -> None:  # noqa: ARG001
     line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3, 4)))
     line.run(15)
     says(line.robots[3], number(LAST_NUMBER, line.robots[0].boot), line.now)
-    line.run(STALE_S + 10)
+    line.run(EXPIRES_S + 10)
     assert b"false" in line.robots[2].delivered(1)
     assert count(line.robots[2], line, 10) > 10
     assert count(line.robots[1], line, 10) > 20
@@ -94,13 +101,13 @@ def test_a_false_number_of_a_robot_over_hops_does_not_count_when_it_is_heard(mod
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_false_start_ends_a_robot_for_a_while_only(mode: SealMode) -> None:
+def test_a_false_start_ends_a_robot_for_a_while_only(mode: SealMode, soon: None) -> None:  # noqa: ARG001
     line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3, 4)))
     line.run(15)
     says(line.robots[3], table(1, LAST_BOOT, 0), line.now)
     line.run(1)
     assert relaying_of(line.robots[2]).far[1].boot == LAST_BOOT
-    line.run(STALE_S + 10)
+    line.run(EXPIRES_S + 10)
     assert count(line.robots[2], line, 10) > 10
     assert count(line.robots[1], line, 10) > 20
 
