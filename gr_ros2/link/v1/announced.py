@@ -90,8 +90,10 @@ class AnnouncedTopics:
         changed = {row.topic_id: row for row in rows if row != self._rows.get(row.topic_id)}
         if not changed:
             return None
+        replaced = [self._rows[topic_id] for topic_id in changed if topic_id in self._rows]
         self._rows.update(changed)
-        self.digest = sum(row.mark for row in self._rows.values()) & 0xFFFF_FFFF
+        marks = sum(row.mark for row in changed.values()) - sum(row.mark for row in replaced)
+        self.digest = (self.digest + marks) & 0xFFFF_FFFF
         topics = tuple(row for _, row in sorted(self._rows.items()) if row.name)
         self.topics = {topic.topic_id: topic for topic in topics}
         if self._decoder_for is not None:

@@ -348,8 +348,9 @@ class Inbox:
         if ready.topic_id == TABLE_TOPIC:
             self.announced.newest = max(ready.order[0], self.announced.newest[0]), self._now
             self._table(ready.payload, ready.order)
-            ready.payload = self.announced.table
         if self._relaying is not None:
+            if ready.topic_id == TABLE_TOPIC:
+                ready.payload = self.announced.table
             self._relaying.direct(self.src_id, self.boot, ready, self._now)
         if ready.topic_id != TABLE_TOPIC:
             self._known(ready)
