@@ -9,6 +9,7 @@ compute the same tables on every machine; a pop never fails, whatever the number
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 
 SCALE_BITS = 12
@@ -21,7 +22,7 @@ class Table:
 
     :param weights: relative probability of each symbol; a symbol with 0 cannot be pushed
     :ivar codes: per symbol (start, share) in units of 1/4096
-    :ivar slots: per 12-bit slot (symbol, start, share)
+    :ivar slots: the symbol of each 12-bit slot
     """
 
     __slots__ = ("codes", "slots")
@@ -39,11 +40,11 @@ class Table:
             shares[symbol] -= taken
             excess -= taken
         self.codes: list[tuple[int, int]] = []
-        self.slots: list[tuple[int, int, int]] = []
+        self.slots = array("H")
         for symbol, share in enumerate(shares):
             start = len(self.slots)
             self.codes.append((start, share))
-            self.slots += [(symbol, start, share)] * share
+            self.slots += array("H", (symbol,)) * share
 
     def push(self, x: int, symbol: int) -> int:
         """The number with a symbol on top of it.
@@ -57,7 +58,8 @@ class Table:
     def pop(self, x: int) -> tuple[int, int]:
         """(x, symbol)"""
         slot = x & MASK
-        symbol, start, share = self.slots[slot]
+        symbol = self.slots[slot]
+        start, share = self.codes[symbol]
         return share * (x >> SCALE_BITS) + slot - start, symbol
 
 

@@ -174,7 +174,8 @@ def pop_double(x: int, table: Table, constants: KnownNumbers) -> tuple[int, int]
     :raises IndexError: a constant that is not in the dictionary
     """
     slot = x & MASK
-    symbol, start, share = table.slots[slot]
+    symbol = table.slots[slot]
+    start, share = table.codes[symbol]
     x = share * (x >> SCALE_BITS) + slot - start
     if symbol == ZERO:
         return x, 0
