@@ -62,7 +62,7 @@ BENCHMARKS = {
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
-    *("gate", "rate_rules", "cells", "hidden", "changes", "scale", "crowd", "energy"),
+    *("gate", "rate_rules", "cells", "hidden", "changes", "scale", "crowd", "energy", "cameras"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

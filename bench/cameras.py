@@ -162,14 +162,16 @@ class Run:
     odometry: list[tuple[float, float]] = field(default_factory=list)
 
 
-def simulate(kind: str, kbit_s: float, loss: float, outage: tuple[float, float] = (0, 0), spare: float = 0.0) -> Run:
+def simulate(
+    kind: str, kbit_s: float, loss: float, seed: int = 1, *, outage: tuple[float, float] = (0, 0), spare: float = 0.0
+) -> Run:
     """One link for ``SECONDS``."""
     rate = 1000 * kbit_s
     capacity = rate / 8 * BODY / (BODY + HEAD)
     scheme: Any = None
     if kind != "none":
         scheme = Pull(capacity, loss, spare) if kind == "pull" else Queue(capacity, jpeg=kind == "jpeg")
-    rng, run = random.Random(1), Run()
+    rng, run = random.Random(seed), Run()
     now, arrived, odometry, odometry_due, scan_due = 0.0, -1, None, 0.0, 0.0
     scan: deque[int] = deque()
     sending: Frame | None = None
@@ -278,31 +280,44 @@ def _qualities(run: Run, times: Any) -> Iterator[float]:
             yield float(10 * np.log10(255**2 / np.mean((large - _luma(number)) ** 2)))
 
 
+SEEDS = (1, 2, 3)
+"""Draws of losses, of which each figure is the mean."""
+MOST_MS = {(64, 0.0): (130, None), (64, 0.2): (180, None), (128, 0.0): (120, 160), (128, 0.2): (200, 350)}
+"""Mean and p95 of the age."""
+WITH_SPARE_MS = 150
+
+
+def _mean(kind: str, kbit_s: float, loss: float, spare: float = 0.0) -> Judged:
+    found = [judged(simulate(kind, kbit_s, loss, seed, spare=spare)) for seed in SEEDS[: len(SEEDS) if loss else 1]]
+    return Judged(*np.mean(found, 0).tolist())
+
+
 def cameras() -> list[Row]:
     """Every rate and loss, beside the peers."""
     rows = []
     for kbit_s in RATES:
         for loss in LOSSES:
-            pull, jpeg, fixed = (judged(simulate(kind, kbit_s, loss)) for kind in ("pull", "jpeg", "fixed"))
-            alone = judged(simulate("none", kbit_s, loss))
+            pull, jpeg, fixed, alone = (_mean(kind, kbit_s, loss) for kind in ("pull", "jpeg", "fixed", "none"))
             what = f"cameras: {kbit_s} kbit/s, {loss:.0%} lost"
-            mean, p95 = {128: {0: (120, 160), 0.2: (200, 350)}, 64: {0: (130, 9e9), 0.2: (180, 9e9)}}.get(
-                kbit_s, {}
-            ).get(loss, (None, None))
-            peers = (
-                f"{pull.per_s:.1f}/s, p95 {pull.p95_ms:.0f} ms, {pull.now_db:.1f} dB; JPEG {jpeg.per_s:.1f}/s, "
-                f"{jpeg.mean_ms:.0f} ms, {jpeg.now_db:.1f} dB; fixed {fixed.per_s:.1f}/s, {fixed.mean_ms:.0f} ms, "
-                f"{fixed.now_db:.1f} dB"
+            mean, p95 = MOST_MS.get((kbit_s, loss), (None, None))
+            others = "; ".join(
+                f"{name} {peer.per_s:.1f}/s, {peer.mean_ms:,.0f} ms, {peer.now_db:.1f} dB"
+                for name, peer in (("JPEG", jpeg), ("fixed", fixed))
             )
-            rows.append(Row(f"{what}, mean age", pull.mean_ms, "ms", "≤" if mean else None, mean or 0, note=peers))
-            if p95 and p95 < 1e9:
+            note = f"{pull.per_s:.1f}/s, p95 {pull.p95_ms:.0f} ms, {pull.now_db:.1f} dB; {others}"
+            rows.append(Row(f"{what}, mean age", pull.mean_ms, "ms", "≤" if mean else None, mean or 0, note=note))
+            if p95:
                 rows.append(Row(f"{what}, p95 of the age", pull.p95_ms, "ms", "≤", p95))
                 rows.append(Row(f"{what}, frames", pull.per_s, "/s", "≥", 14, "{:.1f}"))
             older = pull.odometry_ms / alone.odometry_ms
             rows.append(Row(f"{what}, odometry older than alone", older, "times", "≤", 1.5, "{:.2f}"))
     for spare in (1.0, 1.5, 2.0):
-        ahead = judged(simulate("pull", 512, 0.2, spare=spare))
+        ahead = _mean("pull", 512, 0.2, spare)
         note = f"{ahead.per_s:.1f}/s, p95 {ahead.p95_ms:.0f} ms, {ahead.now_db:.1f} dB"
-        rows.append(Row(f"cameras: 512 kbit/s, 20 % lost, {spare:g} × the loss ahead", ahead.mean_ms, "ms", note=note))
-    back = judged(simulate("pull", 128, 0.05, OUTAGE)).back_s
-    return [*rows, Row("cameras: after 2 s of outage, a picture < .2 s old within", back, "s", "≤", 0.3, "{:.2f}")]
+        what = f"cameras: 512 kbit/s, 20 % lost, {spare:g} × the loss ahead"
+        rows.append(Row(what, ahead.mean_ms, "ms", "≤", WITH_SPARE_MS, note=note))
+    back = np.mean([judged(simulate("pull", 128, 0.05, seed, outage=OUTAGE)).back_s for seed in SEEDS])
+    return [
+        *rows,
+        Row("cameras: after 2 s of outage, a picture < .2 s old within", float(back), "s", "≤", 0.3, "{:.2f}"),
+    ]
