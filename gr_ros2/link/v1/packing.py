@@ -2,8 +2,7 @@
 
 *Order.* Messages of class latency go first, then default, then bulk. Within a class, messages of more than ``LONG``
 packets go last. Of the others the message with the largest value per byte sent goes first, ``weight * g^2 / c`` (see
-``freshness``). Every ``TURN``-th packet begins with the topic
-whose last turn is longest ago, so that no topic starves.
+``freshness``). Every ``TURN``-th packet begins with the topic whose last turn is longest ago, so that no topic starves.
 
 *Fragments.* A message that fits goes whole. A fragment that is not the last one fills its packet. Its size follows from
 the free bytes of the packet; it is not fixed beforehand.
