@@ -11,7 +11,8 @@ greater difference means that the other robot belongs to another group, or that 
 - *A robot is behind*: if it still is after ``BEHIND``, it does not hear this robot. A group whose slots are all in
   use hears nobody whose packets begin between two of them. Move there, and stay for ``STAYS``: told in its own slots
   that there are more robots, the group leaves room, and then hears the one that is ahead. Sooner, or more often, robots
-  of a large network move back as fast as others move on.
+  of a large network move back as fast as others move on. Where nobody agrees there is no group to keep, and
+  ``PATIENCE`` is enough.
 
 Invariants: all times are those of the caller's clock; a robot that is heard can move this clock only as above; the work
 for a packet is bounded by the number of robots heard.
@@ -139,4 +140,5 @@ class SlotClock:
             for other, (by, since) in self._odd.items()
             if abs(by - error) <= TOLERANCE and since > self._agreed_at and other in self._agreed
         ]
-        return len(alike) > 1 or now - odd.since > (PATIENCE if error < 0 else BEHIND) * self.slot_s
+        patience = BEHIND if error > 0 and self.agreeing(now) else PATIENCE
+        return len(alike) > 1 or now - odd.since > patience * self.slot_s

@@ -97,6 +97,16 @@ def test_what_was_not_checked_starts_a_clock_and_moves_none() -> None:
     assert hear(made, 5, 110, 0.4, trusted=False) is None, "once only"
 
 
+def test_where_nobody_agrees_who_is_behind_is_followed_sooner() -> None:
+    for agreed in (True, False):
+        made = clock()
+        if agreed:
+            hear(made, 1, 0)
+        assert hear(made, 2, 1, 0.4 * SLOT) is None
+        hear(made, 2, PATIENCE + 2, 0.4 * SLOT)
+        assert made.jumps == (0 if agreed else 1)
+
+
 def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:
     made = clock()
     slots, stays = BEHIND, STAYS

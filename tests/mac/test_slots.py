@@ -39,6 +39,7 @@ def hear(of: Slots, src_id: int, slot: int, block: Block, *, trusted: bool = Tru
 
 def test_a_robot_keeps_what_it_announces() -> None:
     made = robot()
+    hear(made, 1, 60, Block(0, (200, 200), 1, (5, NOBODY)))
     begin, block = send(made, 1.0)
     for _ in range(50):
         slot = made.clock.slot(begin + SLOT / 2)
@@ -134,6 +135,7 @@ def test_who_is_not_in_three_maps_in_a_row_of_a_neighbour_picks_at_random() -> N
 def test_the_lower_id_keeps_a_slot_that_two_want() -> None:
     for other, keeps in ((9, True), (2, False)):
         made = robot(5)
+        hear(made, 8, 60, Block(0, (300, 300), 1, (5, NOBODY)))
         begin, block = send(made, 1.0)
         slot = made.clock.slot(begin + SLOT / 2)
         wanted = slot + block.ahead[0]
@@ -182,6 +184,39 @@ def test_newcomers_are_named_first() -> None:
     hear(made, 3, made.clock.slot(begin) + 2, Block(0, (40, 40), 6, (5, NOBODY)))
     _, block = send(made, begin + SLOT)
     assert 3 in block.names
+
+
+def test_an_entrant_claims_no_slot_that_it_has_not_announced() -> None:
+    made = robot(5)
+    hear(made, 9, 60, Block(0, (40, 40), 1, (5, NOBODY)))
+    made.departure(made.clock.begin(61))
+    entry = made._mine[0]
+    hear(made, 9, 62, Block(0, (entry - 62, 40), 1, (5, NOBODY)))
+    assert made._mine == [], "whoever has the lower id"
+    assert not made._conflicts
+
+
+def test_an_entrant_waits_for_who_is_to_name_it_however_seldom_that_one_sends() -> None:
+    made = robot(5)
+    hear(made, 1, 60, Block(0, (50, 90), 1, (NOBODY, NOBODY)))
+    begin, _ = send(made, 61 * SLOT)
+    while made.clock.slot(begin) < 100:
+        begin, _ = send(made, begin + SLOT / 2)
+        assert made.reserved, "it stays"
+
+
+def test_a_robot_that_was_alone_for_long_sends_soon_once_it_hears_somebody() -> None:
+    made = robot(5)
+    begin = 1.0
+    for _ in range(8):
+        begin, block = send(made, begin + SLOT / 2)
+    slot = made.clock.slot(begin + SLOT / 2)
+    assert block.ahead[0] > 30
+    hear(made, 9, slot + 2, Block(0, (200, 200), 1, (NOBODY, NOBODY)))
+    begin, block = send(made, begin + 3 * SLOT)
+    assert made.clock.slot(begin + SLOT / 2) < slot + 20
+    assert block.names[0] == 9
+    assert block.ahead[0] < 10
 
 
 def test_an_entrant_that_nobody_names_starts_over() -> None:
