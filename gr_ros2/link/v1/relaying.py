@@ -175,6 +175,8 @@ class Relaying:
         number, place = ready.order
         self.hops[src_id] = 0
         if ready.topic_id == TABLE_TOPIC:
+            if (inbox := self._inbox(src_id, boot & 0xFFFF)) is not None:
+                self._due(inbox, now, receipts=True)
             if self._tables.get(src_id, (0, b"", 0.0))[:2] != (boot, ready.payload):
                 self._table(src_id, boot, ready.payload, number, now)
             return
@@ -264,7 +266,7 @@ class Relaying:
 
     def _due(self, inbox: Inbox, now: float, *, receipts: bool) -> None:
         """Deliver what was carried here of a robot, as far as its turn has come."""
-        for ready in self._carried_here.due(inbox.src_id, inbox.boot & 0xFFFF):
+        for ready in self._carried_here.due(inbox.src_id, inbox.boot & 0xFFFF, inbox.announced.topics):
             self._delivered(inbox, ready, now)
             if receipts:
                 self._confirm(inbox.src_id, inbox.boot & 0xFFFF, ready.topic_id)

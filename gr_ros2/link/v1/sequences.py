@@ -9,10 +9,12 @@ and ``MOST_STREAMS`` topics.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Generic, TypeVar
 
 from gr_ros2.relay.gain import Stream
 from gr_ros2.wire.relayed import PLACES, Relayed
+from gr_ros2.wire.v1 import TABLE_TOPIC
 
 MOST_STREAMS = 1024
 """Topics of which it is known what has come; of others, everything counts as new."""
@@ -81,11 +83,15 @@ class Sequences(Generic[T]):
         sequence.waiting[place] = message, item
         return True
 
-    def due(self, origin: int, start: int) -> list[T]:
-        """The messages of a start of a robot whose turn has come."""
+    def due(self, origin: int, start: int, known: Container[int] = range(TABLE_TOPIC)) -> list[T]:
+        """The messages of a start of a robot whose turn has come.
+
+        :param known: its topics that can be delivered
+        """
         found = []
         for stream, sequence in self._all.items():
-            while stream[:2] == (origin, start) and (out := sequence.take_out()) is not None:
+            wanted = stream[:2] == (origin, start) and stream.topic_id in known
+            while wanted and (out := sequence.take_out()) is not None:
                 self._bytes -= len(out[0].payload) + _COST
                 found.append(out[1])
         return found

@@ -7,14 +7,15 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.link.events import Ended, Gone, Met
+from gr_ros2.link.events import Delivered, Ended, Gone, Met
 from gr_ros2.link.v1 import custody
 from gr_ros2.link.v1.custody import Custody
+from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.relayed import Relayed
-from gr_ros2.wire.v1 import QOS_REPAIR, read_header, read_repair_header
+from gr_ros2.wire.relayed import Relayed, write_carried
+from gr_ros2.wire.v1 import CARRIED_TOPIC, QOS_REPAIR, TABLE_TOPIC, read_header, read_repair_header
 from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_relaying import Line, robot
 
@@ -246,3 +247,23 @@ def test_what_waits_in_order_at_a_robot_that_starts_again_has_not_come() -> None
     until(line, 90, lambda: len(told(first)) == 10)
     assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
     assert told(first) == [True] * 10
+
+
+def test_what_waits_for_the_table_of_its_origin_has_not_come() -> None:
+    """Robot 3 hears robot 1, but not its table; what is carried to it over robot 2 is not confirmed before."""
+    line = line_of(robot(1, topics=named(3)), *(robot(src_id) for src_id in (2, 3)), loss=0.0)
+    last, origin = line.robots[-1], line.robots[0]
+    line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
+    line.run(3)
+    relaying = last.end._receiving.relaying
+    assert relaying is not None
+    announced = last.end.neighbours.all[1].inbox.announced
+    table, announced.topics = announced.topics, {}
+    said = Relayed(1, origin.boot & 0xFFFF, 9999, 128, 1, 1, b"goal", dst_id=3, age=0)
+    carried = Ready(CARRIED_TOPIC, (1, 0), write_carried(3, said), 0, False, False, made=line.now)
+    relaying.receive(2, carried, line.now)
+    assert not custody_of(last)._receipts
+    announced.topics = table
+    relaying.direct(1, origin.boot, Ready(TABLE_TOPIC, (1, 0), b"", 0, False, False, made=line.now), line.now)
+    assert [event.payload for event in relaying._outcomes.take() if isinstance(event, Delivered)] == [b"goal"]
+    assert list(custody_of(last)._receipts) == [1]
