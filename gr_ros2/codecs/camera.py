@@ -138,7 +138,7 @@ class CameraEncoder:
         coded = self._resize.reformat(frame, _even(shown[0]), _even(shown[1]), "yuv420p", interpolation="AREA")
         head = b"".join([*map(varint, shown), text(picture.label), text(picture.origin.frame_id)])
         said = f"H.264 of {shown[0]} × {shown[1]} pixels" + f", of {width} × {height}" * bool(halved)
-        said += ", without alpha" * picture.label.endswith("a8")
+        said += ", without alpha" * any(component.is_alpha for component in picture.frame.format.components)
         return self._video.encode(coded, head, picture.origin.stamp(), budget, key)._replace(said=said)
 
     def confirmed(self, name: int) -> None:

@@ -106,6 +106,13 @@ def test_compressed_images_come_out_as_jpeg(codec: str, kind: str) -> None:
     assert psnr(shown, pixels) > 22
 
 
+def test_a_picture_with_alpha_says_that_it_loses_it() -> None:
+    topic = CodedTopic(COMPRESSED_IMAGE)
+    for kind, said in (("rgba", True), ("rgb24", False)):
+        message = compressed(video.packed("png", picture(view(0, 64, 48), kind)), "png")
+        assert ("without alpha" in topic.encoder().encode(message, BUDGET).said) == said
+
+
 def test_pictures_that_are_neither_jpeg_nor_png_pass_exactly() -> None:
     deep = video.packed("png", video.from_rows(np.zeros((8, 16), np.uint8), 8, "gray16be"))
     for data, label in ((b"RIFF1234WEBP", "webp"), (deep, "png")):
