@@ -42,10 +42,11 @@ def check(*, device: str, device_rx: str, level: float, listen_only: bool) -> in
     with uninterrupted():
         FRONT_ENDS.load("audio")
         from gr_ros2.radio.audio import device_of
-        from gr_ros2.radio.audio_card import PortAudioError, devices, levels, play_and_record
+        from gr_ros2.radio.audio_card import PortAudioError, devices, levels, look_again, play_and_record
 
     console = make_console()
     try:
+        look_again()
         table = Table("Number", "Device", "Plays", "Records", box=None)
         for number, row in enumerate(devices()):
             yes = ["yes" if row[f"max_{way}_channels"] else "" for way in ("output", "input")]

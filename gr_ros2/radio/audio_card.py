@@ -82,7 +82,7 @@ def play_and_record(sound: Sound, plays: str | int | None, records: str | int | 
     :raises PortAudioError, ValueError: when there is no such device, or it does not start
     """
     heard = np.zeros((len(sound), 1), np.float32)
-    sounddevice.playrec(sound[:, None], CARD_RATE, out=heard, device=(records, plays), blocking=True)
+    sounddevice.playrec(sound[:, None], CARD_RATE, out=heard, device=(records, plays), latency="high", blocking=True)
     return np.asarray(np.nan_to_num(heard[:, 0]), np.float32)
 
 
