@@ -80,7 +80,7 @@ def _peer_state(peer: Mapping[str, Any]) -> str:
 def _topic_table(stats: Stats) -> Table | str:
     table = _table("topic", "messages", "age", "latency", "waiting", "dropped")
     for name, topic in stats["source"]["topics"].items():
-        lost = {**topic["refused"], "lost_on_graph": topic["lost_on_graph"]}
+        lost = {**topic["refused"], "lost_on_graph": topic["lost_on_graph"], "unconfirmed": topic["unconfirmed"]}
         table.add_row(f"→ {name}", str(topic["sent"]), "", "", str(topic["queued"]), _reasons(lost))
     for name, topic in stats["sink"]["topics"].items():
         recent = topic["recent_latency_s"]

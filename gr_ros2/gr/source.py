@@ -29,7 +29,7 @@ from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.gr.starts import start_of
 from gr_ros2.gr.subscriptions import Subscriptions
-from gr_ros2.link import AirPacket, Refused, SenderEvent, SentPacket
+from gr_ros2.link import AirPacket, Ended, Refused, SenderEvent, SentPacket
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.rate import Mcs
@@ -329,11 +329,19 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 self._counters["unread"] += len(packets)
 
     def _observe(self, event: SenderEvent) -> None:
-        if isinstance(event, Refused) and (event.topic_id, event.reason) not in self._said:
-            self._said.add((event.topic_id, event.reason))
-            registry = self.subscriptions.registry
-            name = registry[event.topic_id].name if event.topic_id < len(registry) else "of calls"
+        if isinstance(event, Refused):
             level = logging.INFO if event.reason == Fate.SUPERSEDED else logging.WARNING  # as `latest` intends
-            self._log.log(level, "topic %s: a message was dropped (%s): %s", name, event.reason, event.detail)
+            self._say(level, event.topic_id, event.reason, f"a message was dropped ({event.reason}): {event.detail}")
+        elif isinstance(event, Ended) and not event.arrived:
+            what = f"robot {event.dst_id} did not tell whether a message came, which is kept no longer (unconfirmed)"
+            self._say(logging.WARNING, event.topic_id, "unconfirmed", what)
         if self._observer is not None:
             self._guard(self._observer.sender_event, self.src_id, event)
+
+    def _say(self, level: int, topic_id: int, why: str, what: str) -> None:
+        """Log what has become of a message of a topic, once for each reason."""
+        if (topic_id, why) not in self._said:
+            self._said.add((topic_id, why))
+            registry = self.subscriptions.registry
+            name = registry[topic_id].name if topic_id < len(registry) else "of calls"
+            self._log.log(level, "topic %s: %s", name, what)

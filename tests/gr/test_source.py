@@ -17,7 +17,7 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.link import Accepted, Missed, Refused, SenderEvent, SentPacket
+from gr_ros2.link import Accepted, Ended, Missed, Refused, SenderEvent, SentPacket
 from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -235,6 +235,15 @@ def test_a_message_too_large_is_said_once_with_the_remedy(rig: Rig, caplog: pyte
     said = [record.getMessage() for record in caplog.records if "too_large" in record.getMessage()]
     assert len(said) == 1
     assert "packet_len" in said[0]
+
+
+def test_a_message_of_which_a_robot_tells_nothing_is_said_once(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    source = rig.make(version=1)
+    for serial, arrived in enumerate((True, False, False)):
+        source._observe(Ended(serial, 0, 7, arrived))
+    said = [record.getMessage() for record in caplog.records if "unconfirmed" in record.getMessage()]
+    assert len(said) == 1
+    assert said[0].startswith("topic odom: robot 7 ")
 
 
 @pytest.mark.parametrize(("depth", "warned"), [("auto", True), (2, True), (3, False)])

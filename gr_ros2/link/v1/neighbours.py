@@ -57,7 +57,7 @@ _EARLY_S = 30.0
 """s for which they are kept: hellos come more often, and where none came for so long, nobody waits for them."""
 _CHANGE_S = 1.0
 """s after which another start of a robot that does not seal is taken: forged hellos silence it for half of the time at
-most, and a robot that restarts is met soon."""
+most, and a robot that restarts is met soon. What an earlier start has sent arrives within that time."""
 _STARTS = 256
 """Starts that have ended of which is known how far they were heard."""
 _NUMBERS_KEPT = 512
@@ -204,6 +204,8 @@ class Neighbours:
         """By id and boot number of a start that was replaced: the first packet of it that was not heard."""
         self._far_at: dict[int, float] = {}
         """The same of robots that are reached over others."""
+        self._again: dict[tuple[int, int], float] = {}
+        """By id and low 16 bits of the boot number of another start: when it sent something first, s."""
         self._doubled: dict[int, float] = {}
         """When a start of a robot sent something although another one had begun, s."""
 
@@ -303,13 +305,18 @@ class Neighbours:
         """Whether a robot is heard whose messages cannot be taken before it has proven that it hears this start."""
         return any(not n.proven and not n.silent for n in self.all.values())
 
-    def sent_by_another_start(self, src_id: int, at: float, now: float) -> None:
+    def sent_by_another_start(self, src_id: int, boot: int, at: float, now: float) -> None:
         """Note that a start of a robot that is not the present one has sent something.
 
+        :param boot: number of that start, or its low 16 bits
         :param at: when, s. What was sent before the present start was met says nothing
         """
         if at > max(self._met_at.get(src_id, -inf), self._far_at.get(src_id, -inf)):
-            self._doubled[src_id] = now
+            first = self._again.setdefault((src_id, boot & 0xFFFF), at)
+            if at > first + _CHANGE_S:  # later than all that was under way
+                self._doubled[src_id] = now
+            if len(self._again) > _STARTS:
+                del self._again[next(iter(self._again))]
 
     def met_over_others(self, src_id: int, now: float) -> None:
         """Note that the present start of a robot was met, which is not heard itself."""
@@ -402,7 +409,7 @@ class Neighbours:
             if number >= self._ended.get((src_id, hello.boot), _MOST):
                 # No recording of what was heard: the robot of that start goes on, or what it sent then comes only now.
                 self._trailer(src_id, hello, clear, rest, (number, repair.repair_id))
-                self.sent_by_another_start(src_id, now, now)
+                self.sent_by_another_start(src_id, hello.boot, now, now)
             newest = boot if neighbour is None else neighbour.boot
             raise ReplayedError(f"start {hello.boot:016x} of robot {src_id}, after start {newest:016x} was heard")
         trailer = self._trailer(src_id, hello, clear, rest, (number, repair.repair_id))
@@ -420,7 +427,7 @@ class Neighbours:
                 del self._ended[next(iter(self._ended))]
         if (ended := self._ended.pop((src_id, hello.boot), None)) is not None:
             first = max(first, ended)
-            self.sent_by_another_start(src_id, now, now)
+            self.sent_by_another_start(src_id, hello.boot, now, now)
         room = header.room(self._settings.packet_len)
         inbox, proofs = self._make_inbox(src_id, hello.boot, first, room), Proofs(before)
         met = Neighbour(

@@ -247,13 +247,17 @@ class Peers:
         peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
         self._note()
         if settled:
-            for older in range(max(self._packets.oldest, peer.settled), number - MAP + 1):
-                record = records.get(older)
-                if record is not None:
-                    record.confirmed |= bit
-                    peer.lost.discard(older)
-            peer.settled = max(peer.settled, needs)
+            self._settle(peer, number - MAP, needs)
         self._packets.retire(now)
+
+    def _settle(self, peer: Peer, number: int, needs: int) -> None:
+        """A peer has all packets up to a number that are worth something, and needs none before another one."""
+        records = self._packets.records
+        for older in range(max(self._packets.oldest, peer.settled), number + 1):
+            if older in records:
+                records[older].confirmed |= peer.bit
+        peer.settled = max(peer.settled, needs)
+        peer.lost = {lost for lost in peer.lost if lost >= peer.settled}
 
     def _lacks(self, peer: Peer, missing: list[Sent]) -> None:
         """A report names these packets, the newest first, as lost."""

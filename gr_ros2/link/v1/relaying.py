@@ -206,7 +206,7 @@ class Relaying:
         if (message.hops == 0) != (origin == via) or another:
             self._dropped["false_origin"] += 1
             if another:
-                self._neighbours.sent_by_another_start(origin, made, now)
+                self._neighbours.sent_by_another_start(origin, start, made, now)
             return
         if origin == self.src_id:
             self._dropped["relayed_before"] += 1
@@ -415,7 +415,7 @@ class Relaying:
             known, neighbour = self.present(origin), self._neighbours.all.get(origin)
             if known is not None and known.boot > boot and made <= self._came_at(origin) + EXPIRES_S:
                 self._dropped["old_start"] += 1
-                self._neighbours.sent_by_another_start(origin, made, now)
+                self._neighbours.sent_by_another_start(origin, boot, made, now)
                 return False
             if known is not None:
                 known.ended(now)

@@ -50,6 +50,27 @@ def test_a_robot_that_restarts_again_and_again_is_one(mode: SealMode) -> None:
         one.start()
 
 
+class Shuffled(Air):
+    """Packets are .53 s under way in the mean, and overtake each other."""
+
+    def step(self) -> None:
+        super().step()
+        left, self.under_way[-1] = self.under_way[-1], []
+        for packet in left:
+            self.rng.choice(self.under_way).append(packet)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_that_restarts_is_one_where_packets_overtake_each_other(mode: SealMode, seed: int) -> None:
+    one, two = Robot(1, registry(), mode=mode, hears=True), Robot(2, registry(), mode=mode, hears=True)
+    air = Shuffled(one, two, loss=0.1, seed=seed, delay=80)
+    for _ in range(5):
+        talk(air, 6.0, one)
+        assert not doubled(two, air.now)
+        one.start()
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_who_reaches_two_robots_of_one_number_over_others_names_it(mode: SealMode) -> None:
     """1 - 2 - 3 - 4 - 1: robot 3 is two hops from both."""
