@@ -24,11 +24,11 @@ from gr_ros2_lab.study.ablation import air_bytes
 from gr_ros2_lab.study.forecast import Planner
 
 WHOLE_S, PART_S, PLAIN_S = 38.0, 15.0, 8.0
-PACED = ["version=0", "reports=null", "ros_source.topic_options={}"]
+PACED = ["paper={}", "robots=[{direction: send}, {direction: receive}]", "topics=auto"]
 """What turns a scenario into plain version 0."""
-PLAIN = [*PACED, "ros_source.packet_rate=0", "ros_source.queue_depth=0", "drain_s=0"]
+PLAIN = [*PACED, "packet_rate=0", "queue_depth=0", "drain_s=0"]
 """The same, unpaced."""
-WANTED = ["version=1"]
+WANTED: list[str] = []
 SAME = 1.1
 """Ratio of the p50 of two equal runs that differ by chance."""
 RECORDED_SPEED = 3.5
@@ -94,7 +94,7 @@ def _six_topics() -> Iterator[Row]:
 
 def _recorded_topics(settings: Sequence[str]) -> Iterator[Row]:
     queues = "{odom: {queue: latest, weight: 4}, imu: {queue: latest}, fix: {queue: latest}}"
-    outcome = _run("six-topics-paced", PART_S, [*settings, f"ros_source.topic_options={queues}"])
+    outcome = _run("six-topics-paced", PART_S, [*settings, f"topics={queues}"])
     yield _longest_silence("recorded topics, 100 kS/s, 220 B", outcome, _by_name(outcome))
 
 
@@ -119,7 +119,7 @@ def _carries_everything() -> Iterator[Row]:
 
 
 def _fitting() -> Iterator[Row]:
-    alone = ["ros_source.repair='off'"]
+    alone = ["repair='off'"]
     advice = Planner(_scenario("paper-ofdm-paced", PLAIN_S, alone)).advice()
     fitting = min(advice, key=lambda one: one.forecast.air_bytes_per_message or inf)
     outcome = _run("paper-ofdm-paced", PLAIN_S, [*alone, *fitting.setting.split()])

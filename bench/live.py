@@ -1,7 +1,6 @@
-"""What a live link costs: processor time of two robots at 35 Hz odometry, with version 1 beside version 0.
+"""What a live link costs: processor time of two robots at 35 Hz odometry.
 
-Both ends run in this process, their radios are connected by ZeroMQ and their ROS graphs are in memory. The two versions
-run in turn, so that a slow moment of the machine hits both; everything but the version is the same.
+Both ends run in this process, their radios are connected by ZeroMQ and their ROS graphs are in memory.
 """
 
 from __future__ import annotations
@@ -26,23 +25,16 @@ from gr_ros2_lab.sim.sim_settings import SimSettings
 
 REPEATS, WARM_UP_S, MEASURED_S = 5, 3.0, 8.0
 RATE_HZ = 35.0
-MOST = 1.10
-"""Processor time with version 1 over that with version 0."""
 DOMAINS = (91, 92)
 
 
 def live() -> list[Row]:
     """Processor time of both ends together, as a share of one core."""
-    shares: dict[int, list[float]] = {0: [], 1: []}
-    for _ in range(REPEATS):
-        for version, found in shares.items():
-            found.append(_share(version))
-    old, new = (median(found) for found in shares.values())
-    note = f"{new:.1%} of a core instead of {old:.1%}"
-    return [Row("live link, 35 Hz odometry: version 1 over version 0", new / old, "", "≤", MOST, "{:.2f}", note)]
+    share = median(_share() for _ in range(REPEATS))
+    return [Row("live link, 35 Hz odometry: of a core", share, form="{:.1%}")]
 
 
-def _share(version: int) -> float:
+def _share() -> float:
     """Processor time over time while robot 1 sends odometry to robot 2."""
     topic = "/robot_1/odom"
     settings = SimSettings(robots=2, odom_rate=RATE_HZ)
@@ -51,9 +43,7 @@ def _share(version: int) -> float:
         settings: dict[str, Any] = {
             "registry": str(find_registry("odom", Path())),
             "packet_len": 64,
-            "version": version,
             "phy": {"name": "ofdm", "sample_rate": 1e5},
-            "ros_source": {"compression": True},
         }
         links = [zmq_link(number, Path(folder), **settings) for number in (1, 2)]
         graph = MemoryMiddleware(domain_id=DOMAINS[0])
@@ -67,7 +57,7 @@ def _share(version: int) -> float:
         share = (time.process_time() - begin) / MEASURED_S
         least = 0.9 * RATE_HZ * MEASURED_S
         if _delivered(links[1]) - before < least:
-            raise SystemExit(f"bench live: {_delivered(links[1]) - before} messages with version {version}")
+            raise SystemExit(f"bench live: {_delivered(links[1]) - before} messages")
     return share
 
 
@@ -79,11 +69,9 @@ def zmq_link(number: int, folder: Path, **values: Any) -> RobotLink:
     """
     own, other = (f"ipc://{folder}/{end}" for end in (number, 3 - number))
     graph: dict[str, Any] = {"middleware": "memory", "domain_id": DOMAINS[number - 1]}
-    source = {"namespace": f"/robot_{number}", **graph, **values.pop("ros_source", {})}
     ends = {"name": "zmq", "bind": own, "connect": [other]}
-    if values.get("version", 1):
-        values["state"] = str(folder / f"state-{number}")
-    return RobotLink(link_from({"front_end": ends, "ros_source": source, "ros_sink": graph, **values}))
+    own_values = {"robot": f"/robot_{number}", "graph": graph, "state": str(folder / f"state-{number}")}
+    return RobotLink(link_from({"front_end": ends, **own_values, **values}))
 
 
 def _publish(publisher: Publisher, payloads: Iterator[bytes], seconds: float) -> None:

@@ -168,5 +168,5 @@ def _link(number: int, folder: Path, options: dict[str, Any]) -> RobotLink:
         registry=str(folder / "topics.csv"),
         packet_len=PACKET_LEN,
         phy={"name": "psk", "sample_rate": 1e6},
-        ros_source={"topic_options": options},
+        topics={"auto": None, **options},
     )

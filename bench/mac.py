@@ -320,7 +320,7 @@ def energy() -> list[Row]:
     """Processor time of all that a robot does in simulated time, the medium included, per packet that it hears."""
     rows = []
     for robots, most in ((5, 0), (20, 0.15), (60, 0)):
-        sizes = [f"robots={robots}", f"sim.robots={robots}", f"ros_sink.max_sources={robots}"]
+        sizes = [f"robots={robots}", f"sim.robots={robots}", f"max_sources={robots}"]
         scenario = load_scenario("twenty-robots", [*sizes, "sim.size_m=100"])
         registry = scenario.load_registry()
         messages = [iter(list(one)) for one in offered_by(scenario, registry)]  # the simulator is no part of it
@@ -339,7 +339,7 @@ def whole() -> list[Row]:
     """20 s of 255 robots with whole endpoints, each of which hears about eleven."""
     near = at_random(255, 0.125, 1)
     gains = tuple(tuple(-100.0 if other in heard else None for other in range(255)) for heard in near)
-    sizes = ["robots=255", "ros_sink.max_sources=255", "duration_s=20", "sim.odom_rate=2"]
+    sizes = ["robots=255", "max_sources=255", "duration_s=20", "sim.odom_rate=2"]
     scenario = load_scenario("formation", sizes)
     scenario, registry = replace(scenario, gains_db=gains), scenario.load_registry()
     phy = make_phy(scenario, registry)

@@ -67,8 +67,9 @@ def talk(
             "duration_s": END,
             "seed": seed,
             "channel": {"packet_loss": loss},
-            "ros_source": {"repair": "auto", "topic_options": options},
-            "ros_sink": {"max_sources": max(robots, 1)},
+            "repair": "auto",
+            "topics": {"auto": None, **options},
+            "max_sources": max(robots, 1),
         }
         scenario = load_scenario("twenty-robots", [], **common)
         rows = scenario.load_registry()

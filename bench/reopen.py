@@ -69,8 +69,9 @@ def _config(number: int, device: str, folder: str) -> Any:
     graph = {"middleware": "memory", "domain_id": _DOMAINS[number - 1]}
     return link_from(
         {
-            "ros_source": {"robot_id": number, "namespace": f"/robot_{number}", "topics": ["count"], **graph},
-            "ros_sink": graph,
+            "robot": f"/robot_{number}",
+            "topics": ["count"],
+            "graph": graph,
             "phy": {"name": "modem", "options": {"bit_rate": 57_600.0}},
             "front_end": {"name": "serial", "device": device},
             "state": f"{folder}/state-{number}",

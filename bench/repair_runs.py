@@ -40,9 +40,9 @@ def run(settings: dict[str, Any], loss: float, burst: float, repair: str, *, bac
     if burst > 1:
         leave = 1 / burst
         channel = {"burst_loss": {"p_good_to_bad": leave * loss / (1 - loss), "p_bad_to_good": leave}}
-    reports = {"reports": {"channel": channel}} if back else {}
-    options = {**settings, **reports, "version": 1, "time": "packets", "channel": channel}
-    return run_scenario(load_scenario("paper-ofdm-paced", [f"ros_source.repair={repair}"], **options)).result
+    reports = {"robots": [{}, {"topics": []}]} if back else {}
+    options = {**settings, **reports, "time": "packets", "channel": channel}
+    return run_scenario(load_scenario("paper-ofdm-paced", [f"repair={repair}"], **options)).result
 
 
 def _rows(source: str, settings: dict[str, Any]) -> list[Row]:

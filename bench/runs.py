@@ -15,8 +15,8 @@ from tests.recordings import DRIVES
 
 DRIVE = DRIVES[-1]
 """The recorded drive where it is, else that of the simulator."""
-DOMAINS = ["ros_source.domain_id=97", "ros_sink.domain_id=98"]
-PACED = ["ros_source.packet_rate=auto", "drain_s=5", "ros_source.queue_depth=100"]
+DOMAINS = ["robots.0.graph.domain_id=97", "robots.1.graph.domain_id=98"]
+PACED = ["packet_rate=auto", "drain_s=5", "queue_depth=100"]
 """What `paper-ofdm` needs in order not to be overdriven, beside a sample rate that carries it."""
 DDS_PADDING = 3
 
@@ -76,7 +76,6 @@ def recording() -> list[Row]:
             f"registry={registry}",
             f"source=bag:{DRIVE.path}",
             "bag_speed=0",
-            "time=unthrottled",
             "duration_s=0",
         ]
         overrides += [*PACED, "packet_len=220", "phy.sample_rate=1e6"]

@@ -115,8 +115,8 @@ class Load:
 def load(name: str, seconds: float) -> Load:
     """A scenario's traffic and its radio."""
     scenario = load_scenario(name, duration_s=seconds)
-    registry = scenario.load_registry().with_options(scenario.ros_source.topic_options)
-    codec = message_codec((), registry)
+    registry = scenario.load_registry().with_options(scenario.first.topic_options)
+    codec = message_codec(registry)
     messages = [replace(one, payload=codec.encode(one.topic_id, one.payload)) for one in offered(scenario, registry)]
     return Load(scenario, registry, tuple(messages), make_phy(scenario, registry).airtime())
 
@@ -145,7 +145,7 @@ def run(
     :param back: whether receivers report, over a reverse direction of the same loss
     """
     case = load(name, seconds)
-    source, packet_len = case.scenario.ros_source, case.scenario.packet_len
+    source, packet_len = case.scenario.first, case.scenario.packet_len
     times: dict[int, list[float]] = {topic.topic_id: [] for topic in case.registry}
     arrived: dict[int, list[tuple[float, int]]] = {topic.topic_id: [] for topic in case.registry}
     serials: dict[tuple[int, bytes], list[int]] = {}
@@ -230,13 +230,13 @@ def paced(
     :param duration_s: simulated s; None for those of the scenario
     :param odom_rate: messages/s of odometry; None for those of the scenario
     """
-    options = [f"ros_source.topic_options.{topic}.reliability=best_effort" for topic in best_effort]
+    options = [f"topics.{topic}.reliability=best_effort" for topic in best_effort]
     if odom_rate is not None:
         options.append(f"sim.odom_rate={odom_rate}")
     channel = {"packet_loss": loss}
     settings: dict[str, Any] = {"channel": channel, "seed": seed, "time": "packets"}
     if back:
-        settings["reports"] = {"channel": channel}
+        settings["robots"] = [{}, {"topics": []}]
     if duration_s is not None:
         settings["duration_s"] = duration_s
     result = simulate(load_scenario(name, options, **settings))

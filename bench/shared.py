@@ -96,7 +96,7 @@ def _link(number: int, medium: str, addresses: dict[str, str], folder: Path) -> 
             "connect": [addresses["bind"]],
             "medium_process": "lockstep",
         },
-        "ros_source": {"namespace": f"/robot_{number}", **end},
-        "ros_sink": end,
+        "robot": f"/robot_{number}",
+        "graph": end,
     }
     return link_from(values)

@@ -20,7 +20,7 @@ SETTLED_S = 2.0
 LINK = """
 phy: {name: psk, sample_rate: 1e6}
 front_end: {name: zmq, bind: "ipc://FOLDER/1", connect: ["ipc://FOLDER/2"]}
-ros_source: {namespace: /robot_1}
+robot: /robot_1
 """
 
 

@@ -23,7 +23,6 @@ import numpy as np
 from click.testing import CliRunner
 from gnuradio import blocks, gr
 
-from gr_ros2.compression.train import learn
 from gr_ros2.gr import RosSink
 from gr_ros2.gr.factory import EndpointSetup, make_endpoint
 from gr_ros2.gr.starts import start_of
@@ -176,17 +175,6 @@ def kept(**settings: Any) -> list[str]:
         return sorted(path.name for path in Path(folder).rglob("*.json"))
 
 
-@functools.cache
-def dictionary() -> str:
-    """A file with a dictionary of the simulator's odometry, for as long as the process lives."""
-    folder = TemporaryDirectory()
-    dictionary.folder = folder  # type: ignore[attr-defined]
-    payloads = [m.payload for m in Fleet(SimSettings(odom_rate=50.0)).messages(4.0, 0.0, ["/robot_1/odom"])]
-    path = Path(folder.name) / "own.dict"
-    learn([("nav_msgs/msg/Odometry", payload) for payload in payloads], "own", zstd_size=1024).save(path)
-    return str(path)
-
-
 def drawn(**changes: Any) -> list[Any]:
     """What a sweep would run, and what its figures and their captions show of made-up results."""
     with TemporaryDirectory() as folder:
@@ -246,8 +234,8 @@ def linked(front_end: str = "udp", *, options: Mapping[str, Any] = MappingProxyT
             "transmit": True,
             "open": True,
             "state": f"{folder}/state",
-            "ros_source": {"robot_id": 1, "middleware": "memory"},
-            "ros_sink": {"middleware": "memory"},
+            "robot": 1,
+            "graph": {"middleware": "memory"},
             **changes,
         }
         link = RobotLink(link_from(values))

@@ -18,18 +18,19 @@ FILES = dict(re.findall(r"^### [^\n]*`(\w+)\.py`\n.*?^```python\n(.*?)^```$", PA
 DIFFS = re.findall(r"^```diff\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 ASK = """
 from gr_ros2.cli.params import setting_keys
-from gr_ros2.settings.config import SourceConfig, build
+from gr_ros2.settings.config import build
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.ros.parameters import parameters
+from gr_ros2.settings.robot import RobotConfig
 
 try:
-    build(SourceConfig, {"warm_up_s": -1})
+    build(RobotConfig, {"robot": 1, "warm_up_s": -1})
 except ConfigError as error:
     print(error)
-link = link_from({"registry": "topics.csv", "ros_source": {"robot_id": 1, "warm_up_s": 2.5}, "phy": {"name": "direct"}})
+link = link_from({"robot": 1, "warm_up_s": 2.5, "phy": {"name": "direct"}})
 print(*(f"{p.name} {p.value} {p.meaning} {p.minimum}" for p in parameters(link) if "warm_up_s" in p.name))
-print("ros_source.warm_up_s" in list(setting_keys(LinkConfig)))
+print("warm_up_s" in list(setting_keys(LinkConfig)))
 """
 """What the command line, YAML and ROS know of the example's setting."""
 TOML = "".join(re.findall(r"^```toml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
@@ -75,8 +76,8 @@ def test_the_worked_examples_carry_a_run_together(folder: Path, tmp_path: Path) 
     scenario = tmp_path / "worked.yaml"
     scenario.write_text(
         "{name: worked, registry: table4, duration_s: 2, packet_len: 64, phy: {name: halfsine, options: {sps: 8}}, "
-        "ros_source: {namespace: /robot_1, middleware: spool, domain_id: 41}, "
-        "ros_sink: {middleware: spool, domain_id: 42}}"
+        "graph: {middleware: spool}, robots: [{direction: send, graph: {domain_id: 41}}, "
+        "{direction: receive, graph: {domain_id: 42}}]}"
     )
     arguments = ("run", str(scenario), "--no-report", "--out", str(tmp_path / "out"))
     done = run(folder, "-m", "gr_ros2.cli", *arguments, SPOOL=str(tmp_path))
@@ -97,22 +98,22 @@ def test_the_worked_examples_are_written_like_the_rest(folder: Path, name: str) 
 
 def test_the_page_has_an_example_of_each() -> None:
     assert sorted(FILES) == ["halfsine", "spool"]
-    assert len(DIFFS) == 2
+    assert len(DIFFS) == 1
 
 
 @pytest.mark.slow
 def test_a_setting_is_one_field(tmp_path: Path) -> None:
-    """The example's two lines, added to a copy of the tree, are everywhere once the tools have run."""
+    """The example's lines, added to a copy of the tree, are everywhere once the tools have run."""
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     ignored = shutil.ignore_patterns("__pycache__", "scenarios", "losses", "examples")
     for folder in ("gr_ros2", "tools", "docs/reference"):
         shutil.copytree(REPOSITORY / folder, tmp_path / folder, ignore=ignored)
-    config = tmp_path / "gr_ros2" / "settings" / "config.py"
+    config = tmp_path / "gr_ros2" / "settings" / "robot.py"
     text = config.read_text(encoding="utf-8")
     for diff in DIFFS:
-        before, added = (line[1:] for line in diff.splitlines())
+        before, *added = (line[1:] for line in diff.splitlines())
         assert f"{before}\n" in text, before
-        text = text.replace(f"{before}\n", f"{before}\n{added}\n")
+        text = text.replace(f"{before}\n", "\n".join([before, *added, ""]))
     config.write_text(text, encoding="utf-8")
     for command in (["tools/write-parameters"], ["tools/write-grc"], ["-c", ASK]):
         done = subprocess.run(
@@ -126,11 +127,11 @@ def test_a_setting_is_one_field(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         "warm_up_s = -1: must be greater than or equal to 0",
-        "ros_source.warm_up_s 2.5 s after the start in which nothing is sent 0.0",
+        "warm_up_s 2.5 s after the start in which nothing is sent 0.0",
         "True",
     ]
     page = (tmp_path / "docs" / "reference" / "parameters.md").read_text(encoding="utf-8")
     assert page.count("| `warm_up_s` | `0` | 0 or more |  | s after the start in which nothing is sent |") == 1
-    block = (tmp_path / "gr_ros2" / "grc" / "ros2_source.block.yml").read_text(encoding="utf-8")
+    block = (tmp_path / "gr_ros2" / "grc" / "ros2_link.block.yml").read_text(encoding="utf-8")
     for part in ("label: Warm up (s)", "${ 0 <= warm_up_s }", "warm_up_s=${warm_up_s}", "Warm up: s after the start"):
         assert part in block

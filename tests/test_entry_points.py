@@ -109,14 +109,14 @@ def test_the_command_line_takes_them_by_name_and_lives_with_broken_ones(folder: 
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     scenario = tmp_path / "echo.yaml"
     scenario.write_text(
-        "{name: echo, registry: table4, duration_s: 1, phy: {name: echo}, time: unthrottled, "
-        "ros_source: {robot_id: 1, namespace: /robot_1, middleware: echo, domain_id: 41}, "
-        "ros_sink: {middleware: echo, domain_id: 42}}"
+        "{name: echo, registry: table4, duration_s: 1, phy: {name: echo}, "
+        "graph: {middleware: echo}, robots: [{direction: send, graph: {domain_id: 41}}, "
+        "{direction: receive, graph: {domain_id: 42}}]}"
     )
     ran = run(folder, "-m", "gr_ros2.cli", "run", str(scenario), "--no-report", "--out", str(tmp_path / "out"))
     assert ran.returncode == 0, ran.stderr
     assert '"name": "echo"' in next((tmp_path / "out").glob("*.json")).read_text()
-    broken = run(folder, "-m", "gr_ros2.cli", "run", str(scenario), "--set", "ros_sink.middleware=broken")
+    broken = run(folder, "-m", "gr_ros2.cli", "run", str(scenario), "--set", "graph.middleware=broken")
     assert broken.returncode != 0
     assert "package echo-package has it as broken:Bus" in broken.stderr
     assert "Traceback" not in broken.stderr

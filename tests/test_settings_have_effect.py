@@ -42,7 +42,6 @@ from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from tests.experiments import (
     GRAPH,
-    dictionary,
     drawn,
     guarded,
     heard,
@@ -180,16 +179,11 @@ def sweeps(beside: Mapping[str, Any] = MappingProxyType({}), **changed: Any) -> 
 LINE = "gains_db=[[-100, -100, null], [-100, -100, -100], [null, -100, -100]]"
 
 
-def own_dictionary(end: str) -> str:
-    return f"ros_{end}.dictionaries=[{dictionary()}]"
-
-
-LOSSY, PAPER = "channel.packet_loss=0.2", ("version=0", "ros_source.topic_options={}")
-OPTION = "ros_source.topic_options."
+LOSSY, PAPER, REPORTING = "channel.packet_loss=0.2", ("paper={}", "topics=auto"), "robots=[{}, {topics: []}]"
+OPTION = "topics."
 DRIVE = (
     f"source=bag:{REPOSITORY}/tests/data/simulated_drive",
-    "ros_source.topics=[odom]",
-    "ros_source.topic_options={}",
+    "topics=[odom]",
 )
 BURSTS = "channel.burst_loss={{p_good_to_bad: 0.1, p_bad_to_good: 0.3{}}}"
 
@@ -215,79 +209,71 @@ effects(
     keep_s=Elsewhere("link/v1/test_latest_state.py::test_keep_s_says_how_long_a_robot_out_of_range_can_still_get_it"),
     quantize=run(OPTION + "odom.quantize=pose.pose.position=0.1"),
     depth=run(OPTION + "odom.depth=1", OPTION + "odom={queue: auto}"),
-    reliability=run(OPTION + "odom.reliability=best_effort", LOSSY, "reports={}", scenario="paper-ofdm-paced"),
-    durability=run(OPTION + "odom.durability=transient_local", "ros_source.repeat_s=0.5"),
-    publish_as=differs(published, topic_options={"odom": {"publish_as": "/here"}}),
+    reliability=run(OPTION + "odom.reliability=best_effort", LOSSY, REPORTING, scenario="paper-ofdm-paced"),
+    durability=run(OPTION + "odom.durability=transient_local", "repeat_s=0.5"),
 )
+effects("Columns of a registry", publish_as=differs(published, topic_options={"odom": {"publish_as": "/here"}}))
 effects(
     "ROS Source",
     packet_len=run("packet_len=300"),
-    registry=run("registry=odom.csv", "ros_source.topics=[odom]", OPTION[:-1] + "={}"),
-    version=run("version=0", OPTION[:-1] + "={}"),
+    registry=run("registry=odom.csv", "topics=[odom]"),
+    version=run("paper={}", "topics=auto"),
     key=run("key=fleet.key"),
     seal=run("seal=authenticate", "key=fleet.key"),
     state=differs(kept, state="{}/mine.json"),
-    robot_id=run("ros_source.robot_id=7"),
+    robot_id=run("robots.0.robot=7"),
     middleware=Elsewhere("core/test_backends.py::test_choosing_what_is_not_installed_names_what_to_install"),
     domain_id=Elsewhere("gr/test_source.py::test_a_loop_is_refused_whichever_comes_first"),
-    commands=run("ros_source.commands=[]", OPTION + "cmd_vel={qos: auto}"),
-    dictionaries=lambda: (
-        outcome("paper-ofdm-paced"),
-        outcome("paper-ofdm-paced", own_dictionary("source"), own_dictionary("sink")),
-    ),
+    commands=run("commands=[]", OPTION + "cmd_vel={qos: auto}"),
     topic_options=run(OPTION + "odom.max_rate=5"),
     debug=Elsewhere("gr/test_source.py::test_debug_lines"),
-    queue_depth=run("ros_source.queue_depth=2", OPTION + "odom={queue: fifo}"),
-    topics=run("ros_source.topics=[odom, scan]"),
+    queue_depth=run("queue_depth=2", OPTION + "odom={queue: fifo}"),
+    topics=run("topics=[odom, scan]"),
     services=Elsewhere("radio/test_found_services.py::test_services_can_be_left_to_the_robot"),
-    namespace=run("ros_source.namespace=/robot_2"),
-    dst_id=run("ros_source.dst_id=9"),
-    min_fragment=run("ros_source.min_fragment=150", *PAPER),
-    greedy=run("ros_source.greedy=true", *PAPER),
-    flush_timeout_s=run("ros_source.flush_timeout_s=0.2", *PAPER),
+    namespace=run("robots.0.graph.namespace=/robot_2"),
+    dst_id=run("paper.dst_id=9", *PAPER),
+    min_fragment=run("paper.min_fragment=150", *PAPER),
+    greedy=run("paper.greedy=true", *PAPER),
+    flush_timeout_s=run("paper.flush_timeout_s=0.2", *PAPER),
     subscriber_depth=Elsewhere(
         "gr/test_source.py::test_what_the_graph_loses_before_it_reaches_the_source_is_a_row_that_adds_up"
     ),
-    hop=run("ros_source.hop=3", *PAPER),
-    packet_rate=run("ros_source.packet_rate=10"),
+    hop=run("paper.hop=3", *PAPER),
+    packet_rate=run("packet_rate=10"),
     backpressure=Elsewhere("gr/test_source.py::test_backpressure_holds_the_publisher_back_and_close_lets_it_go"),
-    entry_ids=run("ros_source.entry_ids=random", *PAPER),
-    repeat_s=run("ros_source.repeat_s=0.5"),
-    compression=run("ros_source.compression=false"),
-    repair=run("ros_source.repair='off'", scenario="paper-ofdm-paced"),
-    beacon_s=run("ros_source.beacon_s=0.05", LOSSY, "reports={}"),
-    expected_loss=run("ros_source.expected_loss=0.6", LOSSY, "ros_source.repair=thrifty", scenario="paper-ofdm-paced"),
+    entry_ids=run("paper.entry_ids=random", *PAPER),
+    repeat_s=run("repeat_s=0.5"),
+    compression=run("compression=false"),
+    repair=run("repair='off'", scenario="paper-ofdm-paced"),
+    beacon_s=run("beacon_s=0.05", LOSSY, REPORTING),
+    expected_loss=run("expected_loss=0.6", LOSSY, "repair=thrifty", scenario="paper-ofdm-paced"),
 )
 effects(
     "ROS Sink",
     packet_len=run("packet_len=300"),
-    registry=run("registry=odom.csv", "ros_source.topics=[odom]", OPTION[:-1] + "={}"),
-    version=run("version=0", OPTION[:-1] + "={}"),
+    registry=run("registry=odom.csv", "topics=[odom]"),
+    version=run("paper={}", "topics=auto"),
     key=run("key=fleet.key"),
     seal=run("seal=authenticate", "key=fleet.key"),
     state=differs(kept, state="{}/mine.json"),
-    robot_id=run("ros_sink.robot_id=9", "ros_source.dst_id=8"),
+    robot_id=run("robots.1.robot=8", *PAPER, "paper.dst_id=8"),
     middleware=Elsewhere("core/test_backends.py::test_choosing_what_is_not_installed_names_what_to_install"),
     domain_id=differs(published, domain_id=GRAPH + 1),
-    dictionaries=lambda: (
-        outcome("paper-ofdm-paced", own_dictionary("source")),
-        outcome("paper-ofdm-paced", own_dictionary("source"), own_dictionary("sink")),
-    ),
     topic_options=differs(published, topic_options={"odom": {"publish_as": "/here"}}),
     debug=Elsewhere("gr/test_readable.py::test_lines_appear_on_standard_output_where_nothing_else_takes_them"),
     commands=Elsewhere(
         "link/v1/test_commands.py::test_what_repair_brings_too_late_is_dropped_by_the_receiver_and_has_a_row"
     ),
-    namespace_format=differs(published, namespace_format="/from_{src_id}"),
+    namespace_format=differs(published, namespace_format="/from_{robot}"),
     publisher_depth=differs(published, publisher_depth=3),
-    reassembly_timeout_s=run("ros_sink.reassembly_timeout_s=0.05", *PAPER, LOSSY),
+    reassembly_timeout_s=run("paper.reassembly_timeout_s=0.05", *PAPER, LOSSY),
     max_age_s=lambda: (withheld(), withheld(max_age_s=2.0)),
-    hold_s=run("ros_sink.hold_s=0.1", LOSSY, OPTION + "scan={queue: fifo}", "phy.sample_rate=400000"),
+    hold_s=run("hold_s=0.1", LOSSY, OPTION + "scan={queue: fifo}", "phy.sample_rate=400000"),
     max_sources=Elsewhere("link/v0/test_receiver.py::test_sources_beyond_the_bound_wait_until_one_has_gone_silent"),
     max_source_bytes=Elsewhere("link/v1/test_endpoint.py::test_a_long_message_is_given_up_when_its_memory_is_needed"),
     max_bytes=Elsewhere("link/v0/test_receiver.py::test_forged_packets_never_raise_and_memory_stays_bounded"),
     use_sim_time=Elsewhere("gr/test_sink.py::test_latency_by_simulated_clock"),
-    frame_prefix=differs(published, frame_prefix="robot_{src_id}/"),
+    frame_prefix=differs(published, frame_prefix="robot_{robot}/"),
     merge_tf=Elsewhere("gr/test_frame_ids.py::test_two_robots_on_one_graph_of_a_real_dds"),
 )
 effects(
@@ -359,22 +345,35 @@ effects(
 )
 effects(
     "Scenario",
-    packet_len=run("packet_len=300"),
-    registry=run("registry=odom.csv", "ros_source.topics=[odom]", OPTION[:-1] + "={}"),
-    version=run("version=0", OPTION[:-1] + "={}"),
     channel=run(LOSSY),
-    ros_source=run("ros_source.packet_rate=10"),
-    ros_sink=run("ros_sink.robot_id=9", "ros_source.dst_id=8"),
+    paths=run("paths=[{to: 2, packet_loss: 0.2}]"),
+    paper=run("paper={}", "topics=auto"),
     phy=run("phy.sample_rate=200000"),
     seed=run("seed=4"),
     source=lambda: (outcome("six-topics-paced", *DRIVE[1:]), outcome("six-topics-paced", *DRIVE)),
     duration_s=run("duration_s=3"),
-    drain_s=run("drain_s=0", "ros_source.packet_rate=0"),
+    drain_s=run("drain_s=0", "packet_rate=0"),
     sim=run("sim.odom_rate=20"),
     task=Elsewhere("lab/run/test_task_run.py::test_followers_keep_their_places_by_the_link_alone"),
     controller=Elsewhere("lab/run/test_task_run.py::test_robots_meet_in_real_time_whoever_drives_them"),
-    reports=run("reports={}", LOSSY),
     airtime=run("airtime=eu869.4"),
+)
+effects(
+    "Path",
+    to=run("paths=[{to: 2, packet_loss: 0.2}]", "paths=[{to: 1, packet_loss: 0.2}]"),
+    delay_s=run("paths=[{from: 2, delay_s: 0.3}]", LOSSY, REPORTING),
+    **{"from": run("paths=[{from: 1, packet_loss: 0.2}]", "paths=[{from: 2, packet_loss: 0.2}]")},
+)
+effects(
+    "Paper",
+    dst_id=run("paper.dst_id=9", *PAPER),
+    min_fragment=run("paper.min_fragment=150", *PAPER),
+    greedy=run("paper.greedy=true", *PAPER),
+    flush_timeout_s=run("paper.flush_timeout_s=0.2", *PAPER),
+    hop=run("paper.hop=3", *PAPER),
+    entry_ids=run("paper.entry_ids=random", *PAPER),
+    compression=run("paper.compression=true", *PAPER),
+    reassembly_timeout_s=run("paper.reassembly_timeout_s=0.05", *PAPER, LOSSY),
 )
 effects(
     "Airtime",
@@ -387,27 +386,13 @@ effects(
     ),
 )
 effects(
-    "Reports",
-    channel=run("reports={channel: {packet_loss: 0.6}}", LOSSY, "reports={}"),
-    delay_s=run("reports={delay_s: 0.3}", LOSSY, "reports={}"),
-)
-
-
-ENDS = {name: EFFECTS["ROS Source", name] for name in ("packet_len", "registry", "version", "key", "seal", "state")}
-effects(
     "Scenario",
     name=lambda: (printed(), printed("name=another")),
-    key=ENDS["key"],
-    seal=ENDS["seal"],
-    state=Refused(("state=robot.json",)),
-    localhost_only=Elsewhere("middleware/test_dds.py::test_a_domain_is_on_loopback_or_not_for_the_whole_process"),
     own_domains=Elsewhere("lab/run/test_domains.py::test_one_graph_is_that_of_the_shell"),
     description=lambda: (printed(), printed("description=another")),
     repetitions=lambda: (printed(), printed("repetitions=2")),
     time=Elsewhere("lab/run/test_simulated_runner.py::test_in_noise_packets_lose_what_samples_lose"),
     bag_speed=run("bag_speed=2", *DRIVE),
-    back=run("back={ros_source: {namespace: /robot_2}}"),
-    receivers=Elsewhere("lab/run/test_version1.py::test_every_receiver_has_losses_of_its_own"),
     robots=run("robots=3", scenario="two-robots-half-duplex"),
     duplex=run("duplex=full", scenario="two-robots-half-duplex"),
     gains_db=lambda: (reached(), reached("gains_db=-90")),
@@ -415,29 +400,54 @@ effects(
     relay=run("relay='off'", "robots=3", LINE, scenario="line"),
 )
 effects(
-    "Reverse direction",
-    channel=run("back.channel.packet_loss=0.5", scenario="two-way"),
-    ros_source=run("back.ros_source.compression=false", scenario="two-way"),
-    ros_sink=run("back.ros_sink.max_source_bytes=4096", LOSSY, scenario="two-way"),
-)
-effects(
-    "Robot",
-    ros_source=run("robots=[{ros_source: {repair: 'off'}}, {}]", scenario="two-robots-half-duplex"),
+    "Robot of a scenario",
     tx_power_dbm=lambda: (reached(), reached("robots=[{tx_power_dbm: 10}, {}]")),
     noise_figure_db=lambda: (reached(), reached("robots=[{noise_figure_db: 3}, {}]")),
 )
+OF_SOURCE = (
+    *("packet_len", "registry", "key", "seal", "state", "commands", "services", "packet_rate", "queue_depth"),
+    *("compression", "repair", "repeat_s", "beacon_s", "expected_loss", "debug", "topics"),
+)
+effects(
+    "Robot",
+    **{name: EFFECTS["ROS Source", name] for name in OF_SOURCE},
+    **{name: EFFECTS["ROS Sink", name] for name in ("hold_s", "max_age_s", "max_sources", "max_source_bytes")},
+    robot=run("robots.0.robot=7"),
+    direction=run("robots.1.direction=receive", LOSSY, REPORTING),
+    publish=Elsewhere("radio/test_robot_link.py::test_parts_that_do_not_fit_are_refused_and_nothing_stays_open"),
+    graph=run("robots.0.graph.namespace=/robot_2"),
+)
+effects(
+    "Graph",
+    middleware=EFFECTS["ROS Source", "middleware"],
+    domain_id=Elsewhere("lab/run/test_domains.py::test_a_domain_that_is_named_stays"),
+    localhost_only=Elsewhere("middleware/test_dds.py::test_a_domain_is_on_loopback_or_not_for_the_whole_process"),
+    namespace=run("robots.0.graph.namespace=/robot_2"),
+    depth=Elsewhere("radio/test_config.py::test_the_depths_of_a_graph_are_those_of_its_blocks"),
+    use_sim_time=EFFECTS["ROS Sink", "use_sim_time"],
+)
+OF_PUBLISH = {"as": "namespace_format", "depth": "publisher_depth", "topics": "topic_options"}
+effects(
+    "Publish",
+    **{name: EFFECTS["ROS Sink", OF_PUBLISH.get(name, name)] for name in (*OF_PUBLISH, "frame_prefix", "merge_tf")},
+)
+effects(
+    "Topics that come out",
+    depth=differs(published, topic_options={"odom": {"depth": 3}}),
+    reliability=differs(published, topic_options={"odom": {"reliability": "best_effort"}}),
+    durability=differs(published, topic_options={"odom": {"durability": "transient_local"}}),
+    deadline_s=Elsewhere("radio/test_calls.py::test_calls_that_the_server_leaves_open_end_by_name"),
+    max_age_s=lambda: (withheld(), withheld(topic_options={"cmd_vel": TopicOptions(max_age_s=2.0)})),
+    **{"as": differs(published, topic_options={"odom": {"publish_as": "/here"}})},
+)
 effects(
     "Link",
-    **ENDS,
     name=differs(linked, name="another"),
     channel=Elsewhere("radio/test_radio.py::test_a_channel_that_is_given_can_be_changed_while_it_runs"),
-    ros_source=EFFECTS["Scenario", "ros_source"],
-    ros_sink=EFFECTS["Scenario", "ros_sink"],
     phy=EFFECTS["Scenario", "phy"],
     airtime=EFFECTS["Scenario", "airtime"],
     medium=differs(linked, medium="slots"),
     relay=lambda: (linked(medium="slots"), linked(medium="slots", relay="gain")),
-    localhost_only=EFFECTS["Scenario", "localhost_only"],
     front_end=Elsewhere("radio/test_devices.py::test_every_packet_goes_out_as_one_ended_burst_and_comes_back"),
     transmit=differs(linked, transmit=False),
     open=Elsewhere("radio/test_permission.py::test_a_radio_asks_first"),
@@ -528,7 +538,7 @@ effects(
     list=sweeps(list=[{"packet_len": 80}, {"packet_len": 96}]),
     set=sweeps(set={"duration_s": 2}),
     x=sweeps(TWO, x="packet_len"),
-    y=sweeps({"grid": {**TWO["grid"], "ros_source.queue_depth": [8, 16]}}, y="ros_source.queue_depth"),
+    y=sweeps({"grid": {**TWO["grid"], "queue_depth": [8, 16]}}, y="queue_depth"),
     by=sweeps(TWO, by=["packet_len"], x="channel.packet_loss"),
     value=sweeps(value="goodput_Bps"),
     topic=lambda: (drawn(**BOTH), drawn(**{**BOTH, "topic": "/robot_1/odom"})),
@@ -761,7 +771,7 @@ OF_ONE_VERSION = [
 def test_a_version_refuses_what_only_the_other_one_has(cls: type[Any], setting: Setting) -> None:
     assert setting.version is not None
     version, value = 1 - setting.version, {setting.name: other(setting)}
-    said = f"{setting.name} = {other(setting)!r}: version {version} has no such setting; leave it out, or set version"
+    said = f"{setting.name} = {other(setting)!r}: version {version} has no such setting; leave it out"
     if cls is TopicOptions:
         with pytest.raises(ConfigError, match=re.escape(f"topic_options.odom.{said}")):
             build(SourceConfig, {"version": version, "topic_options": {"odom": value}})
@@ -869,17 +879,13 @@ def test_an_option_that_can_change_has_its_effect_then(option: str) -> None:
 
 
 OF_A_GRAPH = {
-    "ros_source.middleware": "memory",
-    "ros_source.domain_id": 3,
-    "ros_source.subscriber_depth": 3,
-    "ros_source.backpressure": True,
-    "ros_source.debug": True,
-    "ros_sink.middleware": "memory",
-    "ros_sink.domain_id": 3,
-    "ros_sink.publisher_depth": 3,
-    "ros_sink.debug": True,
-    "ros_sink.use_sim_time": True,
-    "localhost_only": False,
+    "graph.middleware": "memory",
+    "graph.domain_id": 3,
+    "graph.depth": 3,
+    "graph.localhost_only": False,
+    "graph.use_sim_time": True,
+    "publish.depth": 3,
+    "debug": True,
     "own_domains": False,
     "sim.transforms": True,
 }

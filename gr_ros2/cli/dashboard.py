@@ -53,7 +53,6 @@ def audience(
     console: Console,
     name: str,
     *,
-    instruments: bool = True,
     answers: Mapping[str, Callable[[Any], Any]] = MappingProxyType({}),
 ) -> Iterator[LateObservers]:
     """The observers of a run or a link: a dashboard from the start if ``where`` is given, or later when
@@ -61,14 +60,13 @@ def audience(
 
     :param where: value of ``--dashboard``; None for no dashboard at the start
     :param name: what the program is doing, for clients that search for it
-    :param instruments: see :class:`gr_ros2.observe.observers.RunObserver`
     :param answers: what clients may ask beside that, by name; called with the value given, in a thread of its own
     :raises ConfigError: when the dashboard cannot be served at this place
     :raises BackendMissingError: when the package that draws it is not installed
     """
     from gr_ros2.observe.observers import LateObservers
 
-    seen = LateObservers(instruments or where is not None)
+    seen = LateObservers()
     urls: list[str] = []
     with ExitStack() as dashboards:
 

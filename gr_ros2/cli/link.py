@@ -101,7 +101,7 @@ def link(
     once, SIGUSR2 begins again.
     """
     if middleware is not None:
-        overrides = (f"ros_source.middleware={middleware}", f"ros_sink.middleware={middleware}", *overrides)
+        overrides = (f"graph.middleware={middleware}", *overrides)
     if transmit is not None:
         overrides = (f"transmit={str(transmit).lower()}", *overrides)
     if is_open:
@@ -201,7 +201,7 @@ def _in_one_line(values: Mapping[str, Any], overrides: Sequence[str], save: Path
     """Make the settings of a link, print them as YAML, and write them to ``save``."""
     values = settled(values, Path(), overrides)
     settings = link_from(values, values["name"])
-    text = yaml_text({**values, "registry": portable_registry(values["registry"])})
+    text = yaml_text({**values, **({"registry": portable_registry(settings.registry)} if settings.registry else {})})
     where = "a YAML file (--save FILE writes it)" if save is None else save
     click.echo(f"# The same link as {where}:\n{text}")
     if save is not None:

@@ -24,7 +24,7 @@ _BAD_INPUT_ERRORS = (ConfigError, WireError, BagError, BackendMissingError)
 _GNU_RADIO = ("gnuradio", "pmt")
 _NO_GNU_RADIO = (
     "this needs GNU Radio 3.10, which this Python does not find: apt install gnuradio, and install gr-ros2 in an "
-    "environment made by /usr/bin/python3 -m venv --system-site-packages; without it there are packet, registry, dict, "
+    "environment made by /usr/bin/python3 -m venv --system-site-packages; without it there are packet, registry, "
     "key and scenarios, and with `phy: modem` or `direct` also plan, and replay by packets (`time: packets`)"
 )
 _LABORATORY = ("gr_ros2_lab", "matplotlib", "plotext", "pyarrow", "jinja2")
@@ -65,7 +65,6 @@ COMMANDS: Commands = {
     "scenarios": ("gr_ros2_lab.cli.scenarios:scenarios", "List the built-in scenarios."),
     "packet": ("gr_ros2.cli.main:packet", "Look into packets."),
     "registry": ("gr_ros2.cli.main:registry", "Check and write topic registries."),
-    "dict": ("gr_ros2.cli.dict:group", "Dictionaries for message compression."),
     "key": ("gr_ros2.cli.key:group", "Keys of a fleet, which seal the packets of version 1."),
     "wireshark": ("gr_ros2.cli.wireshark:wireshark", "The Wireshark dissector for captures made with --pcap."),
     "completion": ("gr_ros2.cli.completion:completion", "Completion of commands for bash, zsh and fish."),

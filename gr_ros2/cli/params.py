@@ -76,6 +76,8 @@ def setting_keys(settings: type[Any], prefix: str = "") -> Iterator[str]:
             yield from setting_keys(kinds[field.name], f"{prefix}{field.name}.")
         else:
             yield prefix + field.name.removesuffix("_")  # of a name that Python keeps for itself
+    for other, but in getattr(settings, "also", {}).items():
+        yield from (key for key in setting_keys(other, prefix) if key not in but)
 
 
 def set_option(settings: type[Any], what: str = "one setting") -> Callable[[Any], Any]:

@@ -19,7 +19,6 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import set_option
 from gr_ros2.cli.status import PING, ask_link, find_link, json_option, pid_option
 from gr_ros2.core.backends import uninterrupted
-from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import LinkConfig, load_link
 from gr_ros2.settings.config import DiagnosticsConfig
 from gr_ros2.wire import BROADCAST
@@ -38,18 +37,13 @@ Ask = Callable[[bool], Mapping[str, Any]]
 
 
 def without_topics(settings: LinkConfig) -> LinkConfig:
-    """The same link, with no topic and on no ROS graph.
-
-    :raises ConfigError: for version 0, which has no questions
-    """
-    if not settings.version:
-        raise ConfigError("version = 0: a robot can be asked with version 1 only; set version to 1 at every end")
+    """The same link, with no topic and on no ROS graph."""
     return replace(
         settings,
         registry="",
         record="",
-        ros_source=replace(settings.ros_source, registry="", topics=(), services=False, middleware="memory"),
-        ros_sink=replace(settings.ros_sink, registry="", middleware="memory"),
+        topics={},
+        graph=replace(settings.graph, middleware="memory"),
         diagnostics=DiagnosticsConfig(period_s=0.0),
     )
 

@@ -220,7 +220,7 @@ def peers(*, pid: int | None, as_json: bool) -> None:
 @click.argument("settings", nargs=-1, required=True, metavar="SETTING=VALUE...")
 @pid_option
 def set_live(*, settings: tuple[str, ...], pid: int | None) -> None:
-    """Change settings of a running link, such as ros_source.topic_options.goal.to=7: whom a topic is for.
+    """Change settings of a running link, such as topics.goal.to=7: whom a topic is for.
 
     The file of the link stays as it is. What cannot change while a link runs is refused, and what can is named.
     """

@@ -3,7 +3,7 @@
 Invariants: a name that passes here passes in every ROS 2, since the rules are those its ``rmw`` package enforces
 (``rmw_validate_full_topic_name``, ``rmw_validate_namespace``, ``rmw_validate_node_name``). They come from the ROS 2
 design article "Topic and Service name mapping to DDS"; two underscores in a row, which only the article forbids, pass.
-A form has one field, ``{src_id}``, and nothing else in braces.
+A form has one field, ``{robot}``, and nothing else in braces.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ OWN_NODES = ("/gr_ros2_", "/gr_ros2/")
 """Beginnings of the names of this package's nodes and topics, by which a link says how it is."""
 
 _SHOWN = 10
-_FIELD = "{src_id}"
+_FIELD = "{robot}"
 _LONGEST_ID = 255
 _FOREIGN = re.compile(r"[^A-Za-z0-9_/]")
 
@@ -93,13 +93,13 @@ def checked_namespace(namespace: str) -> str:
 
 
 def checked_namespace_form(form: str) -> str:
-    """A namespace in which ``{src_id}`` may stand."""
+    """A namespace in which ``{robot}`` may stand."""
     _refuse(_form_fault(form) or _of_form(form, _namespace_fault(filled(form, _LONGEST_ID))))
     return form
 
 
 def checked_topic_form(form: str) -> str:
-    """A topic name in which ``{src_id}`` may stand, with or without leading slash; '' means no topic."""
+    """A topic name in which ``{robot}`` may stand, with or without leading slash; '' means no topic."""
     name = filled(form, _LONGEST_ID)
     fault = topic_fault(name if name.startswith("/") else f"/{name}")
     _refuse(form and (_form_fault(form) or _of_form(form, fault)))
@@ -113,7 +113,7 @@ def checked_merged_topic(topic: str) -> str:
 
 
 def checked_frame_form(form: str) -> str:
-    """The beginning of a frame name, in which ``{src_id}`` may stand: tf2 takes no frame that begins with a slash."""
+    """The beginning of a frame name, in which ``{robot}`` may stand: tf2 takes no frame that begins with a slash."""
     fault = "must not begin with /, tf2 refuses such frames" if form.startswith("/") else ""
     unprintable = "" if form.isprintable() else "holds a character that cannot be printed"
     _refuse(_form_fault(form) or fault or unprintable)
@@ -127,7 +127,9 @@ def _namespace_fault(namespace: str) -> str:
 
 def _form_fault(form: str) -> str:
     rest = form.replace(_FIELD, "")
-    return "only {src_id} may stand in braces" if "{" in rest or "}" in rest else ""
+    if "{src_id}" in rest:
+        return "write {robot} for the sender, not {src_id}"
+    return "only {robot} may stand in braces" if "{" in rest or "}" in rest else ""
 
 
 def _of_form(form: str, fault: str) -> str:

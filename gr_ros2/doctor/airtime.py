@@ -111,7 +111,7 @@ def _account(config: LinkConfig) -> Iterator[Finding]:
     rule = config.airtime.rule
     if rule is None or rule.duty_cycle == 1:
         return
-    path = account_of(config.ros_source.state, config.ros_source.src_id())
+    path = account_of(config.state, config.robot_id)
     try:
         file = AirtimeFile(path)
     except ConfigError as error:

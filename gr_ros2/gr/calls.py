@@ -149,7 +149,7 @@ class LiveCalls:
         if not self._source.config.key and not self._own:
             _log.warning(
                 "service %s and others can be called by whoever can send on this link, as it has no key; set key, "
-                "or ros_source.services = false",
+                "or services: false",
                 name,
             )
         self._offer(name, topic)

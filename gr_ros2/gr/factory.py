@@ -28,15 +28,15 @@ if TYPE_CHECKING:
     from gr_ros2.compression import LinkCodec
 
 
-def message_codec(dictionaries: Sequence[str], registry: Sequence[Topic] = ()) -> LinkCodec:
+def message_codec(registry: Sequence[Topic] = ()) -> LinkCodec:
     """The codec of a link.
 
     :param registry: with topic options applied
-    :raises ConfigError: for a dictionary that cannot be read, or a wrong ``codec`` or ``quantize`` of a topic
+    :raises ConfigError: for a wrong ``codec`` or ``quantize`` of a topic
     """
     from gr_ros2.compression import LinkCodec  # imported here: it takes longer than the rest of a block
 
-    return LinkCodec(registry, dictionaries)
+    return LinkCodec(registry)
 
 
 @dataclass(frozen=True)
@@ -110,15 +110,14 @@ def make_endpoint(
         topics = topics.with_calls()
     to_air = None
     if source is not None and source.compresses:
-        to_air = codec or message_codec(source.dictionaries, topics)
-    dictionaries = () if sink is None else sink.dictionaries
+        to_air = codec or message_codec(topics)
     if not version:
         if start is not None and start.mcs_table:
             raise ConfigError("phy.options.rate = 'adaptive' with version 0, which has no reports; set version to 1")
-        from_air = None if sink is None else codec or message_codec(dictionaries, registry)
+        from_air = None if sink is None else codec or message_codec(registry)
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
     start = start or EndpointSetup()
-    known = message_codec(dictionaries)
+    known = message_codec()
     return EndpointV1(
         None if source is None or not topics else topics,
         settings_of(

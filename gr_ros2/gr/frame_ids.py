@@ -44,7 +44,7 @@ def prefixed_frame(prefix: str, frame: str) -> str:
 class FramePrefix:
     """Adds a prefix to the frame names of messages: ``frame_id`` of every Header, and every ``…_frame_id``.
 
-    :param form: the prefix, in which ``{src_id}`` is the sender; '' changes nothing
+    :param form: the prefix, in which ``{robot}`` is the sender; '' changes nothing
     :param counters: counts messages that passed unchanged: ``frame_unknown_type`` (no definition of the type) and
         ``frame_damaged`` (the bytes are not a message of the type)
     """

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.settings.config import SinkConfig, TopicOptions
-from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.config import SinkConfig
+from gr_ros2.settings.registry import Registry, Topic, options_of
 
 Key = tuple[int, int]
 """Source id and topic id."""
@@ -23,7 +23,7 @@ class HeardTopics:
 
     def name_of(self, src_id: int, name: str) -> str:
         """Absolute name under which a sender's topic comes out, by its name in a registry."""
-        options = self._config.topic_options.get(name, TopicOptions())
+        options = options_of(name, self._config.topic_options)
         return Topic(0, name, "", options).republished(self._config.namespace_format, src_id)
 
     def name(self, key: Key) -> str:

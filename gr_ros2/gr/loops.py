@@ -140,7 +140,7 @@ class LoopGuard:
 def _made_by(namespace_format: str, name: str) -> bool:
     """Whether a topic is in the namespace that a sink gives to some sender. A format that all senders share does not
     tell."""
-    parts = [re.escape(part) for part in namespace_format.strip("/").split("{src_id}")]
+    parts = [re.escape(part) for part in namespace_format.strip("/").split("{robot}")]
     return len(parts) > 1 and re.match(f"/{'[0-9]+'.join(parts)}/", name) is not None
 
 

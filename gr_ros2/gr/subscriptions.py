@@ -280,7 +280,7 @@ class Subscriptions:
             self._shared_said.add(topic.name)
             self._log.warning(
                 "topic %s: %d publishers keep messages for late subscribers, and a robot that joins late gets the "
-                "newest %d of all; set ros_source.topic_options.%s.depth to the number of publishers",
+                "newest %d of all; set topics.%s.depth to the number of publishers",
                 topic.name,
                 len(offers),
                 kept,

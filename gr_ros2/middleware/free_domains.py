@@ -44,7 +44,7 @@ class ReservedDomain(Closing):
             self._reservation.close()
         raise MiddlewareError(
             f"all {tried} ROS domains that a run may take are in use (`ss -xp | grep gr-ros2-domain` names the "
-            "processes); set ros_source.domain_id and ros_sink.domain_id"
+            "processes); set graph.domain_id of each robot"
         )
 
     def close(self) -> None:

@@ -1,7 +1,6 @@
 """The configuration of `gr-ros2 link`: one robot's end of a link as one YAML file.
 
-Invariant: the settings on which both ends of a link must agree (`registry`, `packet_len`, `phy`) are at the top level.
-The settings of the front end are under `front_end`. Its sample rate is that of the PHY.
+Invariant: the settings of the front end are under `front_end`. Its sample rate is that of the PHY.
 """
 
 from __future__ import annotations
@@ -18,49 +17,39 @@ from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.permission import check_band
-from gr_ros2.settings.config import AnyLink, DiagnosticsConfig, Text, build
+from gr_ros2.settings.config import STRICT, AirConfig, ChannelConfig, DiagnosticsConfig, Text, build
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.files import SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings.files import read_settings
 from gr_ros2.settings.registry import Registry, check_outputs
+from gr_ros2.settings.robot import RobotConfig, halves
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
-class LinkConfig(AnyLink):
-    """One robot's end: its ROS graph -> RosSource -> PHY -> front end, and back the same way.
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, use_attribute_docstrings=True))
+class LinkConfig(AirConfig, RobotConfig):
+    """One robot's end of a link: its ROS graph -> PHY -> front end, and back the same way."""
 
-    :param name: what errors and the status line call it
-    :param registry: CSV path, relative to the YAML file, or the name of a built-in one: the topics that are sent; with
-        version 0 the same at every robot, with version 1 each announces its own; '' sends what ``ros_source.topics``
-        finds on the ROS graph
-    :param ros_source: the sending block; its robot_id must be another at every robot
-    :param phy: which physical layer, at which sample rate; the same at every robot. ``headroom`` is not used
-    :param front_end: ``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings
-        (docs/how-to/radios.md)
-    :param transmit: whether it sends: auto = yes, where no radio is connected; a radio needs true, the word of the
-        person who answers for it; false = it only receives
-    :param open: a radio may send without a key, so that anybody can read and forge what crosses
-    :param channel: impairments of what is received, for front ends without a radio
-    :param record: SigMF recording to write of all samples received, '' = none
-    :param diagnostics: what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)
-    """
-
-    registry: str = ""
     name: Text = "link"
+    """what errors and the status line call it; the file's name unless it is set"""
     front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
+    """``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings (docs/how-to/radios.md)"""
     transmit: bool | Auto = AUTO
+    """whether it sends: auto = yes, where no radio is connected; a radio needs true, the word of the person who answers
+    for it; false = it only receives"""
     open: Annotated[bool, Field(title="Without a key")] = False
+    """a radio may send without a key, so that anybody can read and forge what crosses"""
+    channel: ChannelConfig = Field(default_factory=ChannelConfig)
+    """impairments of what is received, for front ends without a radio"""
     record: Annotated[str, Field(title="Recording of what is received")] = ""
+    """SigMF recording to write of all samples received, '' = none"""
     diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
+    """what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)"""
 
     @model_validator(mode="after")
     def _known(self) -> LinkConfig:
-        if not self.registry and not self.version:
-            raise ValueError("registry is missing, and version 0 needs the same one at every robot")
         if "name" not in self.front_end:
             raise ValueError(f"front_end.name is missing; known are {', '.join(FRONT_ENDS)}")
         for key, name, table in (
-            ("ros_source.middleware", self.ros_source.middleware, MIDDLEWARE),
-            ("ros_sink.middleware", self.ros_sink.middleware, MIDDLEWARE),
+            ("graph.middleware", self.graph.middleware, MIDDLEWARE),
             ("phy.name", self.phy.name, PHY),
             ("front_end.name", self.front_end_name, FRONT_ENDS),
         ):
@@ -68,7 +57,10 @@ class LinkConfig(AnyLink):
                 raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
         if self.phy.sample_rate == AUTO and PHY.load(self.phy.name).has_samples:
             raise ValueError("phy.sample_rate = auto: a link needs one; set it to what the radio can do, samples/s")
-        self.ros_source.src_id()
+        if self.airtime.rule is not None and self.packet_rate == 0:
+            raise ValueError("packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out")
+        self.airtime.check_seal(encrypts=bool(self.key) and self.seal == "encrypt")
+        halves(self)  # says what does not go together
         check_band(self.airtime, self.front_end, 0.0 if self.phy.sample_rate == AUTO else self.phy.sample_rate)
         return self
 
@@ -92,7 +84,7 @@ class LinkConfig(AnyLink):
         if not self.registry:
             return Registry.empty()
         registry = Registry.from_csv(self.registry)
-        check_outputs(registry, self.ros_sink)
+        check_outputs(registry, halves(self)[1])
         return registry
 
 
@@ -100,11 +92,8 @@ def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:
     """Make a link's configuration from a mapping.
 
     :param where: what to call the mapping in errors, for instance its file name
-    :raises ConfigError: for an unknown key, a value out of range, or blocks that disagree; the message names it
+    :raises ConfigError: for an unknown key or a value out of range; the message names it
     """
-    values = dict(values)
-    shared = {key: values[key] for key in SHARED_KEYS if key in values}
-    values |= with_shared(values, shared, f"{where}: " if where else "")
     return build(LinkConfig, values, where)
 
 

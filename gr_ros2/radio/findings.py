@@ -25,7 +25,7 @@ from gr_ros2.state.keys import read_key_file
 
 _FORMAT = {
     "length": "longer or shorter than packets can be here: set the same packet_len",
-    "version": "of another version of the wire format: set the same version",
+    "version": "of another version of the wire format: update gr-ros2 at every end",
     "crc": "damaged, or of a link with another packet_len",
     "entry_bounds": "not readable: set the same packet_len",
     "entry_kind": "not readable: set the same packet_len",
@@ -59,7 +59,7 @@ def introduce(live: LiveEnd, told: Mapping[str, Any], snr_db: Callable[[], float
 
 
 def peers(live: LiveEnd, now: float) -> list[dict[str, Any]]:
-    """The robots that were heard; the one heard last comes first. Version 0 does not know them."""
+    """The robots that were heard; the one heard last comes first."""
     with live.lock:
         found = live.endpoint.peers(now)
     return [{**asdict(peer), "start": f"{peer.start:016x}"} for peer in sorted(found, key=lambda peer: peer.heard_s)]
@@ -69,7 +69,7 @@ def ping(live: LiveEnd, robot: int, now: float, *, anew: bool = False) -> dict[s
     """Ask a robot, and say what has come of all questions to it so far.
 
     :param anew: forget the earlier ones
-    :raises ConfigError: with version 0, which has no such questions
+    :raises ConfigError: for a number that no robot has
     """
     with live.lock:
         questions = live.endpoint.questions
@@ -118,7 +118,7 @@ def same_id(robot: int, rejected: Mapping[str, int]) -> str | None:
     """
     if not rejected.get("same_id"):
         return None
-    return f"another robot sends as robot {robot}, which is this one; give one of them another robot_id"
+    return f"another robot sends as robot {robot}, which is this one; give one of them another number"
 
 
 def doubled(heard: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -127,7 +127,7 @@ def doubled(heard: Sequence[Mapping[str, Any]]) -> list[str]:
     :param heard: the robots, as :func:`peers` returns them
     """
     return [
-        f"two robots send as robot {peer['robot']}, and what comes out mixes both: give one of them another robot_id "
+        f"two robots send as robot {peer['robot']}, and what comes out mixes both: give one of them another number "
         "(or a recording of an earlier start of it is on the air)"
         for peer in heard
         if peer["doubled"]
@@ -202,10 +202,8 @@ def compared(config: LinkConfig, other: LinkConfig) -> list[str]:
         rate = each.phy.sample_rate
         described.append(about(each, configured(each.phy, each.packet_len, 0.0 if rate == AUTO else rate)))
     found = differences(*described)
-    if config.version != other.version:
-        found.append(f"version is {other.version} there and {config.version} here; set the same at both ends")
-    if config.ros_source.src_id() == other.ros_source.src_id():
-        found.append(f"both are robot {config.ros_source.src_id()}; set another namespace or robot_id at one")
+    if config.robot_id == other.robot_id:
+        found.append(f"both are robot {config.robot_id}; set another robot at one")
     return found
 
 

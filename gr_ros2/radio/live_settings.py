@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError, shortened
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions, TopicOptions
 
-_OPTIONS = "ros_source.topic_options"
+_OPTIONS = "topics"
 
 
 class LiveSettings:
@@ -26,14 +27,14 @@ class LiveSettings:
     def __init__(self, source: RosSource, sink: RosSink) -> None:
         self._source = source
         self._setters: dict[str, Callable[[Any], None]] = {
-            f"{end}.{name}": getattr(block, f"set_{name}")
-            for end, block in (("ros_source", source), ("ros_sink", sink))
-            for name in block.live_settings
+            name: getattr(source, f"set_{name}") for name in source.live_settings if name != "topic_options"
         }
+        self._setters |= {name: partial(self._set_both, name) for name in sink.live_settings}
+        self._sink = sink
         self._options = source.live_options
 
     def can_change(self, name: str) -> bool:
-        """Whether a setting can change while the link runs; ``ros_source.topic_options.TOPIC.OPTION`` for a topic."""
+        """Whether a setting can change while the link runs; ``topics.TOPIC.OPTION`` for a topic."""
         place = _of_topic(name)
         return name in self._setters if place is None else place[1] in self._options
 
@@ -43,8 +44,7 @@ class LiveSettings:
         :raises ConfigError: for one that cannot change, or a value that is not allowed
         """
         if not self.can_change(name):
-            these = [other for other in self._setters if other != _OPTIONS]
-            these += [f"{_OPTIONS}.TOPIC.{'|'.join(self._options)}"] * bool(self._options)
+            these = [*self._setters, f"{_OPTIONS}.TOPIC.{'|'.join(self._options)}"]
             raise ConfigError(f"{name} cannot change while the link runs; these can: {', '.join(these)}")
         place = _of_topic(name)
         if place is None:
@@ -54,10 +54,15 @@ class LiveSettings:
         given = self._source.config.topic_options
         known = next((other for other in given if other.lstrip("/") == topic.lstrip("/")), topic)
         before = given.get(known, TopicOptions())
-        changed = {**{each.name: getattr(before, each.name) for each in fields(TopicOptions)}, option: value}
+        changed = {**{each.name: getattr(before, each.name) for each in fields(SendOptions)}, option: value}
         self._source.set_topic_options({**given, known: changed})
         sent = {topic.name.lstrip("/") for topic in self._source.subscriptions.subscribed.values()}
         return shortened(f"{name} = {value}") + ("" if topic.lstrip("/") in sent else f"; no topic {topic} is sent now")
+
+    def _set_both(self, name: str, value: Any) -> None:
+        """Change what both directions have."""
+        for block in (self._source, self._sink):
+            getattr(block, f"set_{name}")(value)
 
 
 def _of_topic(name: str) -> tuple[str, str] | None:

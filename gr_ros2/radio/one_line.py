@@ -13,7 +13,6 @@ from typing import Any
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS, PRESETS, Preset
-from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.topic_choice import words_of
 
 
@@ -74,13 +73,12 @@ def one_line(
         if name not in flags and item.default is MISSING and item.default_factory is MISSING:
             raise ConfigError(f"--{name} is missing, radio {radio} needs it ({FLAGS[name].meaning})")
     chosen = {names[flag]: list(value) if isinstance(value, tuple) else value for flag, value in flags.items()}
-    if topics is None and registry is None:
-        topics = AUTO
     chosen_topics = {} if topics is None else {"topics": list(words_of(topics))}
     return {
         "name": f"robot_{robot}",
-        "registry": registry or "",
-        "ros_source": {"robot_id": robot, "namespace": f"/robot_{robot}", **chosen_topics},
+        "robot": f"/robot_{robot}",
+        **({"registry": registry} if registry else {}),
+        **chosen_topics,
         **({"packet_len": preset.packet_len} if preset else {}),
         **({"medium": preset.medium} if preset and preset.medium else {}),
         "phy": _phy(front_end, preset),

@@ -48,7 +48,7 @@ class RobotLink(Flowgraph):
     """A robot's end of a link.
 
     :param config: see :class:`LinkConfig`
-    :param middleware: an open Middleware for both blocks, which the caller closes; None: opened as the configuration
+    :param middleware: an open Middleware, which the caller closes; None: opened as the configuration
         says
     :param observer: called with everything that is sent and received. If it raises, it is not called again, and the
         link continues
@@ -90,7 +90,7 @@ class RobotLink(Flowgraph):
         rate = config.phy.sample_rate
         self.phy = configured(config.phy, config.packet_len, 0.0 if rate == AUTO else rate)
         self._front_end_class: type[FrontEnd] = FRONT_ENDS.load(config.front_end_name)
-        self.sends = permitted(
+        self.sends = config.direction != "receive" and permitted(
             config.transmit, self._front_end_class, config.front_end_options, guarded=bool(config.key) or config.open
         )
         """Whether it may send at all."""
@@ -107,20 +107,17 @@ class RobotLink(Flowgraph):
             clock=self._clock,
             stack=self._stack,
         )
-        self.node_name, graphs = self._ros.node_name, self._ros.graphs
+        self.node_name, graph = self._ros.node_name, self._ros.graph
         self.source, self.sink, self.end, self.calls = self._ros.source, self._ros.sink, self._ros.end, self._ros.calls
         self._connect_radio()
         self.source.use_credit()
-        if config.version:
-            introduce(self.end, about(config, self.phy), lambda: self.radio.snr_db, self._clock())
-        if isinstance(graphs[0], ServiceGraph):
-            switch = TransmitSwitch(graphs[0], self.node_name, lambda on: self.transmit(on=on))
+        introduce(self.end, about(config, self.phy), lambda: self.radio.snr_db, self._clock())
+        if isinstance(graph, ServiceGraph):
+            switch = TransmitSwitch(graph, self.node_name, lambda on: self.transmit(on=on))
             self._stack.callback(switch.close)
         self._diagnostics: Diagnostics | None = None
         if config.diagnostics.period_s:
-            self._diagnostics = Diagnostics(
-                config.diagnostics, graphs[1], self.node_name, self.stats, clock=self._clock
-            )
+            self._diagnostics = Diagnostics(config.diagnostics, graph, self.node_name, self.stats, clock=self._clock)
             self._stack.callback(self._diagnostics.stop)
 
     def _open_radio(self) -> None:
@@ -154,7 +151,8 @@ class RobotLink(Flowgraph):
             self.msg_connect(self.radio, "credit", sends, "credit")
             if self._ros.shares:
                 self.front_end.follow(self._at_rest)
-        self.msg_connect(self.radio, "pdus", receives, "pdus")
+        if self.config.receives:
+            self.msg_connect(self.radio, "pdus", receives, "pdus")
 
     def _lose(self, error: RadioError) -> None:
         """The device has vanished: close it, and wait for it. The rest of the link keeps its state."""
@@ -194,9 +192,9 @@ class RobotLink(Flowgraph):
         """What limits the airtime, with what earlier starts of this robot have sent."""
         if not self.sends:
             return None
-        source, longest, now = self.config.ros_source, self.front_end.airtime(), self.front_end.clock()
+        config, longest, now = self.config, self.front_end.airtime(), self.front_end.clock()
         return open_limit(
-            self.config.airtime, longest, now, robot_id=source.src_id(), state=source.state, closing=self._stack
+            config.airtime, longest, now, robot_id=config.robot_id, state=config.state, closing=self._stack
         )
 
     def transmit(self, *, on: bool) -> None:
@@ -276,24 +274,25 @@ class RobotLink(Flowgraph):
         """Ask another robot, which answers at once; returns what has come of all questions to it so far.
 
         :param anew: forget the earlier ones
-        :raises ConfigError: with version 0, or for a number that no robot has
+        :raises ConfigError: for a number that no robot has
         """
         return {**ping(self.end, robot, self._clock(), anew=anew), **self.source.rate()}
 
     @property
     def remark(self) -> str:
         """A remark for the person who starts the link; often empty."""
-        open_to_all = self.config.version and not self.config.key
-        return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)" if open_to_all else ""
+        if self.config.key:
+            return ""
+        return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)"
 
     def findings(self) -> list[str]:
         """What a person should know about this link and its surroundings: one line each, mostly none."""
-        now, own = self._clock(), self.config.ros_source.src_id()
+        now, own = self._clock(), self.config.robot_id
         heard = peers(self.end, now)
         robots = [peer["robot"] for peer in heard]
-        here, there = self.source.middleware, self.sink.middleware
-        names = {info.topic for graph in {here, there} for info in graph.discover() if info.publishers}
-        services = here.discover_services() if isinstance(here, ServiceGraph) else ()
+        graph = self._ros.graph
+        names = {info.topic for info in graph.discover() if info.publishers}
+        services = graph.discover_services() if isinstance(graph, ServiceGraph) else ()
         full, self._outrun = outrun(self._outrun, self.source.stats()["topics"])
         lines = [
             shortcut([*names, *services], own, robots),
@@ -310,7 +309,7 @@ class RobotLink(Flowgraph):
     def same_numbers(self) -> list[str]:
         """One line for each number under which two robots send."""
         with self.end.lock:
-            own = same_id(self.config.ros_source.src_id(), self.end.endpoint.received.rejected)
+            own = same_id(self.config.robot_id, self.end.endpoint.received.rejected)
         return [*([own] if own else []), *doubled(peers(self.end, self._clock()))]
 
     @property

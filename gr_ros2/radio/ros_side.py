@@ -29,6 +29,7 @@ from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import halves
 
 
 class RosSide:
@@ -59,41 +60,33 @@ class RosSide:
         stack: ExitStack,
     ) -> None:
         self.config, self._phy, self._front_end, self._sends, self._stack = config, phy, front_end, sends, stack
-        self.node_name = f"gr_ros2_link_{config.ros_source.src_id()}"
+        self.node_name = f"gr_ros2_link_{config.robot_id}"
         """The node name that ``ros2 node list`` shows."""
         self.shares = config.medium != "exclusive"
         """Whether other robots send on its channel."""
         self.slots: Slots | None = None
         self.calls: LiveCalls | None = None
-        self.graphs = (middleware, middleware) if middleware is not None else self._join()
-        registry, common = config.load_registry(), {"observer": observer, "clock": clock}
+        self.graph = self._join() if middleware is None else middleware
+        common = {"observer": observer, "clock": clock}
         if front_end.loops_back:
-            self._two_blocks(registry, common)
+            self._two_blocks(config.load_registry(), common)
         else:
-            self._one_block(registry, common)
+            self._one_block(common)
 
-    def _one_block(self, registry: Registry, common: dict[str, Any]) -> None:
-        source, sink = self.config.ros_source, self.config.ros_sink
-        if sink.robot_id == AUTO:  # by it the sink knows the robot's own packets on a shared medium
-            sink = replace(sink, robot_id=source.src_id())
+    def _one_block(self, common: dict[str, Any]) -> None:
+        config = self.config
         setup = EndpointSetup(
-            reports=self._sends,
+            reports=self._sends and config.receives,
             half_duplex=self.shares or getattr(self._front_end.options, "half_duplex", False),
             any_length=self._phy.any_length,
             mcs_table=self._phy.mcs_table,
             airtime_s=self._front_end.airtime(),
-            airtime_share=sustained(self.config.airtime.rule),
+            airtime_share=sustained(config.airtime.rule),
             access=self._access if self._sends else lambda _: None,
-            relay=self.config.relay == "gain",
+            relay=config.relay == "gain",
         )
-        both = RosLink(
-            registry if self._sends else Registry.empty(),
-            source if self._sends else replace(source, registry="", topics=()),
-            sink,
-            setup=setup,
-            middleware=self.graphs,
-            **common,
-        )
+        robot = config if self._sends else replace(config, topics={})
+        both = RosLink(robot, setup=setup, middleware=self.graph, **common)
         self._stack.callback(both.close)
         self.source, self.sink, self.end, self.calls = both.source, both.sink, both.end, both.calls
         self.blocks: tuple[Any, Any] = both, both
@@ -104,11 +97,12 @@ class RosSide:
                 f"medium = {self.config.medium!r}: front_end {self._front_end.name} reaches no other robot; leave it "
                 "out, or set another front_end"
             )
-        source, sink = own_settings(self.config.ros_source), own_settings(self.config.ros_sink)
+        source, sink = (own_settings(half) for half in halves(self.config))
+        sink["robot_id"] = AUTO  # it takes the robot's own packets
         carried: dict[str, Any] = {"any_length": self._phy.any_length, "mcs_table": self._phy.mcs_table}
-        self.source = RosSource(registry, middleware=self.graphs[0], **carried, **common, **source)
+        self.source = RosSource(registry, middleware=self.graph, **carried, **common, **source)
         self._stack.callback(self.source.close)
-        self.sink = RosSink(registry, middleware=self.graphs[1], **common, **sink)
+        self.sink = RosSink(registry, middleware=self.graph, **common, **sink)
         self._stack.callback(self.sink.close)
         self.end = self.sink.live
         self.blocks = self.source, self.sink
@@ -122,13 +116,14 @@ class RosSide:
         self.slots = access if isinstance(access, Slots) else None
         return access
 
-    def _join(self) -> tuple[Middleware, Middleware]:
-        """The participants of source and sink: one for both if they are on the same graph."""
-        places = [(end.middleware, end.domain_id) for end in (self.config.ros_source, self.config.ros_sink)]
-        opened = {}
-        for name, domain_id in dict.fromkeys(places):
-            local = self.config.localhost_only
-            graph = join_graph(name, domain_id=domain_id, node_name=self.node_name, localhost_only=local)
-            self._stack.callback(graph.close)
-            opened[name, domain_id] = graph
-        return opened[places[0]], opened[places[1]]
+    def _join(self) -> Middleware:
+        """The robot's participant on its graph."""
+        graph = self.config.graph
+        joined = join_graph(
+            graph.middleware,
+            domain_id=graph.domain_id,
+            node_name=self.node_name,
+            localhost_only=graph.localhost_only,
+        )
+        self._stack.callback(joined.close)
+        return joined

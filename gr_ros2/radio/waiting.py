@@ -59,7 +59,7 @@ def foreign(published: Iterable[str], outputs: Iterable[str]) -> str | None:
         return None
     return (
         f"{_listed(both)}: another program on this robot's ROS graph publishes there too, so not everything there came "
-        "over this link; end it, or set ros_sink.namespace_format"
+        "over this link; end it, or set publish.as"
     )
 
 

@@ -61,7 +61,7 @@ class LinkNode(Node):  # type: ignore[misc]
             raise ConfigError(f"parameter {CONFIG} is missing; give the YAML file: {_USAGE}")
         chosen = {name: value for name, value in given.items() if not name.startswith((*_OF_ROS, "qos_overrides."))}
         if given.get("use_sim_time"):
-            chosen.setdefault("ros_sink.use_sim_time", True)
+            chosen.setdefault("graph.use_sim_time", True)
         self.link = RobotLink(load_link(Path(str(path)).expanduser(), overrides(chosen)))
         self._live = LiveSettings(self.link.source, self.link.sink)
         for parameter in _settings(self.link):

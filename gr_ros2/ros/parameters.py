@@ -44,9 +44,13 @@ def parameters(settings: Any, prefix: str = "") -> Iterator[Parameter]:
     :param prefix: with a dot at its end, or ''
     """
     for setting in settings_of(type(settings)):
-        name, value = f"{prefix}{setting.name}", getattr(settings, setting.name)
+        name, value = f"{prefix}{setting.name}", getattr(settings, setting.attribute)
         if is_dataclass(value):
             yield from parameters(value, f"{name}.")
+        elif name == "topics":
+            yield _parameter(name, list(value), setting)
+            for word, options in value.items():
+                yield from _set_options(options, f"{name}.{word}.")
         elif isinstance(value, Mapping):
             yield from _entries(value, f"{name}.", setting.meaning)
         else:
@@ -66,6 +70,12 @@ def _entries(mapping: Mapping[str, Any], prefix: str, meaning: str) -> Iterator[
             yield from _entries(value, f"{prefix}{key}.", meaning)
         else:
             yield Parameter(f"{prefix}{key}", _plain(value), meaning)
+
+
+def _set_options(options: Any, prefix: str) -> Iterator[Parameter]:
+    """Options of a topic that are not at their defaults."""
+    default = {parameter.name: parameter.value for parameter in parameters(type(options)(), prefix)}
+    return (one for one in parameters(options, prefix) if one.value != default[one.name])
 
 
 def _parameter(name: str, value: Any, setting: Setting) -> Parameter:

@@ -132,15 +132,14 @@ class Agreed:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class TopicOptions:
-    """Options of one topic: named registry columns, or ``topic_options`` in the configuration.
+class SendOptions:
+    """Options of one topic that a robot sends.
 
     :param qos: class of its packets, the two QoS bits of the header; auto = latency for ``commands``, else default
     :param reliability: auto adapts the subscription to the publishers found
     :param durability: auto adapts likewise; the sink publishes volatile unless this says transient_local
     :param depth: QoS depth of subscription and publisher, auto takes ``subscriber_depth``/``publisher_depth``; of a
         transient-local topic also how many messages late robots and late subscribers get, auto 1
-    :param publish_as: topic name at the sink, ``{src_id}`` allowed; auto takes ``namespace_format``
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
         ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
         publishers' QoS (docs/explanation/scheduling.md)
@@ -163,7 +162,6 @@ class TopicOptions:
     reliability: Literal["reliable", "best_effort"] | Auto = AUTO
     durability: Literal["volatile", "transient_local"] | Auto = AUTO
     depth: Count | Auto = AUTO
-    publish_as: Annotated[TopicForm, OnlyAt("sink")] = AUTO
     queue_depth: Annotated[Count | Auto, OnlyAt("source"), Field(title="Queue depth (messages per topic)")] = AUTO
     queue: Annotated[QueuePolicy | Auto, OnlyIn(1), OnlyAt("source")] = AUTO
     deadline_s: Annotated[Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto, OnlyIn(1)] = AUTO
@@ -183,11 +181,21 @@ class TopicOptions:
     )
 
     @model_validator(mode="after")
-    def _deadline(self) -> TopicOptions:
+    def _deadline(self) -> SendOptions:
         refuse_without_effect(self)
         if self.queue == "deadline" and self.deadline_s in (0, AUTO):
             raise ValueError("queue = 'deadline': deadline_s is missing; set it above 0")
         return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class TopicOptions(SendOptions):
+    """Options of one topic: named columns of a registry.
+
+    :param publish_as: its name where it comes out, ``{robot}`` allowed; auto takes that of the receiver
+    """
+
+    publish_as: Annotated[TopicForm, OnlyAt("sink")] = AUTO
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -202,7 +210,6 @@ class EndConfig(Agreed):
     :param domain_id: ROS domain, 0..232; auto takes ROS_DOMAIN_ID
     :param commands: types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before
         others, unless the topic's options say otherwise; the same at both ends, as far as both know the topics
-    :param dictionaries: files of dictionaries of your own, made by `gr-ros2 dict train`; the same at both ends
     :param topic_options: per topic name, over the registry's columns, such as {'odom': {'depth': 100}}
     :param debug: readable log of headers, topic ids and entries
     """
@@ -212,7 +219,6 @@ class EndConfig(Agreed):
     middleware: str = DEFAULT_MIDDLEWARE
     domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
     commands: Annotated[tuple[str, ...], OnlyIn(1), AfterValidator(checked_commands)] = COMMAND_TYPES
-    dictionaries: tuple[str, ...] = ()
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     debug: Annotated[bool, Field(title="Debug log")] = False
     end: ClassVar[Any] = ""
@@ -228,7 +234,7 @@ class EndConfig(Agreed):
     @model_validator(mode="after")
     def _has_effect(self) -> EndConfig:
         for name, options in self.topic_options.items():
-            if fault := topic_fault(f"/{name.removeprefix('/')}"):
+            if fault := topic_fault(f"/{re.sub('[*?]', 'x', name).removeprefix('/')}"):
                 raise ValueError(f"topic_options has topic {name!r}: {fault}")
             refuse_without_effect(options, self.version, f"topic_options.{name}.", self.end)
         refuse_without_effect(self, self.version)
@@ -295,7 +301,7 @@ class SourceConfig(EndConfig):
     end: ClassVar[Any] = "source"
     conditions: ClassVar[Any] = (
         ActsWhere(
-            ("dictionaries", "topic_options.*.codec", "topic_options.*.quantize"),
+            ("topic_options.*.codec", "topic_options.*.quantize"),
             lambda source: source.compresses,
             "no message is coded without compression; set compression: true, or leave it out",
         ),
@@ -356,7 +362,7 @@ class SourceConfig(EndConfig):
 class SinkConfig(EndConfig):
     """ROS Sink (the paper, section 4.4).
 
-    :param namespace_format: topics come out as this + '/' + row name; ``{src_id}`` is the sender
+    :param namespace_format: topics come out as this + '/' + row name; ``{robot}`` is the sender
     :param publisher_depth: QoS depth of the publishers, 0 unbounded
     :param reassembly_timeout_s: s an incomplete message is kept
     :param hold_s: s that a message of a reliable topic waits for an earlier one where the sender gets no reports; where
@@ -367,12 +373,12 @@ class SinkConfig(EndConfig):
     :param max_source_bytes: memory per sender, in version 1 a quarter for incomplete messages; the oldest goes first
     :param max_bytes: fragments held in all
     :param use_sim_time: take latency from stamps on the graph's /clock instead of wall time
-    :param frame_prefix: before every frame name of a message, ``{src_id}`` is the sender; '' leaves messages as sent
+    :param frame_prefix: before every frame name of a message, ``{robot}`` is the sender; '' leaves messages as sent
     :param merge_tf: topic on which the transforms of all senders come out too, and their static ones, latched, on this
         + ``_static``; needs ``frame_prefix``; '' off
     """
 
-    namespace_format: NamespaceForm = "/rx_robot_{src_id}"
+    namespace_format: NamespaceForm = "/rx_robot_{robot}"
     publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
     reassembly_timeout_s: Annotated[float, OnlyIn(0), Field(gt=0, allow_inf_nan=False)] = 1.0
     hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
@@ -395,7 +401,7 @@ class SinkConfig(EndConfig):
         if self.merge_tf and not self.frame_prefix:
             raise ValueError(
                 f"merge_tf = {self.merge_tf!r}: frames of several robots would be mixed up; set frame_prefix, "
-                "for instance to 'robot_{src_id}/'"
+                "for instance to 'robot_{robot}/'"
             )
         return self
 
@@ -490,6 +496,49 @@ class ChannelConfig:
         return bool(self.packet_loss or self.burst_loss or self.outages)
 
 
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, populate_by_name=True))
+class PathConfig(ChannelConfig):
+    """The channel from one robot to another, where it is not that of all.
+
+    :param from_: number of the robot that sends; null = whoever
+    :param to: number of the robot that hears it; null = whoever
+    :param delay_s: s that a packet takes beside its airtime
+    """
+
+    from_: Annotated[RobotId | None, Field(alias="from", title="From")] = None
+    to: RobotId | None = None
+    delay_s: Seconds = 0.0
+
+    def between(self, sender: int, receiver: int) -> bool:
+        """Whether it lies between two robots, by their numbers."""
+        return self.from_ in (None, sender) and self.to in (None, receiver)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class PaperConfig:
+    """What the paper's blocks have, ROS Source and ROS Sink, which speak version 0.
+
+    :param dst_id: destination id, 255 broadcast
+    :param min_fragment: k_min, lower bound on an entry's payload, bytes
+    :param greedy: several entries of one topic in a packet, back to back
+    :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
+    :param hop: initial hop count (TTL) 0..15
+    :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only: on a lossy link it
+        joins fragments of different messages)
+    :param compression: code every message, which the paper leaves off
+    :param reassembly_timeout_s: s an incomplete message is kept
+    """
+
+    dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
+    min_fragment: Annotated[int, Field(ge=1, le=65535, title="Smallest fragment (bytes)")] = 16
+    greedy: bool = False
+    flush_timeout_s: Seconds = 0.0
+    hop: Annotated[int, Field(ge=0, le=15, title="Hop limit (hops)")] = 1
+    entry_ids: Annotated[Literal["sequential", "random"], Field(title="Entry IDs")] = "sequential"
+    compression: bool = False
+    reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Transceiver:
     """What levels at a receiver follow from.
@@ -580,7 +629,9 @@ class ScenarioChannel(Transceiver, ChannelConfig):
 
 LEVELS = (
     ActsWhere(
-        ("channel.snr_db",), lambda robots: robots.gains_db is None, "follows from gains_db; leave one of them out"
+        ("channel.snr_db",),
+        lambda robots: robots.gains_db is None,
+        "follows from gains_db; leave one of them out",
     ),
     ActsWhere(
         ("channel.tx_power_dbm", "channel.noise_figure_db", "robots.*.tx_power_dbm", "robots.*.noise_figure_db"),
@@ -629,28 +680,11 @@ class PhyConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class OneWay:
-    """One direction: the block that sends, what lies between, and the block that receives.
-
-    :param ros_source: the sending block
-    :param channel: what lies between transmitter and receiver
-    :param ros_sink: the receiving block
-    """
-
-    ros_source: SourceConfig = Field(default_factory=SourceConfig)
-    channel: ChannelConfig = Field(default_factory=ChannelConfig)
-    ros_sink: SinkConfig = Field(default_factory=SinkConfig)
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class AnyLink(OneWay, Agreed):
-    """What an experiment and a robot's end of a real link have in common.
+class AirConfig:
+    """How robots send, which is the same for all that share a channel.
 
     :param name: what results, tables and errors call it; the file's name unless it is set
-    :param registry: CSV path, relative to the YAML file (on the command line: to the current directory), or the name of
-        a built-in one such as `table4`; the same at every robot
     :param phy: which physical layer, and how fast; the same at every robot
-    :param localhost_only: DDS stays on the loopback interface; auto takes what the environment of ROS says
     :param airtime: how much a robot may send, whatever waits: settings, or the name of a band alone
     :param medium: when a robot sends on a channel that others use too: slots that it derives from the packets heard,
         aloha (at random, as rarely as the robots heard call for), or exclusive = whenever it has something
@@ -662,29 +696,17 @@ class AnyLink(OneWay, Agreed):
     medium: Medium = "exclusive"
     relay: Literal["off", "gain"] = "off"
     airtime: Airtime = Field(default_factory=AirtimeConfig)
-    localhost_only: bool | Auto = AUTO
 
     @model_validator(mode="after")
-    def _medium_fits(self) -> AnyLink:
-        if self.medium != "exclusive" and not self.version:
-            raise ValueError(f"medium = {self.medium!r}: version 0 says nothing about slots; set version: 1")
+    def _medium_fits(self) -> AirConfig:
         if self.relay != "off" and self.medium != "slots":
             raise ValueError(f"relay = {self.relay!r}: the packets of slots name who hears whom; set medium: slots")
         if self.medium != "exclusive" and not self.phy.takes_airtime:
             raise ValueError(f"medium = {self.medium!r}: phy direct takes no airtime; choose another")
-        return self
-
-    @model_validator(mode="after")
-    def _airtime_fits(self) -> AnyLink:
-        if self.airtime.rule is not None and self.ros_source.packet_rate == 0:
-            raise ValueError(
-                "ros_source.packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out"
-            )
         if self.airtime.listen_before_send and self.medium != "exclusive":
             raise ValueError(f"airtime.listen_before_send: medium = {self.medium!r} has times of its own; leave it out")
         if self.airtime.rule is not None and not self.phy.takes_airtime:
             raise ValueError("airtime: phy direct takes no airtime, so there is nothing to limit; leave it out")
-        self.airtime.check_seal(encrypts=bool(self.key) and self.seal == "encrypt")
         return self
 
 

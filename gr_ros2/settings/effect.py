@@ -36,14 +36,11 @@ def refuse_without_effect(config: Any, version: int | None = None, where: str = 
     :raises ValueError: naming setting, value and remedy
     """
     for setting in () if version is None else settings_of(type(config)):
-        value = getattr(config, setting.name)
+        value = getattr(config, setting.attribute)
         if value == setting.default:
             continue
         if setting.version not in (None, version):
-            raise ValueError(
-                f"{where}{setting.name} = {value!r}: version {version} has no such setting; leave it out, or set "
-                f"version: {setting.version}"
-            )
+            raise ValueError(f"{where}{setting.name} = {value!r}: version {version} has no such setting; leave it out")
         if end and setting.end not in (None, end):
             raise ValueError(
                 f"{where}{setting.name} = {value!r}: acts at the {setting.end} alone; give it to ros_{setting.end}, or "

@@ -45,7 +45,8 @@ _UNITS = {"s": "s", "hz": "Hz", "db": "dB", "m": "m", "len": "bytes"}
 class Setting:
     """One field of a settings class.
 
-    :param name: name of the field
+    :param name: name in files, of the command line and of ROS parameters
+    :param attribute: name of the field, which may be a name that Python keeps for itself, with ``_``
     :param hint: its type, with annotations
     :param default: ``REQUIRED`` if it has none
     :param meaning: text from the docstrings of its class and the base classes
@@ -61,6 +62,7 @@ class Setting:
     """
 
     name: str
+    attribute: str
     hint: Any
     default: Any
     meaning: str
@@ -132,7 +134,8 @@ def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> S
     if default is MISSING or type(default).__name__ == "PydanticUndefinedType":
         default = REQUIRED
     return Setting(
-        item.name.removesuffix("_"),  # of a name that Python keeps for itself
+        item.name.removesuffix("_"),
+        item.name,
         hint,
         default,
         meaning,
@@ -164,6 +167,8 @@ def meanings(cls: type[Any]) -> dict[str, str]:
         described |= {
             name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)
         }
+        own = vars(part).get("__pydantic_fields__", {})
+        described |= {name: " ".join(info.description.split()) for name, info in own.items() if info.description}
     return described
 
 

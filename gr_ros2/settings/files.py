@@ -8,26 +8,21 @@ ranges.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.settings.config import Agreed, read_yaml
+from gr_ros2.settings.config import read_yaml
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.topic_choice import topics_of
 from gr_ros2.settings.yaml_text import parse_yaml
 
 REGISTRY_DIR = Path(__file__).resolve().parent.parent / "registries"
 """Folder of the built-in registries."""
 
-SHARED_KEYS = tuple(field.name for field in fields(Agreed))
-"""Settings that both ends of a link must agree on."""
-
 _FILES = ("key", "state")
-"""Those of them that are files, which need not exist yet."""
-
-ENDS = ("ros_source", "ros_sink")
-"""The blocks at the ends of a link."""
+"""Settings that are files, which need not exist yet."""
 
 _NUMBER = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 
@@ -61,25 +56,6 @@ def settled(values: Mapping[str, Any], directory: Path, overrides: Sequence[str]
             value = find_registry(str(value), Path())
         _replace(values, keys, value, override)
     return values
-
-
-def with_shared(values: Mapping[str, Any], shared: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """The two blocks of a direction with the settings that all ends share.
-
-    :param shared: values of ``SHARED_KEYS``, as far as they are set
-    :param prefix: what errors begin with
-    :raises ConfigError: for a block that sets one of them to a different value
-    """
-    blocks: dict[str, Any] = {}
-    for end in ENDS:
-        block = values.get(end, {})
-        if not isinstance(block, Mapping):
-            continue  # build() says what is wrong with it
-        for key in SHARED_KEYS:
-            if key in block and block[key] != shared.get(key):
-                raise ConfigError(f"{prefix}{end}.{key} = {block[key]!r}: both ends share it; set {key} instead")
-        blocks[end] = {**block, **shared}
-    return blocks
 
 
 def find_registry(name: str, directory: Path) -> str:
@@ -125,10 +101,22 @@ def parse_override(text: str) -> tuple[tuple[str, ...], Any]:
 
 
 def _replace(values: dict[str, Any], keys: tuple[str, ...], value: Any, override: str) -> None:
+    if keys[0] == "topics" and keys[1:]:  # options of one topic beside what is sent anyway
+        values["topics"] = topics_of(values.get("topics", AUTO))
+    if keys[0] == "robots" and keys[1:] and isinstance(values.get("robots"), int):
+        values["robots"] = [{} for _ in range(values["robots"])]
+    inner: Any = values
     for depth, key in enumerate(keys[:-1], start=1):
-        inner = values.get(key, {})
-        if not isinstance(inner, Mapping):
+        place: Any = int(key) if isinstance(inner, list) and key.isdecimal() and int(key) < len(inner) else key
+        below = None if isinstance(inner, list) and place is key else inner[place] if place in _places(inner) else {}
+        if not isinstance(below, Mapping | list):
             raise ConfigError(f"--set {override}: {'.'.join(keys[:depth])} has no settings below it")
-        values[key] = dict(inner)
-        values = values[key]
-    values[keys[-1]] = value
+        inner[place] = below = list(below) if isinstance(below, list) else dict(below)
+        inner = below
+    if isinstance(inner, list):
+        raise ConfigError(f"--set {override}: {'.'.join(keys[:-1])} is a list; name a setting of one, from 0 on")
+    inner[keys[-1]] = value
+
+
+def _places(values: dict[str, Any] | list[Any]) -> Iterable[Any]:
+    return range(len(values)) if isinstance(values, list) else values

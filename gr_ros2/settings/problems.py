@@ -24,6 +24,29 @@ _KINDS = {
     "tuple": "a list",
 }
 """The expected kind of value in words, by pydantic's name of the error."""
+OLD_NAMES = {
+    "ros_source": "write robot, topics and graph, and beside them what the block had",
+    "ros_sink": "write publish and graph, and beside them what the block had",
+    "namespace": "write robot, or graph.namespace where it has another name",
+    "robot_id": "write robot",
+    "topic_options": "write topics, or publish.topics, as a mapping of names to options",
+    "namespace_format": "write publish.as",
+    "frame_prefix": "write publish.frame_prefix",
+    "merge_tf": "write publish.merge_tf",
+    "middleware": "write graph.middleware",
+    "domain_id": "write graph.domain_id",
+    "localhost_only": "write graph.localhost_only",
+    "use_sim_time": "write graph.use_sim_time",
+    "subscriber_depth": "write graph.depth",
+    "publisher_depth": "write publish.depth",
+    "dst_id": "write to of each topic",
+    "dictionaries": "nodes announce the structure of their types",
+    "version": "a link speaks version 1; version 0 is that of the paper's blocks, in a scenario paper: {}",
+    "back": "write robots: 2, and paths where the channels differ",
+    "reports": "write robots: [{}, {topics: []}], and paths where the channels differ",
+    "receivers": "write robots: [{}, {topics: []}, {topics: []}], and paths where the channels differ",
+}
+"""What says now what a setting of another name said."""
 _LIKE_AUTO: tuple[Any, ...] = (None, -1, 0, "", [])
 """Values that elsewhere often mean what ``auto`` means here."""
 
@@ -68,8 +91,15 @@ def _place(cls: type[Any], loc: Sequence[Any]) -> tuple[tuple[str, ...], type[An
         if owner is not None:
             kinds = members(get_type_hints(owner, include_extras=True).get(part))
         else:
-            kinds = members(get_args(kinds[0])[-1]) if kinds and get_origin(kinds[0]) in (dict, Mapping) else ()
+            kinds = members(_inside(kinds[0])) if kinds else ()
     return tuple(keys), owner
+
+
+def _inside(kind: Any) -> Any:
+    """The type of the entries of a mapping or a list; None of anything else."""
+    if get_origin(kind) in (dict, Mapping):
+        return get_args(kind)[-1]
+    return get_args(kind)[0] if get_origin(kind) in (tuple, list) else None
 
 
 def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[Any]) -> str:
@@ -77,8 +107,11 @@ def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[A
     key, item = ".".join(keys), group[0]
     if not key:
         return str(item["msg"]).removeprefix("Value error, ")
-    known = () if owner is None else tuple(setting.name for setting in settings_of(owner))
+    owners: dict[Any, tuple[str, ...]] = {} if owner is None else {owner: (), **getattr(owner, "also", {})}
+    known = [setting.name for one, but in owners.items() for setting in settings_of(one) if setting.name not in but]
     if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        if keys[-1] in OLD_NAMES:
+            return f"{key} is no setting any more: {OLD_NAMES[keys[-1]]} (docs/reference/parameters.md)"
         return f"unknown key {key}" + (f"; known are {', '.join(known)}" if known else "")
     setting = next((found for found in settings_of(owner) if found.name == keys[-1]), None) if owner else None
     purpose = re.split(r"[.;](?: |$)", setting.meaning.replace("``", ""))[0] if setting else ""  # its first sentence

@@ -13,19 +13,21 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import overload
+from typing import TypeVar, overload
 
 from gr_ros2.core.errors import ConfigError, RegistryError
 from gr_ros2.core.names import filled, topic_fault
 from gr_ros2.settings.config import SinkConfig, TopicOptions, build
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.service_rows import OF_ACTION, STATUS, is_of_node, is_service, parts
-from gr_ros2.settings.topic_choice import TopicChoice
+from gr_ros2.settings.topic_choice import TopicChoice, is_wild
 from gr_ros2.wire import FORMATS, AnnouncedTopic
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
 DEFAULT_OPTIONS = TopicOptions()
+_O = TypeVar("_O")
 
 CALLS_TYPE = "gr_ros2/calls/Frame"
 """Type of the row in which requests and replies are sent (see :mod:`gr_ros2.calls`); no topic has this type."""
@@ -226,7 +228,7 @@ class Registry(Sequence[Topic]):
 
         :raises ConfigError: for a name that is not in the registry
         """
-        if not words:
+        if not words or tuple(words) == (AUTO,):
             return list(self)
         choice = TopicChoice([word.replace("/", "", word.startswith(("/", "-/"))) for word in words], "")
         actions = {topic.action.lstrip("/") for topic in self if topic.action}
@@ -251,13 +253,16 @@ class Registry(Sequence[Topic]):
         if not self:
             return self
         topics = list(self._topics)
-        for name, override in options.items():
-            if announced and name.lstrip("/") not in self._by_name:
-                continue
-            topic = self.named(name)
+        for name in options:
+            if not (announced or is_wild(name) or name == AUTO):
+                self.named(name)
+        for topic in self:
+            override = options_of(topic.name, options)
             changed = {f.name: getattr(override, f.name) for f in fields(TopicOptions)}
             changed = {key: value for key, value in changed.items() if value != getattr(DEFAULT_OPTIONS, key)}
-            merged = build(TopicOptions, {**asdict(topic.options), **changed}, f"topic {name}")
+            if not changed:
+                continue
+            merged = build(TopicOptions, {**asdict(topic.options), **changed}, f"topic {topic.name}")
             topics[topic.topic_id] = Topic(topic.topic_id, topic.name, topic.type_name, merged)
         return Registry(topics)
 
@@ -297,9 +302,13 @@ def announced(told: AnnouncedTopic, options: Mapping[str, TopicOptions]) -> Topi
     return Topic(told.topic_id, told.name, told.type_name if special else normalize_type(told.type_name), merged)
 
 
-def options_of(name: str, options: Mapping[str, TopicOptions]) -> TopicOptions:
-    """The configured options of a topic that is in no registry, with or without leading slash."""
-    return {other.lstrip("/"): value for other, value in options.items()}.get(name.lstrip("/"), DEFAULT_OPTIONS)
+def options_of(name: str, options: Mapping[str, _O], default: _O = DEFAULT_OPTIONS) -> _O:  # type: ignore[assignment]
+    """The configured options of a topic, with or without leading slash: its own, or else those of the first word that
+    stands for it too."""
+    plain = {other.lstrip("/"): value for other, value in options.items()}
+    name = name.lstrip("/")
+    words = (word for word in plain if fnmatchcase(name, "*" if word == AUTO else word))
+    return plain.get(name) or plain.get(next(words, ""), default)
 
 
 def check_outputs(registry: Registry, sink: SinkConfig) -> None:

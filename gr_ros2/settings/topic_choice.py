@@ -11,13 +11,16 @@ those that every ROS node or a link itself has. Nothing here asks a graph.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from typing import Any
 
 from gr_ros2.core.names import INFRASTRUCTURE, OWN_NODES, topic_fault
 from gr_ros2.settings.fields import AUTO
 
-_ALL, _LEAVES_OUT, _WILD = "*", "-", "*?"
+LEAVES_OUT = "-"
+"""Before a word that leaves out what it names."""
+_ALL, _WILD = "*", "*?"
 
 
 def words_of(text: str) -> tuple[str, ...]:
@@ -28,11 +31,22 @@ def words_of(text: str) -> tuple[str, ...]:
 def checked_words(words: tuple[str, ...]) -> tuple[str, ...]:
     """:raises ValueError: for a word that can be no topic name"""
     for word in words:
-        name = word.removeprefix(_LEAVES_OUT)
+        name = word.removeprefix(LEAVES_OUT)
         plain = "".join("x" if letter in _WILD else letter for letter in name)
         if fault := topic_fault(plain if plain.startswith("/") else f"/{plain}"):
             raise ValueError(f"{word!r} {fault}" if plain else "a word is empty")
     return words
+
+
+def topics_of(given: Any) -> Any:
+    """What a robot sends, as a mapping of words to options: ``auto, -camera/*``, a list of words, or the mapping."""
+    if isinstance(given, str):
+        given = words_of(given)
+    if isinstance(given, Sequence):
+        return {word: {} for word in given} if all(isinstance(word, str) for word in given) else given
+    if isinstance(given, Mapping):
+        return {word: {} if options in (None, "") else options for word, options in given.items()}
+    return given
 
 
 class TopicChoice:
@@ -44,12 +58,12 @@ class TopicChoice:
 
     def __init__(self, words: Sequence[str], namespace: str) -> None:
         self._namespace = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
-        self._left_out = [self._absolute(word[1:]) for word in words if word.startswith(_LEAVES_OUT)]
-        wanted = [word for word in words if not word.startswith(_LEAVES_OUT)] or [_ALL] * bool(words)
+        self._left_out = [self._absolute(word[1:]) for word in words if word.startswith(LEAVES_OUT)]
+        wanted = [word for word in words if not word.startswith(LEAVES_OUT)] or [_ALL] * bool(words)
         wanted = [_ALL if word == AUTO else word for word in wanted]
-        self.named = {self._absolute(word): word for word in wanted if not _is_wild(word)}
+        self.named = {self._absolute(word): word for word in wanted if not is_wild(word)}
         """Topics that are named exactly: the word by its absolute name on the graph."""
-        self._patterns = [word for word in wanted if _is_wild(word)]
+        self._patterns = [word for word in wanted if is_wild(word)]
         self.open = bool(self._patterns)
         """Whether topics may be chosen that are not named exactly."""
         self.everything = ", ".join(map(self._absolute, self._patterns))
@@ -90,5 +104,6 @@ class TopicChoice:
         return name if name.startswith("/") else self._namespace + name
 
 
-def _is_wild(word: str) -> bool:
+def is_wild(word: str) -> bool:
+    """Whether other characters may stand for some of a word."""
     return any(letter in word for letter in _WILD)

@@ -89,7 +89,7 @@ def demo(wire: str, robots: int | None, overrides: tuple[str, ...], **options: A
         if wire == "0":
             raise click.UsageError("--robots: version 0 says nothing about slots; leave --wire out")
         return _run("demo-team", overrides=(f"robots={robots}", *overrides), **options)
-    older = () if wire == "1" else ("version=0", "reports=null")
+    older = () if wire == "1" else ("paper={}", "robots=[{direction: send}, {direction: receive}]")
     status = _run("demo", overrides=(*older, *overrides), **options)
     make_console().print(_NEXT, soft_wrap=True)
     return status
@@ -111,8 +111,7 @@ def _run(
     scenario = load_scenario(name, overrides, seed=seed, repetitions=repetitions, duration_s=duration)
     out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
-    # An unthrottled flowgraph runs as fast as it can, so it gets instruments only if a dashboard is requested.
-    looked_at = audience(dashboard, console, scenario.name, instruments=scenario.time != "unthrottled")
+    looked_at = audience(dashboard, console, scenario.name)
     with looked_at as run_observers, capture(pcap) as captures, _bar(console) as bar:
         seen: list[RunObserver] = [run_observers, *captures]
         if scenario.repetitions == 1:

@@ -118,7 +118,7 @@ class _Run:
 
     def _scenario(self, duration_s: float) -> Scenario:
         queue = self._contender.settings.get("queue")
-        options = {"topic_options": {_TOPIC: {"queue": queue}}} if queue else {}
+        options = {"topics": {"auto": None, _TOPIC: {"queue": queue}}} if queue else {}
         return scenario_from(
             {
                 "name": "race",
@@ -130,7 +130,7 @@ class _Run:
                 "packet_len": self._settings.packet_len,
                 "phy": {"name": PHY_NAME, "sample_rate": self._condition.sample_rate},
                 "channel": {"packet_loss": self._condition.loss},
-                "ros_source": options,
+                **options,
                 "duration_s": duration_s,
                 "drain_s": DRAIN_S,
                 "seed": self._settings.seed,

@@ -32,7 +32,8 @@ def team_numbers(result: Result) -> dict[str, float | None]:
 
     A pair is a robot and a topic of another one that it could hear. Its age begins with its first delivery.
     """
-    if not result.config.get("robots"):
+    robots = [{**result.config, **robot} for robot in result.config.get("robots", ())]
+    if not robots or not all(robot.get("topics") and robot.get("direction") == "both" for robot in robots):
         return {}
     pairs = team_pairs(result)
     ages = [topic.age_s.mean for topic in pairs if topic.age_s.mean is not None]

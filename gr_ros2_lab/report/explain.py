@@ -64,7 +64,7 @@ def _outcome(result: Result) -> Iterator[str]:
 def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
     """Whether all messages, cut and packed as those that were sent, would have needed more air than there is."""
     airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
-    if not airtime or not result.duration_s or result.config.get("time") == "unthrottled" or not len(packets.packet):
+    if not airtime or not result.duration_s or not len(packets.packet):
         return
     needed = sum((m.fate != Fate.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
     needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
@@ -100,7 +100,7 @@ def air_lines(result: Result) -> Iterator[str]:
     """Which part of the time the air was in use, and for what."""
     senders: dict[str, dict[str, float]] = result.phy.get("airtime_of_senders_s") or {}
     span = result.phy.get("air_span_s")
-    if senders and span and result.config.get("time") != "unthrottled":
+    if senders and span:
         sending = {str(topic.src_id) for topic in result.topics}
         yield air_line(senders, span, sending, shared=result.config.get("duplex") == "half")
 

@@ -288,7 +288,7 @@ def _draw(run: Run, out: Drawings, prefix: str) -> list[Picture]:
         )
     )
     airtime = result.phy.get("airtime_mean_s") or result.phy.get("airtime_s")
-    if airtime and result.config.get("time") != "unthrottled":
+    if airtime:
         pictures.append(
             out.save(
                 airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s),

@@ -155,8 +155,8 @@ class LiveRobots:
         """The graph of a simulated robot: a participant of its own on that of its source, or else the graph at the
         other end of the link."""
         for robot in self.offering:
-            if robot.settings.robot_id == src_id and (source := robot.settings.source) is not None:
-                return stack.enter_context(open_graph(self._scenario, source, f"robot_{src_id}"))
+            if robot.settings.robot_id == src_id:
+                return stack.enter_context(open_graph(robot.settings.config.graph, f"robot_{src_id}"))
         return self.robots[1].graph
 
     def empty(self, unresolved: bool) -> bool:

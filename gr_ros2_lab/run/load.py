@@ -86,7 +86,7 @@ def recorded_names(scenario: Scenario, registry: Registry) -> dict[str, int]:
     :raises ConfigError: when the recording has none of them, or has one with another type or one that cannot be carried
     :raises BagError: when the recording cannot be read
     """
-    names = source_names(scenario.ros_source, registry)
+    names = source_names(scenario.first, registry)
     contents = recording(scenario)
     for name, topic_id in names.items():
         contents.check(name, registry[topic_id].type_name)

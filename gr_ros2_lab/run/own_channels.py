@@ -1,6 +1,6 @@
 """A channel for each robot that sends, in one flowgraph: full duplex in real time.
 
-Packets pass at the pace of the air, or with time ``unthrottled`` as fast as the flowgraph takes them. Every robot has a
+Packets pass at the pace of the air. Every robot has a
 receiver for each channel that it hears. A robot that sends nothing but reports has a source without topics.
 """
 
@@ -23,9 +23,7 @@ from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.loopback import SimulatedLink
-from gr_ros2.settings.config import SinkConfig, SourceConfig, replaced
-from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Registry, options_of
+from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.record.lateness import modem_lateness
 from gr_ros2_lab.run.domains import open_graph
@@ -70,8 +68,7 @@ class OwnChannels:
     def start(self) -> None:
         """Start the flowgraph."""
         self._flowgraph.start()
-        if self._throttled:
-            self.links[0].phy.prefer_latency()
+        self.links[0].phy.prefer_latency()
 
     def run_began(self, now: float) -> None:
         """Messages come from now on, s, monotonic."""
@@ -94,9 +91,7 @@ class OwnChannels:
         return [link.counts() for link in self.links] == before
 
     def lateness(self, records: RunRecords) -> dict[str, list[Lateness]] | None:
-        """How late packets were in each part; None where the links wait for the computer."""
-        if not self._throttled:
-            return None
+        """How late packets were in each part."""
         parts: dict[str, list[Lateness]] = {"gate": [], "modem": []}
         for src_id, link in zip(self._offering, self.links, strict=False):
             gate = link.gate_lateness()
@@ -113,17 +108,11 @@ class OwnChannels:
         """Nothing: the channels have nothing in common."""
         return {}
 
-    @property
-    def _throttled(self) -> bool:
-        return self._scenario.time != "unthrottled"
-
     def _blocks(
         self, number: int, robot: RobotSettings, start: EndpointSetup, *, sends: bool
     ) -> tuple[RosSource | None, RosSink | None]:
         """The blocks of a robot, which share one endpoint."""
         scenario, source, sink = self._scenario, robot.source, robot.sink
-        if source is None and sink is not None and number > 1:
-            sink = _apart(sink, self._registry, number)
         hears = bool(self._hearing[number])
         if source is not None and not sends:
             raise ConfigError(
@@ -139,28 +128,23 @@ class OwnChannels:
             source = replace(source, backpressure=True)
         observer = self._records.of(number)
         blocks = RobotBlocks(self._registry, source, sink, start=start, observer=observer, seed=scenario.seed)
-        here, there = self._graphs(source, sink)
-        sending, receiving = blocks.source(here) if sends else None, blocks.sink(there) if hears else None
+        graph = self._graph(robot)
+        sending, receiving = blocks.source(graph) if sends else None, blocks.sink(graph) if hears else None
         for block in (sending, receiving):
             if block is not None:
                 self._stack.callback(block.close)
         return sending, receiving
 
-    def _graphs(self, source: SourceConfig | None, sink: SinkConfig | None) -> tuple[Middleware, Middleware]:
-        """The participants of a robot's two halves: one for both where they are on the same graph."""
-        ends = [end for end in (source, sink) if end is not None]
-        places = [(end.middleware, end.domain_id) for end in ends]
-        if source is not None and (path := self._scenario.bag_path) is not None:
+    def _graph(self, robot: RobotSettings) -> Middleware:
+        """The participant of a robot."""
+        graph: Middleware
+        if robot.source is not None and (path := self._scenario.bag_path) is not None:
             recorded_names(self._scenario, self._registry)  # raises if the recording has nothing for this link
-            graphs: list[Middleware] = [BagMiddleware(path=path, speed=self._scenario.bag_speed)]
+            graph = BagMiddleware(path=path, speed=self._scenario.bag_speed)
         else:
-            node = "sink" if source is None else "source"
-            graphs = [open_graph(self._scenario, ends[0], node)]
-            if places[-1] != places[0]:
-                graphs.append(open_graph(self._scenario, ends[1], "sink"))
-        for graph in graphs:
-            self._stack.enter_context(graph)
-        return graphs[0], graphs[-1]
+            graph = open_graph(robot.config.graph, f"robot_{robot.robot_id}")
+        self._stack.enter_context(graph)
+        return graph
 
     def _link(self, number: int, phy: Phy, around: Surroundings) -> SimulatedLink:
         """The channel of a robot to all who hear it."""
@@ -171,7 +155,7 @@ class OwnChannels:
             self.blocks[number][0],
             self.blocks[first.receiver][1],
             channel=first.channel,
-            throttled=self._throttled,
+            throttled=True,
             rule=scenario.airtime.rule,
             delay_s=first.delay_s,
             instrumented=self._records.run_observers.instruments,
@@ -179,21 +163,3 @@ class OwnChannels:
             within=self._flowgraph,
             shared=self._hearing[first.receiver] > 1,
         )
-
-
-def _apart(config: SinkConfig, registry: Registry, number: int) -> SinkConfig:
-    """The settings of a further receiver's sink, which publishes on the same graph in a namespace of its own."""
-    inside = f"/receiver_{number}/"
-    options = {
-        topic.name: replaced(
-            options_of(topic.name, config.topic_options), publish_as=inside + topic.options.publish_as.lstrip("/")
-        )
-        for topic in registry.with_options(config.topic_options)
-        if topic.options.publish_as != AUTO
-    }
-    return replaced(
-        config,
-        namespace_format=inside + config.namespace_format.lstrip("/"),
-        topic_options={**config.topic_options, **options},
-        merge_tf=inside + config.merge_tf.lstrip("/") if config.merge_tf else "",
-    )

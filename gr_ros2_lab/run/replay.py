@@ -9,7 +9,7 @@ whole or not at all.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,11 +18,13 @@ from typing import Literal
 from gr_ros2.core.errors import BagError, ConfigError
 from gr_ros2.core.names import first
 from gr_ros2.middleware.bag_files import BagContents, RecordedTopic, bag_contents
-from gr_ros2.settings.config import TopicOptions, replaced
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.registry import Registry, options_of
+from gr_ros2.settings.robot import PublishOptions
 from gr_ros2_lab.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2_lab.run.load import source_names
 from gr_ros2_lab.run.outcome import Outcome
+from gr_ros2_lab.run.robot_settings import ScenarioRobot
 from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.run.simulated_runner import run_simulated
 
@@ -71,8 +73,8 @@ def replay(
     scenario, registry = carrying(
         replace(scenario, time=scenario.time if scenario.simulated else "samples"), contents, topics
     )
-    names = source_names(scenario.ros_source, registry)
-    src_id = scenario.ros_source.src_id()
+    names = source_names(scenario.first, registry)
+    src_id = scenario.first.src_id()
     with _bag_at(target, bag_origin_ns(scenario, names)) as bag:
         bag.copy_source(src_id, {topic_id: recorded[name] for name, topic_id in names.items()})
         outcome = run_simulated(scenario, None, registry=registry, bag=bag)
@@ -88,16 +90,15 @@ def carrying(scenario: Scenario, contents: BagContents, topics: Sequence[str]) -
     scenario = replace(scenario, source=f"bag:{contents.path}", bag_speed=1.0)
     registry = scenario.load_registry()
     names = {
-        name: topic_id
-        for name, topic_id in source_names(scenario.ros_source, registry).items()
-        if name in contents.topics
+        name: topic_id for name, topic_id in source_names(scenario.first, registry).items() if name in contents.topics
     }
     if topics or not names:
         scenario, registry = _made_for(scenario, registry, contents, topics)
-        names = source_names(scenario.ros_source, registry)
+        names = source_names(scenario.first, registry)
     else:
-        carried = tuple(registry[topic_id].name for topic_id in names.values())
-        scenario = replace(scenario, ros_source=replaced(scenario.ros_source, topics=carried))
+        carried = {registry[topic_id].name for topic_id in names.values()}
+        left = {f"-{topic.name}": SendOptions() for topic in registry if topic.name not in carried}
+        scenario = _sending(scenario, lambda robot: {**robot.topics, **left})
     _check_types(names, registry, contents.topics, contents.path)
     return scenario, registry
 
@@ -115,25 +116,28 @@ def _made_for(
         if name not in recorded:
             raise ConfigError(f"topics = {name!r}: {source} has {', '.join(first(recorded)) or 'no topics'}")
     rows = {name: recorded[name].info.type_name for name in topics or contents.some()}
-    most = scenario.ros_source.wire_format.max_topics
+    most = scenario.first.wire_format.max_topics
     if len(rows) > most:
         raise ConfigError(
             f"{source}: has {len(rows)} topics, and a link carries {most}; choose with --topics from "
             f"{', '.join(first(recorded))}"
         )
-    names = {name: registry[topic_id].name for name, topic_id in source_names(scenario.ros_source, registry).items()}
-
-    def options(given: Mapping[str, TopicOptions]) -> dict[str, TopicOptions]:
-        by_name = {name.lstrip("/"): value for name, value in given.items()}
-        return {name: by_name[row.lstrip("/")] for name, row in names.items() if name in rows and row in by_name}
-
-    sending, receiving = scenario.ros_source, scenario.ros_sink
-    scenario = replace(
+    names = {name: registry[topic_id].name for name, topic_id in source_names(scenario.first, registry).items()}
+    kept = {name: row for name, row in names.items() if name in rows}
+    publish = scenario.robots[-1].publish
+    taken = {name: options_of(row, publish.topics, PublishOptions()) for name, row in kept.items()}
+    scenario = _sending(
         scenario,
-        ros_source=replaced(sending, topics=(), topic_options=options(sending.topic_options)),
-        ros_sink=replaced(receiving, topic_options=options(receiving.topic_options)),
+        lambda robot: {name: options_of(kept.get(name, ""), robot.topics, SendOptions()) for name in rows},
     )
-    return scenario, Registry.from_rows(rows)
+    robots = [replace(robot, publish=replace(robot.publish, topics=taken)) for robot in scenario.robots]
+    return replace(scenario, robots=tuple(robots)), Registry.from_rows(rows)
+
+
+def _sending(scenario: Scenario, topics: Callable[[ScenarioRobot], dict[str, SendOptions]]) -> Scenario:
+    """The scenario with another choice of topics of the robot that sends."""
+    first, *others = scenario.robots
+    return replace(scenario, robots=(replace(first, topics=topics(first)), *others))
 
 
 def _check_types(

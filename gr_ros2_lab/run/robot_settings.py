@@ -1,8 +1,7 @@
-"""The robots that a scenario consists of, and what a file writes for them. The short forms ``back``, ``receivers`` and
-``reports`` end here: whatever runs, records or forecasts a scenario knows robots alone.
+"""The robots that a scenario consists of: their settings, and what lies between them.
 
-Invariants: robots that offer messages come first; both halves of a robot are on one graph unless settings say
-otherwise; a receiver that reports has a source id of its own.
+Invariants: robots that offer messages come first; a robot has a receiving half if another one offers messages, and a
+path to whoever it may concern.
 """
 
 from __future__ import annotations
@@ -12,70 +11,38 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import replace
 
-from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.settings.config import (
     STRICT,
-    OneWay,
+    ChannelConfig,
+    PaperConfig,
+    PathConfig,
     ScenarioChannel,
-    Seconds,
     SinkConfig,
     SourceConfig,
     Transceiver,
-    replaced,
-    robot_of,
 )
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.robot import RobotConfig, halves
 from gr_ros2.wire import BROADCAST
 from gr_ros2_lab.medium.base import Path
-from gr_ros2_lab.medium.gains import all_paths
 
 STARTED_S = 1.0
 """s within which the robots of a run begin to send. Hellos of robots that begin together would collide for ever."""
+_APART, _BACK = 7919, 100_003
+"""Differences between the seeds of paths. Those between repetitions are smaller."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Back(OneWay):
-    """The reverse direction of a two-way scenario, at the same time on a second channel (full duplex).
-
-    What is not set is as in the forward direction, with the two graphs swapped; of ``channel`` the seed differs.
-
-    :param ros_source: the second robot's sending block; needs a ``namespace`` or ``robot_id`` of its own
-    :param ros_sink: the first robot's receiving block
-    :param channel: what lies between them
-    """
-
-    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Reports:
-    """The reverse direction for reports of what was heard, on a channel of its own (version 1).
-
-    :param channel: what lies between them and the sender; what is not set is as forward, but for the seed
-    :param delay_s: s that a report takes beside its airtime
-    """
-
-    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
-    delay_s: Seconds = 0.0
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class RobotConfig(Transceiver):
-    """One of the robots that share a medium. What is not set in its block is as in the scenario's, but for the
-    namespace: ``/robot_1``, ``/robot_2``, …
-
-    :param ros_source: its sending block
-    """
-
-    ros_source: SourceConfig = Field(default_factory=SourceConfig)
+class ScenarioRobot(Transceiver, RobotConfig):
+    """One of the robots of a scenario. What is not set in it is as above them; its name is /robot_1, /robot_2, …"""
 
 
 @plain_dataclass(frozen=True)
 class RobotSettings:
     """One robot of a run.
 
+    :param config: its settings
     :param source: settings of its sending half; None: it offers nothing, and sends nothing but reports
     :param sink: settings of its receiving half; None: it has none
     :param paths: what lies between it and those that may hear it. Levels may follow from gains or positions instead
@@ -83,6 +50,7 @@ class RobotSettings:
     :param start_s: in simulated time, when it begins to send, s
     """
 
+    config: RobotConfig
     source: SourceConfig | None
     sink: SinkConfig | None
     paths: tuple[Path, ...]
@@ -91,8 +59,8 @@ class RobotSettings:
 
     @property
     def robot_id(self) -> int:
-        """Its id on the wire, -1 for none."""
-        return robot_of(self.source, self.sink)
+        """Its id on the wire."""
+        return self.config.robot_id
 
     @property
     def namespace(self) -> str:
@@ -105,59 +73,70 @@ def sources_of(robots: Iterable[RobotSettings]) -> list[SourceConfig]:
     return [robot.source for robot in robots if robot.source is not None]
 
 
-def all_to_all(
-    robots: Sequence[RobotConfig], sink: SinkConfig, channel: ScenarioChannel, *, leveled: bool, seed: int
+def settings_of_all(
+    robots: Sequence[ScenarioRobot],
+    channel: ScenarioChannel,
+    differing: Sequence[PathConfig],
+    *,
+    paper: PaperConfig | None,
+    shared: bool,
+    leveled: bool,
+    seed: int,
 ) -> tuple[RobotSettings, ...]:
-    """Robots that all send and receive.
+    """The robots of a run.
 
-    :param sink: settings that they have in common but for the graph, which is that of the source
+    :param channel: between all of them
+    :param differing: the paths that have another one; of several that fit, the last counts
+    :param paper: settings of the paper's blocks; None: they speak version 1
+    :param shared: whether they use one channel, rather than one each
     :param leveled: whether the level of each path follows from gains
     """
     starts = random.Random(f"starts {seed}")
-    return tuple(
-        RobotSettings(
-            source := robot.ros_source,
-            replaced(sink, middleware=source.middleware, domain_id=source.domain_id),
-            tuple(paths),
-            channel.levels(robot),
-            starts.uniform(0.0, STARTED_S),
+    offering = [number for number, robot in enumerate(robots) if robot.sends]
+    made = []
+    for number, robot in enumerate(robots):
+        source, sink = halves(robot, paper)
+        hearers = [other for other, one in enumerate(robots) if other != number and one.receives]
+        if not robot.sends and not shared:  # its reports concern those that send
+            hearers = [other for other in hearers if other in offering]
+        if robot.direction == "receive":
+            hearers = []
+        paths = [_path(robots, number, other, channel, differing, shared=shared, leveled=leveled) for other in hearers]
+        made.append(
+            RobotSettings(
+                robot,
+                source if robot.sends else None,
+                sink if robot.receives and set(offering) - {number} else None,
+                tuple(paths),
+                channel.levels(robot),
+                starts.uniform(0.0, STARTED_S) if shared or len(offering) > 2 else 0.0,
+            )
         )
-        for robot, paths in zip(robots, all_paths(channel, len(robots), leveled=leveled), strict=True)
-    )
+    return tuple(made)
 
 
-def both_ways(
-    source: SourceConfig, sink: SinkConfig, channel: ScenarioChannel, back: Back
-) -> tuple[RobotSettings, ...]:
-    """Two robots. The sink of each is configured beside the source that it hears."""
-    levels = channel.levels(Transceiver())
-    return (
-        RobotSettings(source, back.ros_sink, (Path(1, channel),), levels),
-        RobotSettings(back.ros_source, sink, (Path(0, back.channel),), levels),
-    )
+def _path(
+    robots: Sequence[ScenarioRobot],
+    number: int,
+    other: int,
+    channel: ScenarioChannel,
+    differing: Sequence[PathConfig],
+    *,
+    shared: bool,
+    leveled: bool,
+) -> Path:
+    """What lies between two robots, by their places. Where it draws random numbers, it has a seed of its own."""
+    own = [one for one in differing if one.between(robots[number].robot_id, robots[other].robot_id)]
+    found: ChannelConfig = own[-1] if own else channel
+    if not shared:
+        found = replace(found, seed=found.seed + _seed_of(number, other))
+    elif leveled or found.loses_packets or found.doppler_hz:
+        found = replace(found, seed=found.seed + _APART * (1 + number * BROADCAST + other))
+    return Path(other, found, own[-1].delay_s if own else 0.0)
 
 
-def one_way(
-    source: SourceConfig, sink: SinkConfig, channels: Sequence[ScenarioChannel], reports: Reports | None
-) -> tuple[RobotSettings, ...]:
-    """A robot that sends, and those that receive.
-
-    :param channels: to each receiver
-    """
-    levels = channels[0].levels(Transceiver())
-    forward = tuple(Path(number, channel) for number, channel in enumerate(channels, 1))
-    robots = [RobotSettings(source, None, forward, levels)]
-    for number in range(len(channels)):
-        own, back = sink, []
-        if reports is not None:
-            channel = replaced(reports.channel, seed=reports.channel.seed + number)
-            back = [Path(0, channel, reports.delay_s)]
-            if sink.robot_id in (AUTO, source.src_id()):
-                own = replace(sink, robot_id=_free_id(source.src_id(), number))
-        robots.append(RobotSettings(None, own, tuple(back), levels))
-    return tuple(robots)
-
-
-def _free_id(taken: int, number: int) -> int:
-    """A source id for a receiver that reports and has no id of its own."""
-    return BROADCAST - 1 - number - (BROADCAST - 1 - number <= taken)
+def _seed_of(number: int, other: int) -> int:
+    """By how much the seed of a path between robots with a channel each differs from that of the first path."""
+    if number == 0:
+        return 0 if other == 1 else other * _BACK
+    return _BACK + number - 1 if other == 0 else _APART * (1 + number * BROADCAST + other)

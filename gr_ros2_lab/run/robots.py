@@ -29,8 +29,8 @@ def start_of_run(scenario: Scenario, phy: Phy) -> EndpointSetup:
     """The start of every robot of a run."""
     return EndpointSetup(
         scenario.seed + 1,
-        keys=keys_of_run(scenario.ros_source),
-        reports=any(robot.sink is not None and robot.paths for robot in scenario.all_robots),
+        keys=keys_of_run(scenario.first),
+        reports=scenario.reports,
         half_duplex=scenario.duplex == "half",
         any_length=phy.any_length,
         mcs_table=phy.mcs_table,
@@ -50,15 +50,11 @@ def surroundings(scenario: Scenario, sample_rate: float, task: TaskRun | None = 
     """
     if not scenario.simulated:
         shares = scenario.duplex == "half"
-        for key, wanted, alone in (
-            ("duplex", shares and not scenario.robots, "full"),
-            ("channel.from", scenario.channel.from_positions and not shares, "settings"),
-        ):
-            if wanted:
-                raise ConfigError(
-                    f"{key}: time = {scenario.time!r} has that for robots with duplex = 'half' alone; set both, or "
-                    f"time to packets or samples, or leave it {alone}"
-                )
+        if scenario.channel.from_positions and not shares:
+            raise ConfigError(
+                "channel.from: time = 'real' has that with duplex = 'half' alone; set that, or time to packets or "
+                "samples, or leave it settings"
+            )
     robots = scenario.all_robots
     paths, levels = [robot.paths for robot in robots], [robot.levels for robot in robots]
     if not scenario.channel.from_positions:
@@ -85,7 +81,7 @@ def _motion(scenario: Scenario, task: TaskRun | None) -> tuple[Motion, World | N
         return task.at, task.world
     named = [None if robot.source is None else robot.source.namespace for robot in scenario.all_robots]
     if scenario.bag_path is not None:
-        topics = source_names(scenario.ros_source, scenario.load_registry())
+        topics = source_names(scenario.first, scenario.load_registry())
         recorded = RecordedMotion(scenario.bag_path, named, speed=scenario.bag_speed or 1.0, topics=topics)
         return recorded.at, None
     fleet = Fleet.of(scenario.sim)

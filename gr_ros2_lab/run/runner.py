@@ -19,7 +19,7 @@ from typing import Any
 from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.core.files import make_folder, write_whole
 from gr_ros2.core.guard import Guard, one_line
-from gr_ros2.core.watch import Watch, wait_until
+from gr_ros2.core.watch import wait_until
 from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.observe.observers import RunObserver, RunObservers
@@ -220,7 +220,7 @@ class _Run:
 
     def _listen(self, out: Path, stack: ExitStack) -> DeliveryRecorder:
         graphs = {
-            stack.enter_context(open_graph(self.scenario, robot.settings.sink, "listener")): robot.heard
+            stack.enter_context(open_graph(robot.settings.config.graph, "listener")): robot.heard
             for robot in self.live.recorded
             if robot.settings.sink is not None
         }
@@ -322,13 +322,9 @@ class _Run:
         return bag.finished or over
 
     def _drain(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
-        """Let the link deliver what it holds, for at most ``drain_s``. With time unthrottled, each further message
-        restarts that time."""
-        waited, unthrottled = Watch(), self.scenario.time == "unthrottled"
-        while self.records.unresolved():
-            came = self.records.recorder.progress() if unthrottled else 0
-            if waited.still_s(came, time.monotonic()) >= self.scenario.drain_s:
-                return
+        """Let the link deliver what it holds, for at most ``drain_s``."""
+        until = time.monotonic() + self.scenario.drain_s
+        while self.records.unresolved() and time.monotonic() < until:
             time.sleep(_POLL_S)
             self._report(on_progress, begin)
 

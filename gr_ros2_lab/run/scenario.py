@@ -1,9 +1,8 @@
 """Scenarios: one experiment as one YAML file, with single settings replaced on the command line.
 
-Invariants: settings that must be equal at both ends of the link (`registry`, `packet_len`) are given once, at the top
-level, and apply to all ends; `source` names where messages come from, `ros_source` and `ros_sink` configure the two
-blocks; what runs a scenario reads its `all_robots`, never the short forms `back`, `reports` and `receivers`; `dump`
-gives a mapping from which `scenario_from` makes the same scenario again.
+Invariants: a scenario is robots, a medium between them, and what is sent; what all robots share stands above them in
+the file, and is a setting of each in a :class:`Scenario`; ``dump`` gives a mapping from which ``scenario_from`` makes
+the same scenario again.
 """
 
 from __future__ import annotations
@@ -17,38 +16,40 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 from pydantic import Field, TypeAdapter, model_validator
 from pydantic.dataclasses import dataclass
 
+from gr_ros2.core.backends import BackendTable
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY
 from gr_ros2.settings.config import (
     LEVELS,
     STRICT,
-    AnyLink,
+    AirConfig,
     Decibels,
+    PaperConfig,
+    PathConfig,
     ScenarioChannel,
     Seconds,
+    SourceConfig,
     Traffic,
     build,
 )
 from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
-from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.files import ENDS, SHARED_KEYS, read_settings, with_shared
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.files import read_settings
 from gr_ros2.settings.registry import Registry, check_outputs
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire import BROADCAST
 from gr_ros2_lab.run.builtin import SCENARIO_DIR, builtin_scenarios
-from gr_ros2_lab.run.robot_settings import Back, Reports, RobotConfig, RobotSettings, all_to_all, both_ways, one_way
+from gr_ros2_lab.run.robot_settings import RobotSettings, ScenarioRobot, settings_of_all, sources_of
 from gr_ros2_lab.sim.sim_settings import SimSettings
 
-_GRAPH_KEYS = ("middleware", "domain_id")
-"""Settings of a block that say on which ROS graph it is."""
-_OWN_KEYS = ("namespace", "robot_id", "dst_id", *_GRAPH_KEYS)
-"""Settings of a block that belong to its robot. The reverse direction does not take them over."""
-_BACK_SEED = 100_003
-"""Difference between the channel seeds of the two directions. It is larger than between any two repetitions."""
-
+SHARED = tuple(item.name for item in fields(RobotConfig) if item.name != "robot")
+"""Settings of robots that may stand above them."""
+_EQUAL = ("packet_len", "registry", "key", "seal", "commands")
+"""Those on which all robots have to agree."""
 
 _T = TypeVar("_T")
-Time = Literal["real", "unthrottled", "samples", "packets"]
+Time = Literal["real", "samples", "packets"]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -58,11 +59,10 @@ class Experiment:
     :param description: one line
     :param repetitions: runs, with seeds seed, seed + 1, ...; in a sweep of every cell
     :param time: what the clock of a run follows. `real`: the wall clock, packets pass at the pace of the air;
-        `unthrottled`: the wall clock, packets pass as fast as the flowgraph runs, which measures its speed; `samples`:
-        simulated time, as the samples of the flowgraph tell it, as fast as it can be computed; `packets`: simulated
-        time of the packets alone, which are lost as measured on the flowgraph (docs/explanation/simulated-time.md).
-        Simulated time has no ROS graphs, so what says how one is joined (`middleware`, domains, depths of subscriptions
-        and publishers, `backpressure`, `use_sim_time`, `debug`) has no effect there
+        `samples`: simulated time, as the samples of the flowgraph tell it, as fast as it can be computed; `packets`:
+        simulated time of the packets alone, which are lost as measured on the flowgraph
+        (docs/explanation/simulated-time.md). Simulated time has no ROS graphs, so `graph`, but for its namespace, and
+        `publish.depth` have no effect there
     """
 
     description: str = ""
@@ -71,53 +71,53 @@ class Experiment:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Scenario(Experiment, Traffic, AnyLink):
-    """One experiment: input -> ROS Source -> PHY and channel -> ROS Sink -> output, and for how long.
+class Scenario(Experiment, Traffic, AirConfig):
+    """One experiment: robots, the medium between them, what they send, and for how long.
 
+    :param robots: the robots, those that send first; a number stands for as many that differ in their names alone.
+        What they have in common may stand above them
+    :param channel: what lies between all of them
+    :param paths: the channels that differ: what is not set in one is as in ``channel``
+    :param duplex: full = each robot sends on a channel of its own, and hears while it sends; half = all use one
+        channel: who sends hears nothing meanwhile, and packets that overlap at a receiver disturb each other
+    :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
+        each other, null where nothing arrives. Level and noise then follow from transmit power, noise figure and
+        ``phy.sample_rate``; null = ``channel.snr_db`` between all
+    :param paper: the robots are the paper's blocks, ROS Source and ROS Sink, which speak version 0, with these
+        settings; null = they are ROS Links
     :param drain_s: s the link may go on delivering after ``duration_s``
     :param bag_speed: playback speed of a bag, 1 as recorded, 0 as fast as the link takes it
     :param sim: settings of the simulator, which a recording does not need; its seed is the scenario's unless given
-    :param back: the reverse direction, where both robots talk; null = one way only
-    :param reports: the reverse direction for reports alone (version 1); null = there is none
-    :param receivers: channels of further receivers of the same sender; what is not set in one is as in ``channel``, but
-        for the seed
-    :param robots: robots that all send and receive, in real time each with a ROS graph of its own; a number stands for
-        as many that differ in their names alone
-    :param duplex: full = each robot sends on a channel of its own, and hears while it sends; half = all use one
-        channel: who sends hears nothing meanwhile, and packets that overlap at a receiver disturb each other
-    :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot (without ``robots``
-        first that of ``ros_source``) with a number for each other, null where nothing arrives. Level and noise then
-        follow from transmit power, noise figure and ``phy.sample_rate``; null = ``channel.snr_db`` between all
     :param task: what the robots do on what they hear of each other: `formation`, `rendezvous`, or `module:Class`, a
         subclass of :class:`gr_ros2_lab.sim.tasks.Task`; '' = each drives its own ways
     :param controller: who drives the robots of a task. `task`: the task itself; `ros`: a node on the graph of each
         robot, by ``cmd_vel`` (in real time)
-    :param own_domains: ends whose ``domain_id`` is auto are on ROS domains that no other program of this computer uses;
-        false = they are on ROS_DOMAIN_ID
-    :param seed: of the simulator, the channel and the sender
+    :param own_domains: robots whose ``graph.domain_id`` is auto are on ROS domains that no other program of this
+        computer uses; false = they are on ROS_DOMAIN_ID
+    :param seed: of the simulator, the channel and the robots
     """
 
+    robots: Annotated[tuple[ScenarioRobot, ...], Field(max_length=BROADCAST)]
+    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
+    paths: tuple[PathConfig, ...] = ()
+    duplex: Literal["full", "half"] = "full"
+    gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
+    paper: PaperConfig | None = None
     drain_s: Seconds = 2.0
     bag_speed: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
     sim: SimSettings = Field(default_factory=SimSettings)
-    back: Back | None = None
-    reports: Reports | None = None
-    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
-    receivers: tuple[ScenarioChannel, ...] = ()
-    robots: Annotated[tuple[RobotConfig, ...], Field(max_length=BROADCAST)] = ()
-    duplex: Literal["full", "half"] = "full"
-    gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
     task: str = ""
     controller: Literal["task", "ros"] = "task"
-    localhost_only: bool | Auto = True
     own_domains: bool = True
+    also: ClassVar[Any] = {RobotConfig: ("robot",)}
+    """Settings of these may stand here too, but for some."""
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("bag_speed",),
             lambda scenario: scenario.source != "sim",
             "the simulator plays no recording; leave it out, or set source: bag:PATH",
         ),
-        ActsWhere(("state",), lambda _: False, "a run counts no starts of its robots; leave it out"),
+        ActsWhere(("robots.*.state",), lambda _: False, "a run counts no starts of its robots; leave it out"),
         ActsWhere(
             ("controller",),
             lambda scenario: scenario.task and scenario.time == "real",
@@ -131,35 +131,26 @@ class Scenario(Experiment, Traffic, AnyLink):
         refuse_without_effect(self)
         if self.source == "sim" and self.duration_s == 0:
             raise ValueError("duration_s = 0: the simulator has no end; set duration_s above 0")
-        for key, name, table in (
-            ("ros_source.middleware", self.ros_source.middleware, MIDDLEWARE),
-            ("ros_sink.middleware", self.ros_sink.middleware, MIDDLEWARE),
-            ("phy.name", self.phy.name, PHY),
-        ):
+        named: list[tuple[str, str, BackendTable[Any]]] = [("phy.name", self.phy.name, PHY)]
+        named += [("graph.middleware", robot.graph.middleware, MIDDLEWARE) for robot in self.robots]
+        for key, name, table in named:
             if name not in table:
                 raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
-        if self.back is not None:
-            self._check_back(self.back)
-        if self.reports is not None and (not self.version or self.back is not None):
-            raise ValueError("reports: version 0 has none, and with back they go along; set reports to null")
-        if self.receivers and self.back is not None:
-            raise ValueError("receivers: a two-way scenario has one receiver each way; leave back or receivers out")
         if self.medium != "exclusive" and self.duplex != "half":
             raise ValueError(f"medium = {self.medium!r}: each robot has a channel of its own; set duplex: half")
-        if self.airtime.rule is not None and self.time == "unthrottled":
-            raise ValueError("airtime: packets take no airtime with time = 'unthrottled'; set time to real, or packets")
+        if self.medium != "exclusive" and self.paper is not None:
+            raise ValueError(f"medium = {self.medium!r}: version 0 says nothing about slots; leave paper out")
         if self.airtime.listen_before_send:
             raise ValueError("airtime.listen_before_send: no receiver of a run measures power; leave it to live links")
+        if self.airtime.rule is not None and any(robot.packet_rate == 0 for robot in self.robots):
+            raise ValueError("packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out")
+        self.airtime.check_seal(encrypts=bool(self.key) and self.robots[0].seal == "encrypt")
         self._check_robots()
         self._check_positions()
+        self.all_robots  # noqa: B018 - says what does not go together
         return self
 
     def _check_positions(self) -> None:
-        others = [part.channel for part in (self.back, self.reports) if part is not None]
-        for name in ScenarioChannel.__annotations__:
-            if any(getattr(channel, name) != getattr(self.channel, name) for channel in (*others, *self.receivers)):
-                key = f"channel.{name.removesuffix('_')}"
-                raise ValueError(f"{key}: one world has one; give it in channel alone, not under back or receivers")
         placed, gains = self.channel.from_positions, self.gains_db is not None
         if (placed or gains) and not PHY.load(self.phy.name).has_samples:
             key = "channel.from = 'positions'" if placed else "gains_db"
@@ -172,70 +163,100 @@ class Scenario(Experiment, Traffic, AnyLink):
             raise ValueError("channel.walls_db: a recording has no world to count walls in; leave it out")
 
     def _check_robots(self) -> None:
-        if self.task and (not self.robots or self.time == "samples"):
+        robots, count = self.robots, len(self.robots)
+        numbers = [robot.robot_id for robot in robots]
+        if count < 2:
+            raise ValueError(f"robots: {count} of them; a scenario has two or more")
+        if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
+            raise ValueError(f"robots: two are robot {twice[0]}; give each a number of its own")
+        for name in _EQUAL:
+            if len({getattr(robot, name) for robot in robots}) > 1:
+                raise ValueError(f"{name}: all robots have to agree on it; set it above robots")
+        sends = [robot.sends for robot in robots]
+        if not any(sends):
+            raise ValueError("robots: none sends anything; set topics of the first one")
+        if sends != sorted(sends, reverse=True):
+            raise ValueError("robots: one that sends nothing stands before one that does; name those that send first")
+        if self.source != "sim" and sum(sends) > 1:
             raise ValueError(
-                f"task = {self.task!r}: robots act on what they hear in real time or at packets; set robots, and time: "
-                "real or packets"
+                f"robots: source = {self.source!r} speaks for one robot; set topics: [] of the others, or source: sim"
             )
-        matrix, count = self.gains_db, len(self.robots) or 2 + len(self.receivers)
+        for path in self.paths:
+            for number in (path.from_, path.to):
+                if number is not None and number not in numbers:
+                    raise ValueError(f"paths: there is no robot {number}; there are {', '.join(map(str, numbers))}")
+        if self.task and (not all(sends) or self.time == "samples"):
+            raise ValueError(
+                f"task = {self.task!r}: robots act on what they hear in real time or at packets; set time: real or "
+                "packets, and let all of them send"
+            )
+        matrix = self.gains_db
         if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
             raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
-        if not self.robots:
-            return
         if not self.simulated:
             self._check_live_robots()
-        if self.source != "sim" or self.back is not None or self.reports is not None or self.receivers:
-            raise ValueError("robots: they all send and receive; set source to sim, leave back, reports, receivers out")
-        ids = {robot.ros_source.src_id() for robot in self.robots}
-        if count < 2 or len(ids) < count:
-            raise ValueError(
-                f"robots: {count} robots with {len(ids)} source ids; two or more robots, each with its own"
-            )
 
     def _check_live_robots(self) -> None:
         """Whether the robots fit the medium that carries them in real time."""
-        own = [robot.ros_source.domain_id for robot in self.robots]
-        graphs = [domain for domain in own if domain != AUTO or not self.own_domains]
-        if len(set(graphs)) < len(graphs):
-            raise ValueError(
-                "robots: each has a ROS graph of its own; set own_domains: true, or another domain_id for each"
-            )
+        for sender in self.robots:
+            graphs = [
+                robot.graph.domain_id
+                for robot in self.robots
+                if robot is not sender and robot.receives and not (robot.graph.domain_id == AUTO and self.own_domains)
+            ]
+            if sender.sends and len(set(graphs)) < len(graphs):
+                raise ValueError(
+                    f"robots: what robot {sender.robot_id} sends comes out twice on one ROS graph; set own_domains: "
+                    "true, or another graph.domain_id for each"
+                )
         if self.duplex == "full":
             return
-        if self.time != "real":
-            raise ValueError(
-                f"robots: time = {self.time!r} with duplex = 'half': they share one channel at its pace; set time: real"
-            )
         if not PHY.load(self.phy.name).has_samples:
             raise ValueError(
                 f"robots: phy {self.phy.name} has no samples, which they share in real time; choose another"
             )
-        if not self.version:
-            raise ValueError("robots: on one channel in real time they need version 1; set version: 1")
-        if self.channel.loses_packets:
+        if self.paper is not None:
+            raise ValueError("paper: on one channel in real time robots need version 1; leave it out")
+        if self.channel.loses_packets or any(path.loses_packets for path in self.paths):
             raise ValueError("channel: bursts cross as samples, so none is dropped whole; leave these settings out")
-
-    def _check_back(self, back: Back) -> None:
-        if self.source != "sim":
-            raise ValueError(f"back: source = {self.source!r} speaks for one robot; two-way runs need source: sim")
-        try:
-            src_id = back.ros_source.src_id()
-        except ConfigError as error:
-            raise ValueError(f"back.ros_source: {error}") from error
-        if src_id == self.ros_source.src_id():
-            raise ValueError(
-                f"back.ros_source: source id {src_id} is that of ros_source; set another namespace or robot_id"
-            )
 
     @cached_property
     def all_robots(self) -> tuple[RobotSettings, ...]:
-        """The robots of its runs, those included that short forms stand for. Those that offer messages come first."""
-        if self.robots:
-            leveled = self.gains_db is not None
-            return all_to_all(self.robots, self.ros_sink, self.channel, leveled=leveled, seed=self.seed)
-        if self.back is not None:
-            return both_ways(self.ros_source, self.ros_sink, self.channel, self.back)
-        return one_way(self.ros_source, self.ros_sink, (self.channel, *self.receivers), self.reports)
+        """The robots of its runs. Those that offer messages come first."""
+        return settings_of_all(
+            self.robots,
+            self.channel,
+            self.paths,
+            paper=self.paper,
+            shared=self.duplex == "half",
+            leveled=self.gains_db is not None,
+            seed=self.seed,
+        )
+
+    @property
+    def first(self) -> SourceConfig:
+        """The sending half of the first robot."""
+        return sources_of(self.all_robots)[0]
+
+    @property
+    def packet_len(self) -> int:
+        """Bytes of the longest packet."""
+        return self.robots[0].packet_len
+
+    @property
+    def registry(self) -> str:
+        """File of the topics of all robots."""
+        return self.robots[0].registry
+
+    @property
+    def key(self) -> str:
+        """File of the keys of all robots."""
+        return self.robots[0].key
+
+    @property
+    def reports(self) -> bool:
+        """Whether a robot that sends messages may hear from a robot that receives them."""
+        return any(robot.sink is not None and robot.paths for robot in self.all_robots)
 
     @property
     def simulated(self) -> bool:
@@ -243,22 +264,31 @@ class Scenario(Experiment, Traffic, AnyLink):
         return self.time in ("samples", "packets")
 
     def load_registry(self) -> Registry:
-        """The registry of both ends.
+        """The registry of all robots.
 
         :raises RegistryError: when the file is wrong; names file, line and problem
         :raises ConfigError: when a sink could not publish its topics, see
             :func:`gr_ros2.settings.registry.check_outputs`
         """
+        if not self.registry:
+            raise ConfigError("registry is missing; a scenario names the topics of its robots, as table4 does")
         registry = Registry.from_csv(self.registry)
-        for way in (self, self.back):
-            if way is not None:
-                check_outputs(registry, way.ros_sink)
+        for robot in self.all_robots:
+            if robot.sink is not None:
+                check_outputs(registry, robot.sink)
         return registry
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:
-    """Every setting as JSON values, from which :func:`scenario_from` makes an equal scenario."""
+    """Every setting as JSON values, from which :func:`scenario_from` makes an equal scenario. What all robots have in
+    common stands above them."""
     values: dict[str, Any] = TypeAdapter(Scenario).dump_python(scenario, mode="json", by_alias=True)
+    first, *others = values["robots"]
+    for name in SHARED:
+        if all(robot[name] == first[name] for robot in others):
+            values[name] = first[name]
+            for robot in values["robots"]:
+                del robot[name]
     return values
 
 
@@ -284,71 +314,48 @@ def scenario_from(values: Mapping[str, Any], where: str = "") -> Scenario:
     """Make a scenario from a mapping.
 
     :param where: name of the mapping in errors, for instance its file name
-    :raises ConfigError: for an unknown key, a value out of range, or ends that disagree; names the key
+    :raises ConfigError: for an unknown key, a value out of range, or robots that disagree; names the key
     """
     values = dict(values)
-    prefix = f"{where}: " if where else ""
-    shared = {key: values[key] for key in SHARED_KEYS if key in values}
-    values.update(with_shared(values, shared, prefix))
+    shared = {name: values.pop(name) for name in SHARED if name in values}
+    build(RobotConfig, {"robot": 1, **shared}, where)  # says what is wrong once, rather than for each robot
     for part in ("sim", "channel"):
         if isinstance(block := values.get(part, {}), Mapping) and "seed" in values:
             values[part] = {"seed": values["seed"], **block}
     channel = values.get("channel", {})
-    if isinstance(channel, Mapping):
-        if isinstance(reports := values.get("reports"), Mapping):
-            values["reports"] = {**reports, "channel": _another(channel, reports.get("channel", {}), 1)}
-        if isinstance(receivers := values.get("receivers"), list | tuple):
-            values["receivers"] = [_another(channel, given, 2 + n) for n, given in enumerate(receivers)]
+    if isinstance(channel, Mapping) and isinstance(paths := values.get("paths"), list | tuple):
+        among = {item.name for item in fields(PathConfig)} - {"from_"}
+        kept = {name: value for name, value in channel.items() if name in among}
+        values["paths"] = [{**kept, **path} if isinstance(path, Mapping) else path for path in paths]
     robots = values.get("robots")
-    count = robots if isinstance(robots, int) else len(robots) if isinstance(robots, list | tuple) else 0
-    if count > BROADCAST:
-        raise ConfigError(f"{prefix}robots = {count}: a robot has an id of 0..254; set up to {BROADCAST} robots")
-    if isinstance(robots, int):
+    if isinstance(robots, int) and not isinstance(robots, bool):
+        if robots > BROADCAST:
+            prefix = f"{where}: " if where else ""
+            raise ConfigError(f"{prefix}robots = {robots}: a robot has an id of 0..254; set up to {BROADCAST} robots")
         robots = [{}] * robots
     if isinstance(robots, list | tuple):
-        values["robots"] = [_robot(values, given, n, shared, prefix) for n, given in enumerate(robots, 1)]
+        values["robots"] = [_robot(shared, given, n) for n, given in enumerate(robots, 1)]
         if isinstance(values.get("sim", {}), Mapping):
             values["sim"] = {"robots": max(len(robots), 1), **values.get("sim", {})}
-    if isinstance(values.get("back"), Mapping):
-        back = _way_back(values)
-        values["back"] = {**back, **with_shared(back, shared, f"{prefix}back.")}
     return build(Scenario, values, where)
 
 
-def _robot(values: Mapping[str, Any], given: Any, number: int, shared: Mapping[str, Any], prefix: str) -> Any:
-    """The settings of a robot. Those of its block that it does not have are the scenario's."""
-    block = given.get("ros_source", {}) if isinstance(given, Mapping) else None
-    if not isinstance(block, Mapping) or not isinstance(values.get("ros_source", {}), Mapping):
-        return given  # build() says what is wrong with it
-    kept = {key: value for key, value in values.get("ros_source", {}).items() if key not in _OWN_KEYS}
-    # The ids 0..254 are enough for 255 robots if the last one has the first id.
-    last = {"robot_id": 0} if number == BROADCAST else {}
-    source = {**kept, "namespace": f"/robot_{number}", **last, **block}
-    block = with_shared({"ros_source": source}, shared, f"{prefix}robots[{number - 1}].")["ros_source"]
-    return {**given, "ros_source": block}
-
-
-def _way_back(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of ``back``. Settings that it does not have are taken over from the forward direction."""
-    back = dict(values["back"])
-    parts = {part: values.get(part, {}) for part in (*ENDS, "channel")}
-    if not all(isinstance(part, Mapping) for part in (*parts.values(), *(back.get(name, {}) for name in parts))):
-        return back  # build() says what is wrong with it
-    for end, other in zip(ENDS, reversed(ENDS), strict=True):
-        kept = {key: value for key, value in parts[end].items() if key not in _OWN_KEYS}
-        graph = {key: parts[other][key] for key in _GRAPH_KEYS if key in parts[other]}
-        back[end] = {**kept, **graph, **back.get(end, {})}
-    back["channel"] = _another(parts["channel"], back.get("channel", {}), 1)
-    return back
-
-
-def _another(channel: Mapping[str, Any], given: Any, place: int) -> Any:
-    """A further channel. Settings that are not given are as in the first channel, except for the seed."""
+def _robot(shared: Mapping[str, Any], given: Any, number: int) -> Any:
+    """The settings of a robot. Those that it does not have are as above the robots."""
     if not isinstance(given, Mapping):
         return given  # build() says what is wrong with it
-    seed = channel.get("seed", 0)
-    own = {"seed": seed + place * _BACK_SEED} if isinstance(seed, int) else {}
-    return {**channel, **own, **given}
+    merged = {**shared, **given}
+    for part in ("graph", "publish"):
+        above, own = shared.get(part, {}), given.get(part, {})
+        if isinstance(above, Mapping) and isinstance(own, Mapping):
+            merged[part] = {**above, **own}
+    if isinstance(merged["graph"], Mapping):
+        merged["graph"] = {"localhost_only": True, **merged["graph"]}
+    if "robot" not in given:  # the numbers 0..254 are enough for 255 robots if the last one has the first number
+        merged["robot"] = f"/robot_{number}" if number < BROADCAST else 0
+        if number == BROADCAST:
+            merged["graph"] = {"namespace": f"/robot_{number}", **merged["graph"]}
+    return merged
 
 
 def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **settings: Any) -> Scenario:

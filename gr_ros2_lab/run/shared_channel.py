@@ -23,8 +23,9 @@ from gr_ros2.phy import Phy
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.settings.config import AnyLink, ChannelConfig, DiagnosticsConfig, PhyConfig, build, replaced
+from gr_ros2.settings.config import AirConfig, DiagnosticsConfig, PhyConfig, replaced
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.medium.process import MediumConfig, MediumProcess, MediumRobot
 from gr_ros2_lab.run.recorders import RunRecords
@@ -163,12 +164,7 @@ def _link_of(
     scenario: Scenario, robot: RobotSettings, phy: PhyConfig, front_end: dict[str, Any], state: Path
 ) -> LinkConfig:
     """The link of a robot, by the settings of its scenario."""
-    own = {
-        "phy": phy,
-        "ros_source": replaced(robot.source, state=str(state)),
-        "ros_sink": robot.sink,
-        "channel": ChannelConfig(),
-        "front_end": front_end,
-        "diagnostics": DiagnosticsConfig(period_s=0),
-    }
-    return build(LinkConfig, {field.name: getattr(scenario, field.name) for field in fields(AnyLink)} | own)
+    own = {item.name: getattr(robot.config, item.name) for item in fields(RobotConfig)}
+    air = {item.name: getattr(scenario, item.name) for item in fields(AirConfig)}
+    quiet = DiagnosticsConfig(period_s=0)
+    return LinkConfig(**own | air | {"phy": phy, "state": str(state), "front_end": front_end, "diagnostics": quiet})

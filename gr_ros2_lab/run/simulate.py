@@ -110,7 +110,7 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
     :raises BagError: for a recording whose times jump by more than 30 days
     """
     if scenario.bag_path is None:
-        names = source_names(scenario.ros_source, registry)
+        names = source_names(scenario.first, registry)
         for sent in _simulated(scenario.sim, scenario.duration_s, frozenset(names)):
             yield Offered(sent.t, names[sent.topic], sent.payload)
         return
@@ -181,7 +181,7 @@ def simulate(
     :param codec: of all messages; None makes one
     :param on_packet: called with every packet that leaves a robot
     :param overhead_s: s from the end of a packet's airtime to the republication of what it completes
-    :raises ConfigError: when the scenario cannot be set up, or has no times (time ``unthrottled``)
+    :raises ConfigError: when the scenario cannot be set up
     """
     scenario = coupled(scenario)
     registry = registry or scenario.load_registry()
@@ -211,7 +211,11 @@ def simulate(
 
 def coupled(scenario: Scenario) -> Scenario:
     """What is forecast together: all robots that send, with one receiver where only one does."""
-    return replace(scenario, receivers=())
+    senders = [robot for robot in scenario.robots if robot.sends]
+    others = [robot for robot in scenario.robots if not robot.sends]
+    gains = scenario.gains_db if isinstance(scenario.gains_db, float | int | None) else None
+    kept = (*senders, *others[: 1 if len(senders) == 1 else 0])
+    return scenario if len(kept) == len(scenario.robots) else replace(scenario, robots=kept, gains_db=gains)
 
 
 _OfSender = Received | Delivered | Lost
@@ -235,7 +239,6 @@ class Simulation:
     :param task: offers them instead, and moves the robots
     :param codec: of all messages; None makes one
     :param ideal: the PHY loses nothing
-    :raises ConfigError: for time ``unthrottled``, in which messages have no times
     """
 
     def __init__(
@@ -249,11 +252,6 @@ class Simulation:
         codec: MessageCodec | None = None,
         ideal: bool = False,
     ) -> None:
-        if scenario.time == "unthrottled":
-            raise ConfigError(
-                "time = 'unthrottled': packets pass whenever the computer gets round to it, which cannot "
-                "be simulated; set time to real, samples or packets"
-            )
         if messages is None:
             messages = offered_by(scenario, registry) if task is None else task.offered()
         self.robots = _robots(scenario, registry, phy, messages, codec=codec, busy=ideal)

@@ -42,36 +42,33 @@ def variants(scenario: Scenario) -> list[Variant]:
 
     :raises ConfigError: for a scenario in which all of these parts are off
     """
-    source = scenario.ros_source
+    source, robot = scenario.first, scenario.robots[0]
     found = [Variant(WHOLE)]
     if source.compresses:
-        details = ["dictionaries=[]"] * bool(source.dictionaries)
-        for name, options in source.topic_options.items():
-            details += [f"topic_options.{name}.codec=auto"] * (options.codec != AUTO)
-            details += [f"topic_options.{name}.quantize=''"] * bool(options.quantize)
-        found.append(Variant("no-compression", _source("compression=false", *details)))
+        details = []
+        for name, options in robot.topics.items():
+            details += [f"topics.{name}.codec=auto"] * (options.codec != AUTO)
+            details += [f"topics.{name}.quantize=''"] * bool(options.quantize)
+        found.append(Variant("no-compression", ("compression=false", *details)))
     if source.packet_rate != 0:
-        found.append(Variant("no-pull", _source("packet_rate=0")))
+        found.append(Variant("no-pull", ("packet_rate=0",)))
     if source.version and source.repair != "off":
         expected = SourceConfig.expected_loss
         details = [f"expected_loss={expected}"] * (source.expected_loss != expected)
-        found.append(Variant("no-repair", _source("repair='off'", *details)))
-    if scenario.reports is not None:
-        found.append(Variant("no-reports", ("reports=null",)))
+        found.append(Variant("no-repair", ("repair='off'", *details)))
+    silent = [number for number, one in enumerate(scenario.robots) if not one.sends and one.direction == "both"]
+    if silent:
+        found.append(Variant("no-reports", tuple(f"robots.{number}.direction=receive" for number in silent)))
     registry = scenario.load_registry().with_options(source.topic_options)
     latest = [topic.name for topic in registry if source.version and queue_for(topic.options)[0] == "latest"]
     if latest:
-        found.append(Variant("no-latest", _source(*(f"topic_options.{name}.queue=fifo" for name in latest))))
+        found.append(Variant("no-latest", tuple(f"topics.{name}.queue=fifo" for name in latest)))
     if len(found) == 1:
         raise ConfigError(
             f"scenario {scenario.name}: nothing to switch off; it has no compression, pull, repair, reports or queue "
             "latest"
         )
     return found
-
-
-def _source(*settings: str) -> tuple[str, ...]:
-    return tuple(f"ros_source.{setting}" for setting in settings)
 
 
 def run_variants(

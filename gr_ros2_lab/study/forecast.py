@@ -30,9 +30,10 @@ from gr_ros2.link.events import AirKind
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.observe.result import TopicResult
 from gr_ros2.phy import PHY, configured
-from gr_ros2.settings.config import Agreed, ChannelConfig, SourceConfig, TopicOptions, replaced
+from gr_ros2.settings.config import ChannelConfig, SendOptions, replaced
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.registry import Registry, Topic, options_of
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.loss_table import LossCurve
 from gr_ros2_lab.medium.positions import Positions
 from gr_ros2_lab.report.explain import air_line
@@ -239,8 +240,8 @@ class Planner:
     def __init__(self, scenario: Scenario, registry: Registry | None = None) -> None:
         if not PHY.load(scenario.phy.name).has_airtime:
             raise ConfigError(f"phy.name = {scenario.phy.name!r}: takes no airtime, so everything fits; set a radio")
-        if not scenario.version:
-            raise ConfigError("version = 0: has nothing to choose by, as the paper has it; set version: 1 for a plan")
+        if scenario.paper is not None:
+            raise ConfigError("paper: version 0 has nothing to choose by, as the paper has it; leave it out for a plan")
         if not scenario.simulated:
             # Robots then use wall-clock stamps. These large numbers take one byte more in coded messages.
             scenario = replace(scenario, sim=replaced(scenario.sim, start_time_s=_WALL_S))
@@ -335,11 +336,10 @@ class Planner:
         """The first seconds as they are, and with each change; the settings that make it."""
         base = replace(self.scenario, duration_s=min(self.scenario.duration_s or TRIAL_S, TRIAL_S))
         yield "", base
-        source = base.ros_source
-        if not source.compresses:
-            yield "ros_source.compression=true", _sending(base, lambda own: replace(own, compression=True))
-        if source.packet_rate == 0:
-            yield "ros_source.packet_rate=auto", _sending(base, lambda own: replace(own, packet_rate=AUTO))
+        if not base.first.compresses:
+            yield "compression=true", _sending(base, lambda own: replace(own, compression=True))
+        if base.first.packet_rate == 0:
+            yield "packet_rate=auto", _sending(base, lambda own: replace(own, packet_rate=AUTO))
         if base.duplex == "half" and len(sources_of(base.all_robots)) > 1 and base.medium == "exclusive":
             yield "medium=slots", replace(base, medium="slots")
         for packet_len in self._packet_lens():
@@ -347,7 +347,7 @@ class Planner:
 
     def _packet_lens(self) -> list[int]:
         """Packet lengths such that the messages of one of the topics fit into one packet, or into a few equal parts."""
-        source = self.scenario.ros_source
+        source = self.scenario.first
         wire = source.wire_format
         sizes: dict[int, list[int]] = {}
         for message in chain(*self._messages):
@@ -426,25 +426,20 @@ class Planner:
     def _applied(self, rates: Mapping[str, float]) -> Iterator[tuple[Scenario, Cut]]:
         """Each cut, its load not known yet, and the scenario with it and those before it."""
         scenario = self.scenario
-        without: tuple[str, ...] = ()
-        limited: list[str] = []
+        settings: list[str] = []
         for row, rate_hz in rates.items():
             if rate_hz:
-                limited.append(f"ros_source.topic_options.{row}.max_rate={rate_hz:g}")
+                settings.append(f"topics.{row}.max_rate={rate_hz:g}")
                 scenario = _sending(scenario, partial(_limited, row=row, rate_hz=rate_hz))
             else:
-                scenario = _sending(scenario, partial(self._without, row=row))
-                left = [source.topics for source in sources_of(scenario.all_robots)]
+                scenario = _sending(scenario, partial(_without, row=row))
+                left = [self.registry.chosen(source.topics) for source in sources_of(scenario.all_robots)]
                 if not all(left):
                     return
-                without = (f"ros_source.topics=[{', '.join(left[0])}]",)
+                settings.append(f"topics.-{row}=")
             names = [name for name, other in self._rows.items() if other == row]
             topic = names[0] if len(names) == 1 else f"{row} of every robot"
-            yield scenario, Cut(topic, rate_hz, (*without, *limited), np.nan)
-
-    def _without(self, source: SourceConfig, *, row: str) -> SourceConfig:
-        left = (topic.name for topic in self.registry.chosen(source.topics))
-        return replace(source, topics=tuple(name for name in left if name != row))
+            yield scenario, Cut(topic, rate_hz, tuple(settings), np.nan)
 
     def _weight(self, row: str) -> float:
         """Of a topic of all robots together."""
@@ -454,19 +449,19 @@ class Planner:
         if not compression:
             return None
         if self._remembering is None:
-            self._remembering = _Remembering(message_codec(self.scenario.ros_source.dictionaries, self.registry))
+            self._remembering = _Remembering(message_codec(self.registry))
         return self._remembering
 
     def _size(self, topic_id: int, payload: bytes) -> int:
         """Bytes of a message on the air, without headers."""
-        codec = self._codec(self.scenario.ros_source.compresses)
+        codec = self._codec(self.scenario.first.compresses)
         return len(payload) if codec is None else len(codec.encode(topic_id, payload))
 
     def _forecast(self, scenario: Scenario) -> Forecast:
         sources = sources_of(scenario.all_robots)
         phy = configured(scenario.phy, scenario.packet_len, self.phy.sample_rate)
         airtime = phy.airtime()
-        codec = self._codec(scenario.ros_source.compresses)
+        codec = self._codec(scenario.first.compresses)
         rule = scenario.airtime.rule
         shared = scenario.duplex == "half"
         allowed = 1.0 if rule is None else min(1.0, (len(sources) if shared else 1) * sustained(rule))
@@ -489,7 +484,7 @@ class Planner:
         senders: dict[str, Counter[str]] = {}
         begun, ended = np.inf, 0.0
 
-        wire = scenario.ros_source.wire_format
+        wire = scenario.first.wire_format
 
         def share(sent: SentPacket) -> None:
             nonlocal padded, sent_bytes, begun, ended
@@ -623,18 +618,22 @@ def _process(scenario: Scenario) -> Forecast:
     return _work[0](scenario)
 
 
-def _sending(scenario: Scenario, change: Callable[[SourceConfig], SourceConfig]) -> Scenario:
-    """The scenario with the sending block of every robot changed."""
-    return changed(scenario, SourceConfig, change)
+def _sending(scenario: Scenario, change: Callable[[RobotConfig], RobotConfig]) -> Scenario:
+    """The scenario with every robot changed that sends messages."""
+    return changed(scenario, RobotConfig, lambda robot: change(robot) if robot.sends else robot)
 
 
-def _limited(source: SourceConfig, *, row: str, rate_hz: float) -> SourceConfig:
-    options = replaced(source.topic_options.get(row, TopicOptions()), max_rate=rate_hz)
-    return replace(source, topic_options={**source.topic_options, row: options})
+def _limited(robot: RobotConfig, *, row: str, rate_hz: float) -> RobotConfig:
+    options = replaced(options_of(row, robot.topics, SendOptions()), max_rate=rate_hz)
+    return replace(robot, topics={**robot.topics, row: options})
+
+
+def _without(robot: RobotConfig, *, row: str) -> RobotConfig:
+    return replace(robot, topics={**robot.topics, f"-{row}": SendOptions()})
 
 
 def _with_packet_len(scenario: Scenario, packet_len: int) -> Scenario:
-    return changed(scenario, Agreed, lambda part: replace(part, packet_len=packet_len))
+    return changed(scenario, RobotConfig, lambda robot: replace(robot, packet_len=packet_len))
 
 
 def _fair_level(loads: Sequence[tuple[float, float]]) -> float:

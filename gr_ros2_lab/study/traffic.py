@@ -9,7 +9,6 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,19 +19,22 @@ from gr_ros2.middleware import Middleware, Qos, TopicInfo, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents
 from gr_ros2.radio.config import link_from
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.files import find_registry, read_settings, settled
 from gr_ros2.settings.registry import Registry
 from gr_ros2.settings.topic_choice import TopicChoice
 from gr_ros2_lab.run.replay import carrying
-from gr_ros2_lab.run.scenario import Scenario, scenario_from
+from gr_ros2_lab.run.scenario import SHARED, Scenario, scenario_from
 
 _log = logging.getLogger(__name__)
 _LOOK_S = 2.0
 """s for which the graph is asked what there is: discovery does not say when it is complete."""
+_OF_THE_AIR = ("phy", "medium", "relay", "airtime", "channel")
+"""What a link and a scenario have in common beside their robots."""
 _DEFAULT = {
     "name": "link",
-    "registry": "",
-    "ros_source": {"robot_id": 1, "topics": ["auto"]},
+    "robot": 1,
+    "graph": {"namespace": ""},
     "phy": {"name": "psk", "sample_rate": 1e6},
     "front_end": {"name": "sim"},
 }
@@ -64,19 +66,21 @@ def of_recording(values: Mapping[str, Any], bag: Path, duration_s: float | None)
     for line in contents.remarks:
         _log.warning(line)
     chosen: list[str] = []
-    known = {item.name for item in fields(Scenario)}
-    settings = {key: value for key, value in values.items() if key in known}
+    robot = {name: values[name] for name in SHARED if name in values}
+    air = {name: values[name] for name in _OF_THE_AIR if name in values}
+    settings: dict[str, Any] = {"name": link.name, **robot, **air}
+    settings["robots"] = [{"robot": link.robot}, {"robot": int(not link.robot_id), "topics": []}]
     if not link.registry:
-        choice = TopicChoice(link.ros_source.topics, link.ros_source.namespace)
+        choice = TopicChoice(tuple(link.topics), link.namespace)
         chosen = [name for name in contents.topics if choice.row_name(name) is not None]
         if contents.topics and not chosen:
             raise ConfigError(
-                f"{bag}: has nothing of {choice.everything or ', '.join(link.ros_source.topics) or 'no topics'}; "
-                f"it has {', '.join(first(contents.topics))}; set ros_source.namespace or ros_source.topics"
+                f"{bag}: has nothing of {choice.everything or ', '.join(link.topics) or 'no topics'}; "
+                f"it has {', '.join(first(contents.topics))}; set graph.namespace or topics"
             )
         settings["registry"] = find_registry("odom", Path())  # replaced by that of the recording
-        settings["ros_source"] = {**values.get("ros_source", {}), "topics": []}
-    settings |= {"source": f"bag:{bag}", "duration_s": duration_s or 0.0, "reports": {} if link.version else None}
+        settings["topics"] = [AUTO]
+    settings |= {"source": f"bag:{bag}", "duration_s": duration_s or 0.0}
     return carrying(scenario_from(settings, link.name), contents, chosen)
 
 
@@ -89,18 +93,17 @@ def recorded_graph(values: Mapping[str, Any], seconds: float) -> Iterator[Path]:
     :raises ConfigError: when nothing is published on them
     """
     link = link_from(values)
-    source = link.ros_source
-    choice = TopicChoice(source.topics, source.namespace)
+    choice = TopicChoice(tuple(link.topics), link.namespace)
     if link.registry:
-        registry = Registry.from_csv(link.registry).chosen(source.topics)
-        choice = TopicChoice([topic.on_graph(source.namespace) for topic in registry], "")
+        registry = Registry.from_csv(link.registry).chosen(tuple(link.topics))
+        choice = TopicChoice([topic.on_graph(link.namespace) for topic in registry], "")
     with TemporaryDirectory(prefix="gr-ros2-") as folder, ExitStack() as stack:
         graph = stack.enter_context(
             join_graph(
-                source.middleware,
-                domain_id=source.domain_id,
+                link.graph.middleware,
+                domain_id=link.graph.domain_id,
                 node_name="gr_ros2_plan",
-                localhost_only=link.localhost_only,
+                localhost_only=link.graph.localhost_only,
             )
         )
         time.sleep(_LOOK_S)

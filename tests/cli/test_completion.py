@@ -57,9 +57,9 @@ def test_bash_completes_commands_scenarios_and_options(tmp_path: Path, capsys: p
 
 def test_the_settings_offered_are_there() -> None:
     keys = list(setting_keys(Scenario))
-    assert {"packet_len", "ros_source.domain_id", "phy.options", "back"} <= set(keys)
+    assert {"packet_len", "graph.domain_id", "phy.options", "paths"} <= set(keys)
     for key in keys:
-        value = dump(load_scenario("demo"))
+        value = dump(load_scenario("two-way"))
         for name in key.split("."):
             assert name in value, key
             value = value[name]

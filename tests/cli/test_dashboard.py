@@ -86,7 +86,7 @@ def test_a_port_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     assert "choose another port" in line
 
 
-MEMORY = ("--set", "ros_source.middleware=memory", "--set", "ros_sink.middleware=memory")
+MEMORY = ("--set", "graph.middleware=memory")
 
 
 @pytest.mark.usefixtures("alone")
@@ -95,7 +95,7 @@ def test_beside_what_was_started_without(what: str, tmp_path: Path, capsys: pyte
     pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     config = tmp_path / "link.yaml"
-    config.write_text("registry: odom\nros_source: {namespace: /robot_1}\nphy: {name: direct}\n")
+    config.write_text("registry: odom\nrobot: /robot_1\nphy: {name: direct}\n")
     started = {
         "run": ["run", "paper-direct", "--no-report", "--out", str(tmp_path / "out")],
         "link": ["link", str(config)],

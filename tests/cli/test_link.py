@@ -73,7 +73,7 @@ def test_a_link_that_sends_nothing_says_what_it_waits_for() -> None:
         (("--robot", "1", "--radio", "nope"), "no 'nope'; known are sim, zmq"),
         (
             ("--robot", "1", "--radio", "sim", "--middleware", "nope"),
-            "ros_source.middleware = 'nope': no such",
+            "graph.middleware = 'nope': no such",
         ),
     ],
 )
@@ -90,7 +90,7 @@ def test_the_middleware_is_that_of_both_directions(tmp_path: Path, capsys: pytes
     assert run(["link", str(saved), "--middleware", "nope"]) == BAD_INPUT
     assert "nope" in capsys.readouterr().err
     settings = load_link(saved)
-    assert settings.ros_source.middleware == settings.ros_sink.middleware == "memory"
+    assert settings.graph.middleware == "memory"
 
 
 @pytest.mark.slow

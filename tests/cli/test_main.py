@@ -96,9 +96,9 @@ def test_errors_end_in_a_status(
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("--set ros_source.robot_id={}", "'x...x': must be a whole number (the robot's own id"),
+        ("--set robots={}", "robots = 'x...x': must be a list (the robots, those that send first"),
         ("--set {}", "gr-ros2: --set x...x: write key=value"),
-        ("--set ros_source.{}=1", "gr-ros2: demo: unknown key ros_source.x...x; known are packet_len"),
+        ("--set channel.{}=1", "gr-ros2: demo: unknown key channel.x...x; known are "),
         ("--set registry={}", "gr-ros2: x...x: File name too long"),
         ("--{}", "x...x; see gr-ros2 run --help"),
     ],

@@ -57,13 +57,13 @@ def goes_on(robot: Robot) -> None:
         ({PING: {"robot": "seven"}}, "ping: robot = 'seven'"),
         ({PING: {}}, "ping: robot"),
         ({PING: 7}, "ping: expected keys and values, found 7"),
-        ({SET: "ros_source.dst_id"}, "set: changes = 'ros_source.dst_id'"),
-        ({SET: [["ros_source.repeat_s"]]}, "set: changes"),
-        ({SET: [["ros_source.repeat_s", "soon"]]}, "repeat_s = 'soon'"),
-        ({SET: [["ros_source.robot_id", 7]]}, "ros_source.robot_id cannot change while the link runs"),
-        ({SET: [["ros_source.queue_depth", 10**30]]}, "queue_depth = 10+: must be less"),
-        ({SET: [["ros_source.\nx\x1b[1m", 7]]}, r"ros_source\. x\\x1b\[1m cannot change"),
-        ({SET: [["ros_source.topic_options.a\nb.to", 7]]}, r"topic 'a\\nb': '\\n' may not stand in a ROS name"),
+        ({SET: "repeat_s"}, "set: changes = 'repeat_s'"),
+        ({SET: [["repeat_s"]]}, "set: changes"),
+        ({SET: [["repeat_s", "soon"]]}, "repeat_s = 'soon'"),
+        ({SET: [["packet_len", 7]]}, "packet_len cannot change while the link runs"),
+        ({SET: [["queue_depth", 10**30]]}, "queue_depth = 10+: must be less"),
+        ({SET: [["topic\nx\x1b[1m", 7]]}, r"topic x\\x1b\[1m cannot change"),
+        ({SET: [["topics.a\nb.to", 7]]}, r"topic 'a\\nb': '\\n' may not stand in a ROS name"),
         ({"p\nong": 7}, "p ong: no question here"),
         ({"pong": 7}, "pong: no question here; known are ping, set, status"),
         ({"address": "127.0.0.1", "port": 70000}, "dashboard: port = 70000: .* 65535"),
@@ -78,7 +78,7 @@ def test_what_cannot_be_asked_is_refused_and_says_what_can(robot: Robot, questio
 
 
 def test_a_number_given_as_text_is_a_number(robot: Robot) -> None:
-    request(os.getpid(), {SET: [["ros_source.packet_rate", "70"], ["ros_source.repeat_s", "3"]]})
+    request(os.getpid(), {SET: [["packet_rate", "70"], ["repeat_s", "3"]]})
     assert robot.link.source.config.packet_rate == 70
     goes_on(robot)
 
@@ -101,8 +101,8 @@ def anything(rng: random.Random, depth: int = 0) -> Any:
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_is_asked_the_link_goes_on_and_no_error_is_of_the_program(robot: Robot, seed: int) -> None:
     rng, live = random.Random(seed), LiveSettings(robot.link.source, robot.link.sink)
-    topics = [f"ros_source.topic_options.{topic}.{option}" for topic in ("chat", "x", "") for option in live._options]
-    names = [*live._setters, *topics, "ros_source", "", None, 7]
+    topics = [f"topics.{topic}.{option}" for topic in ("chat", "x", "") for option in live._options]
+    names = [*live._setters, *topics, "topics", "", None, 7]
     quiet = [name for name in names if not str(name).endswith("debug")]
     for number in range(600):
         question: Any = rng.choice(
@@ -124,6 +124,6 @@ def test_whatever_is_asked_the_link_goes_on_and_no_error_is_of_the_program(robot
         assert "\n" not in refused
         if number % 20 == 0:
             robot.publish(message(number, 100))
-    request(os.getpid(), {SET: [["ros_source.packet_rate", "auto"]]})
+    request(os.getpid(), {SET: [["packet_rate", "auto"]]})
     goes_on(robot)
     assert "findings" in request(os.getpid(), {STATUS: True})[STATUS]

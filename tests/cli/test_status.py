@@ -38,8 +38,7 @@ class Ends:
         self.files = [folder / "one.yaml", folder / "two.yaml"]
         for number, (file, own, other) in enumerate(zip(self.files, ports, reversed(ports), strict=True), 1):
             file.write_text(
-                f"ros_source: {{robot_id: {number}, namespace: /robot_{number}, topics: [odom], middleware: memory}}\n"
-                "ros_sink: {middleware: memory}\n"
+                f"robot: /robot_{number}\ntopics: [odom]\ngraph: {{middleware: memory}}\n"
                 "phy: {name: modem, options: {bit_rate: 1000000}}\n"
                 f"front_end: {{name: udp, listen: '127.0.0.1:{own}', send_to: ['127.0.0.1:{other}']}}\n"
             )
@@ -124,11 +123,11 @@ def test_a_running_link_tells_what_it_does(ends: Ends) -> None:
     assert "packets sent" in shown
     several = ends.run("status")
     assert (several.returncode, "say which with --pid" in several.stderr) == (2, True)
-    changed = ends.run("set", "ros_source.topic_options.odom.to=2", "ros_source.debug=true", "--pid", pid)
-    assert changed.stdout == "ros_source.topic_options.odom.to = 2\nros_source.debug = True\n"
+    changed = ends.run("set", "topics.odom.to=2", "debug=true", "--pid", pid)
+    assert changed.stdout == "topics.odom.to = 2\ndebug = True\n"
     fixed = ends.run("set", "packet_len=64", "--pid", pid)
     assert (fixed.returncode, len(fixed.stderr.splitlines())) == (1, 1)
-    assert "packet_len cannot change while the link runs; these can: ros_source." in fixed.stderr
+    assert "packet_len cannot change while the link runs; these can: " in fixed.stderr
     told = json.loads(ends.run("ping", "2", "--json", "--count", "5", "--interval", "0.2", "--pid", pid).stdout)
     assert (told["asked"], told["lost_there"], told["about"]["packet_len"]) == (5, 0, 220)
     assert told["answered"] >= 4
@@ -170,5 +169,5 @@ def test_nobody_there(ends: Ends) -> None:
     )
     assert f"{ends.files[1]} does not match: packet_len is 220 there and 99 here" in other.stdout
     assert "start one with gr-ros2 link" in ends.run("status").stderr
-    refused = ends.run("ping", "2", str(ends.files[0]), "--set", "version=0")
+    refused = ends.run("ping", "2", str(ends.files[0]), "--set", "paper={}")
     assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)

@@ -15,8 +15,8 @@ from gr_ros2_lab.record.result import read_result
 from tests.lab.run.test_replay import COUNT, make_bag
 from tests.lab.study.sweeps import write_sweep_file
 
-PLAIN = ("--set", "version=0", "--set", "ros_source.topic_options={}")
-LOSSY = ("--set", "version=1", "--set", "reports={}", "--set", "channel.packet_loss=0.2")
+PLAIN = ("--set", "paper={}", "--set", "topics=auto")
+LOSSY = ("--set", "robots=[{}, {topics: []}]", "--set", "channel.packet_loss=0.2")
 
 
 def test_replay_repairs_what_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -38,7 +38,7 @@ def test_replay_repairs_what_is_lost(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_a_sweep_tabulates_repaired_messages_and_the_air(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="needs Dask: pip install 'gr-ros2[sweep]'")
     parquet = pytest.importorskip("pyarrow.parquet")
-    fixed = {"version": 1, "reports": {}, "duration_s": 4}
+    fixed = {"robots": [{}, {"topics": []}], "duration_s": 4}
     path = write_sweep_file(
         tmp_path, scenario="paper-ofdm-paced", set=fixed, grid={"channel.packet_loss": [0.0, 0.2]}, repetitions=1
     )
@@ -71,8 +71,8 @@ def test_the_losses_of_a_radio_do_not_depend_on_the_version(tmp_path: Path, caps
     command = ["losses", "paper-ofdm", "--set", "phy.name=gfsk", "--set", "phy.options={}", "--set", "packet_len=40"]
     command += ["--from", "6", "--to", "7", "--packets", "40"]
     shown = []
-    for number, version in enumerate(("0", "1")):
-        assert run([*command, "--out", str(tmp_path / str(number)), "--set", f"version={version}"]) == 0
+    for number, paper in enumerate(("{}", "null")):
+        assert run([*command, "--out", str(tmp_path / str(number)), "--set", f"paper={paper}"]) == 0
         shown.append(capsys.readouterr().out.splitlines())
     assert any("no noise" in line and "1.0000" in line for line in shown[1])
     assert [line for line in shown[0] if "40" in line] == [line for line in shown[1] if "40" in line]
@@ -97,8 +97,6 @@ def test_the_demo_speaks_version_1_unless_told_otherwise(tmp_path: Path, capsys:
     assert run([*demo, "--out", str(tmp_path / "old"), "--wire", "0"]) == 0
     assert "the channel back" not in capsys.readouterr().out
     new, old = (read_result(tmp_path / name) for name in ("new", "old"))
-    assert (new.config["version"], old.config["version"]) == (1, 0)
-    assert new.config["ros_source"]["compression"]
-    assert new.config["reports"] is not None
-    assert old.config["reports"] is None
+    assert new.config["paper"] is None
+    assert old.config["paper"] is not None
     assert any("lost_fragments" in topic.ledger for topic in old.topics)

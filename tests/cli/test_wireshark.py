@@ -319,7 +319,7 @@ def test_our_own_decoder_reads_the_capture(tmp_path: Path, capsys: pytest.Captur
 
 def test_a_run_captures_every_packet_at_both_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    memory = ["--set", "ros_source.middleware=memory", "--set", "ros_sink.middleware=memory"]
+    memory = ["--set", "graph.middleware=memory"]
     from gr_ros2_lab.run.runner import REGISTRY_FILE
 
     path = tmp_path / "run.pcapng"

@@ -45,7 +45,7 @@ def test_a_link_runs_without_them() -> None:
     own, other = free_ports(2, socket.SOCK_DGRAM)
     done = on_a_robot(
         *("link", "--robot", "1", "--radio", "udp", "--listen", f"127.0.0.1:{own}", "--peer", f"127.0.0.1:{other}"),
-        *("--set", "ros_source.middleware=memory", "--set", "ros_sink.middleware=memory", "--duration", "1"),
+        *("--set", "graph.middleware=memory", "--duration", "1"),
     )
     assert done.returncode == 0, done.stderr
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +57,7 @@ def test_a_namespace_may_be_written_as_people_do(namespace: str) -> None:
     assert check_node("n", namespace) == ("n", "/" + namespace.strip("/"))
 
 
-@pytest.mark.parametrize("namespace", ["/robot-1", "/robot 1", "//robot_1", "/robot_1//", "/1", "~", "/{src_id}"])
+@pytest.mark.parametrize("namespace", ["/robot-1", "/robot 1", "//robot_1", "/robot_1//", "/1", "~", "/{robot}"])
 def test_a_namespace_that_ros_refuses(namespace: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(f"namespace = {namespace!r}: ")):
         build(SourceConfig, {"namespace": namespace})
@@ -74,7 +73,7 @@ def test_a_node_name_that_ros_refuses(name: str) -> None:
 
 @pytest.mark.parametrize("key", ["namespace_format", "frame_prefix"])
 @pytest.mark.parametrize(
-    "form", ["{src_id.__class__}", "{src_id!r}", "{src_id:99}", "{src_id}{", "{{src_id}}", "{robot}", "{}", "{0}"]
+    "form", ["{robot.__class__}", "{robot!r}", "{robot:99}", "{robot}{", "{{robot}}", "{who}", "{}", "{0}"]
 )
 def test_a_form_has_one_field(key: str, form: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(f"{key} = '/x{form}'" if key[0] == "n" else f"{key} = 'x{form}'")):
@@ -83,22 +82,22 @@ def test_a_form_has_one_field(key: str, form: str) -> None:
         build(TopicOptions, {"publish_as": f"/x{form}"})
 
 
-@given(st.sampled_from(["/rx_robot_{src_id}", "rx_{src_id}_{src_id}/", "/", "", "/all"]), st.integers(0, 255))
+@given(st.sampled_from(["/rx_robot_{robot}", "rx_{robot}_{robot}/", "/", "", "/all"]), st.integers(0, 255))
 def test_a_form_that_passes_gives_every_sender_a_name_ros_takes(form: str, src_id: int) -> None:
     sink = build(SinkConfig, {"namespace_format": form})
     name = REGISTRY[0].republished(sink.namespace_format, src_id)
     assert check_topic(name) == name
-    assert filled(form, src_id) == form.format(src_id=src_id)
+    assert filled(form, src_id) == form.format(robot=src_id)
 
 
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
-        ("namespace_format", "/rx-{src_id}", "'-' may not stand"),
-        ("namespace_format", "/a b/{src_id}", "' ' may not stand"),
-        ("namespace_format", "/{src_id}", "part '255' must not begin with a digit (for sender 255)"),
-        ("namespace_format", "/rx//{src_id}", "two / in a row"),
-        ("frame_prefix", "/robot_{src_id}/", "must not begin with /"),
+        ("namespace_format", "/rx-{robot}", "'-' may not stand"),
+        ("namespace_format", "/a b/{robot}", "' ' may not stand"),
+        ("namespace_format", "/{robot}", "part '255' must not begin with a digit (for sender 255)"),
+        ("namespace_format", "/rx//{robot}", "two / in a row"),
+        ("frame_prefix", "/robot_{robot}/", "must not begin with /"),
         ("frame_prefix", "robot\0", "cannot be printed"),
         ("merge_tf", "tf", "must begin with /"),
         ("merge_tf", "/all-tf", "'-' may not stand"),
@@ -107,32 +106,32 @@ def test_a_form_that_passes_gives_every_sender_a_name_ros_takes(form: str, src_i
 )
 def test_a_sink_refuses_names_that_ros_does(key: str, value: str, says: str) -> None:
     with pytest.raises(ConfigError, match=f"{re.escape(f'{key} = {value!r}: ')}.*{re.escape(says)}"):
-        build(SinkConfig, {"frame_prefix": "robot_{src_id}/", key: value})
+        build(SinkConfig, {"frame_prefix": "robot_{robot}/", key: value})
 
 
-@pytest.mark.parametrize("value", ["/robot-1/odom", "/a b/odom", "/odom/", "/", "/1/odom", "{src_id}"])
+@pytest.mark.parametrize("value", ["/robot-1/odom", "/a b/odom", "/odom/", "/", "/1/odom", "{robot}"])
 def test_a_topic_cannot_come_out_under_a_name_that_ros_refuses(value: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(f"topic_options.odom.publish_as = {value!r}: ")):
         build(SinkConfig, {"topic_options": {"odom": {"publish_as": value}}})
 
 
 def test_a_link_and_a_scenario_refuse_them_when_they_are_read() -> None:
-    link = {"registry": "r.csv", "phy": {"name": "direct"}, "ros_source": {"robot_id": 1}}
+    link = {"registry": "r.csv", "phy": {"name": "direct"}, "robot": 1}
     for values, key in (
-        ({"ros_sink": {"namespace_format": "/rx-{src_id}"}}, "ros_sink.namespace_format"),
-        ({"ros_source": {"namespace": "/robot-1"}}, "ros_source.namespace"),
-        ({"ros_sink": {"topic_options": {"odom": {"publish_as": "/robot-1/odom"}}}}, "topic_options.odom.publish_as"),
+        ({"publish": {"as": "/rx-{robot}"}}, "publish.as"),
+        ({"graph": {"namespace": "/robot-1"}}, "graph.namespace"),
+        ({"publish": {"topics": {"odom": {"as": "/robot-1/odom"}}}}, "publish.topics.odom.as"),
     ):
         with pytest.raises(ConfigError, match=re.escape(key)):
             link_from({**link, **values})
         with pytest.raises(ConfigError, match=re.escape(key)):
-            scenario_from({"name": "x", "registry": "r.csv", **values})
-    with pytest.raises(ConfigError, match="namespace_format"):
-        load_scenario("demo", ["ros_sink.namespace_format=/rx-{src_id}"])
+            scenario_from({"name": "x", "registry": "r.csv", "robots": 2, **values})
+    with pytest.raises(ConfigError, match=r"publish\.as"):
+        load_scenario("demo", ["publish.as=/rx-{robot}"])
 
 
 def test_names_of_a_registry_and_a_sink_together() -> None:
-    check_outputs(REGISTRY, SinkConfig(frame_prefix="r{src_id}/", merge_tf="/tf"))
+    check_outputs(REGISTRY, SinkConfig(frame_prefix="r{robot}/", merge_tf="/tf"))
     long = Registry.from_rows({"a" * 240: "nav_msgs/Odometry"})
     with pytest.raises(ConfigError, match="ROS allows 247; change its publish_as, or namespace_format"):
         check_outputs(long, SinkConfig())
@@ -143,7 +142,7 @@ def test_names_of_a_registry_and_a_sink_together() -> None:
         check_outputs(
             REGISTRY,
             SinkConfig(
-                frame_prefix="r{src_id}/", merge_tf="/tf", topic_options={"odom": TopicOptions(publish_as="/tf")}
+                frame_prefix="r{robot}/", merge_tf="/tf", topic_options={"odom": TopicOptions(publish_as="/tf")}
             ),
         )
 
@@ -151,9 +150,9 @@ def test_names_of_a_registry_and_a_sink_together() -> None:
 def test_a_scenario_refuses_them_with_its_registry(tmp_path: Path) -> None:
     registry = tmp_path / "r.csv"
     registry.write_text(f"odom,nav_msgs/Odometry\n{'a' * 240},nav_msgs/Odometry\n")
-    scenario = replace(load_scenario("demo"), registry=str(registry))
+    scenario = load_scenario("demo", registry=str(registry))
     with pytest.raises(ConfigError, match="ROS allows 247"):
         scenario.load_registry()
-    values = {"registry": str(registry), "phy": {"name": "direct"}, "ros_source": {"robot_id": 1}}
+    values = {"registry": str(registry), "phy": {"name": "direct"}, "robot": 1}
     with pytest.raises(ConfigError, match="ROS allows 247"):
         link_from(values).load_registry()

@@ -173,7 +173,7 @@ def viewer(browser: Viewer) -> Iterator[Viewer]:
 @contextmanager
 def program(out: Path, port: int = 0, *more: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A long run over OFDM with a dashboard, and where that is."""
-    settings = ["ros_source.middleware=memory", "ros_sink.middleware=memory", "packet_len=220", "phy.name=ofdm"]
+    settings = ["graph.middleware=memory", "packet_len=220", "phy.name=ofdm"]
     settings += ["phy.sample_rate=2.5e5", "channel.snr_db=30", "sim.odom_rate=10", *more]
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--duration", "3600"]
     command += [
@@ -261,7 +261,7 @@ def test_it_shows_what_the_result_says_sliders_act_and_it_returns_with_the_next_
 def test_it_shows_what_repair_does_and_can_be_used_with_a_keyboard_and_a_screen_reader_and_read_in_both_modes(
     viewer: Viewer, tmp_path: Path
 ) -> None:
-    lossy = ("version=1", "reports={}", "channel.packet_loss=0.3", "channel.snr_db=null", "sim.odom_rate=10")
+    lossy = ("robots=[{}, {topics: []}]", "channel.packet_loss=0.3", "channel.snr_db=null", "sim.odom_rate=10")
     with program(tmp_path / "out", 0, *lossy) as (process, url):
         viewer.driver.get(url)
         viewer.wait(lambda: viewer.numbers().get("repaired", 0) > 2, "repaired messages")
@@ -322,7 +322,7 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
     def card(name: str) -> bool:
         return bool(viewer.run(f"{FIND} return found[0].checkVisibility()", f'[data-card="{name}"]'))
 
-    lossy = ("version=1", "reports={}", "ros_source.repair=off", "sim.odom_rate=20")
+    lossy = ("robots=[{}, {topics: []}]", "repair=off", "sim.odom_rate=20")
     with program(tmp_path / "out", 0, *lossy) as (process, url):
         viewer.driver.get(url)
         viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 60, "deliveries")
@@ -374,17 +374,16 @@ def test_a_live_link_shows_the_names_that_come_out_and_no_empty_card(viewer: Vie
     settings = {
         "registry": str(REGISTRY_DIR / "table4.csv"),
         "packet_len": 220,
-        "ros_source": {"namespace": "/robot_1", "domain_id": domain},
-        "ros_sink": {"domain_id": domain},
+        "robot": "/robot_1",
+        "graph": {"domain_id": domain, "localhost_only": True},
         "phy": {"name": "psk", "sample_rate": 1e6},
         "front_end": {"name": "zmq", "bind": f"ipc://{tmp_path}/one", "connect": [f"ipc://{tmp_path}/two"]},
-        "localhost_only": True,
         "state": str(tmp_path / "one.json"),
     }
     (tmp_path / "one.yaml").write_text(json.dumps(settings))
     other = {
         **settings,
-        "ros_source": {"namespace": "/robot_2", "domain_id": domain},
+        "robot": "/robot_2",
         "front_end": {"name": "zmq", "bind": f"ipc://{tmp_path}/two", "connect": [f"ipc://{tmp_path}/one"]},
         "state": str(tmp_path / "two.json"),
         "diagnostics": {"period_s": 0},

@@ -15,7 +15,7 @@ from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
 from tests.waiting import wait_for
 
-ENDS = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
+ENDS = ("graph.middleware=memory",)
 OFDM = ("phy.name=ofdm", "phy.sample_rate=2e6", "packet_len=220", "channel.snr_db=30")
 
 

@@ -29,15 +29,15 @@ from tests.radio.sound_server import sound_server_or_skip
 from tests.waiting import PATIENCE_S
 
 LINK: dict[str, Any] = {
+    "robot": "/robot_1",
     "registry": "table4",
-    "ros_source": {"namespace": "/robot_1"},
     "phy": {"name": "psk", "sample_rate": 1e6},
     "front_end": {"name": "sim"},
 }
 SCENARIO: dict[str, Any] = {
     "name": "trial",
     "registry": str(ROOT / "gr_ros2/registries/odom.csv"),
-    "ros_source": {"namespace": "/robot_1"},
+    "robots": 2,
 }
 SWEEP: dict[str, Any] = {
     "scenario": "paper-ofdm-paced",
@@ -63,7 +63,7 @@ ONLY_PARSED = {
             "peers",
             "ping 2",
             "ping 2 robot.yaml",
-            "set ros_source.topic_options.goal.to=7",
+            "set topics.goal.to=7",
         )
     },
     **{
@@ -80,7 +80,7 @@ ONLY_PARSED = {
         for own, other, more in (
             (1, 2, ""),
             (2, 1, ""),
-            (1, 2, " --set ros_source.namespace=/ --topics odom scan /tf /tf_static"),
+            (1, 2, " --set graph.namespace=/ --topics odom scan /tf /tf_static"),
         )
     },
     (
@@ -261,7 +261,7 @@ def fill(folder: Path) -> None:
     (mcap,) = bag.glob("*.mcap")
     for name in ("IN.mcap", "arrived.mcap"):
         shutil.copy(mcap, folder / name)
-    here(*demo, "--out", "robot", "--set", "ros_sink.namespace_format=/robot_{src_id}", folder=folder)
+    here(*demo, "--out", "robot", "--set", "publish.as=/robot_{robot}", folder=folder)
     shutil.copytree(folder / "robot" / "delivered", folder / "my_bag")
     shutil.copy(ROOT / "gr_ros2_lab/scenarios/demo.yaml", folder / "my_scenario.yaml")
     shutil.copy(ROOT / "gr_ros2/examples/link-sim.yaml", folder / "my_link.yaml")

@@ -17,7 +17,7 @@ from gr_ros2.state.airtime import AirtimeFile
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 MODEM = """
-ros_source: {robot_id: 7}
+robot: 7
 packet_len: 100
 phy: {name: modem, options: {bit_rate: 1000, overhead_bytes: 25}}
 front_end: {name: serial, device: /dev/ttyUSB0, guard_s: 0.5, backoff_s: 0.5}

@@ -22,7 +22,7 @@ COMMAND = (sys.executable, "-m", "gr_ros2.cli")
 def on_free_domains() -> list[str]:
     """Overrides that put the ends of a link on two unused domains."""
     sending, receiving = free_domains()
-    return [f"ros_source.domain_id={sending}", f"ros_sink.domain_id={receiving}"]
+    return [f"robots.0.graph.domain_id={sending}", f"robots.1.graph.domain_id={receiving}"]
 
 
 def scenario(name: str | Path, *overrides: str, duration_s: float | None = None, seed: int | None = None) -> Scenario:

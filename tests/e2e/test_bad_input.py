@@ -49,7 +49,7 @@ def files(folder: Path) -> dict[str, str]:
     ("words", "says"),
     [
         ("run nonsense", "scenario 'nonsense' is neither a file nor built in; built in are "),
-        ("run {f}/key.yaml", "unknown key colour; known are packet_len, registry"),
+        ("run {f}/key.yaml", "unknown key colour; known are "),
         ("run {f}/list.yaml", "expected keys and values, found list"),
         ("run {f}/half.yaml", "no YAML"),
         ("run paper-direct --set registry={f}/columns.csv", "columns.csv:1: 3 columns where 2 were expected"),
@@ -70,14 +70,14 @@ def files(folder: Path) -> dict[str, str]:
         ("run paper-direct --set source=bag:", "the path of the bag is missing; write bag:PATH"),
         ("run paper-direct --set source=radio", "source = 'radio': write sim or bag:PATH"),
         ("run paper-direct --set colour=red", "unknown key colour"),
-        ("run paper-direct --set ros_source.colour=red", "unknown key ros_source.colour; known are packet_len"),
+        ("run paper-direct --set colour=red", "unknown key colour; known are name, phy, "),
         ("run paper-direct --set packet_len=13", "packet_len = 13"),
-        ("run paper-direct --set ros_source.min_fragment=60", "min_fragment = 60 does not fit packet_len = 64"),
+        ("run paper-direct --set paper.min_fragment=60", "min_fragment = 60 does not fit packet_len = 64"),
         ("run paper-direct --set phy.name=smoke", "phy.name = 'smoke': no such phy; known are direct, "),
         ("run paper-direct --set phy.options.colour=red", "phy direct: unknown key colour"),
-        ("run paper-direct --set ros_source.topics=[scan]", "topic 'scan' is not in the registry; it has odom"),
-        ("run paper-direct --set ros_source.namespace=/robot", "has no digits; set robot_id to 0..254"),
-        ("run paper-direct --set ros_sink.domain_id=233", "ros_sink.domain_id = 233"),
+        ("run paper-direct --set topics=[scan]", "topic 'scan' is not in the registry; it has odom"),
+        ("run paper-direct --set robots.0.robot=/robot", "the name has no digits; write the robot's number"),
+        ("run paper-direct --set graph.domain_id=233", "graph.domain_id = 233"),
         ("run paper-direct --set hop", "write key=value"),
         (
             "run paper-direct --set channel.snr_db=20",
@@ -91,7 +91,7 @@ def files(folder: Path) -> dict[str, str]:
         ),
         ("run paper-direct --set channel.outages=[[5,3]]", "outages: [5, 3] ends before it begins"),
         ("run paper-direct --set channel.burst_loss=0.1", "channel.burst_loss = 0.1"),
-        ("run two-way --set back.ros_source.namespace=/robot_1", "source id 1 is that of ros_source"),
+        ("run two-way --set robots.1.robot=/robot_1", "two are robot 1; give each a number of its own"),
         ("run paper-direct --repetitions 0", "'--repetitions': 0 is not in the range x>=1"),
         ("run paper-direct --duration 0", "duration_s = 0: the simulator has no end"),
         ("packet demo", "No such command 'demo'; see gr-ros2 packet --help"),
@@ -128,9 +128,7 @@ def test_results_of_another_run_are_not_overwritten(tmp_path: Path, capfd: pytes
 
 def test_a_message_of_more_than_255_entries_is_counted_and_the_others_pass(tmp_path: Path) -> None:
     # A map of 100 x 100 cells needs 255 entries of 40 bytes; the odometry beside it does not notice.
-    too_small = scenario(
-        "paper-direct", "registry=table4", "ros_source.topics=[odom, map]", "packet_len=40", duration_s=1.5
-    )
+    too_small = scenario("paper-direct", "registry=table4", "topics=[odom, map]", "packet_len=40", duration_s=1.5)
     result = run_scenario(too_small, tmp_path).result
     check_books(result)
     books = {topic.topic: topic.ledger for topic in result.topics}

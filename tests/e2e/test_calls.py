@@ -111,15 +111,11 @@ class Robots:
             front_end: {{name: zmq, bind: "{own}", connect: ["{other}"]}}
             channel: {{packet_loss: 0.2, seed: {number}}}
             state: {self._folder}/state-{number}
-            localhost_only: true
             diagnostics: {{period_s: 0.2}}
-            ros_source:
-              namespace: /robot_{number}
-              topics: {"auto" if self._found else []}
-              domain_id: {self.domains[number - 1]}
-            ros_sink:
-              domain_id: {self.domains[number - 1]}
-              topic_options: {{add: {{deadline_s: {DEADLINE_S}}}}}
+            robot: /robot_{number}
+            topics: {"auto" if self._found or number == 2 else []}
+            graph: {{domain_id: {self.domains[number - 1]}, localhost_only: true}}
+            publish: {{topics: {{add: {{deadline_s: {DEADLINE_S}}}}}}}
             """
         )
         link = subprocess.Popen([*COMMAND, "link", str(path)], stdout=subprocess.DEVNULL, text=True)

@@ -62,8 +62,8 @@ def test_the_demo_reaches_an_independent_subscriber_by_radio_only(tmp_path: Path
     sending, receiving = free_domains()
     out = tmp_path / "out"
     # A busy computer falls behind the radio's clock: then it has room for what waits, and the time to catch up.
-    patient = ["drain_s=60", "ros_source.queue_depth=0", "ros_sink.hold_s=60"]
-    options = set_options([f"ros_source.domain_id={sending}", f"ros_sink.domain_id={receiving}", *patient])
+    patient = ["drain_s=60", "queue_depth=0", "hold_s=60"]
+    options = set_options([f"robots.0.graph.domain_id={sending}", f"robots.1.graph.domain_id={receiving}", *patient])
     with ExitStack() as stack:
         arrived = stack.enter_context(subscriber(receiving, "/rx_robot_1/odom", ODOM))
         not_sent_there = stack.enter_context(subscriber(sending, "/rx_robot_1/odom", ODOM))

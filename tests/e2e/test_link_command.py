@@ -35,8 +35,9 @@ def config(tmp_path: Path, domain: int) -> Path:
         f"""
         registry: topics.csv
         packet_len: 64
-        ros_source: {{namespace: /robot_1, domain_id: {domain}, queue_depth: 0}}
-        ros_sink: {{domain_id: {domain}}}
+        robot: /robot_1
+        graph: {{domain_id: {domain}}}
+        queue_depth: 0
         phy: {{name: psk, sample_rate: 1e6}}
         localhost_only: true
         """

@@ -85,8 +85,8 @@ class Robot:
             f"""
             registry: topics.csv
             packet_len: 64
-            ros_source: {{namespace: /robot_{number}, domain_id: {link_peer.DOMAIN}}}
-            ros_sink: {{domain_id: {link_peer.DOMAIN}}}
+            robot: /robot_{number}
+            graph: {{domain_id: {link_peer.DOMAIN}}}
             phy: {{name: psk, sample_rate: 1e6}}
             front_end: {{name: zmq, bind: "tcp://10.0.0.{number}:5555", connect: ["tcp://10.0.0.{self.other}:5555"]}}
             localhost_only: true

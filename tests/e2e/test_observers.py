@@ -33,7 +33,7 @@ from tests.e2e.support import COMMAND, check_complete
 from tests.radio.robots import ROOT, Robot, link_command
 from tests.waiting import wait_for
 
-MEMORY = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
+MEMORY = ("graph.middleware=memory",)
 FULL = "No space left on device"
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="mounts a disk or limits shared memory: run as root")
 
@@ -364,8 +364,8 @@ def test_a_link_whose_output_is_on_a_full_disk_goes_on(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(
         f"""
         registry: {ROOT / "tests/radio/topics.csv"}
-        ros_source: {{robot_id: 1, middleware: memory}}
-        ros_sink: {{middleware: memory}}
+        robot: 1
+        graph: {{middleware: memory}}
         phy: {{name: psk, sample_rate: 1e6}}
         """
     )

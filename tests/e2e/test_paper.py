@@ -25,7 +25,7 @@ def run_witnessed(name: str, out: Path, overrides: Sequence[str] = (), duration_
     """Run a scenario; what a witness on the sending graph heard of the robot's odometry."""
     sending, receiving = free_domains()
     heard: list[bytes] = []
-    settings = [f"ros_source.domain_id={sending}", f"ros_sink.domain_id={receiving}", *overrides]
+    settings = [f"robots.0.graph.domain_id={sending}", f"robots.1.graph.domain_id={receiving}", *overrides]
     with DdsMiddleware(domain_id=sending, node_name="witness", localhost_only=True) as graph:
         subscription = graph.subscribe("/robot_1/odom", ODOM_TYPE, RELIABLE, heard.append)
         outcome = run_scenario(load_scenario(name, settings, duration_s=duration_s), out)
@@ -39,10 +39,10 @@ def run_witnessed(name: str, out: Path, overrides: Sequence[str] = (), duration_
     ("name", "overrides"),
     [
         ("paper-direct", []),
-        ("paper-ofdm", ["phy.sample_rate=auto", "ros_source.packet_rate=auto", "drain_s=60"]),
+        ("paper-ofdm", ["phy.sample_rate=auto", "packet_rate=auto", "drain_s=60"]),
         (
             "paper-ofdm",
-            ["phy.sample_rate=2e6", "phy.options.payload_modulation=qpsk", "ros_source.packet_rate=auto", "drain_s=60"],
+            ["phy.sample_rate=2e6", "phy.options.payload_modulation=qpsk", "packet_rate=auto", "drain_s=60"],
         ),
     ],
 )

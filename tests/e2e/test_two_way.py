@@ -17,12 +17,12 @@ from tests.e2e.support import check_books, check_complete, delivered_bag, scenar
 @pytest.mark.real_time
 def test_both_directions_deliver_everything_and_are_told_apart(tmp_path: Path) -> None:
     clean = [
-        "ros_source.topic_options={}",
-        "back.channel.burst_loss=null",
+        "topics=auto",
+        "paths=[]",
         "phy.sample_rate=1e6",
-        "ros_source.topics=[odom, imu]",
+        "topics=[odom, imu]",
     ]
-    outcome = run_scenario(scenario("two-way", *clean, "back.ros_source.topics=[odom]", duration_s=2.0), tmp_path)
+    outcome = run_scenario(scenario("two-way", *clean, "robots.1.topics=[odom]", duration_s=2.0), tmp_path)
     result = outcome.result
     check_complete(result)
     names = {topic.topic: topic.src_id for topic in result.topics}
@@ -42,12 +42,12 @@ def test_both_directions_deliver_everything_and_are_told_apart(tmp_path: Path) -
 @pytest.mark.parametrize("version", [0, 1])
 def test_losses_of_one_direction_leave_the_other_alone(tmp_path: Path, version: int) -> None:
     lossy = [
-        f"version={version}",
-        "ros_source.topic_options={}",
+        *([] if version else ["paper={}"]),
+        "topics=auto",
         "phy.name=direct",
         "phy.options={}",
-        "ros_source.topics=[odom]",
-        "back.channel.packet_loss=0.3",
+        "topics=[odom]",
+        "paths=[{from: 2, to: 1, packet_loss: 0.3}]",
     ]
     result = run_scenario(scenario("two-way", *lossy, duration_s=2.0), tmp_path).result
     check_books(result)
@@ -61,7 +61,7 @@ def test_losses_of_one_direction_leave_the_other_alone(tmp_path: Path, version: 
 
 
 def test_a_sink_that_would_feed_the_source_beside_it_is_refused(tmp_path: Path) -> None:
-    loop = scenario("two-way", "back.ros_sink.namespace_format=/robot_1", duration_s=1.0)
+    loop = scenario("two-way", "robots.1.publish.as=/robot_1", duration_s=1.0)
     with pytest.raises(ConfigError, match=r"loop: the sink publishes /robot_1/scan"):
         run_scenario(loop, tmp_path)
 

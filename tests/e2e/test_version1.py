@@ -53,24 +53,22 @@ class Reports:
             self.heard += [event.packet.src_id for entry in event.packet.body if isinstance(entry, Report)]
 
 
+REPORTING = [{}, {"topics": []}]
+
+
 def lossy(**settings: Any) -> Scenario:
     """Odometry over a link that loses a fifth of its packets, and waits for a busy computer."""
-    sending, receiving = free_domains()
     return scenario_from(
         {
             "name": "lossy",
             "registry": find_registry("odom", Path()),
             "sim": {"odom_rate": 35, "robots": 2},
             "packet_len": 64,
-            "version": 1,
-            "ros_source": {
-                "namespace": "/robot_1",
-                "domain_id": sending,
-                "compression": True,
-                "subscriber_depth": 1000,
-                "queue_depth": 0,
-            },
-            "ros_sink": {"domain_id": receiving, "publisher_depth": 1000, "hold_s": 60},
+            "robots": REPORTING,
+            "graph": {"depth": 1000},
+            "publish": {"depth": 1000},
+            "queue_depth": 0,
+            "hold_s": 60,
             "phy": {"name": "ofdm", "sample_rate": 100000, "options": {"detection_threshold": "stock"}},
             "channel": {"packet_loss": 0.2},
             "duration_s": 2.0,
@@ -88,12 +86,12 @@ def run(scenario: Scenario, out: Path) -> tuple[Result, Reports]:
 
 
 def test_reports_cross_a_channel_of_their_own_and_losses_are_repaired(tmp_path: Path) -> None:
-    result, reports = run(lossy(reports={"delay_s": 0.03}), tmp_path)
+    result, reports = run(lossy(paths=[{"from": 2, "delay_s": 0.03}]), tmp_path)
     (odom,) = result.topics
     assert "lost_fragments" not in odom.ledger
     assert odom.ledger["repaired"] > 0
     assert len(delivered_bag(tmp_path, "/rx_robot_1/odom")) == odom.delivered
-    assert set(reports.sent) == set(reports.heard) == {RECEIVER}
+    assert set(reports.sent) == set(reports.heard) == {2}
     assert len(reports.heard) < len(reports.sent), "reports are lost too"
     assert result.packets["air_report"] > 0
     assert sum(result.packets[f"air_{kind}"] for kind in ("new", "repair", "report", "hello")) == result.packets["sent"]
@@ -102,7 +100,7 @@ def test_reports_cross_a_channel_of_their_own_and_losses_are_repaired(tmp_path: 
 
 
 def test_a_way_back_that_loses_everything_leaves_repair_to_the_idle_air(tmp_path: Path) -> None:
-    result, reports = run(lossy(reports={"channel": {"packet_loss": 1.0}}, drain_s=5.0), tmp_path)
+    result, reports = run(lossy(paths=[{"from": 2, "packet_loss": 1.0}], drain_s=5.0), tmp_path)
     (odom,) = result.topics
     assert odom.ledger["repaired"] > 0
     assert reports.sent
@@ -110,8 +108,7 @@ def test_a_way_back_that_loses_everything_leaves_repair_to_the_idle_air(tmp_path
 
 
 def test_both_robots_report_what_they_hear_with_their_own_messages(tmp_path: Path) -> None:
-    back = {"ros_source": {"namespace": "/robot_2"}, "channel": {"packet_loss": 0.1}}
-    result, reports = run(lossy(back=back), tmp_path)
+    result, reports = run(lossy(robots=2, paths=[{"from": 2, "packet_loss": 0.1}]), tmp_path)
     assert {topic.topic for topic in result.topics} == {"/robot_1/odom", "/robot_2/odom"}
     assert all(topic.ledger["repaired"] > 0 for topic in result.topics)
     assert set(reports.sent) == set(reports.heard) == {1, 2}
@@ -120,42 +117,42 @@ def test_both_robots_report_what_they_hear_with_their_own_messages(tmp_path: Pat
 
 
 def test_every_receiver_hears_and_reports_for_itself(tmp_path: Path) -> None:
-    settings = lossy(reports={}, receivers=[{}, {"packet_loss": 0.4}])
+    settings = lossy(robots=[{}, *[{"topics": []}] * 3], paths=[{"from": 1, "to": 4, "packet_loss": 0.4}])
     result, reports = run(settings, tmp_path)
     assert [receiver.number for receiver in result.receivers] == [2, 3]
     every = [result.topics[0], *(topic for receiver in result.receivers for topic in receiver.topics)]
     assert [topic.sent for topic in every] == [result.topics[0].sent] * 3
     assert all(sum(topic.ledger.values()) == topic.sent and not topic.corrupt for topic in every)
     assert all(topic.ledger["repaired"] > 0 and "lost_fragments" not in topic.ledger for topic in every)
-    assert set(reports.sent) == set(reports.heard) == {RECEIVER, RECEIVER - 1, RECEIVER - 2}
+    assert set(reports.sent) == set(reports.heard) == {2, 3, 4}
     assert len(delivered_bag(tmp_path, "/rx_robot_1/odom")) == every[0].delivered
     assert reports.run is not None
     assert [link.channel.seed for link in reports.run.links] == [0, 100_003, 100_004, 100_005]
 
 
-def test_further_receivers_publish_apart() -> None:
-    sending, receiving = free_domains()
-    graph = MemoryMiddleware(domain_id=receiving)
-    heard: list[str] = []
-    names = ["/rx_robot_1/odom", "/receiver_2/rx_robot_1/odom", "/receiver_3/rx_robot_1/odom"]
-    for name in names:
-        graph.subscribe(name, "nav_msgs/msg/Odometry", Qos(), lambda _payload, name=name: heard.append(name))
-    ends = {
-        "ros_source": {"namespace": "/robot_1", "domain_id": sending, "middleware": "memory", "compression": True},
-        "ros_sink": {"domain_id": receiving, "middleware": "memory"},
-    }
-    result = run_scenario(lossy(version=0, receivers=[{}, {}], drain_s=1.0, **ends)).result
+def test_receivers_of_the_paper_have_a_graph_each() -> None:
+    domains = free_domains(3)
+    graphs = [MemoryMiddleware(domain_id=domain) for domain in domains[1:]]
+    heard: list[list[bytes]] = [[], []]
+    for graph, payloads in zip(graphs, heard, strict=True):
+        graph.subscribe("/rx_robot_1/odom", "nav_msgs/msg/Odometry", Qos(), payloads.append)
+    robots = [
+        {"direction": way, "graph": {"domain_id": domain, "middleware": "memory", "depth": 1000}}
+        for way, domain in zip(("send", "receive", "receive"), domains, strict=True)
+    ]
+    result = run_scenario(lossy(paper={"compression": True}, robots=robots, drain_s=1.0, hold_s=1.0)).result
     topics = [result.topics[0], *(receiver.topics[0] for receiver in result.receivers)]
     assert all(topic.delivered > 0 for topic in topics)
-    wait_for(lambda: [heard.count(name) for name in names] == [topic.delivered for topic in topics], "every message")
-    graph.close()
+    wait_for(lambda: [len(got) for got in heard] == [topic.delivered for topic in topics], "every message")
+    for graph in graphs:
+        graph.close()
 
 
 def test_packets_take_as_much_air_as_they_need(tmp_path: Path) -> None:
     means = {}
     for lengths in ("any", "fixed"):
         phy = {"name": "psk", "sample_rate": 1e5, "options": {"lengths": lengths}}
-        result, _ = run(lossy(reports={}, phy=phy), tmp_path / lengths)
+        result, _ = run(lossy(phy=phy), tmp_path / lengths)
         assert result.topics[0].pdr == 1.0
         means[lengths] = result.phy["airtime_mean_s"] / result.phy["airtime_s"]
     assert means["fixed"] == pytest.approx(1.0)

@@ -29,7 +29,7 @@ def test_each_gets_the_grid_and_the_odometry_of_the_other(tmp_path: Path) -> Non
 
 def test_the_forecast_knows_its_airtime() -> None:
     pytest.importorskip("ieee802_11", reason="gr-ieee802-11 is not installed")
-    forecast = Planner(load_scenario("wifi-cars", ["ros_source.topics=[odom]"], duration_s=1.0)).forecast()
+    forecast = Planner(load_scenario("wifi-cars", ["topics=[odom]"], duration_s=1.0)).forecast()
     # 36 bytes around a packet, 48 bits a symbol of 8 us, 40 us of preamble and header, a gap of 40 us.
     assert forecast.airtime_s == pytest.approx((40 + 8 * -(-(22 + 8 * (760 + 36)) // 48) + 40.1) * 1e-6)
     assert all(topic.result.pdr == 1.0 for topic in forecast.topics)

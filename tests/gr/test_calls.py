@@ -6,6 +6,7 @@ import random
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,8 +19,8 @@ from gr_ros2.link import AirPacket
 from gr_ros2.link.events import ReceiverEvent
 from gr_ros2.mac import Slots
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.robot import RobotConfig
 from tests.domains import free_domains
 from tests.link.v1.air import SLOT_S
 from tests.link.v1.test_relaying import Line
@@ -40,22 +41,26 @@ class LinkedRobot:
     def __init__(self, src_id: int, line: Line, folder: Any, stack: ExitStack) -> None:
         self.src_id, self.events = src_id, list[ReceiverEvent]()
         (domain,) = free_domains(1)
-        self.graph, *both = (stack.enter_context(MemoryMiddleware(domain_id=domain)) for _ in range(3))
-        self._graphs = self.graph, *both
-        options = {"odom": TopicOptions(queue="latest")}
+        self._graphs = [stack.enter_context(MemoryMiddleware(domain_id=domain)) for _ in range(2)]
+        self.graph, own = self._graphs
+        registry = Path(folder, "topics.csv")
+        registry.write_text(f"odom,std_msgs/String\nadd,{ADD}\n")
+        config = RobotConfig(
+            robot=f"/robot_{src_id}",
+            registry=str(registry),
+            packet_len=96,
+            topics={"auto": SendOptions(), "odom": SendOptions(queue="latest")},
+            state=f"{folder}/{src_id}",
+        )
         self.link = RosLink(
-            Registry.from_rows({"odom": "std_msgs/String", "add": ADD}),
-            SourceConfig(
-                namespace=f"/robot_{src_id}", packet_len=96, topic_options=options, state=f"{folder}/{src_id}"
-            ),
-            SinkConfig(robot_id=src_id, packet_len=96),
+            config,
             setup=EndpointSetup(
                 reports=True,
                 half_duplex=True,
                 relay=True,
                 access=lambda robot: Slots(robot, SLOT_S, random.Random(robot), period_s=0.1),
             ),
-            middleware=(both[0], both[1]),
+            middleware=own,
             clock=lambda: line.now,
             seed=src_id,
         )

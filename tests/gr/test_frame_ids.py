@@ -36,7 +36,7 @@ from tests.gr.probe import Hears
 from tests.waiting import wait_for
 
 STORE = typestore()
-PREFIX = "robot_{src_id}/"
+PREFIX = "robot_{robot}/"
 FRAMES = st.one_of(st.just(""), st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12))
 ORDERS = st.booleans()
 FRAMED = [
@@ -229,8 +229,8 @@ def test_settings() -> None:
     assert build(SinkConfig, {"frame_prefix": PREFIX, "merge_tf": "/tf"}).merged_topics == ("/tf", "/tf_static")
     with pytest.raises(ConfigError, match="set frame_prefix"):
         build(SinkConfig, {"merge_tf": "/tf"})
-    with pytest.raises(ConfigError, match=r"frame_prefix = '\{robot\}': only"):
-        build(SinkConfig, {"frame_prefix": "{robot}"})
+    with pytest.raises(ConfigError, match=r"frame_prefix = '\{who\}': only"):
+        build(SinkConfig, {"frame_prefix": "{who}"})
 
 
 def test_one_broadcaster_is_left_as_it_is() -> None:

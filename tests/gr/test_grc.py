@@ -26,7 +26,7 @@ from gnuradio.grc.core.platform import Platform
 from gnuradio.grc.core.schema_checker import BLOCK_SCHEME, Validator
 
 from gr_ros2.core.errors import ConfigError, RadioError
-from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.gr.ros_link import make_link
 from gr_ros2.grc.path import example, grc_path
 from gr_ros2.middleware import MIDDLEWARE, Qos
@@ -34,6 +34,8 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.radio import Radio, make_radio
 from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.settings.fields import settings_of
+from gr_ros2.settings.robot import GraphConfig, PublishConfig, RobotConfig
 from tests.gr.probe import Probe
 from tests.once import once
 from tests.waiting import wait_for
@@ -107,11 +109,12 @@ def test_every_parameter_is_handed_over_and_every_callback_exists(name: str) -> 
         assert hasattr(BLOCKS[name][0], callback.split("(")[0])
 
 
-def test_ros_link_has_the_settings_of_both_halves_and_hands_them_over() -> None:
+def test_ros_link_has_the_settings_of_a_robot_and_hands_them_over() -> None:
     loaded = description("ros2_link")
-    halves = {"source": (RosSource, SourceConfig), "sink": (RosSink, SinkConfig)}
+    parts = {"graph": GraphConfig, "publish": PublishConfig}
+    wanted = {setting.name for setting in settings_of(RobotConfig)} - set(parts)
+    wanted |= {f"{part}_{setting.name}" for part, cls in parts.items() for setting in settings_of(cls)}
     offered = [parameter["id"] for parameter in loaded["parameters"]]
-    wanted = {item.name for _, config in halves.values() for item in fields(config)}
     assert len(offered) == len(set(offered))
     assert set(offered) == wanted | {
         "half_duplex",
@@ -122,30 +125,48 @@ def test_ros_link_has_the_settings_of_both_halves_and_hands_them_over() -> None:
         "slot_guard_s",
     }
     values = {parameter["id"]: parameter["default"] for parameter in loaded["parameters"]}
-    assert (values["version"], values["compression"], values["repair"]) == ("1", '"auto"', '"auto"')
+    assert (values["robot"], values["topics"], values["repair"]) == ('"/robot_1"', '("auto",)', '"auto"')
     for name in offered:
         assert f"{name}=${{{name}}}" in loaded["templates"]["make"]
     assert len(loaded["templates"]["callbacks"]) > 5
+    classes = {"": RosLink, "source": RosSource, "sink": RosSink}
     for callback in loaded["templates"]["callbacks"]:
-        half, _, setter = callback.split("(")[0].partition(".")
-        assert hasattr(halves[half][0], setter)
+        half, _, setter = callback.split("(")[0].rpartition(".")
+        assert hasattr(classes[half], setter)
 
 
 def test_ros_link_is_made_of_its_settings_and_refuses_others() -> None:
-    settings = {"middleware": "memory", "namespace": "/robot_3", "version": 1, "hold_s": 0.5, "repair": "idle"}
+    settings = {"graph_middleware": "memory", "robot": "/robot_3", "hold_s": 0.5, "repair": "idle"}
     link = make_link(registry=str(example("topics.csv")), half_duplex=True, any_length=True, **settings)
     try:
         assert (link.source.src_id, link.source.config.repair, link.sink.config.hold_s) == (3, "idle", 0.5)
         assert link.sink.config.robot_id == 3
-        assert link.source.config.version == link.sink.config.version == 1
         assert link.end.endpoint.settings.half_duplex
         assert not link.end.endpoint.settings.fixed
+        assert link.source.middleware is link.sink.middleware
     finally:
         link.close()
-    with pytest.raises(ConfigError, match="unknown key hold; known are backpressure, "):
+    with pytest.raises(ConfigError, match="unknown key hold; known are robot, "):
         make_link(**settings, hold=1)
+    with pytest.raises(ConfigError, match=r"unknown key publish\.hold; known are as, "):
+        make_link(**settings, publish_hold=1)
     with pytest.raises(ConfigError, match=r"hold_s = -1"):
         make_link(**{**settings, "hold_s": -1})
+
+
+def test_options_of_topics_change_while_a_ros_link_runs() -> None:
+    settings = {"graph_middleware": "memory", "robot": "/robot_3", "registry": str(example("topics.csv"))}
+    link = make_link(**settings, topics={"auto": None})
+    try:
+        (name,) = {
+            topic.name for topic in link.source.subscriptions.registry if topic.is_topic and "odom" in topic.name
+        }
+        link.set_topics({"auto": None, name: {"max_rate": 5}})
+        assert link.source.config.topic_options[name].max_rate == 5
+        with pytest.raises(ConfigError, match="codec cannot change while running"):
+            link.set_topics({"auto": None, name: {"codec": "zstd"}})
+    finally:
+        link.close()
 
 
 def test_the_paper_has_an_example_with_version_0_and_radios_have_ros_link() -> None:

@@ -47,7 +47,7 @@ class Link:
             "",
             middleware=graphs[1],
             version=1,
-            frame_prefix="robot_{src_id}/",
+            frame_prefix="robot_{robot}/",
             observer=Hears(self.told.append),
         )
         top = gr.top_block()

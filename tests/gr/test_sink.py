@@ -102,7 +102,7 @@ def test_messages_come_out_unaltered_and_in_order(rig: Rig) -> None:
 
 
 def test_each_sender_has_its_topics(rig: Rig) -> None:
-    sink = rig.make(namespace_format="/from_{src_id}/x")
+    sink = rig.make(namespace_format="/from_{robot}/x")
     rig.start("/from_7/x/cmd_vel", "geometry_msgs/Twist")
     for data in packets((2, b"\0\1\0\0" + bytes(48)), src_id=7) + packets((0, stamped(1)), src_id=8):
         rig.probe.post(data)
@@ -244,8 +244,8 @@ def test_what_was_not_published_is_not_delivered_whatever_the_reason(rig: Rig, e
 @pytest.mark.parametrize(
     ("settings", "key"),
     [
-        ({"namespace_format": "/rx-{src_id}"}, "namespace_format = '/rx-{src_id}'"),
-        ({"namespace_format": "/{src_id.__class__}"}, "namespace_format = '/{src_id.__class__}'"),
+        ({"namespace_format": "/rx-{robot}"}, "namespace_format = '/rx-{robot}'"),
+        ({"namespace_format": "/{robot.__class__}"}, "namespace_format = '/{robot.__class__}'"),
         ({"topic_options": {"odom": {"publish_as": "/robot-1/odom"}}}, "topic_options.odom.publish_as"),
         (
             {"topic_options": {"odom": {"publish_as": "/x"}, "map": {"publish_as": "/x"}}},
@@ -280,7 +280,7 @@ def test_what_fails_after_publication_takes_no_delivery_back(rig: Rig) -> None:
             version=0,
             middleware=middleware,
             packet_len=PACKET_LEN,
-            frame_prefix="r{src_id}/",
+            frame_prefix="r{robot}/",
             merge_tf="/tf",
             observer=Hears(events.append),
         )

@@ -268,7 +268,7 @@ def test_a_latched_topic_of_several_publishers_is_named_once_with_the_remedy(
     if warned:
         wait_for(said, "the warning")
     assert len(said()) == warned
-    assert all(line.startswith("topic odom: ") and "topic_options.odom.depth" in line for line in said())
+    assert all(line.startswith("topic odom: ") and "topics.odom.depth" in line for line in said())
 
 
 def test_a_port_that_nobody_reads_is_said_and_counted(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
@@ -369,10 +369,10 @@ def test_a_registry_is_needed() -> None:
 def test_a_loop_is_refused_whichever_comes_first(rig: Rig) -> None:
     rig.make()
     with pytest.raises(ConfigError, match="loop"):
-        RosSink(REGISTRY, version=0, middleware="memory", domain_id=DOMAIN, namespace_format="/robot_{src_id}")
-    RosSink(REGISTRY, version=0, middleware="memory", domain_id=DOMAIN + 1, namespace_format="/robot_{src_id}").close()
+        RosSink(REGISTRY, version=0, middleware="memory", domain_id=DOMAIN, namespace_format="/robot_{robot}")
+    RosSink(REGISTRY, version=0, middleware="memory", domain_id=DOMAIN + 1, namespace_format="/robot_{robot}").close()
     rig.source.close()
-    sink = RosSink(REGISTRY, version=0, middleware="memory", domain_id=DOMAIN, namespace_format="/robot_{src_id}")
+    sink = RosSink(REGISTRY, version=0, middleware="memory", domain_id=DOMAIN, namespace_format="/robot_{robot}")
     with pytest.raises(ConfigError, match="loop"):
         rig.make()
     sink.close()

@@ -41,7 +41,7 @@ class RecordingObserver:
 
 def test_an_onlooker_hears_what_the_result_counts() -> None:
     observer = RecordingObserver()
-    ends = ["ros_source.middleware=memory", "ros_sink.middleware=memory"]
+    ends = ["graph.middleware=memory"]
     result = run_scenario(load_scenario("paper-direct", ends, duration_s=1.0), observers=[observer]).result
     assert observer.result is result
     (topic,) = result.topics
@@ -86,7 +86,7 @@ def test_who_comes_late_is_told_of_the_run_and_hears_from_then_on() -> None:
         def sender_event(self, src_id: int, event: SenderEvent) -> None:
             """Not counted."""
 
-    ends = ["ros_source.middleware=memory", "ros_sink.middleware=memory"]
+    ends = ["graph.middleware=memory"]
     for observer in (Invites(), early):
         audience.invite(observer)
     result = run_scenario(load_scenario("paper-direct", ends, duration_s=1.0), observers=[audience]).result

@@ -50,8 +50,9 @@ class Robots:
             "front_end": {"name": "zmq", "bind": own, "connect": [other]},
             "channel": {"seed": number, **self._channel},
             "state": str(self._folder / f"state-{number}"),
-            "ros_source": {"namespace": f"/robot_{number}", "topics": self._topics, **graph},
-            "ros_sink": graph,
+            "robot": f"/robot_{number}",
+            "topics": self._topics or ["auto"] * bool(values.get("registry", number == 2 and self._registry)),
+            "graph": graph,
         }
         link = self.links[number] = RobotLink(link_from({**settings, **values}))
         link.start()

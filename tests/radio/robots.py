@@ -29,7 +29,7 @@ def config(number: int, front_end: dict[str, Any], **values: Any) -> LinkConfig:
         "robot": f"/robot_{number}",
         "registry": str(TOPICS),
         "packet_len": 64,
-        "phy": {"name": "psk", "sample_rate": RATE},
+        "phy": {"name": "psk", "sample_rate": RATE, "options": {"lengths": "fixed"}},
         "front_end": front_end,
         "transmit": values.pop("transmit", True),
         "open": "key" not in values,

@@ -76,8 +76,9 @@ def test_a_server_that_ends_and_comes_back_is_waited_for(
     server: SoundServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     at(monkeypatch, "a", "a")
+    monkeypatch.setattr(AudioFrontEnd, "loops_back", True)
     front_end = {**SOUND}
-    with Robot(1, front_end, hears=(1,), ros_sink={"robot_id": 254}, phy=PHY) as alone:
+    with Robot(1, front_end, hears=(1,), repair="off", phy=PHY) as alone:
         alone.say(1)
         wait_for(lambda: serve(alone) and alone.heard)
         server.stop()
@@ -97,7 +98,8 @@ def test_silence_of_zeros_is_named_once_and_so_is_its_end(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     at(monkeypatch, "a", "a")
-    with Robot(1, dict(SOUND), hears=(1,), ros_sink={"robot_id": 254}, phy=PHY) as alone:
+    monkeypatch.setattr(AudioFrontEnd, "loops_back", True)
+    with Robot(1, dict(SOUND), hears=(1,), repair="off", phy=PHY) as alone:
         with caplog.at_level(logging.WARNING):
             wait_for(lambda: serve(alone) and "digital silence" in caplog.text)
             alone.say(1)
@@ -110,8 +112,9 @@ def test_silence_of_zeros_is_named_once_and_so_is_its_end(
 def test_a_transmitter_is_keyed_while_a_packet_sounds(monkeypatch: pytest.MonkeyPatch) -> None:
     rigctld = Rigctld()
     at(monkeypatch, "a", "a")
+    monkeypatch.setattr(AudioFrontEnd, "loops_back", True)
     front_end = {**SOUND, "ptt": "rigctld", "ptt_device": rigctld.where}
-    with Robot(1, front_end, hears=(1,), ros_sink={"robot_id": 254}, phy=PHY) as alone:
+    with Robot(1, front_end, hears=(1,), repair="off", phy=PHY) as alone:
         alone.say(1)
         wait_for(lambda: serve(alone) and alone.heard)
         wait_for(lambda: alone.silent and len(rigctld.told) >= 2 and rigctld.told[-1][1] == b"T 0\n")

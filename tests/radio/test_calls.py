@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,8 +16,8 @@ from gr_ros2.gr import RosLink, RosSink, RosSource
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.registry import MAX_TOPICS, Registry
+from gr_ros2.settings.robot import RobotConfig
 from tests.domains import free_domains
 from tests.middleware.calling import ADD, Adder, Caller
 from tests.radio.calling_robots import Robots
@@ -98,7 +97,7 @@ def test_calls_that_the_server_leaves_open_end_by_name(robots: Robots) -> None:
     assert not caller.got
     robots.links[1].stop()
     # Long enough for the request to arrive on a busy machine.
-    robots.start(1, ros_sink={**_memory(robots, 1), "topic_options": {"add": {"deadline_s": 5.0}}})
+    robots.start(1, publish={"topics": {"add": {"deadline_s": 5.0}}})
     robots.graphs[1].serve(FAR, ADD, lambda _, payload: taken.append(payload))
     wait_for(lambda: caller.there, "the service to appear again")
     caller.call(2)
@@ -125,21 +124,16 @@ def test_the_parameters_of_a_node_are_set_across_the_link(tmp_path: Path) -> Non
         assert answers == [(3, asked + b" and its reply")]
 
 
-def _memory(robots: Robots, number: int) -> dict[str, Any]:
-    return {"middleware": "memory", "domain_id": robots.graphs[number - 1].domain_id}
-
-
 def test_a_service_needs_both_directions_and_version_1() -> None:
     rows = Registry.from_rows({"add": ADD})
     with pytest.raises(ConfigError, match="add is a service, which needs both directions of a link and version 1"):
         RosSource(rows, robot_id=1, middleware=MemoryMiddleware(domain_id=1), version=1)
     with pytest.raises(ConfigError, match="add is a service"):
         RosSink(rows, middleware=MemoryMiddleware(domain_id=1))
-    zero = {"registry": "", "phy": {"name": "psk", "sample_rate": 1e6}, "front_end": {"name": "sim"}, "version": 1}
-    looped = link_from(
-        {**zero, "ros_source": {"robot_id": 1, "middleware": "memory"}, "ros_sink": {"middleware": "memory"}}
+    psk = {"name": "psk", "sample_rate": 1e6}
+    link = RobotLink(
+        link_from({"robot": 1, "graph": {"middleware": "memory"}, "phy": psk, "front_end": {"name": "sim"}})
     )
-    link = RobotLink(looped)
     assert link.stats()["calls"] == {}
     link.stop()
 
@@ -149,12 +143,12 @@ def test_a_service_needs_both_directions_and_version_1() -> None:
 def test_a_service_that_cannot_be_offered_is_counted_and_the_others_are_offered(tmp_path: Path) -> None:
     robots = Robots(tmp_path, f"topic,type,publish_as\nadd,{ADD}")
     with robots.stack:
-        near = {**_memory(robots, 1), "topic_options": {"other": {"publish_as": "/robot_1/own"}}}
+        near = {"topics": {"other": {"as": "/robot_1/own"}}}
         (tmp_path / "own.csv").write_text(f"own,{ADD}\n")
         (tmp_path / "services.csv").write_text(f"add,{ADD}\nother,{ADD}\n")
         for number in (1, 2):
             robots.links[number].stop()
-        robots.start(1, registry=str(tmp_path / "own.csv"), ros_sink=near)
+        robots.start(1, registry=str(tmp_path / "own.csv"), publish=near)
         robots.start(2)
         for name in (FAR, "/robot_2/other"):
             Adder(robots.graphs[1], name)
@@ -163,14 +157,15 @@ def test_a_service_that_cannot_be_offered_is_counted_and_the_others_are_offered(
         wait_for(lambda: robots.links[1].stats()["calls"]["reached"] == [NEAR], "the other service")
 
 
-def test_a_full_registry_has_no_room_for_calls() -> None:
+def test_a_full_registry_has_no_room_for_calls(tmp_path: Path) -> None:
+    def robot(rows: dict[str, str]) -> RobotConfig:
+        (tmp_path / "rows.csv").write_text("".join(f"{name},{kind}\n" for name, kind in rows.items()))
+        return RobotConfig(robot=1, registry=str(tmp_path / "rows.csv"))
+
     full = {f"topic_{number}": "std_msgs/String" for number in range(MAX_TOPICS)}
-    one, two = SourceConfig(robot_id=1, version=1), SinkConfig(version=1)
     with MemoryMiddleware(domain_id=free_domains(1)[0]) as graph:
-        link = RosLink(Registry.from_rows(full), one, two, middleware=(graph, graph))
+        link = RosLink(robot(full), middleware=graph)
         assert link.calls is None
         link.close()
         with pytest.raises(RegistryError, match="241 topics"):
-            RosLink(
-                Registry.from_rows({**dict(list(full.items())[1:]), "add": ADD}), one, two, middleware=(graph, graph)
-            )
+            RosLink(robot({**dict(list(full.items())[1:]), "add": ADD}), middleware=graph)

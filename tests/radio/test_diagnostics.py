@@ -38,8 +38,8 @@ def test_a_running_link_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyP
             "phy": {"name": "psk", "sample_rate": 1e6},
             "front_end": {"name": "sim"},
             "channel": {"snr_db": 20.0},
-            "ros_source": {"namespace": "/robot_1", "domain_id": number},
-            "ros_sink": {"domain_id": number},
+            "robot": "/robot_1",
+            "graph": {"domain_id": number},
             "diagnostics": {"period_s": 0.1, "latency_warn_s": 1.0},
         }
     )
@@ -90,8 +90,8 @@ def test_no_period_no_diagnostics(tmp_path: Path) -> None:
         {
             "registry": str(registry),
             "phy": {"name": "direct"},
-            "ros_source": {"robot_id": 1, **graph},
-            "ros_sink": graph,
+            "robot": 1,
+            "graph": {**graph, "namespace": ""},
             "diagnostics": {"period_s": 0},
         }
     )

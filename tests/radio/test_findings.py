@@ -31,8 +31,6 @@ def pair(folder: Path, wrong: dict[str, Any], **values: Any) -> tuple[Robot, Rob
     def robot(number: int, **own: Any) -> Robot:
         front_end = {"name": "zmq", "bind": addresses[number - 1], "connect": [addresses[2 - number]]}
         own = {"state": str(folder / f"state-{number}"), **values, **own}
-        if not own["version"]:
-            del own["state"]
         return Robot(number, front_end, hears=(3 - number,), **own)
 
     return robot(1), robot(2, **wrong)
@@ -87,8 +85,6 @@ def test_files_are_compared_without_hearing_the_other_end(tmp_path: Path) -> Non
     found = " ".join(compared(here, wrong))
     for said in ("packet_len is 80 there", "phy has other settings", "key ", "both are robot 1"):
         assert said in found
-    (line,) = compared(here, config(2, swapped, version=0))
-    assert line.startswith("version is 0 there and 1 here")
 
 
 @pytest.mark.parametrize(
@@ -98,9 +94,8 @@ def test_files_are_compared_without_hearing_the_other_end(tmp_path: Path) -> Non
         (lambda _: {"phy": {"name": "gfsk", "sample_rate": 2e6}}, "another phy"),
         (lambda _: {"phy": {"name": "psk", "sample_rate": 1e6}}, "another sample rate"),
         (lambda _: {"phy": {"name": "psk", "sample_rate": 2e6, "options": {"modulation": "bpsk"}}}, "another phy"),
-        (lambda _: {"version": 0}, "another version"),
     ],
-    ids=["key", "phy", "rate", "options", "version"],
+    ids=["key", "phy", "rate", "options"],
 )
 def test_ends_that_do_not_match_hear_something(wrong: Wrong, said: str, tmp_path: Path) -> None:
     other = wrong(tmp_path)
@@ -108,8 +103,6 @@ def test_ends_that_do_not_match_hear_something(wrong: Wrong, said: str, tmp_path
     with one, two:
 
         def found() -> bool:
-            if "version" in other:  # which has no hellos
-                two.publish(bytes(304))
             return any(said in line for line in heard_nobody(one.link.stats()))
 
         wait_for(found, f"{said!r}")

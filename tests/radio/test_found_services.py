@@ -111,9 +111,8 @@ def test_a_service_that_came_by_radio_is_not_offered_again(tmp_path: Path) -> No
 def test_services_can_be_left_to_the_robot(tmp_path: Path) -> None:
     robots = Robots(tmp_path, "")
     with robots.stack:
-        graph = {"middleware": "memory", "domain_id": robots.graphs[1].domain_id, "namespace": "/robot_2"}
         robots.links[2].stop()
-        robots.start(2, ros_source={"topics": "auto", "services": False, **graph})
+        robots.start(2, services=False)
         Adder(robots.graphs[1], FAR)
         robots.graphs[1].advertise("/robot_2/later", STRING, Qos())
         source = robots.links[2].source

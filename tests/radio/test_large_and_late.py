@@ -51,7 +51,7 @@ def test_a_map_crosses_once_and_a_robot_that_joins_late_gets_it_by_asking(tmp_pa
             "phy": {"name": "psk", "sample_rate": 2e5},
             "state": str(tmp_path / f"state-{number}"),
             "registry": "",
-            "ros_source": {"topics": "auto", "repeat_s": 0.2 if number == 1 else 0.0},
+            "repeat_s": 0.2 if number == 1 else 0.0,
         }
         front_end = {"name": "zmq", "bind": addresses[number], "connect": [addresses[other] for other in others]}
         return Robot(number, front_end, **{**own, **values})
@@ -94,7 +94,7 @@ def test_a_message_of_almost_16_MB_crosses_and_memory_stays_bounded(tmp_path: Pa
     host = f"127.{20 + (os.getpid() >> 16) % 200}.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
     ends = [{"name": "udp", "listen": f"{host}:{4001 + n}", "send_to": [f"{host}:{4002 - n}"]} for n in (0, 1)]
     values: dict[str, Any] = {
-        **{"packet_len": 4095, "registry": "", "ros_source": {"topics": "auto"}},
+        **{"packet_len": 4095, "registry": ""},
         "phy": {"name": "modem", "options": {"bit_rate": 2e7}},
     }
     sent = message(1, 4) + random.Random(1).randbytes(MAX_MESSAGE - 1004)

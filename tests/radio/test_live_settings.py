@@ -16,14 +16,14 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.live_settings import LiveSettings
-from gr_ros2.settings.config import SinkConfig, SourceConfig
 from gr_ros2.settings.fields import settings_of
+from gr_ros2.settings.robot import RobotConfig
 from tests.domains import free_domains
 from tests.gr.test_found_topics import text
 from tests.middleware.support import STRING
 from tests.waiting import wait_for
 
-TO = "ros_source.topic_options.goal.to"
+TO = "topics.goal.to"
 
 
 @pytest.mark.parametrize("found", [False, True], ids=["registry", "found on the graph"])
@@ -62,10 +62,10 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
         with pytest.raises(ConfigError, match="to = 256"):
             live.change(TO, 256)
         with pytest.raises(
-            ConfigError, match=r"^packet_len cannot change while the link runs; these can: ros_source\.\w+"
+            ConfigError, match=r"^packet_len cannot change while the link runs; these can: packet_rate, \w+"
         ):
             live.change("packet_len", 100)
-        live.change("ros_source.topic_options./goal.weight", 2.0)
+        live.change("topics./goal.weight", 2.0)
         (counted,) = source.stats()["topics"].values()
         assert (counted["submitted"], counted["types"], counted["sent"]) == (5, 1, 5)
         assert [sink.stats()["topics"]["/rx_robot_1/goal"]["delivered"] for sink in sinks] == [3, 3]
@@ -80,32 +80,29 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
             end.close()
 
 
-@pytest.mark.parametrize("version", [0, 1])
-def test_what_can_change_is_what_the_version_says(tmp_path: Path, version: int) -> None:
+def test_what_can_change_is_what_the_blocks_say(tmp_path: Path) -> None:
     (tmp_path / "topics.csv").write_text(f"goal,{STRING}\n")
-    common: dict[str, Any] = {"version": version, "middleware": "memory", "registry": str(tmp_path / "topics.csv")}
+    common: dict[str, Any] = {"version": 1, "middleware": "memory", "registry": str(tmp_path / "topics.csv")}
     common["domain_id"] = free_domains(1)[0]
     source, sink = RosSource(robot_id=1, **common), RosSink(robot_id=2, **common)
     try:
         live = LiveSettings(source, sink)
-        ours = {"packet_rate", "repeat_s", "queue_depth", "debug"} | ({"topic_options"} if version else {"dst_id"})
-        assert {
-            setting.name for setting in settings_of(SourceConfig) if live.can_change(f"ros_source.{setting.name}")
-        } == ours
-        assert [setting.name for setting in settings_of(SinkConfig) if live.can_change(f"ros_sink.{setting.name}")] == [
-            "debug"
-        ]
-        assert live.can_change(TO) == (version == 1)
+        ours = {"packet_rate", "repeat_s", "queue_depth", "debug"}
+        assert {setting.name for setting in settings_of(RobotConfig) if live.can_change(setting.name)} == ours
+        assert live.can_change(TO)
+        assert not live.can_change("topics.goal.codec")
         with pytest.raises(ConfigError) as error:
             live.change("packet_len", 100)
         said = str(error.value).partition("these can: ")[2]
-        assert {name for name in ours if f"ros_source.{name}" in said} == ours
-        assert ("dst_id" in said, "TOPIC.to" in said) == (version == 0, version == 1)
-        assert live.change("ros_source.queue_depth", 7) == "ros_source.queue_depth = 7"
-        assert live.change("ros_source.queue_depth", "7\n") == "ros_source.queue_depth = 7"
+        assert {name for name in ours if name in said} == ours
+        assert "topics.TOPIC.to|qos" in said
+        assert live.change("queue_depth", 7) == "queue_depth = 7"
+        assert live.change("queue_depth", "7\n") == "queue_depth = 7"
         assert source.config.queue_depth == 7
+        live.change("debug", True)
+        assert source.config.debug and sink.config.debug
         with pytest.raises(ConfigError, match="queue_depth = -1"):
-            live.change("ros_source.queue_depth", -1)
+            live.change("queue_depth", -1)
     finally:
         source.close()
         sink.close()

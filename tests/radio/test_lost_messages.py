@@ -62,7 +62,7 @@ def test_a_bag_of_a_link_says_what_is_missing_in_it(tmp_path: Path, storage: Sto
         for own, other in (ports, reversed(ports))
     ]
     # A computer that is too slow drops messages of a stream before they leave, which the other end cannot know of.
-    sends = {"repair": "off", "topic_options": {"chat": {"queue": "fifo"}}}
+    sends = {"repair": "off", "topics": {"chat": {"queue": "fifo"}}}
     common = {"phy": {"name": "modem", "options": {"bit_rate": 1e6}}, "diagnostics": {"period_s": 0.1}}
     recorded: dict[str, list[bytes]] = {CHAT: [], EVENTS: []}
 
@@ -70,7 +70,7 @@ def test_a_bag_of_a_link_says_what_is_missing_in_it(tmp_path: Path, storage: Sto
         return sum(told(event, "/gr_ros2_link_2").get(CHAT, (0, 0))[0] for event in recorded[EVENTS])
 
     with (
-        Robot(1, ends[0], state=str(tmp_path / "1"), ros_source=sends, **common) as one,
+        Robot(1, ends[0], state=str(tmp_path / "1"), **sends, **common) as one,
         Robot(2, ends[1], state=str(tmp_path / "2"), channel={"packet_loss": 0.05}, **common) as two,
         MemoryMiddleware(domain_id=domain(2)) as recorder,
     ):

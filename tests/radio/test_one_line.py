@@ -38,13 +38,13 @@ def test_the_yaml_it_prints_says_the_same(radio: str, tmp_path: Path) -> None:
         one_line(7, radio, None, GIVEN[radio]), Path(), ["front_end.write=sent"] if radio == "file" else []
     )
     settings = link_from(values)
-    assert (settings.name, settings.ros_source.src_id(), settings.ros_source.namespace) == ("robot_7", 7, "/robot_7")
+    assert (settings.name, settings.robot_id, settings.namespace) == ("robot_7", 7, "/robot_7")
     row = FRONT_ENDS[radio]
     assert (settings.phy.name, settings.phy.options) == (row.phy, row.phy_options)
     assert settings.phy.sample_rate == (row.sample_rate if PHY.load(row.phy).has_samples else AUTO)
     FRONT_ENDS.load(radio).Options(**settings.front_end_options)
     path = tmp_path / "saved.yaml"
-    path.write_text(yaml_text({**values, "registry": portable_registry(values["registry"])}))
+    path.write_text(yaml_text(values))
     assert load_link(path) == settings
 
 
@@ -66,21 +66,17 @@ def test_a_registry_of_ones_own_is_found_from_anywhere(tmp_path: Path, monkeypat
 
 def test_a_number_and_a_radio_are_enough() -> None:
     settings = link_from(settled(one_line(1, "sim", None, {}), Path()))
-    assert (settings.version, settings.registry, settings.ros_source.topics) == (1, "", ("auto",))
-    assert settings.ros_source.compresses
-    assert not link_from(settled(one_line(1, "sim", "table4", {}), Path())).ros_source.topics
-    with pytest.raises(ConfigError, match="registry is missing, and version 0 needs the same one at every robot"):
-        link_from(settled(one_line(1, "sim", None, {}), Path(), ["version=0"]))
+    assert (settings.registry, list(settings.topics), settings.compression) == ("", ["auto"], True)
 
 
 def test_topics_of_the_graph_need_no_registry(tmp_path: Path) -> None:
     values = settled(one_line(1, "sim", None, {}, "auto, -camera/*"), Path())
     settings = link_from(values)
-    assert (settings.registry, settings.ros_source.topics) == ("", ("auto", "-camera/*"))
+    assert (settings.registry, list(settings.topics)) == ("", ["auto", "-camera/*"])
     path = tmp_path / "saved.yaml"
-    path.write_text(yaml_text({**values, "registry": portable_registry(values["registry"])}))
+    path.write_text(yaml_text(values))
     assert load_link(path) == settings
-    assert load_link(path, ["ros_source.topics=auto, -camera/*"]) == settings
+    assert load_link(path, ["topics=auto, -camera/*"]) == settings
     assert portable_registry(settled(one_line(1, "sim", "table4", {}, "odom"), Path())["registry"]) == "table4"
 
 

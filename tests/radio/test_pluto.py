@@ -29,10 +29,12 @@ MESSAGES = 10
 TALK = """
 import json, sys
 from tests.waiting import wait_for
+from gr_ros2.radio.pluto import PlutoFrontEnd
 from tests.radio.robots import Robot
 
+PlutoFrontEnd.loops_back = True
 front_end, phy = map(json.loads, sys.argv[1:])
-with Robot(1, front_end, hears=(1,), ros_sink={"robot_id": 254}, phy=phy) as robot:
+with Robot(1, front_end, hears=(1,), repair="off", phy=phy) as robot:
     said = robot.say(*range(10))
     wait_for(lambda: robot.silent and len(robot.heard) >= len(said), "every message")
     print(json.dumps({"heard": robot.heard == said, "out": robot.link.stats()["packets"]["out"],

@@ -10,12 +10,10 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
-from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SenderEvent
 from gr_ros2.link.events import ReceiverEvent, SentPacket
-from gr_ros2.radio.robot_link import RobotLink
 from tests.radio.robot_process import RobotProcess
-from tests.radio.robots import RATE, Robot, config
+from tests.radio.robots import RATE, Robot
 from tests.waiting import wait_for
 
 ADAPTIVE = {"phy": {"name": "ofdm", "sample_rate": RATE, "options": {"rate": "adaptive"}}}
@@ -88,11 +86,6 @@ def test_the_rate_rises_when_a_robot_in_another_process_reports(ends: list[dict[
         finally:
             other.kill()
     assert rates.sent[0] == 0
-
-
-def test_version_0_has_no_reports_and_is_refused(ends: list[dict[str, Any]]) -> None:
-    with pytest.raises(ConfigError, match="'adaptive' with version 0"):
-        RobotLink(config(1, ends[0], **{**ADAPTIVE, "version": 0}))
 
 
 def test_a_robot_that_hears_itself_alone_is_served_at_the_most_robust_rate() -> None:

@@ -44,7 +44,7 @@ class Pair:
         values = {
             "phy": {"name": "psk", "sample_rate": SLOW},
             "state": str(self._folder / f"state-{number}"),
-            **({} if number == 1 else {"registry": "", "ros_source": {"topics": "auto"}}),
+            **({} if number == 1 else {"registry": ""}),
             **self._values,
         }
         self._starts[number] += 1

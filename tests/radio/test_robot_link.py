@@ -34,12 +34,18 @@ def test_on_every_phy_what_goes_out_comes_back(phy: str) -> None:
         PHY.modules(phy)
     except BackendMissingError as error:
         pytest.skip(str(error))
-    with Robot(1, SIM, hears=(1,), phy={"name": phy, "sample_rate": 10e6 if phy == "lora" else RATE}) as robot:
+    values = {"phy": {"name": phy, "sample_rate": 10e6 if phy == "lora" else RATE}, "repair": "off"}
+    with Robot(1, SIM, hears=(1,), **values) as robot:
         said = robot.say(*range(10))
         wait_for(lambda: len(robot.heard) == len(said), "every message")
         assert robot.heard == said
+
+        def through() -> bool:
+            stats = robot.link.stats()
+            return bool(stats["packets"]["out"] == stats["packets"]["in"] == stats["source"]["packets"])
+
+        wait_for(through, "every packet")
         stats = robot.link.stats()
-    assert stats["packets"]["out"] == stats["packets"]["in"] == stats["source"]["packets"]
     assert stats["packets"]["backlog"] == stats["packets"]["refused"] == 0
     assert stats["phy"]["name"] == phy
     assert (stats["phy"]["snr_db"] is None) == (phy in ("direct", "modem"))
@@ -140,9 +146,10 @@ def test_an_observer_is_told_everything() -> None:
     observed = Observed()
     with Robot(1, SIM, hears=(1,), observer=observed) as robot:
         said = robot.say(5, 6)
-        wait_for(lambda: len(observed.received) == 2, "two messages")
+        wait_for(lambda: len([one for one in observed.received if isinstance(one, Delivered)]) == 2, "two messages")
     assert [event.payload for event in observed.sent if isinstance(event, Accepted)] == said
-    assert [event.data for event in observed.sent if isinstance(event, SentPacket)] == observed.packets
+    left = [event.data for event in observed.sent if isinstance(event, SentPacket)]
+    assert left[: len(observed.packets)] == observed.packets, "the last ones may be on the air"
     assert [event.payload for event in observed.received if isinstance(event, Delivered)] == said
     assert observed.times == sorted(observed.times)
 
@@ -159,8 +166,6 @@ def test_both_blocks_take_a_middleware_that_is_handed_over() -> None:
 def test_one_participant_serves_both_blocks_of_one_graph() -> None:
     with Robot(1, SIM) as robot:
         assert robot.link.source.middleware is robot.link.sink.middleware
-    with Robot(1, SIM, ros_sink={"domain_id": domain(5)}) as robot:
-        assert robot.link.source.middleware is not robot.link.sink.middleware
 
 
 @pytest.mark.parametrize(
@@ -170,8 +175,8 @@ def test_one_participant_serves_both_blocks_of_one_graph() -> None:
         ({"phy": {"name": "psk", "sample_rate": 1e6, "options": {"sp": 3}}}, "unknown key sp"),
         ({"front_end": {"name": "sim", "gain": 3}}, "front_end sim: unknown key gain; known are guard_s"),
         ({"front_end": {"name": "sim", "guard_s": -1}}, "guard_s = -1"),
-        ({"ros_sink": {"middleware": "bag"}}, "middleware = 'bag'"),
-        ({"ros_sink": {"namespace_format": "/robot_{src_id}"}}, "loop"),
+        ({"graph": {"middleware": "bag"}}, "middleware = 'bag'"),
+        ({"publish": {"as": "/robot_{robot}"}}, "loop"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused_and_nothing_stays_open(values: dict[str, Any], said: str) -> None:
@@ -241,7 +246,7 @@ def test_sending_is_switched_off_at_once_and_on_again() -> None:
         ({"airtime": {"band": "us915", "max_burst_s": 0}}, "band us915 allows 0.4 s"),
         ({"airtime": "amateur"}, "a station says its callsign in clear"),
         ({"airtime": {"window_s": 60}}, "window_s = 60.0: has no effect without a share; set duty_cycle"),
-        ({"airtime": {"duty_cycle": 0.1}, "ros_source": {"packet_rate": 0}}, "sends whatever airtime allows; set auto"),
+        ({"airtime": {"duty_cycle": 0.1}, "packet_rate": 0}, "sends whatever airtime allows; set auto"),
         (
             {"airtime": "eu868", "front_end": {"name": "uhd", "frequency": 433.2e6}},
             r"not within the 868 to 868.6 MHz of airtime.band = 'eu868'; set another frequency or band",

@@ -93,7 +93,7 @@ def heard(folder: Path, medium: str, robots: int = 2) -> tuple[list[int], Medium
                     medium=medium,
                     phy=PHY,
                     packet_len=PACKET_LEN,
-                    ros_source={"repair": "off"},
+                    repair="off",
                 )
             )
             for number in numbers
@@ -178,12 +178,12 @@ def test_the_guard_is_what_the_front_end_may_be_late_by(accesses: list[tuple[Acc
 
 
 def test_the_block_of_grc_has_slots_too(accesses: list[tuple[Access, float]]) -> None:
-    values = {"namespace": "/robot_1", "middleware": "memory"}
+    values = {"robot": "/robot_1", "graph_middleware": "memory"}
     link = make_link(medium="slots", airtime_s=0.02, slot_guard_s=0.003, **values)
     link.close()
     ((_, slot_s),) = accesses
     assert slot_s == pytest.approx(0.023)
-    with pytest.raises(ConfigError, match="medium = 'slots': needs version 1, and airtime_s above 0"):
+    with pytest.raises(ConfigError, match="medium = 'slots': needs airtime_s above 0"):
         make_link(medium="slots", **values)
 
 
@@ -212,10 +212,9 @@ def test_two_robots_with_one_id_are_told_so_both(tmp_path: Path) -> None:
 def test_a_channel_that_is_too_full_names_the_topics_that_grow_old(tmp_path: Path) -> None:
     with air(tmp_path, 2), ExitStack() as stack:
         values: dict[str, Any] = {"medium": "slots", "phy": PHY, "packet_len": PACKET_LEN}
-        options = {"topic_options": {"chat": {"queue": "latest"}}}
+        options = {"topics": {"chat": {"queue": "latest"}}}
         robots = [
-            stack.enter_context(Robot(number, front_end(tmp_path, number), ros_source=options, **values))
-            for number in (1, 2)
+            stack.enter_context(Robot(number, front_end(tmp_path, number), **options, **values)) for number in (1, 2)
         ]
         wait_for(lambda: bool(robots[0].link.stats()["peers"]), "the other robot to be heard")
         robots[0].link.findings()

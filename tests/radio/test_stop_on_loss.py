@@ -60,8 +60,8 @@ def test_the_robot_stands_still_when_its_operator_is_gone(tmp_path: Path, how: s
         values: dict[str, Any] = {"registry": "", "state": str(tmp_path / f"state-{number}")}
         front_end = {"name": "zmq", "bind": own, "connect": [other]}
         quick = {"period_s": 0.1, "silence_warn_s": 1.0, "silence_error_s": 2.5}
-        source = {"topics": ["cmd_vel"]} if number == 2 else {"topics": []}
-        return RobotLink(config(number, front_end, **values, ros_source=source, diagnostics=quick))
+        topics = ["cmd_vel"] if number == 2 else []
+        return RobotLink(config(number, front_end, **values, topics=topics, diagnostics=quick))
 
     wheels, over = Wheels(), threading.Event()
     drive = b"\0\1\0\0" + struct.pack("<6d", SPEED, 0, 0, 0, 0, 0)

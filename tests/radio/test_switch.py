@@ -62,6 +62,7 @@ def test_the_state_of_a_link_is_a_latched_topic() -> None:
     with Robot(1, SIM, hears=(1,), diagnostics=quick) as robot:
         robot.say(1)
         wait_for(lambda: robot.heard, "a message")
+        robot.link.transmit(on=False)
         states: list[Any] = []
         with MemoryMiddleware(domain_id=domain(1)) as graph:
             wait_for(lambda: "/gr_ros2/link_1" in {info.topic for info in graph.discover()}, "a state that was told")
@@ -76,6 +77,7 @@ def test_the_state_of_a_link_is_a_latched_topic() -> None:
             assert order[-2:] == ["degraded", "lost"]
             assert (states[-1].level, states[-1].name) == (2, "gr_ros2/link_1")
             assert float(states[-1].values[0].value) >= 3.0  # it says hundredths
+            robot.link.transmit(on=True)
             robot.say(2)
             wait_for(lambda: states[-1].message == "up", "the link to be up again")
 

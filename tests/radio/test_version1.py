@@ -37,7 +37,7 @@ def robot(number: int, front_end: dict[str, Any], tmp_path: Path, **values: Any)
     own: dict[str, Any] = {
         "phy": {"name": "psk", "sample_rate": SLOW},
         "state": str(tmp_path / f"state-{number}"),
-        **({} if number == 1 else {"registry": ""}),
+        **({} if number == 1 else {"registry": "", "topics": []}),
     }
     return Robot(number, front_end, hears=(other,), **{**own, **values})
 
@@ -73,11 +73,10 @@ def test_topics_are_taken_from_the_graph_and_what_was_received_is_not_sent_back(
     ends: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     """Both robots send all that they have. Types, QoS, and topics that come later are known from the graph alone."""
-    options = {"robot_1/early": {"codec": "none"}}
-    words: dict[str, Any] = {"topics": "auto, -*/secret/*", "namespace": "", "topic_options": options}
+    words = {"topics": {"auto": None, "-*/secret/*": None, "robot_1/early": {"codec": "none"}}}
     with (
-        robot(1, ends[0], tmp_path, registry="", ros_source={**words, "robot_id": 1}) as one,
-        robot(2, ends[1], tmp_path, registry="", ros_source={**words, "robot_id": 2}) as two,
+        robot(1, ends[0], tmp_path, registry="", **words, graph={"namespace": ""}) as one,
+        robot(2, ends[1], tmp_path, registry="", **words, graph={"namespace": ""}) as two,
         MemoryMiddleware(domain_id=domain(1)) as near,
         MemoryMiddleware(domain_id=domain(2)) as far,
     ):
@@ -162,12 +161,10 @@ def test_with_a_key_only_those_who_have_it_are_heard(
         assert not two.heard
 
 
-def test_a_link_speaks_version_1_unless_told_otherwise(tmp_path: Path) -> None:
+def test_a_file_of_three_lines_is_a_link(tmp_path: Path) -> None:
     path = tmp_path / "link.yaml"
-    path.write_text("ros_source: {robot_id: 1}\nphy: {name: psk, sample_rate: 1e6}\nkey: fleet.key\n")
+    path.write_text("robot: 1\nphy: {name: psk, sample_rate: 1e6}\nkey: fleet.key\n")
     config = load_link(path)
-    assert config.version == config.ros_source.version == config.ros_sink.version == 1
-    assert config.ros_source.compresses
-    assert config.ros_source.key == config.key == str(tmp_path / "fleet.key")
-    old = load_link(path, ["version=0", "registry=table4", "key=''"])
-    assert (old.ros_source.version, old.ros_source.compresses) == (0, False)
+    assert (config.robot_id, config.namespace, list(config.topics)) == (1, "/robot_1", ["auto"])
+    assert config.compression
+    assert config.key == str(tmp_path / "fleet.key")

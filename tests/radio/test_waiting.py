@@ -115,7 +115,7 @@ def test_a_link_on_the_same_graph_is_seen_without_diagnostics_too(tmp_path: Path
     def robot(number: int) -> Robot:
         front_end = {"name": "zmq", "bind": ends[number - 1], "connect": [ends[2 - number]]}
         graph, state = {"domain_id": domain(9)}, str(tmp_path / f"state-{number}")
-        return Robot(number, front_end, ros_source=graph, ros_sink=graph, state=state, **values)
+        return Robot(number, front_end, graph=graph, state=state, **values)
 
     with robot(1) as one:
         assert one.link.findings() == []

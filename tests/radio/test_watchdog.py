@@ -89,8 +89,8 @@ def systemd(tmp_path: Path) -> Iterator[socket.socket]:
 def service(folder: Path, command: Sequence[str] = ("-m", "gr_ros2.cli")) -> subprocess.Popen[bytes]:
     """A link as systemd starts it."""
     (folder / "robot.yaml").write_text(
-        f"ros_source: {{robot_id: 1, namespace: /robot_1, topics: [odom], middleware: memory}}\n"
-        f"ros_sink: {{middleware: memory}}\nstate: {folder / 'state'}\nphy: {{name: modem}}\nfront_end: {udp()}\n"
+        "robot: /robot_1\ntopics: [odom]\ngraph: {middleware: memory}\n"
+        f"state: {folder / 'state'}\nphy: {{name: modem}}\nfront_end: {udp()}\n"
     )
     return subprocess.Popen(
         [sys.executable, *command, "link", str(folder / "robot.yaml")],

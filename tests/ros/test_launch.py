@@ -67,8 +67,8 @@ def domains(tmp_path: Path) -> list[int]:
         (tmp_path / f"robot_{number}.yaml").write_text(
             f"""
             registry: topics.csv
-            ros_source: {{namespace: /robot_{number}, domain_id: {domain}}}
-            ros_sink: {{domain_id: {domain}}}
+            robot: /robot_{number}
+            graph: {{domain_id: {domain}}}
             phy: {{name: psk, sample_rate: 1e6}}
             front_end: {{name: zmq, bind: "{addresses[number - 1]}", connect: ["{addresses[2 - number]}"]}}
             diagnostics: {{period_s: 0.2}}

@@ -35,7 +35,7 @@ def config(tmp_path: Path) -> Path:
     path = tmp_path / "link.yaml"
     path.write_text(
         "registry: topics.csv\nphy: {name: direct}\nfront_end: {name: sim}\n"
-        "ros_source: {namespace: /robot_1}\nros_sink: {frame_prefix: 'robot_{src_id}/'}\n"
+        "robot: /robot_1\npublish: {frame_prefix: 'robot_{robot}/'}\n"
     )
     return path
 
@@ -52,24 +52,25 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_a_link_as_a_node(config: Path, graph: Graph, ending: signal.Signals) -> None:
-    given = ["-p", f"config:={config}", "-p", "ros_source.dst_id:=3", "-p", "diagnostics.period_s:=0.2"]
+    given = ["-p", f"config:={config}", "-p", "queue_depth:=3", "-p", "diagnostics.period_s:=0.2"]
     process = subprocess.Popen([*COMMAND, *given], env=os.environ.copy(), stderr=subprocess.PIPE, text=True)
     try:
-        names = ["ros_source.dst_id", "packet_len", "ros_source.repeat_s"]
+        names = ["queue_depth", "packet_len", "repeat_s"]
         values = graph.ask(GetParameters, "get_parameters", GetParameters.Request(names=names)).values
         assert [value.integer_value for value in values[:2]] == [3, 220]
         described = graph.ask(DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names))
-        dst_id, packet_len, _ = described.descriptors
-        assert (dst_id.integer_range[0].from_value, dst_id.integer_range[0].to_value) == (0, 255)
-        assert not dst_id.read_only
+        queue_depth, packet_len, _ = described.descriptors
+        assert (packet_len.integer_range[0].from_value, packet_len.integer_range[0].to_value) == (14, 4095)
+        assert not queue_depth.read_only
         assert packet_len.read_only
-        assert packet_len.description.startswith("bytes on the wire")
-        assert graph.set("ros_source.dst_id", 5) == (True, "")
-        assert graph.set("ros_source.repeat_s", 0) == (True, "")
-        assert "less than or equal to 255" in graph.set("ros_source.dst_id", 500)[1]
-        assert not graph.set("ros_source.hop", 5)[0]
-        assert "version" in graph.set("ros_source.topic_options.header.to", 7)[1]
-        assert "cannot change while the link runs" in graph.set("ros_source.nothing", 7)[1]
+        assert packet_len.description.startswith("bytes of the longest packet")
+        assert graph.set("queue_depth", 5) == (True, "")
+        assert graph.set("repeat_s", 0) == (True, "")
+        assert graph.set("topics.header.to", 7) == (True, "")
+        assert graph.set("topics.header.to", "auto") == (True, "")
+        assert "queue_depth = -1" in graph.set("queue_depth", -1)[1]
+        assert not graph.set("hold_s", 5.0)[0]
+        assert "cannot change while the link runs" in graph.set("graph.nothing", 7)[1]
         assert not graph.set("packet_len", 64)[0]
 
         heard: list[Header] = []
@@ -107,8 +108,9 @@ def test_ctrl_c_while_it_starts(config: Path, loaded: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["-p", "config:=link.yaml", "-p", "ros_source.hop:=30"], "ros_source.hop = 30"),
-        (["-p", "config:=link.yaml", "-p", "ros_source.hopp:=3"], "unknown key ros_source.hopp"),
+        (["-p", "config:=link.yaml", "-p", "expected_loss:=30.0"], "expected_loss = 30.0"),
+        (["-p", "config:=link.yaml", "-p", "hopp:=3"], "unknown key hopp"),
+        (["-p", "config:=link.yaml", "-p", "ros_source.namespace:=/x"], "ros_source is no setting any more"),
         ([], "parameter config is missing"),
         (["-p", "config:=12"], "link '12': no such file"),
         (["-p", "config"], "write --ros-args -p config:=my_link.yaml"),
@@ -131,7 +133,7 @@ def test_what_the_library_logs_is_in_the_log_of_ros(config: Path, graph: Graph) 
     )
     graph.node.create_publisher(String, "/robot_1/other", 10)
     publisher = graph.node.create_publisher(Header, "/robot_1/header", 10)
-    given = ["-p", f"config:={config}", "-p", "ros_source.debug:=true"]
+    given = ["-p", f"config:={config}", "-p", "debug:=true"]
     process = subprocess.Popen([*COMMAND, *given], env=os.environ.copy())
     try:
         wait_for(lambda: publisher.publish(Header()) or "0:header" in said.get(INFO, ""), "a packet")

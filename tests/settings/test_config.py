@@ -53,7 +53,7 @@ def test_the_defaults_are_the_designs() -> None:
         "sequential",
         10.0,
     )
-    assert (sink.namespace_format, sink.publisher_depth, sink.reassembly_timeout_s) == ("/rx_robot_{src_id}", 10, 1.0)
+    assert (sink.namespace_format, sink.publisher_depth, sink.reassembly_timeout_s) == ("/rx_robot_{robot}", 10, 1.0)
     assert (sink.robot_id, sink.max_sources, sink.packet_len) == ("auto", 16, 220)
 
 
@@ -132,9 +132,9 @@ def test_min_fragment_must_fit_a_packet_of_one_entry(packet_len: int, min_fragme
         )
 
 
-@pytest.mark.parametrize("text", ["/rx_{robot}", "/rx_{}", "/rx_{src_id", "/rx_}", "/rx_{0}"])
-def test_only_src_id_may_stand_in_braces(text: str) -> None:
-    assert f"namespace_format = {text!r}: only {{src_id}} may stand in braces" in refused(
+@pytest.mark.parametrize("text", ["/rx_{src}", "/rx_{}", "/rx_{robot", "/rx_}", "/rx_{0}"])
+def test_only_the_robot_may_stand_in_braces(text: str) -> None:
+    assert f"namespace_format = {text!r}: only {{robot}} may stand in braces" in refused(
         SinkConfig, namespace_format=text
     )
 
@@ -256,7 +256,7 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
         read_yaml(tmp_path / "nowhere.yaml")
 
 
-SCENARIO = {"name": "one", "registry": "table4.csv", "ros_source": {"namespace": "/robot_1"}}
+SCENARIO = {"name": "one", "registry": "table4.csv", "robots": 2}
 
 
 @pytest.mark.parametrize("share", [0, -1, 0.0])
@@ -273,7 +273,11 @@ def test_a_share_of_nothing_is_not_answered_with_no_limit(share: float) -> None:
         (partial(build, TopicOptions), {"queue": None}, "queue = None"),
         (partial(build, TopicOptions), {"publish_as": ""}, "publish_as = ''"),
         (scenario_from, {**SCENARIO, "phy": {"sample_rate": 0}}, "phy.sample_rate = 0"),
-        (link_from, {**SCENARIO, "phy": {"name": "direct"}, "localhost_only": None}, "localhost_only = None"),
+        (
+            link_from,
+            {"robot": 1, "phy": {"name": "direct"}, "graph": {"localhost_only": None}},
+            "localhost_only = None",
+        ),
     ],
 )
 def test_what_looks_like_auto_is_answered_with_auto(make: Callable[[Any], Any], values: Any, key: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,59 +11,31 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.ros_link import make_link
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.settings.airtime import AirtimeConfig
-from gr_ros2.settings.config import PhyConfig, ScenarioChannel, SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.settings.config import PhyConfig, ScenarioChannel, SendOptions, SourceConfig, TopicOptions, build
 from gr_ros2.settings.effect import conditions_of
-from gr_ros2.settings.fields import Setting, settings_of
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.process import MediumConfig
+from gr_ros2_lab.run.robot_settings import ScenarioRobot
 from gr_ros2_lab.run.scenario import Scenario, scenario_from
 from tests.settings.test_fields import classes
 
 ROBOTS = [{"connect": f"tcp://127.0.0.1:555{n}", "bind": f"tcp://127.0.0.1:655{n}"} for n in (1, 2)]
 BASE: Mapping[type[Any], Mapping[str, Any]] = {
-    Scenario: {"name": "one", "registry": "table4.csv", "ros_source": {"namespace": "/robot_1"}},
-    LinkConfig: {"phy": {"sample_rate": 1e6}, "ros_source": {"robot_id": 1}},
+    Scenario: {"name": "one", "registry": "table4.csv", "robots": [{}, {}]},
+    ScenarioRobot: {"robot": 1},
+    RobotConfig: {"robot": 1},
+    LinkConfig: {"phy": {"sample_rate": 1e6}, "robot": 1},
     MediumConfig: {"phy": {"sample_rate": 1e6}, "robots": ROBOTS},
 }
-TWO = {"robots": [{}, {}], "time": "packets"}
+TWO = {"time": "packets"}
 PLACED = {"channel": {"from": "positions"}}
 COMPRESSES = "set compression: true, or leave it out"
 
 Values = Mapping[str, Any]
 IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
-    (TopicOptions, "queue_depth"): ({"queue_depth": 3}, {"queue": "latest"}, {"queue": "fifo"}, "set another queue"),
-    (SourceConfig, "seal"): ({"seal": "authenticate"}, {}, {"key": "fleet.key"}, "set key"),
-    (SourceConfig, "topic_options.*.max_age_s"): (
-        {"topic_options": {"odom": {"max_age_s": 5.0}}},
-        {},
-        {"key": "fleet.key"},
-        "set key",
-    ),
-    (SinkConfig, "seal"): ({"seal": "authenticate"}, {}, {"key": "fleet.key"}, "set key"),
-    (SinkConfig, "topic_options.*.max_age_s"): (
-        {"topic_options": {"odom": {"max_age_s": 5.0}}},
-        {},
-        {"key": "fleet.key"},
-        "set key",
-    ),
-    (SinkConfig, "max_age_s"): ({"max_age_s": 5.0}, {}, {"key": "fleet.key"}, "set key"),
-    (SourceConfig, "dictionaries"): ({"dictionaries": ("my.dict",)}, {"compression": False}, {}, COMPRESSES),
-    (SourceConfig, "topic_options.*.codec"): (
-        {"topic_options": {"odom": {"codec": "zstd"}}},
-        {"version": 0},
-        {"version": 0, "compression": True},
-        COMPRESSES,
-    ),
-    (SourceConfig, "topic_options.*.quantize"): (
-        {"topic_options": {"odom": {"quantize": "pose=0.1"}}},
-        {"compression": False},
-        {},
-        COMPRESSES,
-    ),
-    (SourceConfig, "expected_loss"): ({"expected_loss": 0.5}, {"repair": "off"}, {"repair": "idle"}, "set repair to"),
+    (SendOptions, "queue_depth"): ({"queue_depth": 3}, {"queue": "latest"}, {"queue": "fifo"}, "set another queue"),
     (PhyConfig, "headroom"): (
         {"headroom": 2.0},
         {"sample_rate": 1e6},
@@ -95,15 +66,37 @@ IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
         "set shadowing_db above 0",
     ),
     (ScenarioChannel, "carrier_hz"): ({"carrier_hz": 868e6}, {}, {"from": "positions"}, "set from: positions"),
-    (Scenario, "bag_speed"): ({"bag_speed": 2.0}, {}, {"source": "bag:a"}, "set source: bag:PATH"),
-    (Scenario, "state"): ({"state": "robot.json"}, {}, {}, "leave it out"),
+    (Scenario, "bag_speed"): (
+        {"bag_speed": 2.0},
+        {"robots": [{}, {"topics": []}]},
+        {"robots": [{}, {"topics": []}], "source": "bag:a"},
+        "set source: bag:PATH",
+    ),
+    (Scenario, "robots.*.state"): ({"robots": [{}, {"state": "robot.json"}]}, {}, {}, "leave it out"),
     (Scenario, "controller"): (
-        {"controller": "ros", "robots": [{}, {}]},
+        {"controller": "ros"},
         {},
         {"task": "formation"},
         "set task and time: real",
     ),
 }
+for cls in (ScenarioRobot, LinkConfig):
+    for name, given in (
+        ("seal", {"seal": "authenticate"}),
+        ("max_age_s", {"max_age_s": 5.0}),
+        ("topics.*.max_age_s", {"topics": {"odom": {"max_age_s": 5.0}}}),
+        ("publish.topics.*.max_age_s", {"publish": {"topics": {"odom": {"max_age_s": 5.0}}}}),
+    ):
+        IDLE[cls, name] = (given, {}, {"key": "fleet.key"}, "set key")
+    for option, value in (("codec", "zstd"), ("quantize", "pose=0.1")):
+        IDLE[cls, f"topics.*.{option}"] = (
+            {"topics": {"odom": {option: value}}},
+            {"compression": False},
+            {},
+            COMPRESSES,
+        )
+    IDLE[cls, "expected_loss"] = ({"expected_loss": 0.5}, {"repair": "off"}, {"repair": "idle"}, "set repair to")
+    IDLE[cls, "beacon_s"] = ({"beacon_s": 9.0}, {"direction": "send"}, {}, "set direction: both")
 for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
     for name, given in (
         ("channel.tx_power_dbm", {"channel": {"tx_power_dbm": 3.0}}),
@@ -113,7 +106,8 @@ for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
     ):
         IDLE[cls, name] = (given, beside, {**beside, "gains_db": -90.0}, "set gains_db, or channel.from: positions")
     IDLE[cls, "channel.snr_db"] = ({"channel": {"snr_db": 9.0}}, {**beside, "gains_db": -90.0}, beside, "leave one")
-NEVER = {(Scenario, "state")}
+IDLE[TopicOptions, "queue_depth"] = IDLE[SendOptions, "queue_depth"]
+NEVER = {(Scenario, "robots.*.state")}
 """Nothing makes them act."""
 
 
@@ -155,43 +149,4 @@ def test_what_has_no_effect_is_refused_in_a_line(cls: type[Any], name: str) -> N
 def test_a_default_is_taken_wherever_it_stands() -> None:
     assert build(SourceConfig, {"repair": "off", "expected_loss": 0.2}) == SourceConfig(repair="off")
     assert build(PhyConfig, {"sample_rate": 1e6, "headroom": 1.2}) == PhyConfig(sample_rate=1e6)
-    assert made(Scenario, {"bag_speed": 1, "robots": [{"tx_power_dbm": "auto"}, {}]}) == made(
-        Scenario, TWO, {"time": "real"}
-    )
-
-
-AT_ONE_END = [setting for setting in settings_of(TopicOptions) if setting.end is not None]
-OTHER: dict[str, Any] = {
-    "qos": "bulk", "queue": "fifo", "weight": 2.0, "max_rate": 3.0, "keep_s": 3.0, "to": 3, "codec": "zstd",
-    "quantize": "pose.pose.position=0.1", "publish_as": "/here", "queue_depth": 3,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("setting", AT_ONE_END, ids=lambda setting: setting.name)
-def test_an_option_of_one_end_is_refused_at_the_other(setting: Setting, tmp_path: Path) -> None:
-    options = {"odom": {setting.name: OTHER[setting.name]}}
-    for cls in (SourceConfig, SinkConfig):
-        if cls.end == setting.end:
-            build(cls, {"topic_options": options})
-            continue
-        said = f"topic_options.odom.{setting.name} = {OTHER[setting.name]!r}: acts at the {setting.end} alone; give it"
-        with pytest.raises(ConfigError, match=re.escape(f"{said} to ros_{setting.end}, or leave it out")):
-            build(cls, {"topic_options": options})
-    registry = tmp_path / "both.csv"  # which both ends have
-    registry.write_text(f"name,type,{setting.name}\nodom,nav_msgs/Odometry,{OTHER[setting.name]}\n")
-    assert getattr(Registry.from_csv(registry)[0].options, setting.name) == OTHER[setting.name]
-
-
-def test_a_block_of_both_ends_gives_each_its_options() -> None:
-    link = make_link(
-        middleware="memory",
-        namespace="/robot_1",
-        topic_options={"odom": {"max_rate": 5.0, "publish_as": "/here", "depth": 3}},
-    )
-    try:
-        assert link.source.config.topic_options == {"odom": TopicOptions(max_rate=5.0, depth=3)}
-        assert link.sink.config.topic_options == {"odom": TopicOptions(publish_as="/here", depth=3)}
-    finally:
-        link.close()
-    with pytest.raises(ConfigError, match=r"unknown key topic_options\.odom\.colour"):
-        make_link(middleware="memory", namespace="/robot_1", topic_options={"odom": {"colour": 1}})
+    assert made(Scenario, {"bag_speed": 1, "robots": [{"tx_power_dbm": "auto"}, {}]}) == made(Scenario)

@@ -153,13 +153,13 @@ def test_no_bytes_raise_anything_but_a_registry_error(tmp_path_factory: pytest.T
 def test_named_columns_are_options_and_empty_cells_defaults(tmp_path: Path) -> None:
     text = (
         "topic,type,qos,queue_depth,publish_as,depth,durability,reliability\n"
-        "odom,nav_msgs/Odometry,latency,1,/fleet/r{src_id}/odom,,,best_effort\n"
+        "odom,nav_msgs/Odometry,latency,1,/fleet/r{robot}/odom,,,best_effort\n"
         "map,nav_msgs/OccupancyGrid,bulk,,,1,volatile\n"
         "scan,sensor_msgs/LaserScan\n"
     )
     odom, map_, scan = read(tmp_path, text)
     assert odom.options == TopicOptions(
-        qos="latency", queue_depth=1, publish_as="/fleet/r{src_id}/odom", reliability="best_effort"
+        qos="latency", queue_depth=1, publish_as="/fleet/r{robot}/odom", reliability="best_effort"
     )
     assert map_.options == TopicOptions(qos="bulk", depth=1, durability="volatile")
     assert scan.options == TopicOptions()
@@ -178,10 +178,10 @@ def test_named_columns_are_options_and_empty_cells_defaults(tmp_path: Path) -> N
         ("topic,type,qos", "odom,a/B,urgent", 2, "topic 'odom': qos = 'urgent'"),
         ("topic,type,depth", "odom,a/B,-1", 2, "topic 'odom': depth = '-1'"),
         ("topic,type,depth", "odom,a/B,many", 2, "topic 'odom': depth = 'many'"),
-        ("topic,type,publish_as", "odom,a/B,/x/{robot}", 2, "publish_as = '/x/{robot}': only {src_id} may stand"),
-        ("topic,type,publish_as", "odom,a/B,/x/{", 2, "publish_as = '/x/{': only {src_id} may stand"),
+        ("topic,type,publish_as", "odom,a/B,/x/{who}", 2, "publish_as = '/x/{who}': only {robot} may stand"),
+        ("topic,type,publish_as", "odom,a/B,/x/{", 2, "publish_as = '/x/{': only {robot} may stand"),
         ("topic,type,publish_as", "odom,a/B,/robot-1/odom", 2, "publish_as = '/robot-1/odom': '-' may not stand"),
-        ("topic,type,publish_as", "odom,a/B,/fleet/{src_id}/odom", 2, "part '255' must not begin with a digit"),
+        ("topic,type,publish_as", "odom,a/B,/fleet/{robot}/odom", 2, "part '255' must not begin with a digit"),
         ("topic,type,qos", "odom,a/B,bulk,4", 2, "4 columns where 3 were expected"),
     ],
 )
@@ -197,9 +197,9 @@ def test_names_on_both_graphs() -> None:
         "/odom",
     ]
     assert clock.on_graph("/robot_1") == "/clock"
-    assert odom.republished("/rx_robot_{src_id}", 7) == "/rx_robot_7/odom"
-    assert clock.republished("rx_{src_id}/", 7) == "/rx_7/clock"
-    assert Topic(0, "odom", ODOM, TopicOptions(publish_as="r{src_id}/pose")).republished("/any", 3) == "/r3/pose"
+    assert odom.republished("/rx_robot_{robot}", 7) == "/rx_robot_7/odom"
+    assert clock.republished("rx_{robot}/", 7) == "/rx_7/clock"
+    assert Topic(0, "odom", ODOM, TopicOptions(publish_as="r{robot}/pose")).republished("/any", 3) == "/r3/pose"
 
 
 @pytest.mark.parametrize(
@@ -294,7 +294,7 @@ def test_an_action_is_three_services_and_two_topics(tmp_path: Path) -> None:
         ("go/_action/status", "action_msgs/msg/GoalStatusArray", False, True),
         ("scan", "a_msgs/msg/B", False, False),
     ]
-    assert registry[3].republished("/rx_robot_{src_id}", 2) == "/drive/_action/feedback"
+    assert registry[3].republished("/rx_robot_{robot}", 2) == "/drive/_action/feedback"
     assert [topic.topic_id for topic in registry] == list(range(6))
 
 

@@ -23,7 +23,7 @@ NAMES = {
     "channel.frequency_offset": "carrier offset [sample rates]",
     "channel.epsilon": "sample clock ratio",
     "channel.doppler_hz": "Doppler shift [Hz]",
-    "ros_source.scheduler": "scheduler",
+    "scheduler": "scheduler",
     "sim.odom_rate": "odometry [1/s]",
     "duration_s": "duration [s]",
 }

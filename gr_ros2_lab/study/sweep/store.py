@@ -72,10 +72,8 @@ def without_registry(settings: Any) -> Any:
 
 
 def _files(scenario: Scenario) -> Iterator[Any]:
-    halves = [half for robot in scenario.all_robots for half in (robot.source, robot.sink) if half is not None]
-    for name in (scenario.registry, *(name for half in halves for name in half.dictionaries)):
-        path = Path(name).expanduser()
-        yield hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else name
+    path = Path(scenario.registry).expanduser()
+    yield hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else scenario.registry
     if (bag := scenario.bag_path) is not None:
         for path in sorted(bag.rglob("*")) if bag.is_dir() else [bag]:
             if path.is_file():

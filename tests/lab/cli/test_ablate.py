@@ -18,7 +18,7 @@ def test_it_prints_what_each_part_is_worth_and_writes_the_page(
     arguments = ["ablate", "paper-ofdm-paced", "--duration", "2", "--set", "time=packets", "--out", str(out)]
     assert run(arguments) == 0
     text = capsys.readouterr().out
-    assert "no-compression: ros_source.compression=false\n" in text
+    assert "no-compression: compression=false\n" in text
     (line,) = (line.split() for line in text.splitlines() if "PDR" in line)
     assert line[:3] == ["/robot_1/odom", "PDR", "1.00"]
     assert float(line[3]) < 0.5, "without compression"

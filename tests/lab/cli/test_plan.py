@@ -46,14 +46,14 @@ def test_room_on_the_air_is_not_enough_where_packets_collide(capsys: pytest.Capt
 
 
 def test_it_says_what_does_not_fit_and_what_to_change(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["plan", "paper-ofdm-paced", "--duration", "3", "--set", "ros_source.compression=false"]) == 0
+    assert run(["plan", "paper-ofdm-paced", "--duration", "3", "--set", "compression=false"]) == 0
     out = capsys.readouterr().out
     assert "it does not fit, most of it is /robot_1/odom" in out
-    assert "Better: --set ros_source.compression=true" in out
+    assert "Better: --set compression=true" in out
 
 
 def test_it_says_what_gets_better_by_how_much_and_what_gets_worse(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["plan", "demo", "--duration", "1", "--set", "ros_source.compression=false"]) == 0
+    assert run(["plan", "demo", "--duration", "1", "--set", "compression=false"]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if " --set " in line]
     assert lines
     for line in lines:
@@ -78,7 +78,7 @@ def test_what_takes_no_airtime_is_one_line(capsys: pytest.CaptureFixture[str]) -
 def test_version_0_has_nothing_to_plan(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["plan", "paper-ofdm"]) == BAD_INPUT
     assert capsys.readouterr().err == (
-        "gr-ros2: version = 0: has nothing to choose by, as the paper has it; set version: 1 for a plan\n"
+        "gr-ros2: paper: version 0 has nothing to choose by, as the paper has it; leave it out for a plan\n"
     )
 
 
@@ -105,7 +105,7 @@ def test_a_bag_alone_or_over_a_link_is_planned(tmp_path: Path, capsys: pytest.Ca
     assert "psk at 500,000 samples/s" in capsys.readouterr().out
     saved = tmp_path / "saved.yaml"
     saved.write_text(
-        "registry: ''\nros_source: {robot_id: 1, namespace: '', topics: [auto, -imu]}\n"
+        "robot: 1\ngraph: {namespace: ''}\ntopics: [auto, -imu]\n"
         "phy: {name: gfsk, sample_rate: 200000}\nfront_end: {name: sim}\n"
     )
     assert run(["plan", str(saved), "--bag", drive, "--no-advice"]) == 0
@@ -138,8 +138,8 @@ def test_what_is_on_the_graph_now_is_planned(
 ) -> None:
     monkeypatch.setattr("gr_ros2_lab.study.traffic._LOOK_S", 0.5)
     (number,) = free_domains(1)
-    words = ["plan", "--graph", "--duration", "2", "--no-advice", "--set", "localhost_only=true"]
-    words += ["--set", f"ros_source.domain_id={number}", "--set", f"ros_sink.domain_id={number}"]
+    words = ["plan", "--graph", "--duration", "2", "--no-advice", "--set", "graph.localhost_only=true"]
+    words += ["--set", f"graph.domain_id={number}"]
     assert run(words) == BAD_INPUT
     assert "seen on the graph: no topics" in capsys.readouterr().err
     with DdsMiddleware(domain_id=number, localhost_only=True) as robot:

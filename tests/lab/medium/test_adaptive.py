@@ -59,10 +59,10 @@ def adaptive(snr_db: float, **settings: Any) -> Scenario:
             "sim": {"odom_rate": 50},
             "time": "packets",
             "packet_len": 220,
-            "ros_source": {"namespace": "/robot_1"},
+            "robots": [{}, {"topics": []}],
             "phy": {"name": "ofdm", "sample_rate": 1e6, "options": {"rate": "adaptive"}},
             "channel": {"snr_db": snr_db},
-            "reports": {"delay_s": 0.005},
+            "paths": [{"from": 2, "delay_s": 0.005}],
             "duration_s": 2.0,
             **settings,
         }
@@ -145,7 +145,7 @@ def test_a_scenario_is_sent_at_the_rate_that_its_channel_allows(snr_db: float, m
 def test_without_reports_everything_is_sent_at_the_most_robust_rate() -> None:
     rates = Rates()
     observers = RunObservers([rates], threaded=False)
-    scenario = adaptive(28.0, reports=None)
+    scenario = adaptive(28.0, robots=[{"direction": "send"}, {"direction": "receive"}], paths=[])
     result = run_simulated(scenario, run_observers=observers).result
     assert set(rates.sent) == {0}
     assert result.topics[0].pdr == 1.0

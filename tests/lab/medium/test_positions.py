@@ -135,9 +135,8 @@ def test_a_recording_tells_places_by_its_odometry() -> None:
     settings = (
         f"source=bag:{DRIVE}",
         "time=packets",
-        "ros_source.topics=[odom]",
-        "ros_source.topic_options={}",
-        "reports={}",
+        "topics=[odom]",
+        "robots=[{}, {topics: []}]",
     )
     around = surroundings(load_scenario("paper-ofdm-paced", [*settings, "channel={from: positions}"]), 1e6)
     levels = [float(around.hearers(0, now).snr_db[0]) for now in np.arange(0, 6, 0.5)]
@@ -168,8 +167,8 @@ def test_a_recording_tells_places_by_its_odometry() -> None:
         (["channel={from: positions}", "phy={name: direct}"], "phy direct has no samples, so no level"),
         (["gains_db=-100", "phy={name: direct}"], "gains_db: phy direct has no samples, so no level"),
         (
-            ["channel={from: positions}", "robots=0", "time=real", "duplex=full"],
-            "channel.from: time = 'real' has that for robots with duplex = 'half' alone",
+            ["channel={from: positions}", "medium=exclusive", "time=real", "duplex=full"],
+            "channel.from: time = 'real' has that with duplex = 'half' alone",
         ),
         (["channel={from: positions}", "sim.robots=1"], "/robot_2 is none of the 1 simulated robots, so nobody knows"),
     ],
@@ -184,11 +183,11 @@ def test_what_does_not_go_together_is_said_in_a_line(overrides: list[str], messa
     ("overrides", "message"),
     [
         (["channel={from: positions, walls_db: 3}"], "a recording has no world to count walls in"),
-        (["channel={from: positions}", "ros_source.namespace=/robot_9"], "has no odometry of /robot_9; it has "),
+        (["channel={from: positions}", "robots.0.robot=/robot_9"], "has no odometry of /robot_9; it has "),
     ],
 )
 def test_a_recording_without_what_it_takes_is_refused(overrides: list[str], message: str) -> None:
-    drive = [f"source=bag:{DRIVE}", "time=packets", "ros_source.topics=[odom]", "ros_source.topic_options={}"]
+    drive = [f"source=bag:{DRIVE}", "time=packets", "topics=[odom]"]
     with pytest.raises(ConfigError, match=message):
         surroundings(load_scenario("paper-ofdm-paced", [*drive, *overrides]), 1e6)
 

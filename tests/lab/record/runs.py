@@ -93,7 +93,7 @@ def make_run(directory: Path, scenario: str = "paper-ofdm", *, paced: bool = Tru
         scenario=scenario,
         seed=3,
         duration_s=DURATION_S,
-        config={"name": scenario, "description": "made <by> hand", "time": "real" if paced else "unthrottled"},
+        config={"name": scenario, "description": "made <by> hand", "time": "real" if paced else "samples"},
         topics=topics,
         packets=recorder.ledger.packets(),
         phy={"name": "ofdm", "sample_rate": 1e5, **recorder.airtime(lambda *_: AIRTIME_S)},

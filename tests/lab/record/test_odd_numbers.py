@@ -54,7 +54,7 @@ def replayed(recording: Path, out: Path, *overrides: str) -> tuple[Result, Path]
 
 
 def as_run(recording: Path, out: Path, *overrides: str) -> tuple[Result, Path]:
-    words = [f"source=bag:{recording}", "ros_source.middleware=memory", "ros_sink.middleware=memory", *overrides]
+    words = [f"source=bag:{recording}", "graph.middleware=memory", *overrides]
     command = ["run", "paper-direct", "--out", str(out), "--duration", "0"]
     assert run([*command, *(word for override in words for word in ("--set", override))]) == 0
     return read_result(out), out / DELIVERED_BAG
@@ -65,7 +65,7 @@ def as_run(recording: Path, out: Path, *overrides: str) -> tuple[Result, Path]:
     [
         (replayed, ("time=packets",)),
         (replayed, ("time=samples",)),
-        (replayed, ("time=packets", "ros_source.compression=true")),
+        (replayed, ("time=packets", "compression=true")),
         (as_run, ("time=packets",)),
         (as_run, ("time=real",)),
     ],

@@ -45,7 +45,7 @@ def test_the_page_and_its_figures_are_written(tmp_path: Path) -> None:
 def test_settings_that_differ_stand_first(tmp_path: Path) -> None:
     one, other = make_run(tmp_path / "a", "one"), make_run(tmp_path / "b", "two")
     configs = [
-        {"packet_len": size, "ros_source": {"packet_len": size, "repair": "off"}, "channel": {"snr_db": snr_db}}
+        {"packet_len": size, "part": {"packet_len": size, "repair": "off"}, "channel": {"snr_db": snr_db}}
         for size, snr_db in ((64, 10), (220, 10))
     ]
     runs = [

@@ -116,7 +116,7 @@ def test_every_fate_of_the_ledger_is_said_in_words(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_what_repair_did_is_told_and_tabulated(tmp_path: Path) -> None:
     out = tmp_path / "repaired"
-    settings = ["version=1", "reports={}", "channel.packet_loss=0.2", "time=packets"]
+    settings = ["robots=[{}, {topics: []}]", "channel.packet_loss=0.2", "time=packets"]
     outcome = run_scenario(load_scenario("paper-ofdm-paced", settings, duration_s=4.0), out)
     result = outcome.result
     (odom,), packets = result.topics, result.packets

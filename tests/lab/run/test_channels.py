@@ -14,7 +14,7 @@ DURATION_S = 6.0
 
 
 def odometry(name: str, *changes: str) -> TopicResult:
-    settings = ["time=samples", "ros_source.repair='off'", *changes]
+    settings = ["time=samples", "repair='off'", *changes]
     scenario = load_scenario(name, settings, duration_s=DURATION_S, seed=1)
     (topic,) = run_scenario(scenario).result.topics
     assert sum(topic.ledger.values()) == topic.sent > 0
@@ -57,8 +57,8 @@ def test_fades_take_packets_in_a_row() -> None:
 
 
 def test_repair_brings_back_what_noise_and_fades_take() -> None:
-    assert pdr("channel-awgn", "ros_source.repair=auto") > pdr("channel-awgn") + 0.1
-    assert pdr("channel-rayleigh", "ros_source.repair=auto") > 0.98
+    assert pdr("channel-awgn", "repair=auto") > pdr("channel-awgn") + 0.1
+    assert pdr("channel-rayleigh", "repair=auto") > 0.98
 
 
 def test_bursts_take_fewer_messages_than_as_many_single_losses() -> None:
@@ -67,7 +67,7 @@ def test_bursts_take_fewer_messages_than_as_many_single_losses() -> None:
 
 
 def test_a_link_that_was_unplugged_goes_on_as_before() -> None:
-    alone = "ros_source.topic_options.odom.reliability=best_effort"  # in order, it would wait hold_s for what is lost
+    alone = "topics.odom.reliability=best_effort"  # in order, it would wait hold_s for what is lost
     odom = odometry("channel-unplugged", "channel.outages=[[2, 3.5]]", alone)
     assert odom.pdr == pytest.approx(0.75, abs=0.01)
     assert odom.age_s.peak == pytest.approx(1.55, abs=0.05)

@@ -13,7 +13,7 @@ from gr_ros2_lab.run.outcome import Outcome
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
 
-MEMORY = ("ros_source.middleware=memory", "ros_sink.middleware=memory")
+MEMORY = ("graph.middleware=memory",)
 ROUNDING_S = 1e-6
 
 
@@ -36,7 +36,7 @@ def test_messages_take_at_least_the_airtime_of_their_packets(name: str) -> None:
     there = ~np.isnan(received)
     assert there.sum() > 10
     assert (received - over)[there].min() >= -ROUNDING_S
-    if outcome.result.config["ros_source"]["packet_rate"] == "auto":
+    if outcome.result.config["packet_rate"] == "auto":
         waiting = [int((over[:number] > sent[number] + ROUNDING_S).sum()) for number in range(len(sent))]
         assert max(waiting) < OUTSTANDING, "packets before it that were not through when it was composed"
         assert (sent[1:] - over[:-1]).min() >= -LEAD_S - ROUNDING_S, (

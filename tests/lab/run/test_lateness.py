@@ -53,7 +53,7 @@ def state(pid: int) -> str:
 def test_a_process_that_was_stopped_is_named_with_how_long(tmp_path: Path) -> None:
     out = tmp_path / "run"
     source, sink = free_domains()[:2]
-    overrides = [f"ros_source.domain_id={source}", f"ros_sink.domain_id={sink}"]
+    overrides = [f"robots.0.graph.domain_id={source}", f"robots.1.graph.domain_id={sink}"]
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM, json.dumps(overrides), str(out)],
         cwd=ROOT,

@@ -87,24 +87,17 @@ def test_robots_that_drive_begin_to_do_so_with_the_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["time=unthrottled"], "they share one channel at its pace; set time: real"),
-        (["version=0", "medium=exclusive"], "on one channel in real time they need version 1"),
+        (["paper={}", "medium=exclusive"], "on one channel in real time robots need version 1"),
         (["phy={name: modem, options: {bit_rate: 1e5}}"], "phy modem has no samples"),
         (["channel.packet_loss=0.1"], "bursts cross as samples, so none is dropped whole"),
-        (["own_domains=false"], "each has a ROS graph of its own"),
-        (["own_domains=false", "duplex=full", "medium=exclusive"], "each has a ROS graph of its own"),
+        (["own_domains=false"], "what robot 1 sends comes out twice on one ROS graph"),
+        (["own_domains=false", "duplex=full", "medium=exclusive"], "what robot 1 sends comes out twice"),
     ],
 )
 def test_what_no_robot_in_real_time_has_is_refused_in_a_line(overrides: list[str], said: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(said)) as refused:
         load_scenario("team", ["time=real", *overrides])
     assert "\n" not in str(refused.value)
-
-
-def test_one_channel_in_real_time_is_for_robots() -> None:
-    scenario = load_scenario("team", ["time=real", "robots=0", "gains_db=null", "medium=exclusive"])
-    with pytest.raises(ConfigError, match=r"^duplex: time = 'real' has that for robots with"):
-        run_scenario(scenario)
 
 
 @pytest.mark.slow
@@ -127,7 +120,7 @@ def test_robots_on_channels_of_their_own_hear_whom_they_can_and_send_meanwhile(t
 @pytest.mark.parametrize(
     ("overrides", "arrives"),
     [
-        (["version=0", "phy.options.detection_threshold=stock"], False),
+        (["paper={}", "phy.options.detection_threshold=stock"], False),
         (["phy={name: direct}", "gains_db=null"], True),
     ],
     ids=["version 0, stock receiver", "version 1, no radio"],

@@ -65,7 +65,7 @@ def test_sealed_packets_carry_slots_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["medium=slots", "version=0"], "version 0"),
+        (["medium=slots", "paper={}"], "version 0"),
         (["medium=slots", "phy.name=direct"], "direct"),
         (["medium=slots", "duplex=full"], "duplex: half"),
         (["medium=slot"], "medium"),

@@ -28,11 +28,11 @@ def lossy(count: int, *changes: str) -> Scenario:
 
 def test_every_seed_moves_on_with_the_repetition() -> None:
     two_way = load_scenario("two-way", ["channel.seed=50"], repetitions=3, seed=5)
-    assert two_way.back is not None
     runs = list(repetitions(two_way))
     assert [run.seed for run in runs] == [run.sim.seed for run in runs] == [5, 6, 7]
     assert [run.channel.seed for run in runs] == [50, 51, 52]
-    assert [run.back.channel.seed - two_way.back.channel.seed for run in runs if run.back] == [0, 1, 2]
+    before = two_way.all_robots[1].paths[0].channel.seed
+    assert [run.all_robots[1].paths[0].channel.seed - before for run in runs] == [0, 1, 2]
     assert {run.repetitions for run in runs} == {1}
     assert replace(runs[0], repetitions=3) == two_way
 

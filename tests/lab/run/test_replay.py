@@ -77,7 +77,7 @@ def test_a_bag_comes_out_as_it_went_in_but_for_the_time(tmp_path: Path, blobs: P
 
 
 def test_mcap_keeps_the_original_time_as_publish_time(tmp_path: Path, blobs: Path) -> None:
-    run(blobs, tmp_path / "out.mcap", "channel.packet_loss=0.3", "ros_source.repair='off'")
+    run(blobs, tmp_path / "out.mcap", "channel.packet_loss=0.3", "repair='off'")
     original = {one.payload: one.stamp_ns for one in read_bag(blobs)}
     received = list(read_bag(tmp_path / "out.mcap"))
     assert 0 < len(received) < 2 * COUNT
@@ -109,7 +109,7 @@ def test_the_scenarios_registry_chooses_where_it_fits(tmp_path: Path, blobs: Pat
 
 def test_options_of_a_topic_go_with_it_into_a_registry_made_of_the_recording(tmp_path: Path) -> None:
     source = make_bag(tmp_path / "in", {"/robot_1/odom": "my_msgs/msg/Blob", "/status": "my_msgs/msg/Blob"})
-    options = "ros_source.topic_options={odom: {max_rate: 10}}"
+    options = "topics={odom: {max_rate: 10}}"
     both = ("/robot_1/odom", "/status")
     done = run(source, tmp_path / "out.mcap", options, topics=both)
     sent = {topic.topic: topic.delivered for topic in done.outcome.result.topics}
@@ -119,7 +119,7 @@ def test_options_of_a_topic_go_with_it_into_a_registry_made_of_the_recording(tmp
 
 @pytest.mark.parametrize("version", [0, 1])
 def test_more_topics_than_a_link_carries_have_to_be_chosen(tmp_path: Path, version: int) -> None:
-    most, settings = FORMATS[version].max_topics, f"version={version}"
+    most, settings = FORMATS[version].max_topics, ("paper={}", "paper=null")[version]
     source = make_bag(tmp_path / "in", {f"/t{number}": "my_msgs/msg/Blob" for number in range(most + 1)})
     with pytest.raises(ConfigError, match=rf"has {most + 1} topics, and a link carries {most}; choose with --topics"):
         run(source, tmp_path / "out.mcap", settings)
@@ -137,7 +137,7 @@ def test_compression_clears_alignment_gaps_and_nothing_else(tmp_path: Path, *, c
     for number, (payload, _) in enumerate(messages):
         recorder.write(channel, START_NS + number * 10 * STEP_NS, payload)
     recorder.close()
-    run(tmp_path / "in", tmp_path / "out.mcap", f"ros_source.compression={str(compression).lower()}")
+    run(tmp_path / "in", tmp_path / "out.mcap", f"compression={str(compression).lower()}")
     assert [one.payload for one in read_bag(tmp_path / "out.mcap")] == [one[compression] for one in messages]
 
 

@@ -123,8 +123,7 @@ def test_a_run_writes_the_recordings_definitions_too(tmp_path: Path) -> None:
         overrides = [
             f"registry={registry}",
             f"time={time_}",
-            "ros_source.middleware=memory",
-            "ros_sink.middleware=memory",
+            "graph.middleware=memory",
         ]
         run_scenario(load_scenario("paper-direct", overrides, duration_s=0.0, source=f"bag:{source}"), tmp_path / time_)
         assert bag_definitions(tmp_path / time_ / "delivered")[RANGE] == NEWER_RANGE
@@ -180,8 +179,7 @@ def test_a_wrong_total_is_said_in_a_run_too(tmp_path: Path, caplog: pytest.LogCa
         overrides = [
             f"registry={registry}",
             f"time={time_}",
-            "ros_source.middleware=memory",
-            "ros_sink.middleware=memory",
+            "graph.middleware=memory",
         ]
         with caplog.at_level(logging.WARNING):
             scenario = load_scenario("paper-direct", overrides, duration_s=0.0, source=f"bag:{source}")
@@ -270,8 +268,7 @@ def test_a_run_refuses_a_recorded_topic_of_another_type(tmp_path: Path, time_: s
         overrides = [
             f"registry={registry}",
             f"time={time_}",
-            "ros_source.middleware=memory",
-            "ros_sink.middleware=memory",
+            "graph.middleware=memory",
         ]
         scenario = load_scenario("paper-direct", overrides, duration_s=0.0, source=f"bag:{source}")
         with pytest.raises(ConfigError, match="Int32"):

@@ -79,10 +79,13 @@ def test_levels_follow_from_power_gain_and_noise() -> None:
     assert scenario_from(dump(scenario)) == scenario
 
 
-ONE_WAY = ["phy.sample_rate=1e6", "reports={}", "receivers=[{packet_loss: 0.5}]", "time=packets"]
+ONE_WAY = [
+    *("phy.sample_rate=1e6", "time=packets", "paths=[{to: 3, packet_loss: 0.5}]"),
+    "robots=[{}, {topics: []}, {direction: receive}]",
+]
 
 
-def test_robots_of_short_forms_have_levels_too() -> None:
+def test_robots_that_only_receive_have_levels_too() -> None:
     """20 dBm over a gain, and noise of -174 dBm/Hz at a noise figure of 6 dB."""
     rows = "[[null, -100, -110], [-120, null, -90], [null, null, null]]"
     scenario = load_scenario("demo", [*ONE_WAY, f"gains_db={rows}"])
@@ -98,10 +101,12 @@ def test_robots_of_short_forms_have_levels_too() -> None:
 
 
 @pytest.mark.parametrize("time", ["packets", "samples"])
-@pytest.mark.parametrize(("name", "change"), [("demo", "reports=null"), ("two-way", "back.channel={}")])
+@pytest.mark.parametrize(
+    ("name", "change"), [("demo", "robots=[{direction: send}, {direction: receive}]"), ("two-way", "paths=[]")]
+)
 def test_what_arrives_one_way_and_two_ways_follows_from_the_gain(name: str, change: str, time: str) -> None:
-    own = ["phy.sample_rate=200000", f"time={time}", "channel.packet_loss=0", 'ros_source.repair="off"']
-    own += [change, "ros_source.topics=[odom]", "ros_source.topic_options={}"]
+    own = ["phy.sample_rate=200000", f"time={time}", "channel.packet_loss=0", 'repair="off"']
+    own += [change, "topics=[odom]"]
     near, far = (run(name, *own, f"gains_db={gain}", duration_s=3.0) for gain in (-60, -133))
     assert [topic.pdr for topic in near.topics] == [1.0] * len(near.topics)
     assert all(topic.delivered == 0 for topic in far.topics)
@@ -112,8 +117,13 @@ def test_what_arrives_one_way_and_two_ways_follows_from_the_gain(name: str, chan
 def test_in_real_time_too_and_who_hears_nobody_is_named() -> None:
     result = run("demo", "gains_db=-90", "channel.packet_loss=0", "phy.sample_rate=200000", duration_s=2.0)
     assert all(topic.delivered for topic in result.topics if topic.sent)
-    with pytest.raises(ConfigError, match="receiver 2 hears nobody"):
-        run("demo", "receivers=[{}]", "gains_db=[[0, -90, null], [-90, 0, 0], [0, 0, 0]]", duration_s=2.0)
+    with pytest.raises(ConfigError, match="/robot_3 hears nobody"):
+        run(
+            "demo",
+            "robots=[{}, {topics: []}, {topics: []}]",
+            "gains_db=[[0, -90, null], [-90, 0, 0], [0, 0, 0]]",
+            duration_s=2.0,
+        )
     with pytest.raises(ConfigError, match="nobody hears /robot_1"):
         run("demo", "gains_db=-300", duration_s=2.0)
 
@@ -127,11 +137,10 @@ def test_without_gains_the_snr_is_that_of_the_channel() -> None:
     ("override", "message"),
     [
         ("robots=1", "two or more"),
-        ("robots=[{}, {ros_source: {namespace: /robot_1}}]", "each with its own"),
+        ("robots=[{}, {robot: /robot_1}]", "two are robot 1"),
         ("gains_db=[[1, 2]]", "2 robots need 2 rows of 2 numbers"),
         ("robots=null", "must be a list"),
-        ("reports={}", "leave back, reports, receivers out"),
-        ("receivers=[{}]", "leave back, reports, receivers out"),
+        ("receivers=[{}]", "receivers is no setting any more"),
     ],
 )
 def test_what_does_not_go_together_is_refused(override: str, message: str) -> None:

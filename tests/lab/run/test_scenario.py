@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.settings.config import Agreed, ChannelConfig, replaced
+from gr_ros2.settings.config import ChannelConfig, replaced
 from gr_ros2.settings.files import parse_override
-from gr_ros2_lab.medium.base import Path as Way
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.run.builtin import builtin_scenarios
 from gr_ros2_lab.run.scenario import changed, dump, load_scenario, scenario_from
 
@@ -27,9 +26,9 @@ def test_the_built_in_ones() -> None:
     assert (demo.packet_len, demo.phy.name, demo.phy.sample_rate, demo.phy.headroom) == (220, "ofdm", "auto", 1.2)
     assert (direct.packet_len, direct.sim.odom_rate, direct.duration_s, direct.phy.name) == (64, 30, 15, "direct")
     assert (ofdm.packet_len, ofdm.sim.odom_rate, ofdm.duration_s, ofdm.phy.sample_rate) == (64, 35, 38, 100_000)
-    assert (ofdm.ros_source.packet_rate, ofdm.drain_s, ofdm.ros_source.queue_depth) == (0, 0, 0)
-    assert BUILTIN["paper-ofdm-paced"].ros_source.packet_rate == "auto"
-    assert BUILTIN["paper-ofdm-paced"].ros_source.queue_depth > 0
+    assert (ofdm.first.packet_rate, ofdm.drain_s, ofdm.first.queue_depth, ofdm.first.version) == (0, 0, 0, 0)
+    assert BUILTIN["paper-ofdm-paced"].first.packet_rate == "auto"
+    assert BUILTIN["paper-ofdm-paced"].first.queue_depth > 0
 
 
 @pytest.mark.parametrize("name", sorted(BUILTIN))
@@ -40,9 +39,7 @@ def test_each_is_ready_to_run(name: str) -> None:
         "in real time it is waited for"
     )
     assert scenario.all_robots[0].robot_id == 1
-    assert scenario.ros_source.packet_len == scenario.ros_sink.packet_len == scenario.packet_len
-    assert scenario.ros_source.registry == scenario.ros_sink.registry == scenario.registry
-    assert {scenario.ros_source.domain_id, scenario.ros_sink.domain_id} == {"auto"}, "free ones, or that of the shell"
+    assert {robot.graph.domain_id for robot in scenario.robots} == {"auto"}, "free ones, or that of the shell"
     assert scenario.own_domains == (name != "one-graph")
     assert "odom" in [topic.name for topic in scenario.load_registry()]
 
@@ -53,14 +50,14 @@ def test_a_dump_makes_the_same_scenario(name: str) -> None:
 
 
 def test_overrides() -> None:
-    changes = ["packet_len=64", "phy.sample_rate=2e5", "ros_source.topics=[odom, /imu]", "ros_source.namespace="]
-    changes += ["channel.taps=[1, 0, 0, 0.4]", "source=bag:~/a b", "ros_source.robot_id=7", "phy.options.fft_len=128"]
+    changes = ["packet_len=64", "phy.sample_rate=2e5", "topics=[odom, /imu]", "robots.0.graph.namespace="]
+    changes += ["channel.taps=[1, 0, 0, 0.4]", "source=bag:~/a b", "robots.0.robot=7", "phy.options.fft_len=128"]
     scenario = load_scenario("demo", changes, seed=5, duration_s=None)
-    assert scenario.packet_len == scenario.ros_source.packet_len == scenario.ros_sink.packet_len == 64
+    assert scenario.packet_len == scenario.robots[1].packet_len == 64
     assert scenario.phy.sample_rate == 200_000
     assert scenario.phy.options == {"fft_len": 128}
-    assert scenario.ros_source.topics == ("odom", "/imu")
-    assert scenario.ros_source.namespace == ""
+    robot = scenario.robots[0]
+    assert (list(robot.topics), robot.namespace, robot.robot_id) == (["odom", "/imu"], "", 7)
     assert scenario.channel.taps == (1, 0, 0, 0.4)
     assert scenario.bag_path == Path("~/a b").expanduser()
     assert (scenario.seed, scenario.channel.seed, scenario.sim.seed) == (5, 5, 5)
@@ -73,42 +70,46 @@ def test_a_seed_of_its_own_stays() -> None:
     assert (scenario.channel.seed, scenario.sim.seed) == (9, 5)
 
 
-def test_the_way_back_is_the_way_there_with_the_graphs_swapped() -> None:
-    changes = ["ros_source.compression=true", "ros_source.robot_id=1", "ros_sink.robot_id=2", "channel.snr_db=20"]
-    changes += [
-        "reports=null",
-        "back.ros_source.namespace=/robot_2",
-        "back.ros_sink.publisher_depth=7",
-        "phy.sample_rate=2e5",
-    ]
-    there = load_scenario("demo", changes, seed=5)
-    back = there.back
-    assert back is not None
-    assert replace(there, back=None) == load_scenario("demo", [c for c in changes if not c.startswith("back")], seed=5)
-    here, other = there.all_robots
-    assert (here.source, other.source) == (there.ros_source, back.ros_source)
-    assert (here.sink, other.sink) == (back.ros_sink, there.ros_sink)  # each hears the other's source
-    assert (here.paths, other.paths) == ((Way(1, there.channel),), (Way(0, back.channel),))
-    assert (back.ros_source.domain_id, back.ros_sink.domain_id) == (
-        there.ros_sink.domain_id,
-        there.ros_source.domain_id,
-    )
-    assert (back.ros_source.src_id(), back.ros_sink.robot_id) == (2, "auto")  # a robot's own settings stay its own
-    assert back.ros_source.compression
-    assert (there.ros_sink.publisher_depth, back.ros_sink.publisher_depth) == (1000, 7)
-    assert back.ros_source.registry == there.registry
-    assert back.channel.snr_db == 20
+def test_what_robots_share_stands_above_them_and_what_they_do_not_in_them() -> None:
+    values = {**dump(BUILTIN["demo"]), "robots": [{}, {"publish": {"depth": 7}, "topics": []}], "repair": "thrifty"}
+    one, other = scenario_from(values).robots
+    assert (one.robot, other.robot) == ("/robot_1", "/robot_2")
+    assert (one.publish.depth, other.publish.depth) == (1000, 7)
+    assert (one.repair, other.repair) == ("thrifty", "thrifty")
+    assert one.graph == other.graph
+    told = dump(scenario_from(values))
+    assert told["repair"] == "thrifty"
+    assert [robot.get("publish", {}).get("depth") for robot in told["robots"]] == [1000, 7]
+    assert all("graph" not in robot for robot in told["robots"])
+
+
+def test_two_robots_that_send_hear_each_other_over_channels_of_their_own() -> None:
+    scenario = load_scenario("two-way", ["channel.snr_db=20", "robots.1.publish.depth=7"], seed=5)
+    here, other = scenario.all_robots
+    assert here.source is not None and here.sink is not None and other.source is not None and other.sink is not None
+    assert (here.sink.publisher_depth, other.sink.publisher_depth) == (1000, 7)
+    (there,), (back,) = here.paths, other.paths
+    assert (there.receiver, back.receiver) == (1, 0)
+    assert there.channel.snr_db == back.channel.snr_db == 20
+    assert there.channel.burst_loss is None
+    assert back.channel.burst_loss is not None
     assert back.channel.seed != there.channel.seed == 5
 
 
 def test_a_part_is_changed_at_all_robots() -> None:
     for name in ("two-way", "team", "demo"):
-        scenario = changed(BUILTIN[name], Agreed, lambda part: replaced(part, packet_len=99))
+        scenario = changed(BUILTIN[name], RobotConfig, lambda robot: replaced(robot, packet_len=99))
         halves = [half for robot in scenario.all_robots for half in (robot.source, robot.sink) if half is not None]
         assert {scenario.packet_len, *(half.packet_len for half in halves)} == {99}
-        assert changed(scenario, Agreed, lambda part: replaced(part, packet_len=64)) == changed(
-            BUILTIN[name], Agreed, lambda part: replaced(part, packet_len=64)
-        )
+
+
+def test_one_robot_of_a_list_is_changed_by_its_place() -> None:
+    team = load_scenario("team", ["robots.2.packet_rate=5"])
+    assert [robot.packet_rate for robot in team.robots] == ["auto", "auto", 5, "auto"]
+    with pytest.raises(ConfigError, match=r"robots\.7 has no settings below it"):
+        load_scenario("team", ["robots.7.packet_rate=5"])
+    with pytest.raises(ConfigError, match="robots is a list; name a setting of one"):
+        load_scenario("demo", ["robots.7=5"])
 
 
 def test_override_values_are_yaml() -> None:
@@ -122,18 +123,19 @@ def test_override_values_are_yaml() -> None:
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("foo=1", "unknown key foo; known are packet_len, registry"),
+        ("foo=1", "unknown key foo; known are "),
         ("phy.foo=1", "unknown key phy.foo; known are name, sample_rate"),
         ("phy.sample_rate=-1", "phy.sample_rate = -1: write auto"),
         ("phy.sample_rate=-2", "phy.sample_rate = -2: must be greater than 0, or 'auto'"),
         ("packet_len=9", "^demo: packet_len = 9: [^;]*$"),
         ("seed=x", "^demo: seed = 'x': [^;]*$"),
         ("sim.robots=0", "sim.robots = 0"),
-        ("ros_source.packet_len=64", "ros_source.packet_len = 64: both ends share it; set packet_len"),
-        ("ros_source.min_fragment=999", "ros_source: min_fragment = 999: version 1 has no such setting"),
-        ("ros_source.middleware=foo", "ros_source.middleware = 'foo': .* known are dds"),
+        ("robots.1.packet_len=64", "packet_len: all robots have to agree on it; set it above robots"),
+        ("paper.min_fragment=999", "min_fragment = 999 does not fit packet_len = 220"),
+        ("paper.hop=99", "paper.hop = 99"),
+        ("graph.middleware=foo", "graph.middleware = 'foo': .* known are dds"),
         ("phy.name=foo", "phy.name = 'foo': .* known are direct, ofdm"),
-        ("ros_source=5", "ros_source = 5"),
+        ("ros_source=5", "ros_source is no setting any more: write robot"),
         ("packet_len.x=4", "packet_len has no settings below it"),
         ("source=bag:", "the path of the bag is missing"),
         ("source=dds", "write sim or bag:PATH"),
@@ -156,12 +158,15 @@ def test_override_values_are_yaml() -> None:
             "unknown key channel.burst_loss.loss; known are p_good_to_bad, p_bad_to_good, loss_good, loss_bad",
         ),
         ("repetitions=0", "repetitions = 0: .* greater than or equal to 1"),
-        ("back={}", "back.ros_source: .* set robot_id to 0..254"),
-        ("back=5", "back = 5"),
-        ("back={ros_source: 5}", "back.ros_source = 5"),
-        ("back={ros_source: {namespace: /robot_1}}", "back.ros_source: source id 1 is that of ros_source"),
-        ("back={ros_source: {colour: 1}}", "unknown key back.ros_source.colour; known are packet_len, registry"),
-        ("back={ros_sink: {packet_len: 9}}", "back.ros_sink.packet_len = 9: both ends share it"),
+        ("back={}", "back is no setting any more: write robots"),
+        ("reports={}", "reports is no setting any more: write robots"),
+        ("receivers=[{}]", "receivers is no setting any more: write robots"),
+        ("robots=5x", "robots = '5x': must be a list"),
+        ("robots=[{}, 5]", "robots.1 = 5: must be keys and values"),
+        ("robots=[{}, {robot: /robot_1}]", "robots: two are robot 1; give each a number of its own"),
+        ("robots=[{}, {colour: 1}]", "unknown key robots.1.colour; known are "),
+        ("robots.1.graph={colour: 1}", "unknown key robots.1.graph.colour; known are middleware"),
+        ("time=unthrottled", "time = 'unthrottled': must be 'real', 'samples' or 'packets'"),
         (".packet_len=1", "write key=value"),
     ],
 )
@@ -172,14 +177,14 @@ def test_what_is_wrong_is_named(override: str, says: str) -> None:
 
 
 def test_a_recording_speaks_for_one_robot() -> None:
-    with pytest.raises(ConfigError, match="back: source = 'bag:here' speaks for one robot"):
+    with pytest.raises(ConfigError, match="robots: source = 'bag:here' speaks for one robot"):
         load_scenario("two-way", ["source=bag:here"])
 
 
 def test_a_file_with_a_registry_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine.csv").write_text("fix,sensor_msgs/NavSatFix\n")
     path = tmp_path / "field-trial.yaml"
-    path.write_text("registry: mine.csv\nsource: bag:here\nduration_s: 0\nros_source: {robot_id: 3}\n")
+    path.write_text("registry: mine.csv\nsource: bag:here\nduration_s: 0\nrobots: [{robot: 3}, {topics: []}]\n")
     scenario = load_scenario(path)
     assert (scenario.name, scenario.duration_s, scenario.bag_path) == ("field-trial", 0, Path("here"))
     assert [topic.name for topic in scenario.load_registry()] == ["fix"]

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.core.errors import ConfigError, RunError
+from gr_ros2.core.errors import RunError
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import AirPacket, Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
@@ -140,7 +140,7 @@ def test_six_topics_share_a_link_that_carries_a_third_of_them() -> None:
 
 
 def test_a_link_that_carries_everything_carries_everything() -> None:
-    plain = books(run("demo", "ros_source.compression=false"))
+    plain = books(run("demo", "compression=false"))
     paced = books(run("demo"))
     assert paced.keys() == plain.keys() == {"scan", "odom", "imu", "cmd_vel", "map", "clock"}
     for name, topic in paced.items():
@@ -153,7 +153,7 @@ def test_with_version_1_packets_take_as_much_air_as_they_need() -> None:
 
     def airtime_per_message(lengths: str) -> float:
         radio = f"phy.options={{payload_modulation: bpsk, lengths: {lengths}}}"
-        settings = (radio, "phy.sample_rate=400000", 'ros_source.repair="off"')
+        settings = (radio, "phy.sample_rate=400000", 'repair="off"')
         there = scenario("six-topics-paced", *settings, duration=2.0)
         phy = make_phy(there, there.load_registry())
         done = simulate(there, phy=phy)
@@ -166,14 +166,14 @@ def test_with_version_1_packets_take_as_much_air_as_they_need() -> None:
 
 
 def test_messages_too_late_have_their_own_rows_and_the_ledger_adds_up() -> None:
-    deadline = "ros_source.topic_options={odom: {queue: deadline, deadline_s: 0.4}}"
-    odom = only(run("narrow-ofdm-paced", deadline, "ros_source.compression=false"))
+    deadline = "topics={odom: {queue: deadline, deadline_s: 0.4}}"
+    odom = only(run("narrow-ofdm-paced", deadline, "compression=false"))
     assert {"cannot_complete", "stale"} & odom.ledger.keys()
     assert sum(odom.ledger.values()) == odom.sent
 
 
 def test_lost_packets_are_lost() -> None:
-    odom = only(run("paper-ofdm-paced", "channel.packet_loss=0.2", "ros_source.repair='off'"))
+    odom = only(run("paper-ofdm-paced", "channel.packet_loss=0.2", "repair='off'"))
     assert 0.7 < odom.pdr < 0.9
     assert sum(odom.ledger.values()) == odom.sent
 
@@ -181,11 +181,6 @@ def test_lost_packets_are_lost() -> None:
 def test_the_time_of_the_computer_is_added_to_every_latency() -> None:
     bare, with_it = (only(run("paper-ofdm-paced", overhead_s=s, duration=2.0)) for s in (0.0, 0.004))
     assert with_it.latency_s.p50 == pytest.approx(bare.latency_s.p50 + 0.004)
-
-
-def test_what_has_no_times_is_refused() -> None:
-    with pytest.raises(ConfigError, match="time = 'unthrottled'"):
-        run("paper-ofdm-paced", "time=unthrottled")
 
 
 class Answering(EndpointV0):
@@ -202,13 +197,13 @@ class Answering(EndpointV0):
 
 
 def test_a_robot_may_answer_what_it_hears() -> None:
-    settings = scenario("two-way", "time=packets", "version=0", "ros_source.topic_options={}", duration=2.0)
+    settings = scenario("two-way", "time=packets", "paper={}", "topics=auto", duration=2.0)
     registry = settings.load_registry()
     coming = [Offered(0.5, 0, bytes(51)), Offered(1.0, 0, bytes(300))]
     robots = []
     for number, one in enumerate(settings.all_robots):
         told: list[SenderEvent] = []
-        codecs = message_codec((), registry), message_codec((), registry)
+        codecs = message_codec(registry), message_codec(registry)
         kind = Answering if number else EndpointV0
         endpoint = kind(registry, one.source, one.sink, codecs=codecs, observer=told.append)
         messages = iter(() if number else coming)
@@ -238,7 +233,7 @@ class Stuck(EndpointV0):
 def test_a_simulation_that_stands_still_says_which_end_and_which_timer() -> None:
     settings = scenario("paper-ofdm", "time=packets", duration=2.0)
     registry = settings.load_registry()
-    endpoint = Stuck(registry, settings.ros_source, None)
+    endpoint = Stuck(registry, settings.first, None)
     messages = iter([Offered(0.5, 0, bytes(51))])
     stuck = Robot(settings, 0, endpoint, src_id=1, airtime=lambda *_: 0.0, events=[], messages=messages)
     medium = PacketMedium(FixedPaths([[]]), [DirectPhy(220)])

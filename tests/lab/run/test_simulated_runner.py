@@ -32,7 +32,7 @@ from gr_ros2_lab.run.scenario import load_scenario
 from tests.e2e.support import check_books, check_complete, scenario
 
 BOTH = ("samples", "packets")
-PLAIN = ("version=0", "ros_source.compression=true")
+PLAIN = ("paper={}", "compression=true")
 """Each message is one packet, which nothing repairs and beside which nothing is sent."""
 NOISY = ("channel.snr_db=14", "channel.packet_loss=0.02", "channel.outages=[[0.5, 0.7]]", "channel.doppler_hz=3")
 
@@ -86,7 +86,7 @@ def test_equal_seeds_give_equal_results_in_one_process_and_in_another(
 @pytest.mark.slow
 @pytest.mark.real_time
 def test_without_noise_real_time_samples_and_packets_agree() -> None:
-    patient = "ros_source.queue_depth=100"  # a busy computer may hold up real time, which must not lose messages
+    patient = "queue_depth=100"  # a busy computer may hold up real time, which must not lose messages
     real = run_scenario(scenario("paper-ofdm-paced", *PLAIN, patient, duration_s=3.0)).result
     samples, packets = (run("paper-ofdm-paced", time, *PLAIN, patient).result for time in BOTH)
     span = {"air_span_s": real.phy["air_span_s"]}  # the wall clock's
@@ -176,7 +176,7 @@ def test_what_is_delivered_is_kept_with_both_times(tmp_path: Path) -> None:
 
 
 def test_what_is_delivered_is_kept_under_the_name_the_sinks_options_give_it(tmp_path: Path) -> None:
-    settings = ["time=packets", "ros_sink.topic_options={odom: {publish_as: '/fleet/r{src_id}/pose'}}"]
+    settings = ["time=packets", "publish.topics={odom: {as: '/fleet/r{robot}/pose'}}"]
     outcome = run_scenario(load_scenario("paper-ofdm-paced", settings, duration_s=1.0), tmp_path / "out")
     assert [info.topic for info in bag_topics(tmp_path / "out" / DELIVERED_BAG)] == ["/fleet/r1/pose"]
     assert list(outcome.result.counters["listener"]) == ["/fleet/r1/pose"]

@@ -123,7 +123,7 @@ def test_the_numbers_of_a_team_are_those_of_its_pairs() -> None:
 def test_the_controller_of_the_documentation_stands_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine.py").write_text(PROGRAMS[0].text)
     monkeypatch.syspath_prepend(tmp_path)
-    settings = "robots=3", "duration_s=15", "ros_source.packet_rate=1"
+    settings = "robots=3", "duration_s=15", "packet_rate=1"
     careful, usual = (result("formation", *settings, task).task for task in ("task=mine:Careful", "task=formation"))
     assert careful["formation_error_m"] != usual["formation_error_m"]
 
@@ -153,7 +153,7 @@ def test_a_run_without_controllers_says_where_they_are_missed(monkeypatch: pytes
     ("overrides", "said"),
     [
         (["time=samples"], "task = 'formation'"),
-        (["registry=table4"], "their odometry|send their odometry alone"),
+        (["registry=table4", "topics=auto"], "their odometry|send their odometry alone"),
         (["task=dance"], "task = 'dance': is no task"),
         (["controller=ros"], "controller = 'ros'"),
         (["task=", "time=real", "controller=ros"], "controller = 'ros'"),

@@ -19,6 +19,10 @@ from gr_ros2_lab.run.scenario import Scenario, dump, load_scenario, scenario_fro
 LOSS = 0.2
 
 
+REPORTING: list[dict[str, Any]] = [{}, {"topics": []}]
+"""One that sends, and one that hears it and reports."""
+
+
 def scenario(**settings: Any) -> Scenario:
     """Odometry at 35 Hz, compressed, over the paper's OFDM link, which takes twice as many packets."""
     values = {
@@ -26,8 +30,7 @@ def scenario(**settings: Any) -> Scenario:
         "registry": find_registry("odom", Path()),
         "sim": {"odom_rate": 35},
         "packet_len": 64,
-        "version": 1,
-        "ros_source": {"namespace": "/robot_1"},
+        "robots": [{"direction": "send"}, {"direction": "receive"}],
         "phy": {"name": "ofdm", "sample_rate": 100000, "options": {"detection_threshold": "stock"}},
         "channel": {"packet_loss": LOSS},
         "duration_s": 10.0,
@@ -59,7 +62,7 @@ def test_one_way_everything_comes_in_spite_of_losses() -> None:
 
 
 def test_without_repair_what_is_lost_stays_lost() -> None:
-    result = run(ros_source={"namespace": "/robot_1", "repair": "off"})
+    result = run(repair="off")
     (odom,) = map(checked, result.topics)
     assert 0.7 < odom.pdr < 0.9
     assert odom.ledger["lost_fragments"] > 0
@@ -67,23 +70,23 @@ def test_without_repair_what_is_lost_stays_lost() -> None:
 
 
 def test_reports_are_lost_too_and_save_air() -> None:
-    one_way, reported = run(), run(reports={"delay_s": 0.05})
+    one_way, reported = run(), run(robots=REPORTING, paths=[{"from": 2, "delay_s": 0.05}])
     (odom,) = map(checked, reported.topics)
     assert odom.pdr >= 0.99
     assert reported.packets["air_report"] > 0
     assert reported.packets["air_repair"] < one_way.packets["air_repair"]
-    nothing_lost = run(reports={}, channel={})
+    nothing_lost = run(robots=REPORTING, channel={})
     assert nothing_lost.topics[0].pdr == 1
     assert nothing_lost.packets["air_repair"] == 0
 
 
 def test_a_way_back_that_loses_everything_is_none() -> None:
-    (odom,) = map(checked, run(reports={"channel": {"packet_loss": 1.0}}).topics)
+    (odom,) = map(checked, run(robots=REPORTING, paths=[{"from": 2, "packet_loss": 1.0}]).topics)
     assert odom.pdr >= 0.95
 
 
 def test_every_receiver_has_losses_of_its_own(tmp_path: Path) -> None:
-    result = run(reports={}, receivers=[{}, {"packet_loss": 0.4}])
+    result = run(robots=[*REPORTING, {"topics": []}, {"topics": []}], paths=[{"from": 1, "to": 4, "packet_loss": 0.4}])
     assert [receiver.number for receiver in result.receivers] == [2, 3]
     every = [result.topics[0], *(topic for receiver in result.receivers for topic in receiver.topics)]
     assert [checked(topic).pdr >= 0.97 for topic in every] == [True] * 3
@@ -103,8 +106,7 @@ def test_both_ways_at_once() -> None:
         packet_len=220,
         sim={"robots": 2, "odom_rate": 20, "imu_rate": 20, "scan_rate": 1, "map_cells": 40},
         phy={"name": "ofdm", "sample_rate": 2_000_000, "options": {"detection_threshold": "stock"}},
-        ros_source={"namespace": "/robot_1", "topics": ["odom", "imu"]},
-        back={"ros_source": {"namespace": "/robot_2", "topics": ["odom"]}},
+        robots=[{"topics": ["odom", "imu"]}, {"topics": ["odom"]}],
         duration_s=5.0,
     )
     assert {topic.topic for topic in both.topics} == {"/robot_1/odom", "/robot_1/imu", "/robot_2/odom"}
@@ -113,18 +115,22 @@ def test_both_ways_at_once() -> None:
 
 
 def test_equal_scenarios_give_equal_numbers() -> None:
-    one, other = run(reports={}, duration_s=3.0), run(reports={}, duration_s=3.0)
+    one, other = run(robots=REPORTING, duration_s=3.0), run(robots=REPORTING, duration_s=3.0)
     assert (one.topics, one.packets) == (other.topics, other.packets)
 
 
 def test_through_the_flowgraph_too() -> None:
-    (odom,) = map(checked, run(time="samples", reports={}, duration_s=1.0).topics)
+    (odom,) = map(checked, run(time="samples", robots=REPORTING, duration_s=1.0).topics)
     assert odom.pdr >= 0.9
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.05])
 def test_without_a_pace_reports_still_repair(delay_s: float) -> None:
-    direct = {"phy": {"name": "direct"}, "reports": {"delay_s": delay_s}}
+    direct: dict[str, Any] = {
+        "phy": {"name": "direct"},
+        "robots": REPORTING,
+        "paths": [{"from": 2, "delay_s": delay_s}],
+    }
     result = run(**direct)
     (odom,) = map(checked, result.topics)
     assert odom.pdr == 1
@@ -136,23 +142,25 @@ def test_without_a_pace_reports_still_repair(delay_s: float) -> None:
     assert run(phy={"name": "direct"}).packets["air_repair"] == 0, "nobody says what is lost"
 
 
-def test_channels_take_over_what_is_not_set_but_the_seed() -> None:
-    made = scenario(reports={}, receivers=[{"packet_loss": 0.5}], seed=3)
-    assert made.reports is not None
-    assert made.reports.channel.packet_loss == LOSS
-    assert made.receivers[0].packet_loss == 0.5
-    assert len({made.channel.seed, made.reports.channel.seed, made.receivers[0].seed}) == 3
+def test_paths_take_over_what_is_not_set_but_the_seed() -> None:
+    made = scenario(robots=[*REPORTING, {"topics": []}], paths=[{"from": 1, "to": 3, "packet_loss": 0.5}], seed=3)
+    assert made.reports
+    paths = [path.channel for robot in made.all_robots for path in robot.paths]
+    assert [path.packet_loss for path in paths] == [LOSS, 0.5, LOSS, LOSS]
+    assert len({path.seed for path in paths}) == 4
     assert scenario_from(dump(made)) == made
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"version": 0, "reports": {}}, "reports: version 0 has none"),
-        ({"packet_len": 30}, "version 1 needs at least 40"),
-        ({"version": 2}, "version = 2"),
-        ({"back": {"ros_source": {"namespace": "/robot_2"}}, "receivers": [{}]}, "one receiver each way"),
-        ({"ros_source": {"version": 0, "namespace": "/robot_1"}}, "both ends share it; set version instead"),
+        ({"packet_len": 30}, "packet_len = 30: version 1 needs at least 40"),
+        ({"version": 1}, "version is no setting any more"),
+        ({"back": {}}, "back is no setting any more: write robots"),
+        ({"paths": [{"from": 7}]}, "paths: there is no robot 7; there are 1, 2"),
+        ({"robots": [{"topics": []}, {}]}, "name those that send first"),
+        ({"robots": [{"topics": []}, {"direction": "receive"}]}, "none sends anything"),
+        ({"robots": [{}, {"packet_len": 80}]}, "packet_len: all robots have to agree on it; set it above robots"),
     ],
 )
 def test_what_does_not_go_together_is_refused(settings: dict[str, Any], message: str) -> None:
@@ -161,7 +169,7 @@ def test_what_does_not_go_together_is_refused(settings: dict[str, Any], message:
 
 
 def test_a_run_in_which_messages_wait_for_their_turn_comes_to_its_end() -> None:
-    setting = "ros_source.topic_options={odom: {max_rate: 5}}"
+    setting = "topics={odom: {max_rate: 5}}"
     values = load_scenario("demo", [setting], time="packets", duration_s=1.0)
     result = run_scenario(values).result
     assert all(topic.delivered for topic in result.topics if topic.topic in ("odom", "scan"))

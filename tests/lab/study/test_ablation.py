@@ -23,16 +23,16 @@ def named(name: str, *overrides: str) -> list[str]:
 def test_each_part_that_is_on_has_a_variant() -> None:
     assert named("six-topics-paced") == ["whole", "no-compression", "no-pull", "no-repair", "no-latest"]
     assert named("paper-ofdm-paced") == ["whole", "no-compression", "no-pull", "no-repair"]
-    plain = ("reports=null", "ros_source.compression=false", "ros_source.repair='off'", "ros_source.packet_rate=0")
-    assert named("demo", *plain, "ros_source.topic_options.odom.depth=1") == ["whole", "no-latest"]
-    assert named("demo", "version=0", "reports=null") == ["whole", "no-pull"]
+    plain = ("robots=[{direction: send}, {direction: receive}]", "compression=false", "repair='off'", "packet_rate=0")
+    assert named("demo", *plain, "topics.odom.depth=1") == ["whole", "no-latest"]
+    assert named("demo", "paper={}", "robots=[{direction: send}, {direction: receive}]") == ["whole", "no-pull"]
     assert named("demo") == ["whole", "no-compression", "no-pull", "no-repair", "no-reports"]
     with pytest.raises(ConfigError, match="scenario paper-ofdm: nothing to switch off"):
         named("paper-ofdm")
 
 
 def test_a_part_goes_with_its_details_which_have_no_effect_without_it() -> None:
-    details = ["ros_source.expected_loss=0.4", "ros_source.topic_options.odom.quantize=pose.pose.position=0.1"]
+    details = ["expected_loss=0.4", "topics.odom.quantize=pose.pose.position=0.1"]
     whole = load_scenario("six-topics-paced", details)
     for variant in variants(whole):
         assert load_scenario("six-topics-paced", [*details, *variant.settings]) != whole or variant.name == "whole"
@@ -57,11 +57,11 @@ def test_every_run_differs_in_its_part_alone(tmp_path: Path) -> None:
     whole, *others = (dict(flat(read_result(run.directory).config)) for run in runs)
     assert whole["seed"] == 3
     differing = [{key for key in whole.keys() | other.keys() if whole.get(key) != other.get(key)} for other in others]
-    queues = {f"ros_source.topic_options.{topic}.queue" for topic in ("scan", "odom", "imu", "cmd_vel", "map", "clock")}
+    queues = {f"topics.{topic}.queue" for topic in ("scan", "odom", "imu", "cmd_vel", "map", "clock")}
     assert differing == [
-        {"ros_source.compression"},
-        {"ros_source.packet_rate"},
-        {"ros_source.repair"},
+        {"compression"},
+        {"packet_rate"},
+        {"repair"},
         queues,
     ]
 

@@ -26,16 +26,16 @@ def planner(name: str, *overrides: str, duration: float = 5.0) -> Planner:
 @pytest.mark.parametrize("name", ["paper-ofdm-paced", "six-topics-paced", "demo"])
 def test_the_shares_of_the_topics_are_the_airtime_used(name: str) -> None:
     """Without repair, which uses air too; hellos and the table of topics take the rest."""
-    forecast = planner(name, "reports=null", "ros_source.repair='off'").forecast()
+    forecast = planner(name, "robots=[{direction: send}, {direction: receive}]", "repair='off'").forecast()
     assert min(1.0, sum(topic.share for topic in forecast.topics)) == pytest.approx(forecast.used, rel=0.08)
     assert forecast.capacity == pytest.approx(1 / forecast.airtime_s)
     assert 0 <= forecast.pad < (0.13 if name == "six-topics-paced" else 1), "packets are filled"
 
 
 def test_commands_come_in_time_on_a_link_that_is_full() -> None:
-    settings = ["phy={name: modem, options: {bit_rate: 9600}}", "ros_source.topic_options={}"]
+    settings = ["phy={name: modem, options: {bit_rate: 9600}}", "topics=auto"]
     full = planner("six-topics-paced", *settings, duration=20.0).forecast()
-    late = planner("six-topics-paced", *settings, "ros_source.commands=[]", duration=20.0).forecast()
+    late = planner("six-topics-paced", *settings, "commands=[]", duration=20.0).forecast()
     now, before = ({topic.topic: topic.result for topic in plan.topics}["/robot_1/cmd_vel"] for plan in (full, late))
     assert full.load > 10
     assert now.latency_s.p99 is not None
@@ -62,7 +62,7 @@ def test_what_to_cut_is_known_where_a_topic_finds_no_place_at_all() -> None:
 
 
 def test_what_fits_is_said_to_fit() -> None:
-    fits = planner("paper-ofdm-paced", "ros_source.repair='off'").forecast()
+    fits = planner("paper-ofdm-paced", "repair='off'").forecast()
     assert fits.load == pytest.approx(fits.used, rel=0.08)
     assert fits.load < 1
     assert fits.topics[0].rate_hz == pytest.approx(fits.topics[0].offered_hz)
@@ -82,9 +82,9 @@ def test_a_forecast_is_what_the_link_does() -> None:
     ("settings", "least_pdr", "most_packets"),
     [
         (["channel.packet_loss=0.2"], 0.995, 2.8),
-        (["channel.packet_loss=0.2", "reports={}"], 0.995, 1.75),
-        (["reports={}"], 1.0, 1.1),
-        (["channel.packet_loss=0.2", "ros_source.repair='off'"], 0.7, 1.1),
+        (["channel.packet_loss=0.2", "robots=[{}, {topics: []}]"], 0.995, 1.75),
+        (["robots=[{}, {topics: []}]"], 1.0, 1.1),
+        (["channel.packet_loss=0.2", "repair='off'"], 0.7, 1.1),
     ],
 )
 def test_repair_is_forecast_as_a_run_in_simulated_time_has_it(
@@ -100,7 +100,7 @@ def test_repair_is_forecast_as_a_run_in_simulated_time_has_it(
     assert topic.result.pdr >= least_pdr
     assert topic.result.latency_s.p99 == pytest.approx(there.latency_s.p99 or 0, rel=0.15, abs=0.005)
     packets = sum(count for kind, count in forecast.air.items() if kind != "report")
-    assert (forecast.air["report"] > 0) == ("reports={}" in settings)
+    assert (forecast.air["report"] > 0) == ("robots=[{}, {topics: []}]" in settings)
     spent_s = sum(real.phy["airtime_of_kinds_s"].values())
     assert sum(forecast.air.values()) == pytest.approx(spent_s / real.phy["airtime_s"] / there.sent, rel=0.03)
     assert 1 <= packets <= most_packets
@@ -122,9 +122,9 @@ def test_a_forecast_of_six_topics_is_what_the_flowgraph_does() -> None:
 
 
 def test_advice_holds_when_it_is_followed() -> None:
-    plain = ("ros_source.compression=false", "ros_source.repair='off'")
+    plain = ("compression=false", "repair='off'")
     best = planner("paper-ofdm-paced", *plain).advice()[0]
-    assert best.setting == "ros_source.compression=true"
+    assert best.setting == "compression=true"
     followed = planner("paper-ofdm-paced", *plain, best.setting)
     assert followed.forecast().load < 1
     lens = [advice for advice in followed.advice() if advice.setting.startswith("packet_len=")]
@@ -175,7 +175,7 @@ def test_what_is_proposed(effects: list[Effect], used: tuple[float, float], wort
     ("name", "settings"),
     [
         ("six-topics-paced", ()),
-        ("demo", ("ros_source.compression=false",)),
+        ("demo", ("compression=false",)),
         ("narrow-ofdm-paced", ()),
     ],
 )
@@ -204,7 +204,7 @@ def test_several_processes_say_what_one_says(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_planned_packet_length_fits_messages_stamped_by_the_wall_clock() -> None:
     plan = planner("paper-ofdm-paced")
-    codec = message_codec((), plan.registry)
+    codec = message_codec(plan.registry)
     sent = [m.payload for m in Fleet(plan.scenario.sim).messages(5.0, time.time()) if m.topic == "/robot_1/odom"]
     sizes = sorted(len(codec.encode(0, payload)) for payload in sent)
     assert plan.forecast().topics[0].air_bytes == pytest.approx(np.mean(sizes), abs=0.5)
@@ -214,7 +214,7 @@ def test_a_planned_packet_length_fits_messages_stamped_by_the_wall_clock() -> No
 
 @pytest.mark.parametrize(
     ("overrides", "says"),
-    [(["phy.name=direct"], "takes no airtime"), (["sim.robots=1", "ros_source.namespace=/robot_7"], "has nothing on")],
+    [(["phy.name=direct"], "takes no airtime"), (["sim.robots=1", "robots.0.robot=/robot_7"], "has nothing on")],
 )
 def test_what_cannot_be_planned(overrides: list[str], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
@@ -227,7 +227,7 @@ def test_what_cannot_be_planned(overrides: list[str], says: str) -> None:
 def test_robots_on_one_channel_are_forecast_together(name: str, duration: float, rows: int) -> None:
     """Robot 1 of a run counts what it hears; a forecast counts what the first robot hears that hears a sender. Without
     repair, which where packets overlap makes a small difference large."""
-    scenario = load_scenario(name, ["ros_source.repair='off'"], duration_s=duration)
+    scenario = load_scenario(name, ["repair='off'"], duration_s=duration)
     forecast = Planner(scenario).forecast()
     real = run_scenario(scenario).result
     there = {topic.topic: topic for topic in real.topics}

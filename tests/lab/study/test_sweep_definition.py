@@ -10,7 +10,6 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2_lab.run.scenario import dump
 from gr_ros2_lab.study.sweep.definition import builtin_sweeps, load_sweep, read_sweep
 from tests.lab.study.sweeps import plan, write_sweep_file
 
@@ -20,7 +19,7 @@ def test_a_grid_is_all_combinations(tmp_path: Path) -> None:
     points = [(cell.values["channel.packet_loss"], cell.values["packet_len"]) for cell in made.cells]
     assert points == [(loss, length) for loss in (0.0, 0.1) for length in (64, 128, 256)]
     scenario = made.cells[-1].runs[0]
-    assert (scenario.packet_len, scenario.ros_sink.packet_len, scenario.duration_s) == (256, 256, 1.0)
+    assert (scenario.packet_len, scenario.packet_len, scenario.duration_s) == (256, 256, 1.0)
     assert scenario.time == "packets"
 
 
@@ -45,10 +44,10 @@ def test_values_are_taken_as_they_stand(tmp_path: Path) -> None:
     odd = ["1", "null", "a: b", "{x}", "2e5"]
     made = plan(
         tmp_path,
-        grid={"ros_source.topic_options": [{"odom": {"codec": text}} for text in odd]},
-        set={"ros_source.compression": True},
+        grid={"topics": [{"odom": {"codec": text}} for text in odd]},
+        set={"paper.compression": True},
     )
-    found = [dump(cell.runs[0])["ros_source"]["topic_options"]["odom"]["codec"] for cell in made.cells]
+    found = [cell.runs[0].robots[0].topics["odom"].codec for cell in made.cells]
     assert found == odd
 
 
@@ -61,7 +60,7 @@ def test_repetitions_differ_in_all_seeds_and_cells_share_them(tmp_path: Path) ->
 
 def test_scenario_and_registry_are_looked_for_beside_the_sweep(tmp_path: Path) -> None:
     (tmp_path / "own.csv").write_text("odom,nav_msgs/Odometry\n")
-    (tmp_path / "mine.yaml").write_text("registry: own.csv\nphy: {name: direct}\nros_source: {namespace: /robot_1}\n")
+    (tmp_path / "mine.yaml").write_text("registry: own.csv\nphy: {name: direct}\nrobots: 2\n")
     made = plan(tmp_path, scenario="mine.yaml", grid={"registry": ["own.csv", "odom"]})
     assert made.cells[0].runs[0].registry == str(tmp_path / "own.csv")
     assert made.cells[1].runs[0].registry.endswith("registries/odom.csv")

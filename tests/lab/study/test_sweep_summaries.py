@@ -132,11 +132,11 @@ def test_axes_suggested_by_the_keys(tmp_path: Path, changes: dict[str, Any], axe
 
 
 def test_what_is_on_no_axis_has_a_panel_of_its_own(tmp_path: Path) -> None:
-    grid = {"channel.packet_loss": [0.1, 0], "ros_source.entry_ids": ["sequential", "random"], "packet_len": [64, 128]}
+    grid = {"channel.packet_loss": [0.1, 0], "paper.entry_ids": ["sequential", "random"], "packet_len": [64, 128]}
     made = plan(tmp_path, grid=grid)
     found = summaries(made, rows_of(made, results(made, topic(ODOM, 10, 5, 0.1))))
     axes = choose_axes(made)
-    assert axes == Axes("channel.packet_loss", ("ros_source.entry_ids",), "packet_len")
+    assert axes == Axes("channel.packet_loss", ("paper.entry_ids",), "packet_len")
     panels = curve_panels(made, axes, found)
     assert [panel.title for panel in panels] == ["packet length [B]=64", "packet length [B]=128"]
     assert list(panels[0].curves) == ["sequential", "random"]
@@ -150,15 +150,15 @@ def test_figures_say_what_they_leave_out(tmp_path: Path) -> None:
     lengths = list(range(64, 64 + MOST_PANELS + 3))
     made = plan(
         tmp_path,
-        grid={"channel.packet_loss": [0, 0.1], "ros_source.backpressure": [False, True], "packet_len": lengths},
+        grid={"channel.packet_loss": [0, 0.1], "debug": [False, True], "packet_len": lengths},
     )
     found = summaries(made, rows_of(made, results(made, topic(ODOM, 10, 5, 0.1))))
     figure, left_out = curves_figure(made, found)
     assert (len(figure.axes), left_out) == (MOST_PANELS, 3)
     assert figure.axes[0].get_xlabel() == "packet loss"
     assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [
-        "ros_source.backpressure=false",
-        "ros_source.backpressure=true",
+        "debug=false",
+        "debug=true",
     ]
     drawn = heat_figure(made, found)
     assert drawn is not None and drawn[1] == 0

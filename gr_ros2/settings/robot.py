@@ -1,0 +1,328 @@
+"""The configuration of one robot: the same in a link file, in each robot of a scenario, in GRC's ROS Link and as ROS
+parameters.
+
+Invariants: a value has one name and one place; ``topics`` is a mapping, whatever form a file gives it; what a robot
+does not send or does not receive has no settings that act.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic.dataclasses import dataclass
+
+from gr_ros2.core.errors import ConfigError
+from gr_ros2.settings.commands import COMMAND_TYPES, checked_commands
+from gr_ros2.settings.config import (
+    DEFAULT_MIDDLEWARE,
+    MAX_PACKET_LEN,
+    MIN_PACKET_LEN,
+    STRICT,
+    Bytes,
+    Count,
+    DomainId,
+    FrameForm,
+    MergedTopic,
+    Namespace,
+    NamespaceForm,
+    PaperConfig,
+    Repairs,
+    Seconds,
+    SendOptions,
+    SinkConfig,
+    SourceConfig,
+    TopicForm,
+    TopicOptions,
+    build,
+)
+from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.topic_choice import LEAVES_OUT, checked_words, topics_of
+from gr_ros2.state.keys import checked_key_file
+from gr_ros2.wire import BROADCAST
+
+_DESCRIBED = ConfigDict(**STRICT, use_attribute_docstrings=True)
+_ALIASED = ConfigDict(**_DESCRIBED, populate_by_name=True)
+Age = Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")]
+
+
+def _checked_topics(topics: dict[str, SendOptions]) -> dict[str, SendOptions]:
+    checked_words(tuple(topics))
+    for word, options in topics.items():
+        if word.startswith(LEAVES_OUT) and options != SendOptions():
+            raise ValueError(f"{word!r} leaves topics out, which have no options; leave these out")
+    return topics
+
+
+def _named(topics: dict[str, Any]) -> dict[str, Any]:
+    checked_words(tuple(topics))
+    return topics
+
+
+@dataclass(frozen=True, kw_only=True, config=_DESCRIBED)
+class GraphConfig:
+    """The ROS graph of a robot."""
+
+    middleware: str = DEFAULT_MIDDLEWARE
+    """where it is reached, a name of ``gr_ros2.middleware.MIDDLEWARE``"""
+    domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
+    """ROS domain, 0..232; auto takes ROS_DOMAIN_ID"""
+    localhost_only: bool | Auto = AUTO
+    """DDS stays on the loopback interface; auto takes what the environment of ROS says, in a scenario true"""
+    namespace: Namespace | Auto = AUTO
+    """namespace of the robot's topics there; '' is the root, auto the name of the robot"""
+    depth: Annotated[Count, Field(title="Depth of subscriptions (messages)")] = 10
+    """QoS depth of the subscriptions, 0 unbounded"""
+    use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
+    """take latency from stamps on the graph's /clock instead of wall time"""
+
+
+@dataclass(frozen=True, kw_only=True, config=_ALIASED)
+class PublishOptions:
+    """How one topic of other robots comes out, and how long its messages count."""
+
+    as_: Annotated[TopicForm, Field(alias="as", title="Published as")] = AUTO
+    """its name on the graph, ``{robot}`` allowed; auto = ``publish.as`` and the topic's own name"""
+    reliability: Literal["reliable", "best_effort"] | Auto = AUTO
+    """of its publisher; auto leaves it to the middleware"""
+    durability: Literal["volatile", "transient_local"] | Auto = AUTO
+    """of its publisher; auto as its sender announces it"""
+    depth: Count | Auto = AUTO
+    """QoS depth of its publisher; auto = ``publish.depth``, of a transient-local topic 1"""
+    deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
+    """s after which a command is not delivered any more; of a service: s that a call waits for its reply, auto 30"""
+    max_age_s: Age = AUTO
+    """s for which a sealed message of it may have been withheld (with a key), or it is not taken; 0 = any time, auto
+    takes ``max_age_s`` of the robot"""
+
+
+@dataclass(frozen=True, kw_only=True, config=_ALIASED)
+class PublishConfig:
+    """How what a robot receives comes out on its graph."""
+
+    as_: Annotated[NamespaceForm, Field(alias="as", title="Published under")] = "/rx_robot_{robot}"
+    """topics come out as this + '/' + their names; ``{robot}`` is the number of the sender"""
+    depth: Annotated[Count, Field(title="Depth of publishers (messages)")] = 10
+    """QoS depth of the publishers, 0 unbounded"""
+    frame_prefix: FrameForm = ""
+    """before every frame name of a message, ``{robot}`` is the sender; '' leaves messages as sent"""
+    merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
+    """topic on which the transforms of all senders come out too, and their static ones, latched, on this + ``_static``;
+    needs ``frame_prefix``; '' off"""
+    topics: Annotated[dict[str, PublishOptions], AfterValidator(_named), Field(title="Topics that come out")] = Field(
+        default_factory=dict
+    )
+    """single topics of others, such as {odom: {depth: 100}}; * and ? stand for others"""
+
+
+@dataclass(frozen=True, kw_only=True, config=_DESCRIBED)
+class RobotConfig:
+    """One robot: what it sends, what it takes, and how it joins its graph and the link."""
+
+    robot: Annotated[int, Field(ge=0, le=BROADCAST - 1)] | str
+    """its number on the air, 0..254, or its name: the number then is the last digits, /robot_1 is robot 1"""
+    direction: Literal["both", "send", "receive"] = "both"
+    """whether it sends and receives; with one of them alone nobody gets reports from it, or it gets none"""
+    topics: Annotated[dict[str, SendOptions], BeforeValidator(topics_of), AfterValidator(_checked_topics)] = Field(
+        default_factory=lambda: {AUTO: SendOptions()}
+    )
+    """what it sends: names, in which * and ? stand for others, or a mapping of names to options; auto = every topic of
+    the registry or, without one, of the robot's namespace on the graph; -NAME leaves out; [] = nothing"""
+    publish: PublishConfig = Field(default_factory=PublishConfig)
+    """how what it receives comes out"""
+    graph: GraphConfig = Field(default_factory=GraphConfig)
+    """its ROS graph"""
+    registry: Annotated[str, Field(title="Registry CSV")] = ""
+    """file of topics and their types, or the name of a built-in one such as ``table4``; '' = ``topics`` are looked for
+    on the graph"""
+    services: Annotated[bool, Field(title="Services and actions too")] = True
+    """whether ``topics`` choose services and actions of the graph too, which other robots may then call"""
+    commands: Annotated[tuple[str, ...], AfterValidator(checked_commands)] = COMMAND_TYPES
+    """types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before others, unless
+    the topic's options say otherwise; the same at all robots"""
+    packet_len: Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN, title="Packet length (bytes)")] = 220
+    """bytes of the longest packet, 40..4095 (14 or more of the paper's blocks), the same at all robots"""
+    key: Annotated[str, Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
+    """file of the fleet's keys (gr-ros2 key new); '' sends packets that anybody can read and forge; with one, sealed
+    packets alone are taken"""
+    seal: Literal["encrypt", "authenticate"] = "encrypt"
+    """with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption"""
+    state: Annotated[str, Field(title="State file")] = ""
+    """file that counts this robot's starts and says what was heard before a restart; '' keeps it in the user's state
+    folder"""
+    packet_rate: Annotated[
+        Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Packet rate (packets/s)")
+    ] = AUTO
+    """packets/s at most. auto = as the PHY grants credits, each packet composed just before; a number is a limit beside
+    that; 0 = every packet at once, whatever the PHY grants, as the paper has it"""
+    queue_depth: Annotated[Count, Field(title="Queue depth (messages per topic)")] = 100
+    """messages waiting per topic, the oldest dropped and counted; 0 unbounded"""
+    compression: bool = True
+    """code every message, which a receiver sees by itself"""
+    repair: Repairs | Auto = AUTO
+    """what idle air is spent on: idle = all of it on what may have been lost, thrifty = as much as losses are known or
+    expected, off; auto = thrifty where receivers report, idle where none does"""
+    expected_loss: Annotated[float, Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
+    """share of packets lost, 0..1, as long as no report tells (thrifty)"""
+    repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
+    """s between repeats of a transient-local topic such as /map while no robot reports, and up to 32 times as long
+    while none is heard that could be; 0 off"""
+    beacon_s: Annotated[Seconds, Field(title="Time until only beacons are sent (s)")] = 0.0
+    """s without hearing any robot after which nothing is sent but one hello every so many s, until one is heard; 0 =
+    never"""
+    hold_s: Annotated[Seconds, Field(title="Wait for repair (s)")] = 1.0
+    """s that a message of a reliable topic waits for an earlier one where the sender gets no reports; where it does,
+    until that one is repaired or given up by its sender"""
+    max_age_s: Age = AUTO
+    """s for which a sealed message may have been withheld on its way (with a key), or it is not taken; auto: 15 for
+    calls and topics with a deadline or lifespan, any time for others; 0 = any time"""
+    max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
+    """robots heard at a time; packets of further ones are counted and dropped"""
+    max_source_bytes: Annotated[Bytes, Field(title="Memory per sender (bytes)")] = 72_000_000
+    """memory per robot heard, a quarter for incomplete messages; the oldest goes first"""
+    debug: Annotated[bool, Field(title="Debug log")] = False
+    """readable log of headers, topic ids and entries"""
+    conditions: ClassVar[tuple[ActsWhere, ...]] = (
+        ActsWhere(
+            ("seal", "max_age_s", "topics.*.max_age_s", "publish.topics.*.max_age_s"),
+            lambda robot: bool(robot.key),
+            "nothing is sealed without a key; set key, or leave it out",
+        ),
+        ActsWhere(
+            ("topics.*.codec", "topics.*.quantize"),
+            lambda robot: robot.compression,
+            "no message is coded without compression; set compression: true, or leave it out",
+        ),
+        ActsWhere(
+            ("expected_loss",),
+            lambda robot: robot.repair != "off",
+            "nothing is repaired; set repair to thrifty, or leave it out",
+        ),
+        ActsWhere(
+            ("beacon_s",),
+            lambda robot: robot.direction == "both",
+            "who hears nobody would fall silent for ever; leave it out, or set direction: both",
+        ),
+    )
+
+    @field_validator("repair", mode="before")
+    @classmethod
+    def _off_is_a_word(cls, value: object) -> object:
+        """YAML 1.1 reads an unquoted ``off`` as false."""
+        return "off" if value is False else value
+
+    @field_validator("robot", mode="after")
+    @classmethod
+    def _has_a_number(cls, robot: int | str) -> int | str:
+        if isinstance(robot, str):
+            if robot.isdecimal():
+                robot = int(robot)
+            number_of(robot)
+        return robot
+
+    @model_validator(mode="after")
+    def _fits(self) -> RobotConfig:
+        refuse_without_effect(self)
+        if self.publish.merge_tf and not self.publish.frame_prefix:
+            raise ValueError(
+                f"publish.merge_tf = {self.publish.merge_tf!r}: frames of several robots would be mixed up; set "
+                "publish.frame_prefix, for instance to 'robot_{robot}/'"
+            )
+        return self
+
+    @property
+    def robot_id(self) -> int:
+        """Its number on the air."""
+        return number_of(self.robot)
+
+    @property
+    def namespace(self) -> str:
+        """Namespace of its topics on its graph; '' is the root."""
+        if self.graph.namespace != AUTO:
+            return self.graph.namespace
+        return f"/robot_{self.robot}" if isinstance(self.robot, int) else self.robot
+
+    @property
+    def sends(self) -> bool:
+        """Whether it offers messages, rather than reports alone."""
+        return bool(self.topics) and self.direction != "receive"
+
+    @property
+    def receives(self) -> bool:
+        """Whether messages of others come out."""
+        return self.direction != "send"
+
+
+def number_of(robot: int | str) -> int:
+    """The number of a robot: itself, or the last digits of a name.
+
+    :raises ConfigError: for a name without digits, one that ROS does not allow, or a number of 255 or more
+    """
+    if isinstance(robot, int):
+        return robot
+    runs = re.findall(r"[0-9]+", robot)
+    if not runs:
+        raise ConfigError("the name has no digits; write the robot's number, and its name as graph.namespace")
+    if int(runs[-1]) >= BROADCAST:
+        raise ConfigError(
+            f"{int(runs[-1])} is not below 255; write a number of 0..254, and the name as graph.namespace"
+        )
+    return int(runs[-1])
+
+
+def halves(robot: RobotConfig, paper: PaperConfig | None = None) -> tuple[SourceConfig, SinkConfig]:
+    """The settings of a robot as its two blocks have them.
+
+    :param paper: those of the paper's blocks; None: it speaks version 1
+    :raises ConfigError: for a setting that the paper's blocks do not have
+    """
+    common: dict[str, Any] = {
+        name: getattr(robot, name) for name in ("packet_len", "key", "seal", "state", "commands", "debug")
+    }
+    common |= {"robot_id": robot.robot_id, "middleware": robot.graph.middleware, "domain_id": robot.graph.domain_id}
+    registry = robot.registry if robot.sends else ""
+    words = tuple(robot.topics) if robot.sends else ()
+    sent = {
+        word: TopicOptions(**vars_of(options)) for word, options in robot.topics.items() if options != SendOptions()
+    }
+    taken = {
+        name: TopicOptions(
+            publish_as=options.as_, **{key: value for key, value in vars_of(options).items() if key != "as_"}
+        )
+        for name, options in robot.publish.topics.items()
+    }
+    common["version"] = 1 if paper is None else 0
+    of_paper = {} if paper is None else vars_of(paper)
+    timeout = {"reassembly_timeout_s": of_paper.pop("reassembly_timeout_s")} if of_paper else {}
+    both = ("services", "packet_rate", "queue_depth", "compression", "repair", "expected_loss", "repeat_s", "beacon_s")
+    source = {
+        **common,
+        "registry": registry,
+        "topics": () if registry and words == (AUTO,) else words,
+        "topic_options": sent if robot.sends else {},
+        "namespace": robot.namespace,
+        "subscriber_depth": robot.graph.depth,
+        **{name: getattr(robot, name) for name in both},
+        **of_paper,
+    }
+    sink = {
+        **common,
+        "registry": robot.registry,
+        "topic_options": taken,
+        "namespace_format": robot.publish.as_,
+        "publisher_depth": robot.publish.depth,
+        "frame_prefix": robot.publish.frame_prefix,
+        "merge_tf": robot.publish.merge_tf,
+        "use_sim_time": robot.graph.use_sim_time,
+        **{name: getattr(robot, name) for name in ("hold_s", "max_age_s", "max_sources", "max_source_bytes")},
+        **timeout,
+    }
+    return build(SourceConfig, source), build(SinkConfig, sink)
+
+
+def vars_of(config: Any) -> dict[str, Any]:
+    """The fields of a settings object by name."""
+    return {item.name: getattr(config, item.name) for item in fields(config)}
