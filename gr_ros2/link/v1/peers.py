@@ -267,6 +267,10 @@ class Peers:
                 heappush(self._resend, -record.number)
                 if self._ordered < inf or any(lifetime.in_order for lifetime in record.lifetimes):
                     heappush(self.urges, (all(lifetime.long for lifetime in record.lifetimes), record.number))
+        records = self._packets.records
+        if len(self.urges) + len(self._resend) > 4 * len(records) + MAP:  # most of these are over
+            self.urges = sorted({urge for urge in self.urges if urge[1] in records})
+            self._resend = sorted({resend for resend in self._resend if -resend in records})
 
     def urgent(self, now: float) -> Sent | None:
         """The oldest packet that a report names as lost and for which later messages wait; packets of long messages go

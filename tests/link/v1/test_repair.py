@@ -385,3 +385,17 @@ def test_a_receiver_is_told_of_what_is_over_between_packets_that_others_lack(sha
     told = sender.tell(300, 7.0)
     assert isinstance(told, Repair)
     assert told.number - told.mask.bit_length() < 300 <= told.number
+
+
+@pytest.mark.parametrize("shares", [False, True])
+def test_what_peers_lacked_and_need_no_more_is_forgotten(shares: bool) -> None:
+    sender = RepairWindow("thrifty", ROOM, shares=shares)
+    before = Lifetime()
+    for number in range(1, 3001):
+        before.end()
+        sender.sent(number, body(number), b"", (before := Lifetime(),), number / 10)
+        for src_id in (8, 9):
+            sender.peers.report(src_id, number, (1 << 64) - 2, settled=True, loss=0.2, now=number / 10 + 0.05)
+        sender.next(number / 10 + 0.06)
+    peers = sender.peers
+    assert len(peers.urges) + len(peers._resend) + sum(len(peer.lost) for peer in peers.all.values()) < 200
