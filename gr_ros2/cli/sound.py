@@ -20,6 +20,8 @@ from gr_ros2.radio.sound_check import SoundMeasured, measured, sweep
 from gr_ros2.settings.fields import AUTO
 
 _METER_S = 3.0
+_TRIES = 2
+"""A busy computer may lose what it plays once."""
 _QUIETEST_DB = -80.0
 _LOUD_DB, _WEAK_DB = -3.0, -50.0
 """dB of full scale at the microphone: above the first peaks are cut off, below the second a card's noise shows."""
@@ -63,7 +65,10 @@ def check(*, device: str, device_rx: str, level: float, listen_only: bool) -> in
         if listen_only:
             return 0
         played = sweep(level)
-        found = measured(played, play_and_record(played, plays, records))
+        for _ in range(_TRIES):
+            found = measured(played, play_and_record(played, plays, records))
+            if found.heard:
+                break
     except (PortAudioError, ValueError) as error:
         raise RadioError(f"sound: {' '.join(str(error).split())}") from error
     for line in said(found):
