@@ -222,6 +222,11 @@ class Gains:
         self._streams.pop(stream, None)
         self._told.pop((stream.origin, stream.start & 0xFF, stream.topic_id), None)
 
+    def started(self, src_id: int) -> None:
+        """A robot that is heard has started again: it has nothing of what it had."""
+        for state in self._streams.values():
+            state.has.pop(src_id, None)
+
     def _state(self, stream: Stream) -> _State:
         state = self._streams.get(stream)
         if state is None:

@@ -132,3 +132,14 @@ def test_the_choice_is_something_that_is_here(packets: list[tuple[int, int, int,
             assert gains.has(best) == newest[best]
             gains.sent(best, now)
             assert gains.gain(best, now) < gain
+
+
+def test_a_robot_that_has_started_again_has_nothing_of_what_it_told() -> None:
+    gains = Gains(1)
+    gains.neighbour(2, 1.0)
+    gains.neighbour(3, 1.0)
+    gains.message(2, ODOM, 10, 1.0)
+    gains.told(3, Newest(ODOM.origin, ODOM.start & 0xFF, ODOM.topic_id, 10))
+    assert not gains.lacks(ODOM, 1.0)
+    gains.started(3)
+    assert gains.lacks(ODOM, 1.0)

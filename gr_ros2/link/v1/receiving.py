@@ -272,6 +272,8 @@ class ReceivingSide:
         if opened.replaced is not None:
             opened.replaced.inbox.ended(now)
             self._end(opened.replaced.src_id, self._window.peers.forget)
+            if self.relaying is not None:
+                self.relaying.gains.started(opened.replaced.src_id)
         self._sending.met(now)
 
     def _meet(self, neighbour: Neighbour, now: float) -> None:
