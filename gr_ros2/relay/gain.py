@@ -95,10 +95,11 @@ class Gains:
     """See the module.
 
     :param src_id: of this robot
+    :param slower: by how much longer than written robots are waited for, where they send seldom
     """
 
-    def __init__(self, src_id: int) -> None:
-        self.src_id = src_id
+    def __init__(self, src_id: int, slower: Callable[[], float] = lambda: 1.0) -> None:
+        self.src_id, self.slower = src_id, slower
         self._streams: dict[Stream, _State] = {}
         self._told: dict[tuple[int, int, int], _State] = {}
         """The same by what an entry ``Newest`` names."""
@@ -130,10 +131,14 @@ class Gains:
         if len(robot.named) > heard:
             robot.named = {name: at for name, at in robot.named.items() if robot.packets - at <= heard + 2}
 
+    def near(self, at: float, now: float) -> bool:
+        """Whether a robot that was heard at a time counts as a neighbour."""
+        return now - at < HEARD_S * self.slower()
+
     def hears(self, src_id: int, now: float) -> bool:
         """Whether a robot is heard and says that it hears this one."""
         robot = self._heard.get(src_id)
-        return robot is not None and now - robot.at < HEARD_S and self.src_id in robot.named
+        return robot is not None and self.near(robot.at, now) and self.src_id in robot.named
 
     def message(self, via: int, stream: Stream, number: int, now: float, made: float | None = None) -> bool:
         """A message was heard.
@@ -256,7 +261,7 @@ class Gains:
             state.has[robot] = before + share * (number - before)
 
     def _neighbours(self, now: float) -> list[int]:
-        return [src_id for src_id, robot in self._heard.items() if now - robot.at < HEARD_S]
+        return [src_id for src_id, robot in self._heard.items() if self.near(robot.at, now)]
 
     def _gain(self, stream: Stream, state: _State, neighbours: Iterable[int]) -> float:
         newest, origin, has = state.newest, stream.origin, state.has

@@ -19,9 +19,13 @@ DOUBT_S = 300.0
 
 
 class Routes:
-    """The distances of the robots that are heard from all others."""
+    """The distances of the robots that are heard from all others.
 
-    def __init__(self) -> None:
+    :param slower: by how much longer than written a distance counts, where robots send seldom
+    """
+
+    def __init__(self, slower: Callable[[], float] = lambda: 1.0) -> None:
+        self._slower = slower
         self._ways: dict[int, dict[int, tuple[int, float]]] = {}
         """By robot, and by the one that is heard: how many stand between them, this one included, and when that was
         last so, s."""
@@ -36,10 +40,15 @@ class Routes:
         """
         ways = self._ways.setdefault(robot, {})
         before, at = ways.get(via, (hops, now))
-        if hops < before or now > at + STALE_S:
+        if hops < before or now > at + self.stale_s:
             ways[via] = hops, now
         elif hops == before:  # a detour says nothing about the shortest way
             ways[via] = hops, max(at, now)
+
+    @property
+    def stale_s(self) -> float:
+        """s for which a distance counts."""
+        return STALE_S * self._slower()
 
     def doubt(self, robot: int, via: int, now: float) -> None:
         """What was handed to ``via`` for ``robot`` has not arrived."""
@@ -58,10 +67,10 @@ class Routes:
         open_ways = [
             (now < self._doubted.get((robot, via), now), hops, via)
             for via, (hops, at) in ways
-            if now <= at + STALE_S and usable(via)
+            if now <= at + self.stale_s and usable(via)
         ]
         return min(open_ways)[2] if open_ways else None
 
     def hops(self, robot: int, now: float) -> int | None:
         """Robots between this one and another; 0 if it is heard, None if nothing is known."""
-        return min((hops for hops, at in self._ways.get(robot, {}).values() if now <= at + STALE_S), default=None)
+        return min((hops for hops, at in self._ways.get(robot, {}).values() if now <= at + self.stale_s), default=None)

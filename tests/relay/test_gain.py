@@ -143,3 +143,11 @@ def test_a_robot_that_has_started_again_has_nothing_of_what_it_told() -> None:
     assert not gains.lacks(ODOM, 1.0)
     gains.started(3)
     assert gains.lacks(ODOM, 1.0)
+
+
+def test_a_robot_that_sends_seldom_counts_as_a_neighbour_for_longer() -> None:
+    gains = Gains(1, lambda: 4.0)
+    gains.neighbour(2, 0.0, [1], 1)
+    assert gains.hears(2, 3.9 * HEARD_S)
+    assert gains.neighbours(3.9 * HEARD_S) == 1
+    assert not gains.hears(2, 4 * HEARD_S)

@@ -56,3 +56,10 @@ def test_a_way_leads_over_who_was_heard_and_is_no_longer_than_the_last_note(
         if way is not None and hops is not None:
             assert (robot, way) in said
             assert hops <= said[robot, way]
+
+
+def test_a_distance_counts_for_longer_where_robots_send_seldom() -> None:
+    routes = Routes(lambda: 4.0)
+    routes.note(9, 2, 1, 0.0)
+    assert routes.over(9, 4 * STALE_S, anybody) == 2
+    assert routes.over(9, 4 * STALE_S + 0.1, anybody) is None

@@ -29,7 +29,7 @@ from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopics
 from gr_ros2.relay.gain import Gains
 from gr_ros2.relay.rooms import Rooms
-from gr_ros2.relay.routes import STALE_S, Routes
+from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.relayed import (
     FIRST_PLACE,
     MOST_HOPS,
@@ -148,7 +148,7 @@ class Custody:
         drop: Callable[[list[Dropped[Message]]], None],
         ended: Callable[[Message, bool], None],
     ) -> None:
-        self.routes = Routes()
+        self.routes = Routes(gains.slower)
         self._src_id, self._start, self._boot = own[0], own[1] & 0xFFFF, own[1]
         self._topics, self._packets, self._peers, self._gains = topics, packets, peers, gains
         self._room, self._most, self._dropped, self._drop, self._ended = room, most, dropped, drop, ended
@@ -320,7 +320,7 @@ class Custody:
 
         def usable(via: int) -> bool:
             reports = via in self._peers.all and self._peers.all[via].newest >= 0
-            return reports and self._gains.hears(via, now) and (via != came or now > at + STALE_S)
+            return reports and self._gains.hears(via, now) and (via != came or now > at + self.routes.stale_s)
 
         return self.routes.over(robot, now, usable)
 

@@ -93,7 +93,13 @@ class ReceivingSide:
         )
         self.relaying: Relaying | None = None
         if settings.relay:
-            self.relaying = Relaying(settings.src_id, self.neighbours, self._outcomes, most=settings.max_source_bytes)
+            self.relaying = Relaying(
+                settings.src_id,
+                self.neighbours,
+                self._outcomes,
+                most=settings.max_source_bytes,
+                slower=lambda: settings.slower,
+            )
             self.relaying.tell(lambda src_id, boot: self._inbox(src_id, boot, 0, settings.packet_len, far=True))
         self._now = -inf
         self._sender: Neighbour | None = None

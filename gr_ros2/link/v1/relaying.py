@@ -39,9 +39,8 @@ from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sent_topics import SentTopic
 from gr_ros2.link.v1.sequences import Sequences
-from gr_ros2.relay.gain import EXPIRES_S, HEARD_S, Gains, Stream
+from gr_ros2.relay.gain import EXPIRES_S, Gains, Stream
 from gr_ros2.relay.rooms import Rooms
-from gr_ros2.relay.routes import STALE_S
 from gr_ros2.settings.registry import CALLS_TYPE
 from gr_ros2.wire import QOS_DEFAULT
 from gr_ros2.wire.control import Newest
@@ -92,17 +91,20 @@ class Relaying:
     :param neighbours: the robots that are heard
     :param outcomes: takes what comes of it
     :param most: bytes of messages that are kept to be sent on, of those carried here that wait, and of far tables
+    :param slower: see :class:`gr_ros2.relay.gain.Gains`
     :ivar hops: over how many robots the newest message of each robot came; 0 for directly
     """
 
-    def __init__(self, src_id: int, neighbours: Neighbours, outcomes: Outcomes, *, most: int) -> None:
+    def __init__(
+        self, src_id: int, neighbours: Neighbours, outcomes: Outcomes, *, most: int, slower: Callable[[], float]
+    ) -> None:
         self.src_id = src_id
         self.hops: dict[int, int] = {}
         self.relayed: Counter[tuple[int, int]] = Counter()
         """Messages sent on, by origin and topic id."""
         self.far: dict[int, Inbox] = {}
         """Robots that are or were known over others only."""
-        self.gains = Gains(src_id)
+        self.gains = Gains(src_id, slower)
         self.custody: Custody
         self._here: dict[int, tuple[int, float]] = {}
         """Robots that are reached over others: boot number, and when something of them last came, s."""
@@ -144,7 +146,7 @@ class Relaying:
         if neighbour is not None and not neighbour.hello.digest and boot != neighbour.boot:
             boot, table, at = neighbour.boot, write_table(()), -inf  # others learn that it is there, and where
         self._there[src_id] = now
-        if table and neighbour is not None and now - at > TABLE_S:
+        if table and neighbour is not None and now - at > TABLE_S * self.gains.slower():
             self._table(src_id, boot, table, neighbour.inbox.newest, now)
         if now > self._swept + TABLE_S:
             self._sweep(now)
@@ -225,7 +227,7 @@ class Relaying:
             return
         if table and not self._starts(message, via, now, made, heard=heard is not None):
             return
-        if heard is not None and message.number > heard.inbox.newest and now < heard.heard + HEARD_S:
+        if heard is not None and message.number > heard.inbox.newest and self.gains.near(heard.heard, now):
             self._dropped["ahead"] += 1  # its next packet tells whether it has come so far
             return
         inbox = self._inbox(origin, start)
@@ -290,7 +292,7 @@ class Relaying:
         self._there[inbox.src_id] = max(self._there.get(inbox.src_id, -inf), made)
         boot, at = self._here.get(inbox.src_id, (-1, -inf))
         at = max(made, at if boot == inbox.boot else -inf)
-        if now >= at + STALE_S:
+        if now >= at + self.custody.routes.stale_s:
             return  # it was there when that was made, which is too long ago
         neighbour = self._neighbours.all.get(inbox.src_id)
         known = neighbour is not None and not neighbour.gone
@@ -303,7 +305,7 @@ class Relaying:
     def reaches(self, src_id: int, boot: int, now: float) -> bool:
         """Whether a start of a robot is reached over others."""
         known, at = self._here.get(src_id, (-1, -inf))
-        return known == boot and now < at + STALE_S
+        return known == boot and now < at + self.custody.routes.stale_s
 
     def robots(self, now: float, *, sealed: bool) -> list[HeardRobot]:
         """The robots that are not heard, but reached over others.
@@ -325,7 +327,7 @@ class Relaying:
         for inbox in self.far.values():
             inbox.handle_timeout(now)
         for src_id, (boot, at) in list(self._here.items()):
-            if now >= at + STALE_S:
+            if now >= at + self.custody.routes.stale_s:
                 del self._here[src_id]
                 neighbour = self._neighbours.all.get(src_id)
                 if neighbour is None or neighbour.gone:
@@ -333,7 +335,7 @@ class Relaying:
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do."""
-        times = [at + STALE_S for _, at in self._here.values()]
+        times = [at + self.custody.routes.stale_s for _, at in self._here.values()]
         times += [at for inbox in self.far.values() if (at := inbox.next_timeout()) is not None]
         return min(times, default=None)
 
@@ -373,7 +375,7 @@ class Relaying:
         """Forget what is too long ago."""
         self._swept = now
         for origin, at in list(self._there.items()):
-            if now > at + FORGET_S:
+            if now > at + FORGET_S * self.gains.slower():
                 self._drop_of(origin, lambda _: True)
             if now > max(at, self._came.get(origin, at)) + FAR_S:
                 del self._there[origin]
@@ -409,7 +411,7 @@ class Relaying:
             self._dropped["relayed_before"] += 1
             return False
         if self._inbox(origin, message.start) is None:
-            if now > made + FORGET_S:
+            if now > made + FORGET_S * self.gains.slower():
                 self._dropped["too_old"] += 1
                 return False
             known, neighbour = self.present(origin), self._neighbours.all.get(origin)
