@@ -12,7 +12,8 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError, shortened
 from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.settings.config import SendOptions, TopicOptions
+from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.registry import options_of
 
 _OPTIONS = "topics"
 
@@ -53,7 +54,7 @@ class LiveSettings:
         topic, option = place
         given = self._source.config.topic_options
         known = next((other for other in given if other.lstrip("/") == topic.lstrip("/")), topic)
-        before = given.get(known, TopicOptions())
+        before = options_of(topic, given)
         changed = {**{each.name: getattr(before, each.name) for each in fields(SendOptions)}, option: value}
         self._source.set_topic_options({**given, known: changed})
         sent = {topic.name.lstrip("/") for topic in self._source.subscriptions.subscribed.values()}
