@@ -61,7 +61,7 @@ def test_losses_of_one_direction_leave_the_other_alone(tmp_path: Path, version: 
 
 
 def test_a_sink_that_would_feed_the_source_beside_it_is_refused(tmp_path: Path) -> None:
-    loop = scenario("two-way", "robots.1.publish.as=/robot_1", duration_s=1.0)
+    loop = scenario("two-way", "robots.0.publish.as=/robot_1", duration_s=1.0)
     with pytest.raises(ConfigError, match=r"loop: the sink publishes /robot_1/scan"):
         run_scenario(loop, tmp_path)
 

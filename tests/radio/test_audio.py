@@ -44,7 +44,7 @@ def at(monkeypatch: pytest.MonkeyPatch, sink: str, source: str) -> None:
 
 
 def robot(number: int, front_end: dict[str, Any] | None = None, **values: Any) -> Robot:
-    return Robot(number, {**SOUND, **(front_end or {})}, (3 - number,), version=1, phy=PHY, **values)
+    return Robot(number, {**SOUND, **(front_end or {})}, (3 - number,), phy=PHY, **values)
 
 
 def serve(*robots: Robot) -> bool:
@@ -101,7 +101,9 @@ def test_silence_of_zeros_is_named_once_and_so_is_its_end(
     monkeypatch.setattr(AudioFrontEnd, "loops_back", True)
     with Robot(1, dict(SOUND), hears=(1,), repair="off", phy=PHY) as alone:
         with caplog.at_level(logging.WARNING):
+            alone.link.transmit(on=False)
             wait_for(lambda: serve(alone) and "digital silence" in caplog.text)
+            alone.link.transmit(on=True)
             alone.say(1)
             wait_for(lambda: serve(alone) and "comes in again" in caplog.text)
         assert caplog.text.count("digital silence") == 1

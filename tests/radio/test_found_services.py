@@ -112,7 +112,7 @@ def test_services_can_be_left_to_the_robot(tmp_path: Path) -> None:
     robots = Robots(tmp_path, "")
     with robots.stack:
         robots.links[2].stop()
-        robots.start(2, services=False)
+        robots.start(2, topics=["auto"], services=False)
         Adder(robots.graphs[1], FAR)
         robots.graphs[1].advertise("/robot_2/later", STRING, Qos())
         source = robots.links[2].source
