@@ -2,7 +2,8 @@
 
 First byte of a coded message: high nibble, the dictionaries used (0 none, 1..13 a shipped set; 14 the structure of the
 type, as the sender has announced it, and 15 a user's own dictionary, whose two-byte id follows); low nibble, the codec
-(0 stored, 1 zstd, 2 fields, 3 fields with a second part). 0x00 is stored as it is.
+(0 stored, 1 zstd, 2 fields, 3 fields with a second part, 4 a frame of a codec for this type alone, such as that of
+clouds). 0x00 is stored as it is.
 
 A sender announces in its table of topics how a topic is coded: the option ``codec`` and, where it has learned the
 definition of the type, a blank and the structure (``compression.structure``).
@@ -16,11 +17,11 @@ different dictionary is an UnknownDictionaryError.
 from __future__ import annotations
 
 from binascii import crc_hqx
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from gr_ros2.compression import bounds
 from gr_ros2.compression.dictionary import GENERAL, OWN, SHIPPED, Dictionary, load, shipped
@@ -39,13 +40,26 @@ zstd is shorter."""
 MAX_MESSAGE = max(version.largest_message(version.max_packet_len) for version in FORMATS.values())
 """Bytes; what a link can carry uncompressed."""
 
-STORED, ZSTD, FIELDS, FIELDS_AND_MORE = range(4)
+STORED, ZSTD, FIELDS, FIELDS_AND_MORE, WHOLE = range(5)
 ANNOUNCED = 14
 """Number in the first byte for the structure that the sender has announced; two bytes of its CRC follow."""
 MAX_ANNOUNCEMENT = 255
 """Bytes of what a table says about the coding of a topic. A type whose structure is longer is not announced."""
 MAX_LEARNED = 8
 """Definitions of one type that are learned at most, as publishers of different age come and go."""
+
+
+class Whole(Protocol):
+    """The codec of one topic for messages of its type alone."""
+
+    def encode(self, payload: bytes) -> tuple[bytes, bytes] | None:
+        """The frame and the message that ``decode`` makes of it; None for a message that it does not take."""
+
+    def decode(self, coded: bytes, max_size: int) -> bytes:
+        """The message.
+
+        :raises CodecError: as :meth:`LinkCodec.decode`
+        """
 
 
 class LinkCodec:
@@ -56,6 +70,7 @@ class LinkCodec:
     :param dictionaries: a user's own dictionaries, or their files; the first one with a topic's type is used, otherwise
         the shipped one
     :param max_size: bytes; larger messages are stored, and nothing larger is decoded
+    :param whole: makes the codec that a topic's type has for itself; None from it: the type has none
     :raises ConfigError: a file that is not a dictionary, two that share an id, a wrong ``codec`` or ``quantize``
     """
 
@@ -65,7 +80,9 @@ class LinkCodec:
         dictionaries: Sequence[Dictionary | str | Path] = (),
         *,
         max_size: int = MAX_MESSAGE,
+        whole: Callable[[Topic], Whole | None] = lambda _: None,
     ) -> None:
+        self._whole = whole
         own = [item if isinstance(item, Dictionary) else load(item) for item in dictionaries]
         by_id: dict[bytes, Dictionary] = {}
         for item in own:
@@ -74,16 +91,16 @@ class LinkCodec:
                 raise ConfigError(f"dictionaries {other.name!r} and {item.name!r} share the id {item.prefix.hex()}")
         self._sets = [*by_id.values(), *(shipped(number) for number in reversed(SHIPPED))]
         self._max_size = max_size
-        self._made: dict[tuple[str, str, str], TopicCodec] = {}
-        """Codecs by type, ``codec`` and ``quantize``: topics that have these in common share one."""
+        self._made: dict[tuple[Any, ...], TopicCodec] = {}
+        """Codecs by type, ``codec``, ``quantize`` and ``cloud``: topics that have these in common share one."""
         self._topics: dict[int, TopicCodec] = {}
         for topic in topics:
             self.add(topic)
 
     def add(self, topic: Topic) -> None:
-        key = (topic.type_name, topic.options.codec, topic.options.quantize)
+        key = (topic.type_name, topic.options.codec, topic.options.quantize, topic.options.cloud)
         if key not in self._made:
-            self._made[key] = TopicCodec(topic, self._sets, self._max_size)
+            self._made[key] = TopicCodec(topic, self._sets, self._max_size, self._whole(topic))
         self._topics[topic.topic_id] = self._made[key]
 
     def of(self, topics: Iterable[Topic], announcements: Mapping[int, str] | None = None) -> LinkCodec:
@@ -145,9 +162,11 @@ class TopicCodec:
     """Codes the messages of one topic.
 
     :param sets: dictionaries, the preferred ones first
+    :param whole: the codec that its type has for itself, which a sender with ``codec`` auto prefers
     """
 
-    def __init__(self, topic: Topic, sets: Sequence[Dictionary], max_size: int) -> None:
+    def __init__(self, topic: Topic, sets: Sequence[Dictionary], max_size: int, whole: Whole | None = None) -> None:
+        self._whole = whole
         self._mode: str = topic.options.codec
         if self._mode not in CODECS:
             raise ConfigError(f"codec = {self._mode!r}: topic {topic.name!r} takes one of {', '.join(CODECS)}")
@@ -203,7 +222,10 @@ class TopicCodec:
         return bool(coded) and coded[0] >> 4 == ANNOUNCED and bytes([ANNOUNCED]) + coded[1:3] not in self._held
 
     def encode(self, payload: bytes) -> bytes:
-        payload = self.canonical(payload)
+        own = self._own(payload)
+        if own is not None:
+            return bytes([WHOLE]) + own[0]
+        payload = self._spoken(payload)
         if self._mode == "none" or len(payload) > self._max_size:
             return b"\0" + payload
         coders = self._fitting(payload)
@@ -227,6 +249,8 @@ class TopicCodec:
             if len(coded) - 1 > self._max_size:
                 raise DamagedError(f"damaged message: larger than {self._max_size} bytes")
             return coded[1:]
+        if coded[0] == WHOLE and self._whole is not None:
+            return self._whole.decode(coded[1:], min(self._max_size, bounds.largest(len(coded) - 1)))
         if codec not in (ZSTD, FIELDS, FIELDS_AND_MORE) or (number == 0 and codec != ZSTD):
             raise CodecError(f"unknown codec {codec} with dictionaries {number}")
         start = 3 if number in (OWN, ANNOUNCED) else 1
@@ -249,6 +273,19 @@ class TopicCodec:
 
     def canonical(self, payload: bytes) -> bytes:
         """The message that comes out at the other end. One that the configuration stores uncoded keeps its gaps."""
+        own = self._own(payload)
+        return self._spoken(payload) if own is None else own[1]
+
+    def _own(self, payload: bytes) -> tuple[bytes, bytes] | None:
+        """Frame and message of the codec that the type has for itself, where it is used."""
+        if self._whole is None or self._mode != "auto" or len(payload) > self._max_size:
+            return None
+        own = self._whole.encode(payload)
+        fits = own is not None and len(own[0]) < len(payload) and len(own[1]) <= bounds.largest(len(own[0]))
+        return own if fits else None
+
+    def _spoken(self, payload: bytes) -> bytes:
+        """What comes out where the type has no codec for itself."""
         if len(payload) > self._max_size:
             return payload
         coders = self._fitting(payload)

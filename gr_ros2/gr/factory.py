@@ -32,11 +32,12 @@ def message_codec(registry: Sequence[Topic] = ()) -> LinkCodec:
     """The codec of a link.
 
     :param registry: with topic options applied
-    :raises ConfigError: for a wrong ``codec`` or ``quantize`` of a topic
+    :raises ConfigError: for a wrong ``codec``, ``quantize`` or ``cloud`` of a topic
     """
-    from gr_ros2.compression import LinkCodec  # imported here: it takes longer than the rest of a block
+    from gr_ros2.codecs.whole import whole_of  # imported here: they take longer than the rest of a block
+    from gr_ros2.compression import LinkCodec
 
-    return LinkCodec(registry)
+    return LinkCodec(registry, whole=whole_of)
 
 
 @dataclass(frozen=True)

@@ -132,6 +132,32 @@ class Agreed:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class CloudOptions:
+    """What leaves of a point cloud.
+
+    :param voxel: m, edge of the cells that the points of a cloud become, each a point at its middle; 0 = every point,
+        exactly
+    :param range: m from the origin of the cloud's frame, beyond which points are left out where they become cells;
+        auto = none are
+    :param keep: what of a cell's points is sent beside their place, as a mean: intensity, rgb, or '' for neither
+    """
+
+    voxel: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    range: Annotated[float, Field(gt=0, le=1e6)] | Auto = AUTO
+    keep: Literal["", "intensity", "rgb"] = ""
+    conditions: ClassVar[Any] = (
+        ActsWhere(
+            ("range", "keep"), lambda cloud: cloud.voxel > 0, "an exact cloud has every point; set voxel above 0"
+        ),
+    )
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> CloudOptions:
+        refuse_without_effect(self)
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class SendOptions:
     """Options of one topic that a robot sends.
 
@@ -156,6 +182,8 @@ class SendOptions:
     :param to: robot for which its messages are, 0..254; other robots do not deliver them; auto = all robots
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
+    :param cloud: what leaves of a PointCloud2: exact, or cells of so many m, such as {voxel: 0.1, range: 30}
+        (docs/explanation/codecs.md)
     """
 
     qos: Annotated[QosClass | Auto, OnlyAt("source")] = AUTO
@@ -172,6 +200,7 @@ class SendOptions:
     to: Annotated[Annotated[int, Field(ge=0, le=254)] | Auto, OnlyIn(1), OnlyAt("source")] = AUTO
     codec: Annotated[str, OnlyAt("source")] = AUTO
     quantize: Annotated[str, OnlyAt("source")] = ""
+    cloud: Annotated[CloudOptions, OnlyAt("source")] = Field(default_factory=CloudOptions)
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("queue_depth",),

@@ -13,7 +13,15 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.settings.airtime import AirtimeConfig
-from gr_ros2.settings.config import PhyConfig, ScenarioChannel, SendOptions, SourceConfig, TopicOptions, build
+from gr_ros2.settings.config import (
+    CloudOptions,
+    PhyConfig,
+    ScenarioChannel,
+    SendOptions,
+    SourceConfig,
+    TopicOptions,
+    build,
+)
 from gr_ros2.settings.effect import conditions_of
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.process import MediumConfig
@@ -106,6 +114,8 @@ for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
     ):
         IDLE[cls, name] = (given, beside, {**beside, "gains_db": -90.0}, "set gains_db, or channel.from: positions")
     IDLE[cls, "channel.snr_db"] = ({"channel": {"snr_db": 9.0}}, {**beside, "gains_db": -90.0}, beside, "leave one")
+for name, value in {"range": 30.0, "keep": "rgb"}.items():
+    IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
 IDLE[TopicOptions, "queue_depth"] = IDLE[SendOptions, "queue_depth"]
 NEVER = {(Scenario, "robots.*.state")}
 """Nothing makes them act."""
