@@ -36,10 +36,9 @@ def config(tmp_path: Path, domain: int) -> Path:
         registry: topics.csv
         packet_len: 64
         robot: /robot_1
-        graph: {{domain_id: {domain}}}
+        graph: {{domain_id: {domain}, localhost_only: true}}
         queue_depth: 0
         phy: {{name: psk, sample_rate: 1e6}}
-        localhost_only: true
         """
     )
     return path

@@ -86,10 +86,9 @@ class Robot:
             registry: topics.csv
             packet_len: 64
             robot: /robot_{number}
-            graph: {{domain_id: {link_peer.DOMAIN}}}
+            graph: {{domain_id: {link_peer.DOMAIN}, localhost_only: true}}
             phy: {{name: psk, sample_rate: 1e6}}
             front_end: {{name: zmq, bind: "tcp://10.0.0.{number}:5555", connect: ["tcp://10.0.0.{self.other}:5555"]}}
-            localhost_only: true
             """
         )
         ip(namespace, "address", "add", f"10.0.0.{number}/24", "dev", CABLE)
