@@ -50,7 +50,8 @@ WAITING = 8
 """Messages that wait in a queue of carried ones, and own ones of a topic that have not left. Further ones wait in the
 queue of their topic, by its rules."""
 WINDOW = PLACES // 2
-"""Own messages of a topic for a robot that are kept until they have come. Further ones wait likewise."""
+"""Most places from the first own message of a topic for a robot that is kept until it has come, to the newest. Those
+given up in between count: nobody could tell apart what is ``PLACES`` apart. Further ones wait likewise."""
 PATIENCE_S = 30.0
 """s after which a message that has left is handed on again if no receipt has come; more where messages take longer."""
 SLOW = 4
@@ -234,10 +235,14 @@ class Custody:
         return robot in self._reached
 
     def _is_full(self, message: Message) -> bool:
-        own = self._own.get((message.topic_id, message.dst_id), [])
-        if len(own) >= WINDOW or sum(held.last < 0 for held in own) >= WAITING:
+        stream = message.topic_id, message.dst_id
+        own = self._own.get(stream)
+        if not own:
+            return False
+        places = (self._newest[stream][1] - own[0].message.place) % PLACES + 1
+        if places >= WINDOW or sum(held.last < 0 for held in own) >= WAITING:
             return True
-        return bool(own) and sum(len(held.message.payload) for held in own) + len(message.payload) > self._most
+        return sum(len(held.message.payload) for held in own) + len(message.payload) > self._most
 
     def _submit(self, message: Message, now: float) -> None:
         stream = message.topic_id, message.dst_id

@@ -12,9 +12,10 @@ from gr_ros2.link.v1 import custody
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.relayed import Relayed, write_carried
+from gr_ros2.wire.relayed import PLACES, Relayed, read_carried, write_carried
 from gr_ros2.wire.v1 import CARRIED_TOPIC, QOS_REPAIR, TABLE_TOPIC, read_header, read_repair_header
 from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_relaying import Line, robot
@@ -158,6 +159,25 @@ def test_a_message_with_a_deadline_is_not_handed_on_after_it() -> None:
     line.run(15)
     assert not len(custody_of(line.robots[0]))
     assert line.robots[0].end.sent.refused[1, "stale"]
+
+
+def test_what_is_kept_stays_in_order_however_many_after_it_are_given_up() -> None:
+    """The goals have 2 s each, and the first one an hour. Of those that are kept, the newest may arrive first."""
+    line = line_of(robot(1, topics=named(3, queue="deadline", deadline_s=3600.0)), robot(2), robot(3), loss=0.0)
+    messages = line.robots[0].end.messages
+    line.near = lambda one: [1 - one] if one < 2 else []  # type: ignore[method-assign]
+    messages.submit(1, b"first", line.now)
+    for n in range(PLACES + 10):
+        messages.submit(1, b"goal %d" % n, line.now, 2.0)
+        line.run(0.5)
+    here, kept = Sequences[bytes](100_000), custody_of(line.robots[0])
+    (own,) = kept._own.values()
+    for held in reversed(own):
+        held.taker = 2
+        message = read_carried(kept._written(held, line.now))[1]
+        here.take(message, message.payload)
+    assert here.due(1, own[0].message.start) == [held.message.payload for held in own]
+    assert own[0].message.payload == b"first"
 
 
 def told(one: Robot) -> list[bool]:

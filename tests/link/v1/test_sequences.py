@@ -22,11 +22,16 @@ def message(n: int, waits: int = 0, size: int = 1) -> Relayed:
 
 
 class Origin:
-    """It keeps messages until a receipt or until it gives them up, and hands on any that it keeps at any time."""
+    """It keeps messages until a receipt or until it gives them up, and hands on any that it keeps at any time. From the
+    first that it keeps to the newest that it made there are ``WINDOW``."""
 
     def __init__(self) -> None:
         self.kept: list[int] = []
         self.made = 0
+
+    @property
+    def full(self) -> bool:
+        return bool(self.kept) and self.made - self.kept[0] >= WINDOW
 
     def hand_on(self, n: int) -> Relayed:
         return message(n, n - self.kept[0])
@@ -41,7 +46,7 @@ def test_everything_comes_once_and_in_order_unless_it_is_given_up(seed: int, giv
     under_way: list[tuple[int, Relayed]] = []
     over: set[int] = set()
     while origin.made < 400 or origin.kept:
-        if origin.made < 400 and len(origin.kept) < WINDOW and rng.random() < 0.6:
+        if origin.made < 400 and not origin.full and rng.random() < 0.6:
             origin.kept.append(origin.made)
             origin.made += 1
         if origin.kept and rng.random() < 0.7:
