@@ -9,10 +9,12 @@ tag says so; everything lost is counted.
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -28,8 +30,20 @@ from gr_ros2.radio.audio_bursts import CARD_RATE, BurstQueue, Played, Sound, Str
 from gr_ros2.radio.bursts import BurstCutter
 from gr_ros2.radio.front_end import AGAIN_MS
 
+
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """PulseAudio's part of ALSA blocks SIGPIPE in a thread that calls it. What is started later would inherit that."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 try:
-    import sounddevice
+    with _signals_kept():
+        import sounddevice
 except OSError as missing:  # the package is there, and the library that it loads is not
     raise ImportError(f"{missing}; apt install libportaudio2") from missing
 
@@ -54,6 +68,7 @@ _streams: set[Any] = set()
 _RX_RATE = pmt.intern("rx_rate")
 
 
+@_signals_kept()
 def devices() -> list[dict[str, Any]]:
     """The sound devices that are there now: ``name``, ``max_input_channels``, ``max_output_channels``.
 
@@ -70,12 +85,13 @@ def levels(device: str | int | None) -> Iterator[float]:
 
     :raises PortAudioError, ValueError: when there is no such device, or it does not start
     """
-    with sounddevice.InputStream(CARD_RATE, 0, device, 1, "float32") as stream:
+    with _signals_kept(), sounddevice.InputStream(CARD_RATE, 0, device, 1, "float32") as stream:
         while True:
             heard, _ = stream.read(CARD_RATE // 10)
             yield float(np.abs(heard).max())
 
 
+@_signals_kept()
 def play_and_record(sound: Sound, plays: str | int | None, records: str | int | None) -> Sound:
     """Play, and return what came in from the first sample on, shape (frames,).
 
@@ -86,6 +102,7 @@ def play_and_record(sound: Sound, plays: str | int | None, records: str | int | 
     return np.asarray(np.nan_to_num(heard[:, 0]), np.float32)
 
 
+@_signals_kept()
 def look_again() -> None:
     """Forget the list of devices, which PortAudio makes once, unless a stream of this process is open.
 
@@ -97,6 +114,7 @@ def look_again() -> None:
             sounddevice._initialize()
 
 
+@_signals_kept()
 def _opened(kind: type[Any], device: str | int | None, latency_s: float, callback: Callable[..., None]) -> Any:
     with _opening:
         devices()
@@ -105,6 +123,7 @@ def _opened(kind: type[Any], device: str | int | None, latency_s: float, callbac
     return stream
 
 
+@_signals_kept()
 def _close(stream: Any) -> None:
     stream.abort(ignore_errors=True)
     stream.close(ignore_errors=True)
@@ -154,7 +173,8 @@ class Speaker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self.lead_s = 0.0
         self._stream = _opened(sounddevice.OutputStream, device, latency_s, self._fill)
         try:
-            self._stream.start()
+            with _signals_kept():
+                self._stream.start()
             end = time.monotonic() + _OPEN_S
             while self.blocks < _SETTLED:
                 if time.monotonic() > end:
@@ -225,7 +245,8 @@ class _Recorder(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         """s, monotonic, when a sample other than zero came last."""
         self._stream = _opened(sounddevice.InputStream, device, latency_s, self._take)
         try:
-            self._stream.start()
+            with _signals_kept():
+                self._stream.start()
         except BaseException:
             self.close()
             raise

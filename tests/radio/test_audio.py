@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,13 @@ def test_a_transmitter_is_keyed_while_a_packet_sounds(monkeypatch: pytest.Monkey
     assert keyed[0::2][: len(keyed) // 2] == [b"T 1\n"] * (len(keyed) // 2)
     assert keyed[-1] == b"T 0\n"
     rigctld.close()
+
+
+@pytest.mark.usefixtures("server")
+def test_no_signal_stays_blocked() -> None:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    AudioFrontEnd(PskPhy(64, 24_000), device="pulse").close()
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before == set()
 
 
 @pytest.mark.usefixtures("server")
