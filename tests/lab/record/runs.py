@@ -83,7 +83,7 @@ def recorded() -> Recorder:
     return recorder
 
 
-def make_run(directory: Path, scenario: str = "paper-ofdm", *, paced: bool = True, missed: int = 0) -> Run:
+def make_run(directory: Path, scenario: str = "paper-ofdm", *, missed: int = 0) -> Run:
     """The run, written into a folder; before, the ROS graph lost ``missed`` odometry messages besides."""
     recorder = recorded()
     if missed:
@@ -93,7 +93,7 @@ def make_run(directory: Path, scenario: str = "paper-ofdm", *, paced: bool = Tru
         scenario=scenario,
         seed=3,
         duration_s=DURATION_S,
-        config={"name": scenario, "description": "made <by> hand", "time": "real" if paced else "samples"},
+        config={"name": scenario, "description": "made <by> hand", "time": "real"},
         topics=topics,
         packets=recorder.ledger.packets(),
         phy={"name": "ofdm", "sample_rate": 1e5, **recorder.airtime(lambda *_: AIRTIME_S)},

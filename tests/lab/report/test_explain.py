@@ -64,11 +64,6 @@ def test_without_airtime_nothing_is_said_of_the_air(tmp_path: Path, airtime: flo
     assert "took" not in text
 
 
-def test_as_fast_as_the_flowgraph_runs_the_clock_says_nothing_of_the_air(tmp_path: Path) -> None:
-    run = make_run(tmp_path, paced=False)
-    assert "packets/s" not in " ".join(explanation(run.result, run.trace))
-
-
 LATE = LatenessResult({"threads": 0.24, "gate": 0.06, "modem": 0.012}, 3, 0.045, 16, 5, 200, 20)
 
 

@@ -32,7 +32,7 @@ from gr_ros2_lab.run.scenario import load_scenario
 from tests.e2e.support import check_books, check_complete, scenario
 
 BOTH = ("samples", "packets")
-PLAIN = ("paper={}", "compression=true")
+PLAIN = ("paper.compression=true",)
 """Each message is one packet, which nothing repairs and beside which nothing is sent."""
 NOISY = ("channel.snr_db=14", "channel.packet_loss=0.02", "channel.outages=[[0.5, 0.7]]", "channel.doppler_hz=3")
 
