@@ -113,13 +113,14 @@ class Hold:
         if self._would_end < inf and not waiting:
             self._ended(0.0)
 
-    def until(self, now: float, end: float, airtime: float) -> float:
+    def until(self, now: float, end: float, airtime: float, *, repairs: bool = True) -> float:
         """Time until which a repair waits that could leave now; ``now`` if it does not have to wait.
 
         :param end: when it would be over
         :param airtime: of a packet, 0 if unknown
+        :param repairs: whether it is a repair: nothing else is owed
         """
-        if not airtime or self._owed >= 1:
+        if not airtime or (repairs and self._owed >= 1):
             return now
         due, until = self._next(now)
         if end - due <= OVERLAP * airtime:

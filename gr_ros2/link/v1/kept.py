@@ -177,7 +177,7 @@ class KeptMessages:
     def announce(self, now: float) -> None:
         """Send all kept messages, for robots that cannot ask."""
         for topic_id in (TABLE_TOPIC, *self._kept):
-            if not self._topics[topic_id].queue:
+            if topic_id == TABLE_TOPIC or not self._topics[topic_id].queue:
                 self.ask(topic_id, now)
 
     def marks(self, now: float) -> list[tuple[int, int]]:

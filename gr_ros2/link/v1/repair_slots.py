@@ -124,8 +124,8 @@ class RepairSlots:
             return now
         return min(now + _POLL_S, window.thrift.next_doubt(since))
 
-    def held(self, now: float) -> bool:
-        """Whether what could leave now waits for a new message."""
+    def held(self, now: float, *, repairs: bool = True) -> bool:
+        """Whether what could leave now, a repair or something else, waits for a new message."""
         airtime = self._pace.interval
-        self.waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime)
+        self.waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime, repairs=repairs)
         return self.waits_until > now

@@ -120,7 +120,7 @@ class SendingSide:
 
     def _rows(self, now: float) -> SentPacket | None:
         """Rows of the table in a packet that nothing else needs."""
-        wait = not self._messages.packing.fills or self.repairs.held(now)
+        wait = not self._messages.packing.fills or self.repairs.held(now, repairs=False)
         return None if wait else self._fill([], now, spare=True)
 
     def _fill(self, due: list[Reporter], now: float, *, spare: bool = False) -> SentPacket | None:

@@ -71,6 +71,13 @@ def test_what_fits_is_said_to_fit() -> None:
     assert planner("narrow-ofdm-paced").forecast().load > 1
 
 
+def test_rows_of_the_table_delay_no_messages() -> None:
+    """One way they follow each hello, and wait for the message that is due: fewer than 1 in 100 comes late."""
+    (odom,) = planner("paper-ofdm-paced", "repair='off'", duration=30.0).forecast().topics
+    assert odom.result.latency_s.p99 is not None
+    assert odom.result.latency_s.p99 < 0.02
+
+
 def test_a_forecast_is_what_the_link_does() -> None:
     scenario = load_scenario("six-topics-paced", ["time=packets"], duration_s=5.0)
     done = {topic.topic: topic for topic in simulate(scenario).topics}

@@ -56,6 +56,14 @@ def test_a_topic_of_which_one_message_has_come_is_not_waited_for() -> None:
         assert made.until(now, now + AIRTIME, AIRTIME) == now
 
 
+def test_what_is_no_repair_waits_however_many_repairs_are_owed() -> None:
+    owing = hold()
+    for _ in range(10):
+        owing.left(0.0, 0.2)
+    assert owing.until(0.026, 0.039, AIRTIME) == 0.026
+    assert owing.until(0.026, 0.039, AIRTIME, repairs=False) > PERIOD
+
+
 def test_without_a_known_airtime_nothing_waits() -> None:
     assert hold().until(0.026, 0.026, 0.0) == 0.026
 

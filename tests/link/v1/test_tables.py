@@ -56,6 +56,16 @@ def test_a_receiver_that_is_switched_on_later_knows_the_topics_in_two_seconds(se
     assert air.run(9.0, lambda: len(rows(two)) == 6) <= 2.0
 
 
+def test_where_a_long_message_leaves_no_room_it_knows_them_when_the_table_is_repeated() -> None:
+    one, two, air = one_way(*NAMES[:2], loss=0.0, repeat_s=10.0)
+    air.robots.remove(two)
+    one.end.messages.submit(0, bytes(1_000_000), air.now)
+    air.run(15.0)
+    air.robots.append(two)
+    assert air.run(30.0, lambda: len(rows(two)) == 2) <= 10.5
+    assert not one.end.messages.idle, "the message is still on its way"
+
+
 def test_so_does_one_that_a_robot_cannot_hear_while_it_says_something() -> None:
     one, two = Robot(1, registry(**dict.fromkeys(NAMES[:6], DEFAULT))), Robot(2)
     air = Air(one)
