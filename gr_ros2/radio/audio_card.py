@@ -50,7 +50,7 @@ except OSError as missing:  # the package is there, and the library that it load
 PortAudioError = sounddevice.PortAudioError
 _BLOCK = 480
 """Frames of a block, 10 ms."""
-_PASS_S = 0.05
+_PASS_S = 0.15
 """s before a block is made in which a burst must come: its way through GNU Radio's buffers, and two blocks."""
 _SETTLED = 20
 """Blocks after which a server has settled on how far ahead it asks for them."""
