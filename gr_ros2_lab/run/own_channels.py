@@ -121,7 +121,7 @@ class OwnChannels:
             )
         if source is None and not hears:
             raise ConfigError(
-                f"gains_db: receiver {number} hears nobody; set a higher gain, or time to packets or samples"
+                f"gains_db: {robot.config.namespace} hears nobody; set a higher gain, or time to packets or samples"
             )
         if source is not None and scenario.bag_path is not None and not scenario.bag_speed:
             # A bag that is read as fast as the link takes it: the reader waits, so that nothing is dropped.

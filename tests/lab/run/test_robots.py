@@ -41,7 +41,7 @@ def test_two_robots_on_one_channel_disturb_each_other_and_repair_it(time: str) -
 
 
 def test_twenty_robots_have_a_table_each(tmp_path: Path) -> None:
-    result = run("twenty-robots", "medium=exclusive", duration_s=1.0)
+    result = run("twenty-robots", "medium=exclusive", duration_s=2.0)
     assert len(result.topics) == 19
     assert [receiver.name for receiver in result.receivers] == [f"/robot_{number}" for number in range(2, 21)]
     assert {len(receiver.topics) for receiver in result.receivers} == {19}
