@@ -52,7 +52,7 @@ _STEPS = (*[1] * 24, 2, 2, 3, 65, 128, 600, 30_000, 0x8001)
 _ROWS = [
     AnnouncedTopic(0, "a", "std_msgs/msg/String", 0, True),
     AnnouncedTopic(1, "b", "std_msgs/msg/String", 1, False, True),
-    AnnouncedTopic(2, "c", "std_msgs/msg/String", 2, True, False, 1, "", True, _OWN),
+    AnnouncedTopic(2, "c", "std_msgs/msg/String", 2, True, False, 1, "", True, _OWN, 30),
 ]
 _T = TypeVar("_T")
 

@@ -268,9 +268,6 @@ effects(
     domain_id=differs(published, domain_id=GRAPH + 1),
     topic_options=differs(published, topic_options={"odom": {"publish_as": "/here"}}),
     debug=Elsewhere("gr/test_readable.py::test_lines_appear_on_standard_output_where_nothing_else_takes_them"),
-    commands=Elsewhere(
-        "link/v1/test_commands.py::test_what_repair_brings_too_late_is_dropped_by_the_receiver_and_has_a_row"
-    ),
     namespace_format=differs(published, namespace_format="/from_{robot}"),
     publisher_depth=differs(published, publisher_depth=3),
     reassembly_timeout_s=run("paper.reassembly_timeout_s=0.05", *PAPER, LOSSY),

@@ -237,8 +237,6 @@ class EndConfig(Agreed):
         front end loops back. A sink that has one drops and counts its own packets and those for others
     :param middleware: where the ROS graph is reached, a name of ``gr_ros2.middleware.MIDDLEWARE``
     :param domain_id: ROS domain, 0..232; auto takes ROS_DOMAIN_ID
-    :param commands: types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before
-        others, unless the topic's options say otherwise; the same at both ends, as far as both know the topics
     :param topic_options: per topic name, over the registry's columns, such as {'odom': {'depth': 100}}
     :param debug: readable log of headers, topic ids and entries
     """
@@ -247,7 +245,6 @@ class EndConfig(Agreed):
     robot_id: Annotated[RobotId | Auto, Field(title="Robot ID")] = AUTO
     middleware: str = DEFAULT_MIDDLEWARE
     domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
-    commands: Annotated[tuple[str, ...], OnlyIn(1), AfterValidator(checked_commands)] = COMMAND_TYPES
     topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
     debug: Annotated[bool, Field(title="Debug log")] = False
     end: ClassVar[Any] = ""
@@ -279,6 +276,8 @@ class SourceConfig(EndConfig):
         which says type and QoS ([] = none)
     :param services: whether these names choose services and actions of the ROS graph too, which other robots may then
         call; this needs both directions of a link
+    :param commands: types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before
+        others, unless the topic's options say otherwise
     :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
     :param dst_id: destination id, 255 broadcast; while a link runs it can change with version 0 only
     :param min_fragment: k_min, lower bound on an entry's payload, bytes
@@ -309,6 +308,7 @@ class SourceConfig(EndConfig):
         AfterValidator(checked_words),
     ] = ()
     services: Annotated[bool, OnlyIn(1), Field(title="Services and actions too")] = True
+    commands: Annotated[tuple[str, ...], OnlyIn(1), AfterValidator(checked_commands)] = COMMAND_TYPES
     namespace: Namespace = ""
     dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
     min_fragment: Annotated[int, OnlyIn(0), Field(ge=1, le=65535, title="Smallest fragment (bytes)")] = 16

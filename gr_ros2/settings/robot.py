@@ -93,7 +93,8 @@ class PublishOptions:
     depth: Count | Auto = AUTO
     """QoS depth of its publisher; auto = ``publish.depth``, of a transient-local topic 1"""
     deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
-    """s after which a command is not delivered any more; of a service: s that a call waits for its reply, auto 30"""
+    """s after which a message is not delivered any more; 0 = any time, auto takes that of its sender. Of a service: s
+    that a call waits for its reply, auto 30"""
     max_age_s: Age = AUTO
     """s for which a sealed message of it may have been withheld (with a key), or it is not taken; 0 = any time, auto
     takes ``max_age_s`` of the robot"""
@@ -142,7 +143,7 @@ class RobotConfig:
     """whether ``topics`` choose services and actions of the graph too, which other robots may then call"""
     commands: Annotated[tuple[str, ...], AfterValidator(checked_commands)] = COMMAND_TYPES
     """types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before others, unless
-    the topic's options say otherwise; the same at all robots"""
+    the topic's options say otherwise"""
     packet_len: Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN, title="Packet length (bytes)")] = 220
     """bytes of the longest packet, 40..4095 (14 or more of the paper's blocks), the same at all robots"""
     key: Annotated[str, Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
@@ -279,9 +280,7 @@ def halves(robot: RobotConfig, paper: PaperConfig | None = None) -> tuple[Source
     :param paper: those of the paper's blocks; None: it speaks version 1
     :raises ConfigError: for a setting that the paper's blocks do not have
     """
-    common: dict[str, Any] = {
-        name: getattr(robot, name) for name in ("packet_len", "key", "seal", "state", "commands", "debug")
-    }
+    common: dict[str, Any] = {name: getattr(robot, name) for name in ("packet_len", "key", "seal", "state", "debug")}
     common |= {"robot_id": robot.robot_id, "middleware": robot.graph.middleware, "domain_id": robot.graph.domain_id}
     registry = robot.registry if robot.sends else ""
     words = tuple(robot.topics) if robot.sends else ()
@@ -297,7 +296,10 @@ def halves(robot: RobotConfig, paper: PaperConfig | None = None) -> tuple[Source
     common["version"] = 1 if paper is None else 0
     of_paper = {} if paper is None else vars_of(paper)
     timeout = {"reassembly_timeout_s": of_paper.pop("reassembly_timeout_s")} if of_paper else {}
-    both = ("services", "packet_rate", "queue_depth", "compression", "repair", "expected_loss", "repeat_s", "beacon_s")
+    both = (
+        *("services", "commands", "packet_rate", "queue_depth", "compression"),
+        *("repair", "expected_loss", "repeat_s", "beacon_s"),
+    )
     source = {
         **common,
         "registry": registry,

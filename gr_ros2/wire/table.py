@@ -12,10 +12,12 @@ from zlib import crc32
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError, VersionError
 from gr_ros2.wire.format import BROADCAST, QOS_NAMES
+from gr_ros2.wire.relayed import NO_AGE, age_of
 
 _FORMAT = 1
-_QOS, _RELIABLE, _LATCHED, _FRESH, _ADDRESSED = 3, 4, 8, 16, 32
+_QOS, _RELIABLE, _LATCHED, _FRESH, _ADDRESSED, _DEADLINE = 3, 4, 8, 16, 32, 64
 _FIXED = 4
+_MOST = 239, 2, 255, BROADCAST, NO_AGE - 1
 
 
 class AnnouncedTopic(NamedTuple):
@@ -32,6 +34,7 @@ class AnnouncedTopic(NamedTuple):
     :param codec: how its messages are coded, '' if they are not; the codec defines the text
     :param fresh: its messages are of no use when they are old: they have a deadline or a lifespan, or are calls
     :param dst_id: the robot for which its messages are, 255 for all
+    :param deadline: code of the age (``wire.relayed``) at which its messages are of no more use, 0 for none
     """
 
     topic_id: int
@@ -44,6 +47,12 @@ class AnnouncedTopic(NamedTuple):
     codec: str = ""
     fresh: bool = False
     dst_id: int = BROADCAST
+    deadline: int = 0
+
+    @property
+    def deadline_s(self) -> float:
+        """Age in s at which its messages are of no more use; 0 for none."""
+        return age_of(self.deadline)
 
     @property
     def mark(self) -> int:
@@ -58,6 +67,7 @@ class AnnouncedTopic(NamedTuple):
         words += ["reliable"] * self.reliable + ["latched"] * self.latched + ["of no use when old"] * self.fresh
         words += [f"depth {self.depth}"] * (self.depth > 0) + [f"codec {self.codec}"] * bool(self.codec)
         words += [f"for robot {self.dst_id}"] * (self.dst_id != BROADCAST)
+        words += [f"over after {self.deadline_s:g} s"] * (self.deadline > 0)
         return ", ".join(words)
 
 
@@ -69,15 +79,16 @@ def write_table(topics: Iterable[AnnouncedTopic]) -> bytes:
     parts = [bytes((_FORMAT,))]
     for topic in topics:
         texts = [text.encode() for text in (topic.name, topic.type_name, topic.codec)]
-        numbers = topic.topic_id, topic.qos, topic.depth, topic.dst_id
-        if any(not 0 <= value <= most for value, most in zip(numbers, (239, 2, 255, BROADCAST), strict=True)):
+        numbers = topic.topic_id, topic.qos, topic.depth, topic.dst_id, topic.deadline
+        if any(not 0 <= value <= most for value, most in zip(numbers, _MOST, strict=True)):
             raise EncodeError(f"a field of {topic} is out of range")
         if max(map(len, texts)) > 255:
             raise EncodeError(f"{topic}: name, type and codec have at most 255 bytes each")
         flags = topic.qos | topic.reliable * _RELIABLE | topic.latched * _LATCHED | topic.fresh * _FRESH
-        addressed = topic.dst_id != BROADCAST
-        parts.append(bytes((topic.topic_id, flags | addressed * _ADDRESSED, topic.depth)))
-        parts.append(bytes((topic.dst_id,)) * addressed)
+        addressed, limited = topic.dst_id != BROADCAST, topic.deadline > 0
+        flags |= addressed * _ADDRESSED | limited * _DEADLINE
+        parts.append(bytes((topic.topic_id, flags, topic.depth)))
+        parts.append(bytes((topic.dst_id,)) * addressed + bytes((topic.deadline,)) * limited)
         parts += [bytes((len(text),)) + text for text in texts]
     return b"".join(parts)
 
@@ -101,6 +112,13 @@ def read_table(data: bytes) -> tuple[AnnouncedTopic, ...]:
             dst_id, position = data[position], position + 1
             if dst_id == BROADCAST:
                 raise EntryKindError(f"topic {len(topics)} of a table is for robot {BROADCAST}")
+        deadline = 0
+        if flags & _DEADLINE:
+            if position == len(data):
+                raise EntryBoundsError(f"topic {len(topics)} of a table ends before its deadline")
+            deadline, position = data[position], position + 1
+            if deadline in (0, NO_AGE):
+                raise EntryKindError(f"topic {len(topics)} of a table has a deadline of code {deadline}")
         texts: list[str] = []
         for _ in range(3):
             start = position + 1
@@ -111,13 +129,10 @@ def read_table(data: bytes) -> tuple[AnnouncedTopic, ...]:
                 texts.append(data[start:position].decode())
             except UnicodeDecodeError as error:
                 raise EntryKindError(f"a text in topic {len(topics)} of a table is no UTF-8") from error
-        if topic_id >= 240 or flags & _QOS == _QOS or flags > 63 or any(topic.topic_id == topic_id for topic in topics):
+        if topic_id >= 240 or flags & _QOS == _QOS or flags > 127 or topic_id in {row.topic_id for row in topics}:
             raise EntryKindError(f"topic id {topic_id} or flags {flags:#x} in topic {len(topics)} of a table")
         name, type_name, codec = texts
         reliable, latched = flags & _RELIABLE != 0, flags & _LATCHED != 0
-        topics.append(
-            AnnouncedTopic(
-                topic_id, name, type_name, flags & _QOS, reliable, latched, depth, codec, flags & _FRESH != 0, dst_id
-            )
-        )
+        of = flags & _QOS, reliable, latched, depth, codec, flags & _FRESH != 0, dst_id, deadline
+        topics.append(AnnouncedTopic(topic_id, name, type_name, *of))
     return tuple(topics)

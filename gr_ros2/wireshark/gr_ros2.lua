@@ -127,6 +127,7 @@ local f = {
     table_reliable = ProtoField.bool("gr_ros2.table.reliable", "Reliable"),
     table_latched = ProtoField.bool("gr_ros2.table.latched", "Kept for late joiners"),
     table_depth = ProtoField.uint8("gr_ros2.table.depth", "Depth"),
+    table_deadline = ProtoField.uint8("gr_ros2.table.deadline", "Deadline"),
 }
 local fields = {}
 for _, field in pairs(f) do
@@ -496,6 +497,12 @@ local function read_table(bytes)
         if math.floor(flags / 32) % 2 == 1 then
             at = at + 1 -- the robot for which it is
         end
+        if math.floor(flags / 64) % 2 == 1 then
+            if at >= bytes:len() then
+                return nil
+            end
+            row.deadline, at = bytes:get_index(at), at + 1
+        end
         for _, text in ipairs({ "name", "kind", "codec" }) do
             if at >= bytes:len() or at + 1 + bytes:get_index(at) > bytes:len() then
                 return nil
@@ -532,6 +539,15 @@ local function keep_fragment(src, begin, offset, last, bytes)
     return read_table(whole)
 end
 
+-- The age for which a code stands, in words.
+local function age_of(code)
+    if code == 255 then
+        return " (without limit)"
+    end
+    local steps = code < 16 and code or (16 + code % 16) * 2 ^ (math.floor(code / 16) - 1)
+    return string.format(" (%g s)", steps / 100)
+end
+
 local function show_table(tree, range, rows)
     for _, row in ipairs(rows) do
         local item = tree:add(f.table_topic_id, range, row.id)
@@ -543,16 +559,10 @@ local function show_table(tree, range, rows)
         item:add(f.table_reliable, range, math.floor(row.flags / 4) % 2 == 1):set_generated()
         item:add(f.table_latched, range, math.floor(row.flags / 8) % 2 == 1):set_generated()
         item:add(f.table_depth, range, row.depth):set_generated()
+        if row.deadline then
+            item:add(f.table_deadline, range, row.deadline):set_generated():append_text(age_of(row.deadline))
+        end
     end
-end
-
--- The age for which a code stands, in words.
-local function age_of(code)
-    if code == 255 then
-        return " (without limit)"
-    end
-    local steps = code < 16 and code or (16 + code % 16) * 2 ^ (math.floor(code / 16) - 1)
-    return string.format(" (%g s)", steps / 100)
 end
 
 -- Whose message it is that stands in a message of another robot.

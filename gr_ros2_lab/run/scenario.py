@@ -45,7 +45,7 @@ from gr_ros2_lab.sim.sim_settings import SimSettings
 
 SHARED = tuple(item.name for item in fields(RobotConfig) if item.name != "robot")
 """Settings of robots that may stand above them."""
-_EQUAL = ("packet_len", "registry", "key", "seal", "commands")
+_EQUAL = ("packet_len", "registry", "key", "seal")
 """Those on which all robots have to agree."""
 
 _T = TypeVar("_T")

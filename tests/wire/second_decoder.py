@@ -444,6 +444,13 @@ def read_table(data: bytes) -> list[dict[str, object]]:
             at, to = at + 1, data[at]
             if to == 255:
                 raise Refused("entry_kind")
+        deadline = 0
+        if flags & 64:
+            if at == len(data):
+                raise Refused("entry_bounds")
+            at, deadline = at + 1, data[at]
+            if deadline in (0, 255):
+                raise Refused("entry_kind")
         texts: list[str] = []
         for _ in range(3):
             if at >= len(data) or at + 1 + data[at] > len(data):
@@ -453,11 +460,11 @@ def read_table(data: bytes) -> list[dict[str, object]]:
             except UnicodeDecodeError as error:
                 raise Refused("entry_kind") from error
             at += 1 + data[at]
-        if topic_id >= 240 or flags >= 64 or flags % 4 == 3 or topic_id in [row["topic_id"] for row in rows]:
+        if topic_id >= 240 or flags >= 128 or flags % 4 == 3 or topic_id in [row["topic_id"] for row in rows]:
             raise Refused("entry_kind")
         row: dict[str, object] = {"topic_id": topic_id, "name": texts[0], "type_name": texts[1], "qos": flags % 4}
         row |= {"reliable": bool(flags & 4), "latched": bool(flags & 8), "depth": depth, "codec": texts[2]}
-        rows.append(row | {"fresh": bool(flags & 16), "dst_id": to})
+        rows.append(row | {"fresh": bool(flags & 16), "dst_id": to, "deadline": deadline})
     return rows
 
 

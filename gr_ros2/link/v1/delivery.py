@@ -15,7 +15,6 @@ from gr_ros2.link.fates import Fate
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.relay.gain import EXPIRES_S
-from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire.relayed import NO_AGE, age_of
@@ -50,12 +49,10 @@ class DeliveryRules:
         self._own, self._settings = settings.src_id, settings
         self._silent_before = 0
         self._max_age_s, self._max_ages = settings.max_age_s, settings.max_ages
-        self._limited = bool(settings.max_ages) or settings.max_age_s != AUTO
-        """Whether messages have limits also where their topic's table asks for none."""
         self._relays = settings.relay
-        self._commands, self._deadlines = settings.commands, settings.deadlines
-        self._reached: deque[tuple[int, float]] = deque(maxlen=_REACHED)
-        """Numbers that the robot's packets have reached, and when, s."""
+        self._deadlines = settings.deadlines
+        self._reached: deque[tuple[int, float, bool]] = deque(maxlen=_REACHED)
+        """Numbers that the robot's packets have reached, when, s, and whether it may have reached them long before."""
         self._over: dict[tuple[int, tuple[int, int]], None] = {}
         """Messages that came over other robots, by topic id and order: they may come again."""
         self._came: dict[int, float] = {}
@@ -63,20 +60,28 @@ class DeliveryRules:
         self._direct: dict[int, tuple[int, int]] = {}
         """The newest message of a topic that its maker's own packets brought."""
 
-    def reached(self, number: int, now: float) -> None:
-        """The robot has reached a number, as a packet shows that arrived at a time, s."""
-        self._reached.append((number, now))
+    def reached(self, number: int, now: float, *, late: bool = False) -> None:
+        """The robot has reached a number, as a packet shows that arrived at a time, s.
 
-    def made(self, ready: Ready, now: float) -> float:
+        :param late: it may have reached it long before
+        """
+        self._reached.append((number, now, late))
+
+    def made(self, ready: Ready, now: float, repaired_s: float = inf) -> float:
         """When a message of this robot was made at the latest, s: before a packet arrived that left after it. One that
-        had to be repaired may have left right after the packet before it."""
+        had to be repaired may have left right after the packet before it, unless its robot repairs it no longer than
+        it is of use: then it came in time if it came soon after it was missed.
+
+        :param repaired_s: s for which its robot repairs the packet that brought it
+        """
         number, before, after = ready.order[0], now - UNKNOWN_S, now
-        for reached, at in reversed(self._reached):
-            if reached < number:
+        for reached, at, late in reversed(self._reached):
+            if reached >= number:
+                after = at
+            elif not late:
                 before = at
                 break
-            after = at
-        made = before if ready.repaired else after
+        made = before if ready.repaired and repaired_s == inf else after
         if ready.repaired and self.sealed_after is not None:
             made = max(made, self.sealed_after(number))
         return made if made < now else now
@@ -141,14 +146,12 @@ class DeliveryRules:
         """Why a message is not delivered; None for one that is, or that is here already."""
         if topic.dst_id != BROADCAST and self._own not in (topic.dst_id, NOBODY):
             return Fate.NOT_FOR_US
-        if topic.fresh or self._limited:
-            withheld_s, deadline_s = self._limits(topic)
+        withheld_s, deadline_s = self._limits(topic)
+        if withheld_s < inf:
             oldest = self.sealed(ready) if ready.over is None else min(ready.sealed, ready.made)
             if now - oldest > withheld_s:
                 return Fate.NOT_FRESH
-            if now - ready.made > deadline_s:
-                return Fate.LATE
-        if now - ready.made > ready.limit_s:
+        if now - ready.made > min(deadline_s, ready.limit_s):
             return Fate.LATE
         before = ready.over is None and ready.order[0] < self._silent_before
         if before and (topic.fresh or not (topic.reliable or topic.latched)):
@@ -185,10 +188,12 @@ class DeliveryRules:
         withheld_s = self._max_ages.get(name, self._max_age_s)
         if withheld_s == AUTO:
             withheld_s = self.withheld_s if topic.fresh else 0.0
-        deadline_s = self._deadlines.get(name, 0.0) if topic.fresh else 0.0
-        if topic.fresh and name not in self._deadlines and is_command(name, topic.type_name, self._commands):
-            deadline_s = COMMAND_DEADLINE_S
-        return withheld_s or inf, deadline_s or inf
+        return withheld_s or inf, self.deadline_s(topic)
+
+    def deadline_s(self, topic: AnnouncedTopic) -> float:
+        """s for which a message of a topic may be under way, as this robot or else the one that sends it says; infinite
+        for any time."""
+        return self._deadlines.get(topic.name.lstrip("/"), topic.deadline_s) or inf
 
     def _passed(self, ready: Ready) -> bool:
         """Whether a message whose order is not the newest of its topic comes after a later one."""

@@ -44,8 +44,9 @@ class Settings:
     :param max_sources: robots heard at a time
     :param packet_rate: packets/s at most; auto = as many as credits allow, where credits are given; 0 = no limit
     :param queue_depth: messages that may wait per topic; 0 = no limit
-    :param commands: types and names of topics whose messages come in time or not at all
-    :param deadlines: s by topic, without leading slash, after which a received command is not delivered any more
+    :param commands: types and names of topics that it sends whose messages come in time or not at all
+    :param deadlines: s by topic, without leading slash, after which a message is not delivered any more, whatever its
+        sender says; 0 = any time
     :param airtime_share: part of the time that this robot may send, above 0..1
     :param turn_s: tells s from one packet of this robot to its next, where it always has one; 0 = not known
     :param beacon_s: s without hearing any robot after which one hello leaves every so many s, and nothing else; 0 = off
@@ -142,7 +143,7 @@ def settings_of(
         max_sources=take.max_sources,
         packet_rate=send.packet_rate,
         queue_depth=send.queue_depth,
-        commands=take.commands if source is None else send.commands,
+        commands=send.commands,
         deadlines={
             name.lstrip("/"): options.deadline_s
             for name, options in take.topic_options.items()

@@ -289,12 +289,11 @@ class Inbox:
         newest = self.decoder.newest
         if not late:
             silence, self._heard = now - self._heard, now
-            if number > newest:
-                self.deliveries.reached(number, self.began)
             if silence >= self._give_up_s:
                 self.deliveries.silent_before(number + (not here))
         if number <= newest:
             return
+        self.deliveries.reached(number, self.began, late=late)
         gone = number - newest - here
         if gone:
             met = newest >= self._first  # what came before the first packet that was heard is not lost
@@ -309,6 +308,7 @@ class Inbox:
     def _take(self, number: int, entries: Sequence[EntryV1], qos: int, *, repaired: bool) -> None:
         """Process the entries of a packet that is known now."""
         self.order.contents.learn(number)
+        repaired_s = self._repaired_s(entries) if repaired else inf
         for place, entry in enumerate(entries):
             if not isinstance(entry, Part):
                 self._control(entry)
@@ -317,7 +317,9 @@ class Inbox:
             if topic is None or topic.reliable or topic.latched:
                 self.reports.confirms = True
             if entry.whole:
-                self._arrived(Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired))
+                self._arrived(
+                    Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired), repaired_s
+                )
             else:
                 self._fragment(entry, number, place, qos, repaired=repaired)
 
@@ -336,9 +338,19 @@ class Inbox:
             return
         self._arrived(Ready(whole.topic_id, whole.order, payload, qos, whole.coded, whole.repaired))
 
-    def _arrived(self, ready: Ready) -> None:
-        """A message is complete."""
-        ready.made = self.deliveries.made(ready, self.began)
+    def _repaired_s(self, entries: Iterable[EntryV1]) -> float:
+        """s for which the sender repairs a packet: as long as one of its messages is of use."""
+        rows = (self.announced.topics.get(entry.topic_id) for entry in entries if isinstance(entry, Part))
+        return max((inf if row is None else row.deadline_s or inf for row in rows), default=inf)
+
+    def _arrived(self, ready: Ready, repaired_s: float = inf) -> None:
+        """A message is complete.
+
+        :param repaired_s: s for which its sender repairs the packet that brought it
+        """
+        topic = self.announced.topics.get(ready.topic_id)
+        of_use_s = inf if topic is None else self.deliveries.deadline_s(topic)
+        ready.made = self.deliveries.made(ready, self.began, repaired_s if repaired_s <= of_use_s else inf)
         if ready.topic_id > TABLE_TOPIC:
             if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
                 self.order.wait(ready)

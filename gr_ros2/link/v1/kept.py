@@ -155,7 +155,8 @@ class KeptMessages:
         for kept in self._kept.get(topic_id, ()):
             if now > kept.until:
                 continue
-            again = Message(kept.serial, topic_id, kept.payload, qos, now, topic.weight, repeat=True, coded=kept.coded)
+            again = Message(kept.serial, topic_id, kept.payload, qos, now, topic.weight, kept.until - now)
+            again.repeat, again.coded = True, kept.coded
             again.begin, again.dst_id = kept.begin, topic.dst_id
             self._admit(topic, again)
             self._stats.repeats += 1

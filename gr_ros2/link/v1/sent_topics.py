@@ -15,6 +15,7 @@ from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
+from gr_ros2.wire.relayed import NO_AGE, age_code
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
 
@@ -124,6 +125,7 @@ class SentTopic:
             codec,
             fresh,
             self.dst_id,
+            age_code(self.queue.deadline_s) % NO_AGE,
         )
 
 

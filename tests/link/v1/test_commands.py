@@ -89,11 +89,11 @@ def test_a_lifespan_of_the_publishers_goes_before_the_default() -> None:
     assert end.queue(0) == ("latest", COMMAND_DEADLINE_S)
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_what_repair_brings_too_late_is_dropped_by_the_receiver_and_has_a_row(named: bool) -> None:
+@pytest.mark.parametrize("follows", [True, False])
+def test_what_repair_brings_too_late_is_dropped_by_the_receiver_and_has_a_row(follows: bool) -> None:
     """The packet with the command is lost, and comes half a second after the packets behind it."""
     sender = robot()
-    receiver = Robot(2, **({} if named else {"commands": ()}))
+    receiver = Robot(2, commands=(), deadlines={} if follows else {"cmd_vel": 0.0})
     air = Air(sender, receiver)
     air.run(2.0)
     held: list[bytes] = []
@@ -109,9 +109,9 @@ def test_what_repair_brings_too_late_is_dropped_by_the_receiver_and_has_a_row(na
     receiver.receive(held[0], air.now + 0.5)
     events = [event for event in receiver.events[before:] if isinstance(event, Delivered | Lost)]
     (outcome,) = (event for event in events if event.topic_id == 0)
-    assert isinstance(outcome, Delivered) != named
+    assert isinstance(outcome, Delivered) != follows
     assert sum(isinstance(event, Delivered) for event in events if event.topic_id == 1) == 3
-    assert receiver.end.received.lost[1, 0, "late"] == named
+    assert receiver.end.received.lost[1, 0, "late"] == follows
 
 
 def test_a_robot_that_hears_nobody_sends_beacons_alone_until_it_hears_somebody() -> None:
