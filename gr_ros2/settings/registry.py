@@ -308,7 +308,7 @@ def options_of(name: str, options: Mapping[str, _O], default: _O = DEFAULT_OPTIO
     plain = {other.lstrip("/"): value for other, value in options.items()}
     name = name.lstrip("/")
     words = (word for word in plain if fnmatchcase(name, "*" if word == AUTO else word))
-    return plain.get(name) or plain.get(next(words, ""), default)
+    return plain[name] if name in plain else plain.get(next(words, ""), default)
 
 
 def check_outputs(registry: Registry, sink: SinkConfig) -> None:

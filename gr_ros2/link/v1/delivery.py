@@ -17,6 +17,7 @@ from gr_ros2.link.v1.order import Ready
 from gr_ros2.relay.gain import EXPIRES_S
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import options_of
 from gr_ros2.wire.relayed import NO_AGE, age_of
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST
@@ -184,8 +185,7 @@ class DeliveryRules:
     def _limits(self, topic: AnnouncedTopic) -> tuple[float, float]:
         """s for which a message of a topic may have been withheld, and s for which it may have been under way; infinite
         for any time."""
-        name = topic.name.lstrip("/")
-        withheld_s = self._max_ages.get(name, self._max_age_s)
+        withheld_s = options_of(topic.name, self._max_ages, self._max_age_s)
         if withheld_s == AUTO:
             withheld_s = self.withheld_s if topic.fresh else 0.0
         return withheld_s or inf, self.deadline_s(topic)
@@ -193,7 +193,7 @@ class DeliveryRules:
     def deadline_s(self, topic: AnnouncedTopic) -> float:
         """s for which a message of a topic may be under way, as this robot or else the one that sends it says; infinite
         for any time."""
-        return self._deadlines.get(topic.name.lstrip("/"), topic.deadline_s) or inf
+        return options_of(topic.name, self._deadlines, topic.deadline_s) or inf
 
     def _passed(self, ready: Ready) -> bool:
         """Whether a message whose order is not the newest of its topic comes after a later one."""

@@ -38,14 +38,14 @@ class Settings:
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
     :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
         topics with a deadline or lifespan, no bound for others; 0 = no bound
-    :param max_ages: the same by topic, without leading slash
+    :param max_ages: the same by topic; * and ? in its name stand for others
     :param repeat_s: s between repeats of latched messages while no robot reports; 0 = no repeats
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard
     :param max_sources: robots heard at a time
     :param packet_rate: packets/s at most; auto = as many as credits allow, where credits are given; 0 = no limit
     :param queue_depth: messages that may wait per topic; 0 = no limit
     :param commands: types and names of topics that it sends whose messages come in time or not at all
-    :param deadlines: s by topic, without leading slash, after which a message is not delivered any more, whatever its
+    :param deadlines: s by topic likewise, after which a message is not delivered any more, whatever its
         sender says; 0 = any time
     :param airtime_share: part of the time that this robot may send, above 0..1
     :param turn_s: tells s from one packet of this robot to its next, where it always has one; 0 = not known
@@ -133,11 +133,7 @@ def settings_of(
         relay=relay,
         hold_s=take.hold_s,
         max_age_s=take.max_age_s,
-        max_ages={
-            name.lstrip("/"): options.max_age_s
-            for name, options in take.topic_options.items()
-            if options.max_age_s != AUTO
-        },
+        max_ages={name: options.max_age_s for name, options in take.topic_options.items() if options.max_age_s != AUTO},
         repeat_s=send.repeat_s,
         max_source_bytes=take.max_source_bytes,
         max_sources=take.max_sources,
@@ -145,9 +141,7 @@ def settings_of(
         queue_depth=send.queue_depth,
         commands=send.commands,
         deadlines={
-            name.lstrip("/"): options.deadline_s
-            for name, options in take.topic_options.items()
-            if options.deadline_s != AUTO
+            name: options.deadline_s for name, options in take.topic_options.items() if options.deadline_s != AUTO
         },
         airtime_share=airtime_share,
         turn_s=lambda: airtime_s,

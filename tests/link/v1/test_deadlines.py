@@ -28,7 +28,7 @@ def rows(**options: TopicOptions) -> Registry:
 @pytest.mark.parametrize("own_s", [None, 0.0, 20.0])
 def test_what_waited_for_a_hello_counts_from_when_it_came(after_s: float, own_s: float | None) -> None:
     sender = Robot(1, rows(scan=SCAN), packet_len=128)
-    receiver = Robot(2, packet_len=128, deadlines={} if own_s is None else {"scan": own_s})
+    receiver = Robot(2, packet_len=128, deadlines={} if own_s is None else {"/sc*": own_s})
     sender.end.messages.submit(1, b"scan", 0.0)
     packets = [data for n in range(6) if (data := sender.slot(n * SLOT_S)) is not None]
     hellos = [data for data in packets if Robot(3, packet_len=128).receive(data, 0.0)]
