@@ -261,7 +261,13 @@ def test_it_shows_what_the_result_says_sliders_act_and_it_returns_with_the_next_
 def test_it_shows_what_repair_does_and_can_be_used_with_a_keyboard_and_a_screen_reader_and_read_in_both_modes(
     viewer: Viewer, tmp_path: Path
 ) -> None:
-    lossy = ("robots=[{}, {topics: []}]", "channel.packet_loss=0.3", "channel.snr_db=null", "sim.odom_rate=10")
+    lossy = (
+        "paper=null",
+        "robots=[{}, {topics: []}]",
+        "channel.packet_loss=0.3",
+        "channel.snr_db=null",
+        "sim.odom_rate=10",
+    )
     with program(tmp_path / "out", 0, *lossy) as (process, url):
         viewer.driver.get(url)
         viewer.wait(lambda: viewer.numbers().get("repaired", 0) > 2, "repaired messages")
@@ -322,7 +328,7 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
     def card(name: str) -> bool:
         return bool(viewer.run(f"{FIND} return found[0].checkVisibility()", f'[data-card="{name}"]'))
 
-    lossy = ("robots=[{}, {topics: []}]", "repair=off", "sim.odom_rate=20")
+    lossy = ("paper=null", "robots=[{}, {topics: []}]", "repair=off", "sim.odom_rate=20")
     with program(tmp_path / "out", 0, *lossy) as (process, url):
         viewer.driver.get(url)
         viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 60, "deliveries")
