@@ -18,7 +18,7 @@ from gr_ros2.dashboard.monitor import RunMonitor
 from gr_ros2.radio.findings import about, compared, differences, heard_nobody, in_words
 from gr_ros2.state.keys import new_key_file
 from tests.radio.cables import SerialCable
-from tests.radio.robots import Robot, config
+from tests.radio.robots import RATE, Robot, config
 from tests.waiting import wait_for
 
 Wrong = Callable[[Path], dict[str, Any]]
@@ -56,7 +56,7 @@ def test_ends_that_match_say_so_with_figures(tmp_path: Path) -> None:
 
 
 def test_another_packet_len_is_named(tmp_path: Path) -> None:
-    one, two = pair(tmp_path, {"packet_len": 128})
+    one, two = pair(tmp_path, {"packet_len": 128}, phy={"name": "psk", "sample_rate": RATE})
     with one, two:
         wait_for(lambda: (one.link.ping(2)["about"] or {}).get("packet_len") == 128, "what the other end is")
         (line,) = differences(about(one.link.config, one.link.phy), one.link.ping(2)["about"])
