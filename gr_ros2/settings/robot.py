@@ -280,6 +280,8 @@ def halves(robot: RobotConfig, paper: PaperConfig | None = None) -> tuple[Source
     :param paper: those of the paper's blocks; None: it speaks version 1
     :raises ConfigError: for a setting that the paper's blocks do not have
     """
+    if paper is not None and not robot.compression:
+        raise ConfigError("compression = False: the paper's blocks have a setting of their own; set paper.compression")
     common: dict[str, Any] = {name: getattr(robot, name) for name in ("packet_len", "key", "seal", "state", "debug")}
     common |= {"robot_id": robot.robot_id, "middleware": robot.graph.middleware, "domain_id": robot.graph.domain_id}
     registry = robot.registry if robot.sends else ""

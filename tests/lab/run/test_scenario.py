@@ -176,6 +176,11 @@ def test_what_is_wrong_is_named(override: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_what_the_papers_blocks_have_of_their_own_is_not_set_beside_them() -> None:
+    with pytest.raises(ConfigError, match=r"compression = False: .* set paper\.compression"):
+        load_scenario("paper-ofdm", ["compression=false"])
+
+
 def test_a_recording_speaks_for_one_robot() -> None:
     with pytest.raises(ConfigError, match="robots: source = 'bag:here' speaks for one robot"):
         load_scenario("two-way", ["source=bag:here"])
