@@ -330,7 +330,7 @@ class SourceConfig(EndConfig):
     end: ClassVar[Any] = "source"
     conditions: ClassVar[Any] = (
         ActsWhere(
-            ("topic_options.*.codec", "topic_options.*.quantize"),
+            ("topic_options.*.codec", "topic_options.*.quantize", "topic_options.*.cloud.voxel"),
             lambda source: source.compresses,
             "no message is coded without compression; set compression: true, or leave it out",
         ),

@@ -193,7 +193,7 @@ class RobotConfig:
             "nothing is sealed without a key; set key, or leave it out",
         ),
         ActsWhere(
-            ("topics.*.codec", "topics.*.quantize"),
+            ("topics.*.codec", "topics.*.quantize", "topics.*.cloud.voxel"),
             lambda robot: robot.compression,
             "no message is coded without compression; set compression: true, or leave it out",
         ),

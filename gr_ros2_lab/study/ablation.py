@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.queues import queue_for
-from gr_ros2.settings.config import SourceConfig
+from gr_ros2.settings.config import CloudOptions, SourceConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.report.page import Run, read_runs
@@ -49,7 +49,9 @@ def variants(scenario: Scenario) -> list[Variant]:
         for name, options in robot.topics.items():
             details += [f"topics.{name}.codec=auto"] * (options.codec != AUTO)
             details += [f"topics.{name}.quantize=''"] * bool(options.quantize)
-        found.append(Variant("no-compression", ("compression=false", *details)))
+            details += [f"topics.{name}.cloud={{}}"] * (options.cloud != CloudOptions())
+        where = "" if scenario.paper is None else "paper."
+        found.append(Variant("no-compression", (f"{where}compression=false", *details)))
     if source.packet_rate != 0:
         found.append(Variant("no-pull", ("packet_rate=0",)))
     if source.version and source.repair != "off":

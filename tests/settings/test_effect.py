@@ -96,13 +96,12 @@ for cls in (ScenarioRobot, LinkConfig):
         ("publish.topics.*.max_age_s", {"publish": {"topics": {"odom": {"max_age_s": 5.0}}}}),
     ):
         IDLE[cls, name] = (given, {}, {"key": "fleet.key"}, "set key")
-    for option, value in (("codec", "zstd"), ("quantize", "pose=0.1")):
-        IDLE[cls, f"topics.*.{option}"] = (
-            {"topics": {"odom": {option: value}}},
-            {"compression": False},
-            {},
-            COMPRESSES,
-        )
+    for option, given in {
+        "codec": {"codec": "zstd"},
+        "quantize": {"quantize": "pose=0.1"},
+        "cloud.voxel": {"cloud": {"voxel": 0.1}},
+    }.items():
+        IDLE[cls, f"topics.*.{option}"] = ({"topics": {"odom": given}}, {"compression": False}, {}, COMPRESSES)
     IDLE[cls, "expected_loss"] = ({"expected_loss": 0.5}, {"repair": "off"}, {"repair": "idle"}, "set repair to")
     IDLE[cls, "beacon_s"] = ({"beacon_s": 9.0}, {"direction": "send"}, {}, "set direction: both")
 for cls, beside in ((Scenario, TWO), (MediumConfig, {})):

@@ -74,3 +74,8 @@ def test_every_run_differs_in_its_part_alone(tmp_path: Path) -> None:
     rate = float(table["/robot_1/odom", "messages/s"][0])
     assert rate == pytest.approx(runs[0].result.topics[1].delivered / 4.0, abs=0.01)
     assert float(table["link", "air bytes per message"][0]) < float(table["link", "air bytes per message"][1])
+
+
+def test_the_papers_blocks_are_told_by_their_own_setting() -> None:
+    whole, first, *_ = variants(load_scenario("paper-ofdm", ["paper.compression=true"]))
+    assert (whole.settings, first.settings) == ((), ("paper.compression=false",))
