@@ -273,7 +273,8 @@ class CloudDecoder:
         if channels:
             values = np.cumsum(np.frombuffer(packed, np.uint8).reshape(channels, count), axis=1, dtype=np.uint8)
             if keep == 1:
-                points[:, 3] = least + values[0] * ((greatest - least) / 255)
+                with np.errstate(all="ignore"):  # the ends may be any numbers
+                    points[:, 3] = least + values[0] * ((greatest - least) / 255)
             else:
                 red, green, blue = values.astype("<u4")
                 points[:, 3] = (red << np.uint32(16) | green << np.uint32(8) | blue).view("<f4")
@@ -317,6 +318,8 @@ def _column(cloud: Any, field: Any, kind: int | None = None) -> Whole:
     name = _KINDS.get(kind or field.datatype)
     if name is None or field.offset + int(name[1]) > cloud.point_step:
         raise UnfitError(f"cloud: field {field.name} has an unknown type or lies beyond its point")
+    if not cloud.width * cloud.height:
+        return np.zeros((0, 0), name)
     return np.ndarray(
         (cloud.height, cloud.width),
         (">" if cloud.is_bigendian else "<") + name,

@@ -5,17 +5,18 @@ Invariant: a message that the codec does not take is left to the other codecs of
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
-from gr_ros2.codecs.base import MAX_SIZE
 from gr_ros2.codecs.messages import CLOUD
 from gr_ros2.codecs.topic import CodedTopic
-from gr_ros2.core.errors import CodecError, DamagedError
+from gr_ros2.core.errors import CodecError
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Topic
 
 _CLOUD = 3
 """Number of the codec of clouds in a frame."""
+_log = logging.getLogger(__name__)
 
 
 class WholeCodec:
@@ -30,17 +31,22 @@ class WholeCodec:
         if chosen.range != AUTO:
             options["range"] = chosen.range
         self._lossless = not chosen.voxel
+        self._name, self._said = topic.name, False
         self._topic = CodedTopic(topic.type_name, {"cloud": options})
         self._encoder = self._topic.encoder()
 
-    def encode(self, payload: bytes) -> tuple[bytes, bytes] | None:
+    def encode(self, payload: bytes, max_size: int) -> tuple[bytes, bytes] | None:
         try:
-            coded = self._encoder.encode(payload).data
-        except DamagedError:  # it contradicts itself, and passes as it is
-            return None
-        if coded[0] != _CLOUD:
-            return None
-        return coded, payload if self._lossless else self.decode(coded, MAX_SIZE)
+            coded = self._encoder.encode(payload)
+            if coded.data[0] == _CLOUD:
+                return coded.data, payload if self._lossless else self.decode(coded.data, max_size)
+            why = coded.said
+        except (CodecError, ValueError, OverflowError) as error:  # it contradicts itself, or has numbers beyond all
+            why = str(error)
+        if not self._lossless and not self._said:
+            self._said = True
+            _log.warning("topic %s: a cloud passes exactly, not as cells: %s", self._name, why)
+        return None
 
     def decode(self, coded: bytes, max_size: int) -> bytes:
         if coded[:1] != bytes([_CLOUD]):

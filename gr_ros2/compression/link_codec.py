@@ -52,7 +52,7 @@ MAX_LEARNED = 8
 class Whole(Protocol):
     """The codec of one topic for messages of its type alone."""
 
-    def encode(self, payload: bytes) -> tuple[bytes, bytes] | None:
+    def encode(self, payload: bytes, max_size: int) -> tuple[bytes, bytes] | None:
         """The frame and the message that ``decode`` makes of it; None for a message that it does not take."""
 
     def decode(self, coded: bytes, max_size: int) -> bytes:
@@ -280,7 +280,7 @@ class TopicCodec:
         """Frame and message of the codec that the type has for itself, where it is used."""
         if self._whole is None or self._mode != "auto" or len(payload) > self._max_size:
             return None
-        own = self._whole.encode(payload)
+        own = self._whole.encode(payload, self._max_size)
         fits = own is not None and len(own[0]) < len(payload) and len(own[1]) <= bounds.largest(len(own[0]))
         return own if fits else None
 

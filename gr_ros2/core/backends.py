@@ -152,7 +152,7 @@ def uninterrupted() -> Iterator[None]:
         yield
         return
     came: dict[int, None] = {}
-    found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     handlers = {number: handler for number, handler in found.items() if handler is not None}  # None: not Python's
     try:
         for number in handlers:

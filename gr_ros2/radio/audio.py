@@ -12,7 +12,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError, RadioError
-from gr_ros2.core.watch import Watch, wait_until
+from gr_ros2.core.watch import wait_until
 from gr_ros2.phy import Phy
 from gr_ros2.radio.audio_bursts import CARD_RATE, LATE_S
 from gr_ros2.radio.audio_card import Microphone, PortAudioError, Speaker, devices, look_again
@@ -108,7 +108,9 @@ class AudioFrontEnd(BurstFrontEnd):
         self._keyer: Keyer | None = None
         self._muted = self._too_loud = False
         self._blocks = 0, 0
-        self._working = Watch()
+        self._counted: dict[str, int] = {}
+        self._promised_s = 0.0
+        """s ahead of the card that bursts come."""
         super().__init__(phy, transmits=transmits, **options)
 
     @classmethod
@@ -203,13 +205,16 @@ class AudioFrontEnd(BurstFrontEnd):
         return f"device = {chosen.device!r}{also}"
 
     def _device_counters(self) -> dict[str, int]:
-        counted = dict(self._receiving.counters())
-        if self._transmitting is not None:
-            counted |= self._transmitting.counters()
-            counted["clipped"] += self._shaper.clipped
-        return counted
+        heard, sent = self._receiving, self._transmitting
+        if heard is not None:  # closed, the last counts stay
+            self._counted = dict(heard.counters())
+            if sent is not None:
+                self._counted |= sent.counters()
+                self._counted["clipped"] += self._shaper.clipped
+        return dict(self._counted)
 
     def close(self) -> None:
+        self._device_counters()
         for part in (self._keyer, self._transmitting, self._receiving):
             if part is not None:
                 part.close()

@@ -14,7 +14,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -44,8 +44,12 @@ def _signals_kept() -> Iterator[None]:
 try:
     with _signals_kept():
         import sounddevice
+except ImportError:
+    raise
 except OSError as missing:  # the package is there, and the library that it loads is not
     raise ImportError(f"{missing}; apt install libportaudio2") from missing
+except Exception as failed:  # PortAudio does not start; its own class of errors is not there yet
+    raise ImportError(f"PortAudio does not start ({failed})") from failed
 
 PortAudioError = sounddevice.PortAudioError
 _BLOCK = 480
@@ -110,7 +114,8 @@ def look_again() -> None:
     """
     with _opening:
         if not _streams:
-            sounddevice._terminate()
+            with suppress(PortAudioError):  # the last time may have failed
+                sounddevice._terminate()
             sounddevice._initialize()
 
 

@@ -7,6 +7,7 @@ pressed as far as this process can help it. No thread of the sound card waits fo
 
 from __future__ import annotations
 
+import atexit
 import socket
 import threading
 import time
@@ -136,6 +137,7 @@ class Keyer:
         self._said = f"ptt = {kind!r}, ptt_device = {where!r}"
         try:
             self._key = KEYS[kind](where)
+            self._key.press(on=False)  # whoever keyed it last may have died
         except (OSError, ValueError) as error:
             raise RadioError(
                 f"front_end audio: {self._said}: {' '.join(str(error).split())}; ptt_device looks like "
@@ -147,6 +149,7 @@ class Keyer:
         self._trouble: RadioError | None = None
         self._thread = threading.Thread(target=self._run, name="ptt", daemon=True)
         self._thread.start()
+        atexit.register(self.close)  # a program may end without closing its radio
 
     def key(self, played: Played) -> None:
         """Press from the begin of a burst to its end. Bursts come in order."""
@@ -163,6 +166,7 @@ class Keyer:
 
     def close(self) -> None:
         """Let go. Idempotent."""
+        atexit.unregister(self.close)
         with self._changed:
             self._open = False
             self._changed.notify()

@@ -159,8 +159,9 @@ def main(args: Sequence[str] | None = None) -> None:
     asked: list[int] = []
     # Not KeyboardInterrupt: if it is raised in an import or a C callback during the start, it is lost. And one
     # Ctrl-C may come twice, from the terminal and from `ros2 launch`.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: asked.append(number))
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda number, _: asked.append(number))
     node = None
     status: int | str = 0
     try:

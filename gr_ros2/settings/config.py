@@ -142,7 +142,7 @@ class CloudOptions:
     :param keep: what of a cell's points is sent beside their place, as a mean: intensity, rgb, or '' for neither
     """
 
-    voxel: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    voxel: Annotated[Literal[0] | Annotated[float, Field(ge=0.001, le=1000)], Field(title="Cell (m)")] = 0
     range: Annotated[float, Field(gt=0, le=1e6)] | Auto = AUTO
     keep: Literal["", "intensity", "rgb"] = ""
     conditions: ClassVar[Any] = (
@@ -207,6 +207,7 @@ class SendOptions:
             lambda topic: topic.queue != "latest",
             "queue latest keeps the newest message alone; leave it out, or set another queue",
         ),
+        ActsWhere(("cloud.voxel",), lambda topic: topic.codec == AUTO, "codec has to be auto for cells; leave it out"),
     )
 
     @model_validator(mode="after")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -33,9 +35,10 @@ class Rigctld:
     def _run(self) -> None:
         connection, _ = self._server.accept()
         with connection, connection.makefile("rb") as lines:
-            for line in lines:
-                self.told.append((time.monotonic(), line))
-                connection.sendall(self._answer)
+            for number, line in enumerate(lines):
+                if number:  # it is let go when it is opened
+                    self.told.append((time.monotonic(), line))
+                connection.sendall(self._answer if number else b"RPRT 0\n")
 
     def close(self) -> None:
         self._server.close()
@@ -123,17 +126,19 @@ def test_a_sound_chip_gets_reports_of_its_pin(tmp_path: Path) -> None:
     keyer = Keyer("cm108", str(device))
     now = time.monotonic()
     keyer.key(Played(now, now + 0.01))
-    wait_for(lambda: device.stat().st_size == 10)
+    wait_for(lambda: device.stat().st_size == 15)
     keyer.close()
-    assert device.read_bytes() == bytes([0, 0, 4, 4, 0] + 2 * [0, 0, 0, 4, 0])
+    off = [0, 0, 0, 4, 0]
+    assert device.read_bytes() == bytes([*off, 0, 0, 4, 4, 0, *off, *off])
 
 
 def test_no_thread_of_a_card_waits_for_a_key_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     hangs, pressed = threading.Event(), threading.Event()
 
-    def press(*, on: bool) -> None:  # noqa: ARG001 - as a key takes it
-        pressed.set()
-        hangs.wait(PATIENCE_S)
+    def press(*, on: bool) -> None:
+        if on:
+            pressed.set()
+            hangs.wait(PATIENCE_S)
 
     monkeypatch.setitem(ptt.KEYS, "rts", lambda _: SimpleNamespace(press=press, close=lambda: None, example=""))
     keyer = Keyer("rts", "x")
@@ -144,3 +149,17 @@ def test_no_thread_of_a_card_waits_for_a_key_that_hangs(monkeypatch: pytest.Monk
     assert not hangs.is_set()
     hangs.set()
     keyer.close()
+
+
+def test_a_program_that_ends_without_closing_lets_go(tmp_path: Path) -> None:
+    program = (
+        "import sys, time\n"
+        "from gr_ros2.radio.audio_bursts import Played\n"
+        "from gr_ros2.radio.ptt import Keyer\n"
+        "now = time.monotonic()\n"
+        "Keyer('cm108', sys.argv[1]).key(Played(now, now + 1000))\n"
+        "while len(open(sys.argv[1], 'rb').read()) < 10: time.sleep(0.01)\n"
+    )
+    device = tmp_path / "hidraw0"
+    subprocess.run([sys.executable, "-c", program, str(device)], check=True, timeout=PATIENCE_S)
+    assert device.read_bytes()[-5:] == bytes([0, 0, 0, 4, 0])

@@ -113,6 +113,8 @@ for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
     ):
         IDLE[cls, name] = (given, beside, {**beside, "gains_db": -90.0}, "set gains_db, or channel.from: positions")
     IDLE[cls, "channel.snr_db"] = ({"channel": {"snr_db": 9.0}}, {**beside, "gains_db": -90.0}, beside, "leave one")
+for cls in (SendOptions, TopicOptions):
+    IDLE[cls, "cloud.voxel"] = ({"cloud": {"voxel": 0.1}}, {"codec": "zstd"}, {}, "leave it out")
 for name, value in {"range": 30.0, "keep": "rgb"}.items():
     IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
 IDLE[TopicOptions, "queue_depth"] = IDLE[SendOptions, "queue_depth"]

@@ -108,8 +108,8 @@ def test_links_of_two_processes_hear_each_other_also_after_the_medium_was_killed
 def test_who_sends_alone_is_heard_and_who_send_together_collide(medium: Start, tmp_path: Path) -> None:
     process = medium()
     with (
-        Robot(1, front_end(tmp_path, 1), hears=(2,)) as one,
-        Robot(2, front_end(tmp_path, 2), hears=(1,)) as two,
+        Robot(1, front_end(tmp_path, 1), hears=(2,), repair="off") as one,
+        Robot(2, front_end(tmp_path, 2), hears=(1,), repair="off") as two,
     ):
         for robot, other in ((one, two), (two, one)):
             wait_for(lambda: robot.say(1000) and bool(other.heard), "the other to hear")  # noqa: B023 - called at once
