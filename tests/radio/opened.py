@@ -80,6 +80,9 @@ class Sound:
         self._said = said
         said.append((name, *map(str, values), *(str(named[key]) for key in sorted(named) if key != "begun")))
 
+    def counters(self) -> dict[str, int]:
+        return {"clipped": 0}
+
     def key(self, _: Any) -> None:
         pass
 
