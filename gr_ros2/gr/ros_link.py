@@ -26,7 +26,7 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.mac import GUARD_S, access_of
-from gr_ros2.middleware import Middleware, join_graph
+from gr_ros2.middleware import Middleware, join
 from gr_ros2.settings.config import airtime_from, build, replaced
 from gr_ros2.settings.registry import MAX_TOPICS
 from gr_ros2.settings.robot import RobotConfig, halves
@@ -65,13 +65,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         calls = config.direction == "both" and (len(topics) < MAX_TOPICS or bool(topics.services))
         common: dict[str, Any] = {"observer": observer, "clock": clock, "seed": seed, "calls": calls}
         blocks = RobotBlocks(topics, source, sink, start=start, **common)
-        graph = config.graph
-        self._graph = middleware or join_graph(
-            graph.middleware,
-            domain_id=graph.domain_id,
-            node_name=f"gr_ros2_link_{config.robot_id}",
-            localhost_only=graph.localhost_only,
-        )
+        self._graph = middleware or join(config.graph, f"gr_ros2_link_{config.robot_id}")
         self._leave = weakref.finalize(self, self._graph.close if middleware is None else lambda: None)
         self.end, self.source, self.sink = blocks.end, blocks.source(self._graph), blocks.sink(self._graph)
         self.calls: LiveCalls | None = None

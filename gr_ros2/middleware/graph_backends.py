@@ -7,12 +7,15 @@ other module mentions a middleware by name.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from gr_ros2.core.backends import Backend, BackendTable
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.base import Middleware
 from gr_ros2.settings.fields import AUTO, Auto
+
+if TYPE_CHECKING:
+    from gr_ros2.settings.robot import GraphConfig
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,13 @@ def join_graph(name: str, *, domain_id: int | Auto, node_name: str, localhost_on
         settings["localhost_only"] = localhost_only
     graph: Middleware = cls(**settings)
     return graph
+
+
+def join(graph: GraphConfig, node_name: str) -> Middleware:
+    """A new participant on the graph of a robot; see :func:`join_graph`."""
+    return join_graph(
+        graph.middleware, domain_id=graph.domain_id, node_name=node_name, localhost_only=graph.localhost_only
+    )
 
 
 def meet(one: Middleware, other: Middleware) -> bool:

@@ -23,7 +23,7 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.mac import Slots, access_of
-from gr_ros2.middleware import Middleware, join_graph
+from gr_ros2.middleware import Middleware, join
 from gr_ros2.phy import Phy
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.front_end import FrontEnd
@@ -118,12 +118,6 @@ class RosSide:
 
     def _join(self) -> Middleware:
         """The robot's participant on its graph."""
-        graph = self.config.graph
-        joined = join_graph(
-            graph.middleware,
-            domain_id=graph.domain_id,
-            node_name=self.node_name,
-            localhost_only=graph.localhost_only,
-        )
+        joined = join(self.config.graph, self.node_name)
         self._stack.callback(joined.close)
         return joined

@@ -7,26 +7,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 
-from gr_ros2.middleware import Middleware, join_graph
 from gr_ros2.middleware.free_domains import FREE, ReservedDomain
 from gr_ros2.settings.config import replaced
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.robot import GraphConfig
 from gr_ros2_lab.run.robot_settings import RobotSettings
 from gr_ros2_lab.run.scenario import Scenario
-
-
-def open_graph(graph: GraphConfig, node: str) -> Middleware:
-    """Join the graph of a robot with a participant of its own.
-
-    :param node: name of the node on the graph, after ``gr_ros2_``
-    """
-    return join_graph(
-        graph.middleware,
-        domain_id=graph.domain_id,
-        node_name=f"gr_ros2_{node}",
-        localhost_only=graph.localhost_only,
-    )
 
 
 def on_own_domains(scenario: Scenario, stack: ExitStack) -> tuple[RobotSettings, ...]:

@@ -15,13 +15,12 @@ from typing import Any, Protocol
 
 from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.middleware import Middleware
+from gr_ros2.middleware import Middleware, join
 from gr_ros2.observe.observers import LiveLink
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.medium.base import Surroundings
-from gr_ros2_lab.run.domains import open_graph
 from gr_ros2_lab.run.load import source_names
 from gr_ros2_lab.run.outcome import by_sender
 from gr_ros2_lab.run.own_channels import OwnChannels
@@ -156,7 +155,7 @@ class LiveRobots:
         other end of the link."""
         for robot in self.offering:
             if robot.settings.robot_id == src_id:
-                return stack.enter_context(open_graph(robot.settings.config.graph, f"robot_{src_id}"))
+                return stack.enter_context(join(robot.settings.config.graph, f"gr_ros2_robot_{src_id}"))
         return self.robots[1].graph
 
     def empty(self, unresolved: bool) -> bool:

@@ -18,7 +18,7 @@ from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.factory import EndpointSetup
 from gr_ros2.gr.robot_blocks import RobotBlocks
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.middleware import Middleware
+from gr_ros2.middleware import Middleware, join
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.phy import Phy
 from gr_ros2.phy.flowgraph import Flowgraph
@@ -26,7 +26,6 @@ from gr_ros2.phy.loopback import SimulatedLink
 from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.record.lateness import modem_lateness
-from gr_ros2_lab.run.domains import open_graph
 from gr_ros2_lab.run.load import recorded_names
 from gr_ros2_lab.run.recorders import RunRecords
 from gr_ros2_lab.run.robot_settings import RobotSettings, sources_of
@@ -142,7 +141,7 @@ class OwnChannels:
             recorded_names(self._scenario, self._registry)  # raises if the recording has nothing for this link
             graph = BagMiddleware(path=path, speed=self._scenario.bag_speed)
         else:
-            graph = open_graph(robot.config.graph, f"robot_{robot.robot_id}")
+            graph = join(robot.config.graph, f"gr_ros2_robot_{robot.robot_id}")
         self._stack.enter_context(graph)
         return graph
 
@@ -155,7 +154,6 @@ class OwnChannels:
             self.blocks[number][0],
             self.blocks[first.receiver][1],
             channel=first.channel,
-            throttled=True,
             rule=scenario.airtime.rule,
             delay_s=first.delay_s,
             instrumented=self._records.run_observers.instruments,

@@ -20,7 +20,7 @@ from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.core.files import make_folder, write_whole
 from gr_ros2.core.guard import Guard, one_line
 from gr_ros2.core.watch import wait_until
-from gr_ros2.middleware import Middleware, Qos
+from gr_ros2.middleware import Middleware, Qos, join
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.observe.observers import RunObserver, RunObservers
 from gr_ros2.settings.config import ChannelConfig, Traffic
@@ -28,7 +28,7 @@ from gr_ros2_lab.record.lateness import lateness_result
 from gr_ros2_lab.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2_lab.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2_lab.record.trace import Trace, write_trace
-from gr_ros2_lab.run.domains import on_own_domains, open_graph
+from gr_ros2_lab.run.domains import on_own_domains
 from gr_ros2_lab.run.load import make_phy, recording
 from gr_ros2_lab.run.outcome import DELIVERED_BAG, Outcome, Progress
 from gr_ros2_lab.run.pulse import Pulse
@@ -220,7 +220,7 @@ class _Run:
 
     def _listen(self, out: Path, stack: ExitStack) -> DeliveryRecorder:
         graphs = {
-            stack.enter_context(open_graph(robot.settings.config.graph, "listener")): robot.heard
+            stack.enter_context(join(robot.settings.config.graph, "gr_ros2_listener")): robot.heard
             for robot in self.live.recorded
             if robot.settings.sink is not None
         }

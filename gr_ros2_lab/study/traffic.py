@@ -15,7 +15,7 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.names import first
-from gr_ros2.middleware import Middleware, Qos, TopicInfo, join_graph
+from gr_ros2.middleware import Middleware, Qos, TopicInfo, join
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents
 from gr_ros2.radio.config import link_from
@@ -98,14 +98,7 @@ def recorded_graph(values: Mapping[str, Any], seconds: float) -> Iterator[Path]:
         registry = Registry.from_csv(link.registry).chosen(tuple(link.topics))
         choice = TopicChoice([topic.on_graph(link.namespace) for topic in registry], "")
     with TemporaryDirectory(prefix="gr-ros2-") as folder, ExitStack() as stack:
-        graph = stack.enter_context(
-            join_graph(
-                link.graph.middleware,
-                domain_id=link.graph.domain_id,
-                node_name="gr_ros2_plan",
-                localhost_only=link.graph.localhost_only,
-            )
-        )
+        graph = stack.enter_context(join(link.graph, "gr_ros2_plan"))
         time.sleep(_LOOK_S)
         seen = [info for info in graph.discover() if info.publishers]
         wanted = [info for info in seen if choice.row_name(info.topic) is not None]
