@@ -9,13 +9,12 @@ import logging
 from typing import Any
 
 from gr_ros2.codecs.messages import CLOUD
-from gr_ros2.codecs.topic import CodedTopic
+from gr_ros2.codecs.topic import CODECS, CodedTopic
 from gr_ros2.core.errors import CodecError
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Topic
 
-_CLOUD = 3
-"""Number of the codec of clouds in a frame."""
+_CLOUD = CODECS["cloud"].number
 _log = logging.getLogger(__name__)
 
 

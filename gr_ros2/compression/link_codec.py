@@ -167,6 +167,8 @@ class TopicCodec:
 
     def __init__(self, topic: Topic, sets: Sequence[Dictionary], max_size: int, whole: Whole | None = None) -> None:
         self._whole = whole
+        self._foreseen: tuple[bytes, tuple[bytes, bytes]] | None = None
+        """What ``canonical`` made of a message, for ``encode``, which follows it."""
         self._mode: str = topic.options.codec
         if self._mode not in CODECS:
             raise ConfigError(f"codec = {self._mode!r}: topic {topic.name!r} takes one of {', '.join(CODECS)}")
@@ -274,12 +276,18 @@ class TopicCodec:
     def canonical(self, payload: bytes) -> bytes:
         """The message that comes out at the other end. One that the configuration stores uncoded keeps its gaps."""
         own = self._own(payload)
-        return self._spoken(payload) if own is None else own[1]
+        if own is None:
+            return self._spoken(payload)
+        self._foreseen = payload, own
+        return own[1]
 
     def _own(self, payload: bytes) -> tuple[bytes, bytes] | None:
         """Frame and message of the codec that the type has for itself, where it is used."""
         if self._whole is None or self._mode != "auto" or len(payload) > self._max_size:
             return None
+        foreseen, self._foreseen = self._foreseen, None
+        if foreseen is not None and foreseen[0] is payload:
+            return foreseen[1]
         own = self._whole.encode(payload, self._max_size)
         fits = own is not None and len(own[0]) < len(payload) and len(own[1]) <= bounds.largest(len(own[0]))
         return own if fits else None
