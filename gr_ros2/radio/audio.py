@@ -13,7 +13,6 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.watch import wait_until
-from gr_ros2.phy import Phy
 from gr_ros2.radio.audio_bursts import CARD_RATE, LATE_S
 from gr_ros2.radio.audio_card import Microphone, PortAudioError, Speaker, devices, look_again
 from gr_ros2.radio.burst_device import BurstDeviceOptions, BurstFrontEnd
@@ -94,25 +93,6 @@ class AudioFrontEnd(BurstFrontEnd):
     timing_error_s = timed_error_s = LATE_S
     """s by which a burst may begin late, and by which a sound server's times are off."""
 
-    def __init__(self, phy: Phy, *, transmits: bool = True, **options: Any) -> None:
-        chosen = build(AudioOptions, options, "front_end audio")
-        if phy.has_samples and (CARD_RATE % phy.sample_rate or phy.sample_rate > CARD_RATE):
-            raise ConfigError(
-                f"front_end audio: phy.sample_rate = {phy.sample_rate:g}: a sound card has {CARD_RATE:,} samples/s; "
-                "set one of which that is a multiple, such as 6000, 8000 or 24000"
-            )
-        if chosen.ptt in KEYS and not chosen.ptt_device:
-            raise ConfigError(
-                f"front_end audio: ptt = {chosen.ptt!r} needs ptt_device, such as {KEYS[chosen.ptt].example}"
-            )
-        self._keyer: Keyer | None = None
-        self._muted = self._too_loud = False
-        self._blocks = 0, 0
-        self._counted: dict[str, int] = {}
-        self._promised_s = 0.0
-        """s ahead of the card that bursts come."""
-        super().__init__(phy, transmits=transmits, **options)
-
     @classmethod
     def asks(cls, options: Mapping[str, Any]) -> bool:
         return build(AudioOptions, options, "front_end audio").keys
@@ -124,9 +104,26 @@ class AudioFrontEnd(BurstFrontEnd):
         return f"sound around {chosen.centre_hz:g} Hz with level {chosen.level:g}{keyed}"
 
     def _open(self) -> None:
+        self._check_asked()
+        self._keyer: Keyer | None = None
+        self._muted = self._too_loud = False
+        self._blocks = 0, 0
+        self._counted: dict[str, int] = {}
         with self._one_line():
             look_again()
             super()._open()
+
+    def _check_asked(self) -> None:
+        chosen, rate = self.options, self.phy.sample_rate
+        if CARD_RATE % rate:
+            raise ConfigError(
+                f"front_end audio: phy.sample_rate = {rate:g}: a sound card has {CARD_RATE:,} samples/s; "
+                "set one of which that is a multiple, such as 6000, 8000 or 24000"
+            )
+        if chosen.ptt in KEYS and not chosen.ptt_device:
+            raise ConfigError(
+                f"front_end audio: ptt = {chosen.ptt!r} needs ptt_device, such as {KEYS[chosen.ptt].example}"
+            )
 
     def _open_transmitter(self) -> Speaker:
         chosen, rate = self.options, self.phy.sample_rate

@@ -13,7 +13,6 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import RadioError
-from gr_ros2.phy import Phy
 from gr_ros2.radio.burst_device import BurstDeviceOptions, BurstFrontEnd
 from gr_ros2.radio.bursts import BurstLayout
 from gr_ros2.radio.device_checks import DeviceChecks
@@ -74,12 +73,8 @@ class DeviceFrontEnd(BurstFrontEnd):
     example_args: ClassVar[str]
     """Example of ``args``, for error messages."""
 
-    def __init__(self, phy: Phy, *, transmits: bool = True, **options: Any) -> None:
-        chosen = build(self.Options, options, f"front_end {self.name}")
-        self.checks = DeviceChecks(self.name, chosen, phy.sample_rate)
-        super().__init__(phy, transmits=transmits, **options)
-
     def _open(self) -> None:
+        self.checks = DeviceChecks(self.name, self.options, self.phy.sample_rate)
         with self.one_line():
             super()._open()
 
