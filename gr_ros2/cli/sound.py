@@ -102,13 +102,11 @@ def said(found: SoundMeasured) -> list[str]:
 
 def _expected(name: str) -> str:
     preset = PRESETS[name]
-    row = FRONT_ENDS[preset.front_end]
+    row, front_end = FRONT_ENDS[preset.front_end], FRONT_ENDS.load(preset.front_end)
     phy = PHY.load(preset.phy or row.phy)(
         preset.packet_len, preset.sample_rate or row.sample_rate, **preset.phy_options
     )
-    airtime = FRONT_ENDS.load(preset.front_end).airtime_with(
-        phy, FRONT_ENDS.load(preset.front_end).Options(**preset.settings)
-    )
+    airtime = front_end.airtime_with(phy, front_end.Options(**preset.settings))
     return (
         f"--radio {name} fits: packets of {preset.packet_len} B in {airtime:.2f} s, about {1 / airtime:.1f} small "
         f"messages/s for all robots together, {2 * airtime:.1f} s old with two robots"

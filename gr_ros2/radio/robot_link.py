@@ -297,7 +297,7 @@ class RobotLink(Flowgraph):
         lines = [
             shortcut([*names, *services], own, robots),
             foreign(names, self.sink.stats()["topics"]),
-            *self.same_numbers(),
+            *self._same_numbers(heard),
             *without_table(peer["robot"] for peer in heard if peer["no_table"]),
             full if self._ros.shares else None,
         ]
@@ -308,9 +308,12 @@ class RobotLink(Flowgraph):
 
     def same_numbers(self) -> list[str]:
         """One line for each number under which two robots send."""
+        return self._same_numbers(peers(self.end, self._clock()))
+
+    def _same_numbers(self, heard: list[dict[str, Any]]) -> list[str]:
         with self.end.lock:
             own = same_id(self.config.robot_id, self.end.endpoint.received.rejected)
-        return [*([own] if own else []), *doubled(peers(self.end, self._clock()))]
+        return [*([own] if own else []), *doubled(heard)]
 
     @property
     def finished(self) -> bool:
