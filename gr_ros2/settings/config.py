@@ -802,8 +802,12 @@ def replaced(config: _T, **changes: Any) -> _T:
 
     :raises ConfigError: naming key, value and what is allowed
     """
-    current = {item.name: getattr(config, item.name) for item in fields(config)}  # type: ignore[arg-type]
-    return build(type(config), {**current, **changes})
+    return build(type(config), {**vars_of(config), **changes})
+
+
+def vars_of(config: Any) -> dict[str, Any]:
+    """The fields of a settings object by name."""
+    return {item.name: getattr(config, item.name) for item in fields(config)}
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

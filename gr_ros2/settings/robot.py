@@ -8,7 +8,6 @@ does not send or does not receive has no settings that act.
 from __future__ import annotations
 
 import re
-from dataclasses import fields
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, field_validator, model_validator
@@ -37,6 +36,7 @@ from gr_ros2.settings.config import (
     TopicForm,
     TopicOptions,
     build,
+    vars_of,
 )
 from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
 from gr_ros2.settings.fields import AUTO, Auto
@@ -325,8 +325,3 @@ def halves(robot: RobotConfig, paper: PaperConfig | None = None) -> tuple[Source
         **timeout,
     }
     return build(SourceConfig, source), build(SinkConfig, sink)
-
-
-def vars_of(config: Any) -> dict[str, Any]:
-    """The fields of a settings object by name."""
-    return {item.name: getattr(config, item.name) for item in fields(config)}
