@@ -27,16 +27,18 @@ from gr_ros2_lab.cli.terminal import path_text
 from gr_ros2_lab.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.report.explain import explanation, lateness_lines
+from gr_ros2_lab.report.headline import headline, topics_grid
 from gr_ros2_lab.report.repetitions import repetition_grid
 from gr_ros2_lab.report.table import (
     as_table,
     hops_grid,
-    ledger_table,
+    ledger_grid,
     notes,
     packets_line,
+    pairs_grid,
     paper_grid,
     paper_results,
-    summary_table,
+    summary_grid,
     team_grid,
 )
 from gr_ros2_lab.run import runner
@@ -54,6 +56,7 @@ _options = [
     click.option("--seed", type=int, help="Seed of robots, channel and sender."),
     click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
     click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),
+    click.option("--details", is_flag=True, help="All tables, paths and sentences of the report, here too."),
     click.option("--no-report", is_flag=True, help="No report; `gr-ros2 report FOLDER` makes it later."),
     pictures_option,
     set_option(Scenario),
@@ -102,6 +105,7 @@ def _run(
     seed: int | None,
     repetitions: int | None,
     duration: float | None,
+    details: bool,
     no_report: bool,
     pictures: bool,
     overrides: tuple[str, ...],
@@ -121,7 +125,8 @@ def _run(
             results = runner.run_repetitions(scenario, out, lambda: _advance(bar, scenario, next(turns)), seen)
     drawn = None if no_report else pictures  # None: nothing at all
     if scenario.repetitions == 1:
-        _report_run(console, scenario, outcome, out, drawn)
+        _details(console, scenario, outcome) if details else _headline(console, outcome)
+        _report_run(console, outcome, scenario.name, out, drawn)
         results = [outcome.result]
     else:
         _report_repetitions(console, scenario, results, out, drawn)
@@ -161,8 +166,7 @@ def _graphs(graphs: Iterable[tuple[str, int | None]]) -> Iterator[str]:
             yield f"ROS_DOMAIN_ID={domain} ROS_LOCALHOST_ONLY=1 ros2 topic list   # {what}\n"
 
 
-def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Path, drawn: bool | None) -> None:
-    _print(console, scenario, outcome)
+def _report_run(console: Console, outcome: Outcome, name: str, out: Path, drawn: bool | None) -> None:
     kept = f"result.json, bag {runner.DELIVERED_BAG}/, {runner.REGISTRY_FILE}, the tables messages and packets"
     if drawn is None or outcome.result.interrupted:
         # After Ctrl-C the prompt returns at once, without a second of drawing.
@@ -170,7 +174,7 @@ def _report_run(console: Console, scenario: Scenario, outcome: Outcome, out: Pat
         return
     with uninterrupted():  # matplotlib is loaded only when there is something to draw
         from gr_ros2_lab.report.page import Run, write_report
-    runs = [Run(out, scenario.name, outcome.result, outcome.trace)]
+    runs = [Run(out, name, outcome.result, outcome.trace)]
     written = [path.name for path in write_report(runs, out, pictures=drawn)]
     console.print(f"\nWritten to {out}: {', '.join([written[0], kept, *written[1:]])}", soft_wrap=True)
 
@@ -207,25 +211,36 @@ def _bar(console: Console) -> Progress:
     )
 
 
-def _print(console: Console, scenario: Scenario, outcome: Outcome) -> None:
+def _headline(console: Console, outcome: Outcome) -> None:
+    """What came of it, in few lines."""
+    result = outcome.result
+    late = len(lateness_lines(result))
+    for place, line in enumerate(headline(result, outcome.trace)):
+        style = "bold red" if place < late else "bold" if place == late else None
+        console.print(line, style=style, soft_wrap=True)
+    if (grid := topics_grid(result)) is not None:
+        console.print(as_table(grid))
+
+
+def _details(console: Console, scenario: Scenario, outcome: Outcome) -> None:
     """What came of it first, then the tables, then why."""
     result = outcome.result
     late = lateness_lines(result)
     for line in late:  # first, since all that follows depends on it
         console.print(line, style="bold red", soft_wrap=True)
-    arrived, *why = explanation(result, outcome.trace)[len(late) :]
+    arrived, *reasons = explanation(result, outcome.trace)[len(late) :]
     console.print(f"{arrived}\n", style="bold", soft_wrap=True)
     if paper_results([result]):
         console.print(as_table(paper_grid([result])))
-    console.print(summary_table([result]))
-    console.print(ledger_table(result))
-    for grid in (team_grid(outcome.result), hops_grid(outcome.result)):
+    pairs = pairs_grid(result)
+    tables = [summary_grid([result]), ledger_grid(result)] if pairs is None else [pairs]
+    for grid in (*tables, team_grid(result), hops_grid(result)):
         if grid is not None:
             console.print(as_table(grid))
     for path in outcome.trace.paths():
-        title = f"{path.topic} sent (blue), {path.published_as} received (red), m"
+        title = f"{path.topic} sent (dots), {path.published_as} received (x), m"
         console.print(Text.from_ansi(path_text(path.sent, path.received, title)), soft_wrap=True)
-    for line in (*notes(result), *why, packets_line(result), *_radio(scenario, result)):
+    for line in (*notes(result), *reasons, packets_line(result), *_radio(scenario, result)):
         console.print(line, soft_wrap=True)
 
 

@@ -6,10 +6,14 @@ import numpy as np
 import numpy.typing as npt
 
 WIDTH, HEIGHT = 78, 22
+_DOTS = 2 * (WIDTH - 8), 4 * (HEIGHT - 4)
+"""Dots of the area between the axes, which are as far apart both ways."""
+_MARKS = 30
+"""Marks of the received path."""
 
 
 def path_text(sent: npt.ArrayLike, received: npt.ArrayLike, title: str) -> str:
-    """Transmitted path in blue, received in red over it, axes in metres, with terminal colours.
+    """Transmitted path as blue dots, received as red crosses, axes in metres and of one scale, with terminal colours.
 
     :param sent: positions (x, y), m, shape (n, 2)
     :param received: the same, in the order of reception
@@ -20,8 +24,16 @@ def path_text(sent: npt.ArrayLike, received: npt.ArrayLike, title: str) -> str:
     plotext.plot_size(WIDTH, HEIGHT)
     plotext.theme("clear")
     plotext.title(title)
-    for path, color in ((sent, "blue"), (received, "red")):
-        xs, ys = np.asarray(path, dtype=float).reshape(-1, 2).T.tolist()
-        if xs:
-            plotext.scatter(xs, ys, color=color, marker="braille")
+    paths = [np.asarray(path, dtype=float).reshape(-1, 2) for path in (sent, received)]
+    together = np.concatenate(paths)
+    if len(together):
+        middle = (together.min(0) + together.max(0)) / 2
+        dot_m = max(float((np.ptp(together, axis=0) / _DOTS).max()), 1e-3)
+        (left, low), (right, high) = middle - dot_m * np.array(_DOTS) / 2, middle + dot_m * np.array(_DOTS) / 2
+        plotext.xlim(left, right)
+        plotext.ylim(low, high)
+    fewer = paths[1][:: max(len(paths[1]) // _MARKS, 1)]
+    for path, color, marker in ((paths[0], "blue", "braille"), (fewer, "red", "x")):
+        if len(path):
+            plotext.scatter(*path.T.tolist(), color=color, marker=marker)
     return str(plotext.build())

@@ -71,7 +71,8 @@ class Result:
     :param phy: name, channels (one per direction), sample_rate, runs_on (what processed the samples), airtime_s (of one
         packet), airtime_per_message_s and airtime_per_byte_s (of all packets sent, per delivered message and byte),
         bytes_per_message (of all packets sent, per delivered message), airtime_of_kinds_s (of new packets, repairs,
-        reports, hellos), airtime_of_senders_s (the same by source id), air_span_s (first to last packet), …
+        reports, hellos), airtime_of_senders_s (the same by source id), air_span_s (first to last packet),
+        half_snr_db (SNR at which half of the longest packets arrive in theory), …
     :param wall_s: s the run took by the wall clock, drain included
     :param interrupted: the run was stopped before its end
     :param counters: of the blocks, by name: what was dropped and why

@@ -19,7 +19,7 @@ TEAM_VALUES = {
     "pairs_unheard": "pairs over which nothing came",
     "relayed": "share of the delivered messages that came over other robots",
     "jain": "Jain's index of the robots' delivered messages",
-    "air_use": "airtime of all packets over the duration",
+    "air_use": "airtime of all packets over the time from the first to the last",
     "formation_error_m": "formation error [m]",
     "time_to_meet_s": "time to meet [s]",
     "met": "share of runs that met",
@@ -42,8 +42,8 @@ def team_numbers(result: Result) -> dict[str, float | None]:
     for topic in pairs:
         each[topic.src_id] += topic.delivered
     sent = sum(topic.sent for topic in pairs)
-    phys = [result.phy, *(receiver.phy for receiver in result.receivers)]
-    airtimes = {src_id: sum(kinds.values()) for phy in phys for src_id, kinds in _senders(phy).items()}
+    span = result.phy.get("air_span_s")
+    airtimes = {src_id: sum(kinds.values()) for src_id, kinds in airtime_of_senders(result).items()}
     return {
         "pair_pdr": each.total() / sent if sent else None,
         "pair_age_mean_s": sum(ages) / len(ages) if ages else None,
@@ -51,7 +51,7 @@ def team_numbers(result: Result) -> dict[str, float | None]:
         "pairs_unheard": float(len(pairs) - len(ages)),
         "relayed": sum(map(relayed, pairs)) / each.total() if each.total() else None,
         "jain": jain(each.values()),
-        "air_use": sum(airtimes.values()) / result.duration_s if airtimes and result.duration_s else None,
+        "air_use": sum(airtimes.values()) / span if airtimes and span else None,
         **result.task,
     }
 
@@ -68,5 +68,7 @@ def jain(counts: Collection[int]) -> float | None:
     return sum(counts) ** 2 / squares if squares else None
 
 
-def _senders(phy: dict[str, dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    return phy.get("airtime_of_senders_s") or {}
+def airtime_of_senders(result: Result) -> dict[str, dict[str, float]]:
+    """s of airtime by source id and kind of packet, of every robot that any receiver of the run could hear."""
+    phys = [result.phy, *(receiver.phy for receiver in result.receivers)]
+    return {src_id: kinds for phy in phys for src_id, kinds in (phy.get("airtime_of_senders_s") or {}).items()}

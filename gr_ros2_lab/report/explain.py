@@ -15,6 +15,7 @@ import numpy as np
 from gr_ros2.link.fates import FATES, Fate, fate_order
 from gr_ros2.link.lateness import LATE_S
 from gr_ros2_lab.record.result import Result, air_uses
+from gr_ros2_lab.record.team_numbers import airtime_of_senders, team_pairs
 from gr_ros2_lab.record.trace import Ints, Packets, Trace
 from gr_ros2_lab.report.table import milliseconds
 
@@ -45,9 +46,14 @@ def explanation(result: Result, trace: Trace) -> list[str]:
     ]
 
 
+def why(result: Result, trace: Trace) -> list[str]:
+    """The sentences that say why messages were lost or late: the capacity of the link, and the latency."""
+    return [*_capacity(result, trace, trace.packets()), *_trend(result, trace)]
+
+
 def _outcome(result: Result) -> Iterator[str]:
     ledger: Counter[str] = Counter()
-    for topic in result.topics:
+    for topic in team_pairs(result):
         ledger.update(topic.ledger)
     sent = ledger.total()
     if not sent:
@@ -57,7 +63,7 @@ def _outcome(result: Result) -> Iterator[str]:
     words = {Fate.DELIVERED.value: "delivered", **words}
     if Fate.REPAIRED in words:
         words[Fate.DELIVERED.value] = "delivered at the first try"
-    parts = [f"{ledger[fate]:,} ({_percent(ledger[fate] / sent)}) {what}" for fate, what in words.items()]
+    parts = [f"{ledger[fate]:,} ({percent(ledger[fate] / sent)}) {what}" for fate, what in words.items()]
     yield f"Of {sent:,} messages sent: {', '.join(parts)}."
 
 
@@ -80,7 +86,7 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     here = np.flatnonzero(~np.isnan(t_received))
     came = len(here)
     passed = int(here[-1]) + 1 if came else 0  # later packets may still be on their way
-    text = f"Of {len(t_sent):,} packets with messages, {came:,} ({_percent(came / len(t_sent))}) arrived"
+    text = f"Of {len(t_sent):,} packets with messages, {came:,} ({percent(came / len(t_sent))}) arrived"
     if passed - came:
         text += f", {passed - came:,} were lost on the way"
     if len(t_sent) - passed:
@@ -91,14 +97,14 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
         unrepaired = " without repair" if air_uses(result) else ""
         yield (
             f"A message had {wanted:.1f} fragments on average and needs every one: of {whole:,} messages that left "
-            f"whole {complete:,} ({_percent(complete / whole)}) arrived complete{unrepaired}; had the same share of "
-            f"packets been lost at random, {_percent((came / passed) ** wanted)} would have."
+            f"whole {complete:,} ({percent(complete / whole)}) arrived complete{unrepaired}; had the same share of "
+            f"packets been lost at random, {percent((came / passed) ** wanted)} would have."
         )
 
 
 def air_lines(result: Result) -> Iterator[str]:
     """Which part of the time the air was in use, and for what."""
-    senders: dict[str, dict[str, float]] = result.phy.get("airtime_of_senders_s") or {}
+    senders = airtime_of_senders(result)
     span = result.phy.get("air_span_s")
     if senders and span:
         sending = {str(topic.src_id) for topic in result.topics}
@@ -117,7 +123,7 @@ def air_line(senders: Mapping[str, Mapping[str, float]], span: float, sending: C
     for kinds in senders.values():
         together.update(kinds)
     if shared or len(senders) == 1:
-        return f"Air in use: {_busy(together, span)}."
+        return f"Air in use: {_busy(together, span, several=len(senders) > 1)}."
     if len(senders) > _CHANNELS:
         return f"Air in use, on an average robot's channel: {_busy(together, span * len(senders))}."
     back = [src_id for src_id in senders if src_id not in sending]
@@ -131,16 +137,17 @@ def air_line(senders: Mapping[str, Mapping[str, float]], span: float, sending: C
     return f"Air in use: {'; '.join(each)}."
 
 
-def _busy(kinds: Mapping[str, float], span: float) -> str:
+def _busy(kinds: Mapping[str, float], span: float, *, several: bool = False) -> str:
     """Share of the time, with its parts where there are several. Above 1 where robots send at the same time."""
     share = sum(kinds.values()) / span
-    text = f"{_percent(min(share, 1.0))} of the time" + (", often by several at once" if share > _ABOVE else "")
+    together = ", often by several at once" if several and share > _ABOVE else ""
+    text = f"{percent(min(share, 1.0))} of the time{together}"
     by_share = sorted(kinds.items(), key=lambda kind: -kind[1])
     parts = [
         (_KINDS.get(kind, kind), part) for kind, spent in by_share if (part := spent / span) > _UNSEEN or part == share
     ]
     if len(parts) > 1:
-        return f"{text} ({', '.join(f'{name} {_percent(part)}' for name, part in parts)})"
+        return f"{text} ({', '.join(f'{name} {percent(part)}' for name, part in parts)})"
     return f"{text}, with {parts[0][0]}" if parts else text
 
 
@@ -182,8 +189,8 @@ def _trend(result: Result, trace: Trace) -> Iterator[str]:
     first, last = float(np.median(latency[:tenth])), float(np.median(latency[-tenth:]))
     if last - first > _BEHIND * result.duration_s:
         yield (
-            f"The link fell behind: the median latency was {_seconds(first)} among the first tenth of the deliveries "
-            f"and {_seconds(last)} among the last."
+            f"The link fell behind: the median latency was {seconds(first)} among the first tenth of the deliveries "
+            f"and {seconds(last)} among the last."
         )
 
 
@@ -194,24 +201,24 @@ def lateness_lines(result: Result) -> list[str]:
     if slow_s > _SLOW * result.duration_s:
         lines.append(
             f"The computer carried {len(result.config['robots'])} robots at "
-            f"{_percent(result.duration_s / (result.duration_s + slow_s))} of real time: "
-            f"{_seconds(result.duration_s)} on their clock took {_seconds(slow_s)} longer. Nothing is lost by it, but "
+            f"{percent(result.duration_s / (result.duration_s + slow_s))} of real time: "
+            f"{seconds(result.duration_s)} on their clock took {seconds(slow_s)} longer. Nothing is lost by it, but "
             "programs on their graphs see a slower world."
         )
     late = result.lateness
     if late is None or not late.moments:
         return lines
     parts = sorted(late.worst_s.items(), key=lambda item: -item[1])
-    worst = ", ".join(f"{name} {_seconds(value)}" for name, value in parts)
+    worst = ", ".join(f"{name} {seconds(value)}" for name, value in parts)
     times = "once" if late.moments == 1 else f"{late.moments:,} times"
     text = (
         f"The computer did not keep up with the clock: {times} it was {LATE_S * 1e3:.0f} ms late or more, for "
-        f"{_percent(min(late.share, 1.0))} of the run (at most: {worst}); latencies include that"
+        f"{percent(min(late.share, 1.0))} of the run (at most: {worst}); latencies include that"
     )
     if late.lost:
         text += (
-            f"; {_percent(late.lost_after / late.lost)} of the losses follow such moments, as do "
-            f"{_percent(late.sent_after / late.sent)} of all messages"
+            f"; {percent(late.lost_after / late.lost)} of the losses follow such moments, as do "
+            f"{percent(late.sent_after / late.sent)} of all messages"
         )
     return [*lines, f"{text}."]
 
@@ -246,7 +253,7 @@ def _fragments(packets: Packets, passed: int) -> tuple[float, int, int]:
     return float(total[whole].mean()), int((arrived >= total)[whole].sum()), int(whole.sum())
 
 
-def _percent(share: float) -> str:
+def percent(share: float) -> str:
     """A percentage with as many digits as are needed to distinguish it from 0 and from 100 %."""
     for digits in range(3):
         text = f"{share:.{digits}%}"
@@ -255,5 +262,6 @@ def _percent(share: float) -> str:
     return f"{share:.1e}" if share < 0.5 else text
 
 
-def _seconds(value: float) -> str:
+def seconds(value: float) -> str:
+    """A time with its unit: in ms below 1 s."""
     return f"{value:.1f} s" if abs(value) >= 1 else f"{milliseconds(value)} ms"

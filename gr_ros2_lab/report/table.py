@@ -29,12 +29,14 @@ class Grid:
 
     :param texts: number of columns from the left that are text; the others are numbers
     :param sections: lines by section
+    :param one_line: headings are not broken, and no space surrounds the table
     """
 
     title: str
     headings: tuple[str, ...]
     sections: tuple[tuple[tuple[str, ...], ...], ...]
     texts: int = 1
+    one_line: bool = False
 
 
 PAPER_TABLE_6 = {"ofdm": ("OFDM", 38.0, 1328, 12, 0.01, 228.6), "direct": ("Direct", 15.0, 452, 452, 1.00, 21767.9)}
@@ -62,7 +64,7 @@ def summary_grid(results: Sequence[Result]) -> Grid:
                     *_table_6(result, topic)[table_6],
                     *(milliseconds(value) for value in (topic.latency_s.p50, topic.latency_s.p95, topic.latency_s.p99)),
                 )
-                for name, topic in _at_every_receiver(result)
+                for name, topic in by_receiver(result)
             )
             for result in results
         ),
@@ -92,6 +94,31 @@ def team_grid(result: Result) -> Grid | None:
     return Grid("The team", ("Number", "value"), (lines,)) if lines else None
 
 
+def pairs_grid(result: Result) -> Grid | None:
+    """PDR and mean age in s by receiver (lines) and sender (columns), over all topics; None for less than three
+    robots."""
+    pairs: dict[tuple[str, int], list[TopicResult]] = {}
+    own = next((one.get("robot", "") for one in result.config.get("robots", ())), "") or "receiver 1"
+    ends = [(own, result.topics), *((one.name or f"receiver {one.number}", one.topics) for one in result.receivers)]
+    for name, topics in ends:
+        for topic in topics:
+            if topic.sent:
+                pairs.setdefault((name, topic.src_id), []).append(topic)
+    senders = sorted({src_id for _, src_id in pairs})
+    if len(senders) < 3:
+        return None
+    lines = tuple((name, *(_pair(pairs.get((name, src_id), ())) for src_id in senders)) for name, _ in ends)
+    return Grid("PDR and mean age [s] of each robot at each other", ("At", *map(str, senders)), (lines,))
+
+
+def _pair(topics: Sequence[TopicResult]) -> str:
+    if not topics:
+        return ""
+    ages = [topic.age_s.mean for topic in topics if topic.age_s.mean is not None]
+    share = sum(topic.delivered for topic in topics) / sum(topic.sent for topic in topics)
+    return f"{share:.2f} {sum(ages) / len(ages):.2f}" if ages else f"{share:.2f} {_DASH}"
+
+
 def hops_grid(result: Result) -> Grid | None:
     """The pairs of a robot and a topic of another one, by how many robots sent most of its messages on; None where all
     came from the robot itself."""
@@ -116,7 +143,7 @@ def hops_grid(result: Result) -> Grid | None:
 
 def ledger_grid(result: Result) -> Grid:
     """The ledger fates of the sent messages of each topic. Fates that are zero for every topic are left out."""
-    topics = list(_at_every_receiver(result))
+    topics = list(by_receiver(result))
     found = {fate for _, topic in topics for fate, count in topic.ledger.items() if count}
     first = [Fate.DELIVERED, *(fate for fate in (Fate.REPAIRED,) if fate in found)]
     fates = list(dict.fromkeys([*first, *sorted(found)]))
@@ -139,7 +166,7 @@ def air_grid(result: Result) -> Grid | None:
     return Grid("What the air was used for", ("Packets", "sent", "of the air used", "per message delivered"), (lines,))
 
 
-def _at_every_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:
+def by_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:
     """Every topic with its name in the tables. Topics of further receivers follow those of the first receiver."""
     yield from ((topic.topic, topic) for topic in result.topics)
     for receiver in result.receivers:
@@ -150,13 +177,20 @@ def _at_every_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:
 def as_table(grid: Grid) -> Table:
     """A grid for the terminal."""
     # The table is narrow, so that ten columns fit a terminal of 80 characters.
-    table = Table(box=box.SIMPLE_HEAD, title=grid.title, title_justify="left", pad_edge=False, collapse_padding=True)
+    table = Table(
+        box=None if grid.one_line else box.SIMPLE_HEAD,
+        title=escape(grid.title) or None,
+        title_justify="left",
+        pad_edge=False,
+        collapse_padding=not grid.one_line,
+    )
     table.min_width = len(grid.title)  # a title is wrapped to the width of its table
     for place, heading in enumerate(grid.headings):
         if place < grid.texts:
             table.add_column(escape(heading), no_wrap=place == 0, overflow="fold")
         else:
-            table.add_column(escape(heading.replace(" ", "\n")), justify="right", no_wrap=True)
+            text = heading if grid.one_line else heading.replace(" ", "\n")
+            table.add_column(escape(text), justify="right", no_wrap=True)
     for section in grid.sections:
         for line in section:
             table.add_row(*map(escape, line))
@@ -174,16 +208,9 @@ def ledger_table(result: Result) -> Table:
     return as_table(ledger_grid(result))
 
 
-def notes(result: Result) -> list[str]:
-    """Important remarks for a reader of the tables, one line each; often empty."""
+def faults(result: Result) -> list[str]:
+    """What is wrong in a run, one line each; often empty."""
     lines = [f"{topic.topic}: {topic.corrupt} messages arrived altered" for topic in result.topics if topic.corrupt]
-    lines += [_path_note(topic) for topic in result.topics if topic.path_error_m is not None]
-    lines += [
-        f"{topic.topic}: {topic.left_out_sent} messages sent and {topic.left_out_received} received have no position "
-        "(not finite, beyond 1e9 m, or unreadable) and are left out of the path"
-        for topic in result.topics
-        if topic.left_out_sent or topic.left_out_received
-    ]
     counters = result.counters
     counted = [counters, counters.get("back", {}), *counters.get("robots", ())]
     lines += without_table({robot: None for one in counted for robot in one.get("sink", {}).get("no_table", ())})
@@ -191,6 +218,18 @@ def notes(result: Result) -> list[str]:
     if result.interrupted:
         lines.append(f"stopped after {result.duration_s:.1f} s")
     return lines
+
+
+def notes(result: Result) -> list[str]:
+    """Remarks for a reader of the tables, one line each: :func:`faults`, and of paths."""
+    lines = [_path_note(topic) for topic in result.topics if topic.path_error_m is not None]
+    lines += [
+        f"{topic.topic}: {topic.left_out_sent} messages sent and {topic.left_out_received} received have no position "
+        "(not finite, beyond 1e9 m, or unreadable) and are left out of the path"
+        for topic in result.topics
+        if topic.left_out_sent or topic.left_out_received
+    ]
+    return [*faults(result), *lines]
 
 
 def packets_line(result: Result) -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gr_ros2.phy import Phy
+from gr_ros2.phy.theory import half_point
 from gr_ros2_lab.record.recorder import Recorder
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.record.team import TeamRecord
@@ -65,5 +66,6 @@ def phy_numbers(phy: Phy, channels: int, recorder: Recorder) -> dict[str, Any]:
         "sample_rate": phy.sample_rate if phy.has_samples else None,
         "runs_on": phy.runs_on(),
         "airtime_samples": phy.airtime_samples() if phy.has_samples else None,
+        "half_snr_db": round(half_point(phy.computed_pdr), 1) if phy.has_samples else None,
         **recorder.airtime(phy.airtime if phy.has_airtime else None),
     }

@@ -32,7 +32,10 @@ def test_repetitions_end_in_means_and_one_report(tmp_path: Path, capsys: pytest.
 
 def test_one_repetition_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (
-        command.run(["run", "paper-direct", "--repetitions", "1", *LOSSY, "--no-report", "--out", str(tmp_path)]) == 0
+        command.run(
+            ["run", "paper-direct", "--repetitions", "1", *LOSSY, "--details", "--no-report", "--out", str(tmp_path)]
+        )
+        == 0
     )
     assert (tmp_path / "result.json").is_file()
     assert not (tmp_path / "repetitions.json").exists()

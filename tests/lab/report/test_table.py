@@ -10,7 +10,7 @@ from rich.table import Table
 
 from gr_ros2.observe.result import LatencyResult
 from gr_ros2_lab.record.result import Result
-from gr_ros2_lab.report.table import as_table, ledger_table, notes, paper_grid, summary_table
+from gr_ros2_lab.report.table import as_table, faults, ledger_table, notes, paper_grid, summary_table
 
 
 def _text(table: Table, width: int = 140) -> str:
@@ -56,8 +56,8 @@ def test_notes_say_what_must_not_be_missed(result: Result) -> None:
     assert len(notes(result)) == 1
     assert "deviates from the sent path by 0.010 m" in notes(result)[0]
     bad = replace(result, topics=(replace(result.topics[0], corrupt=2),), interrupted=True)
-    assert "2 messages arrived altered" in notes(bad)[0]
-    assert "stopped after 15.0 s" in notes(bad)[-1]
+    assert "2 messages arrived altered" in faults(bad)[0]
+    assert "stopped after 15.0 s" in faults(bad)[-1]
     deaf = replace(result, counters={"sink": {"no_table": [1]}, "robots": [{"sink": {"no_table": [1, 3]}}]})
     said = [line for line in notes(deaf) if "no table of topics" in line]
     assert [line.split(" arrived")[0][-7:] for line in said] == ["robot 1", "robot 3"]

@@ -1,0 +1,60 @@
+"""The few lines in which a run ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.report.headline import MOST_LINES, headline, topics_grid
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
+from tests.lab.record.runs import empty_trace, make_run
+
+
+def test_delivered_ages_and_reasons(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    delivered, *rest = headline(run.result, run.trace)
+    assert delivered == (
+        "Delivered: 33 of 49 messages (67%); 8 lost because a fragment did not arrive, "
+        "2 too large for the packet length, 6 still in flight at the end."
+    )
+    assert rest[-1].startswith("Air in use: ")
+    grid = topics_grid(run.result)
+    assert grid is not None
+    assert [line[1] for line in grid.sections[0]] == [f"{t.delivered} of {t.sent}" for t in run.result.topics if t.sent]
+
+
+def test_a_team_says_its_task_all_its_robots_and_what_was_worst() -> None:
+    outcome = run_scenario(load_scenario("team", ("channel.packet_loss=0.3", "repair=off"), duration_s=3))
+    lines = headline(replace(outcome.result, task={"formation_error_m": 0.271}), outcome.trace)
+    assert lines[0] == "Formation error: 0.271 m."
+    assert " messages of 4 robots (" in lines[1]
+    assert any(line.startswith("Worst: /robot_") for line in lines)
+    assert topics_grid(outcome.result) is None
+    assert len(lines) <= MOST_LINES - 4
+    all_sent = sum(t.sent for end in (outcome.result, *outcome.result.receivers) for t in end.topics)
+    assert f" of {all_sent:,} messages of 4 robots" in lines[1]
+
+
+def test_where_nothing_arrives_the_snr_that_the_radio_needs_is_told(result: Result) -> None:
+    nothing = tuple(replace(t, delivered=0, ledger={"given_up": t.sent}) for t in result.topics)
+    deaf = replace(
+        result,
+        topics=nothing,
+        config={**result.config, "channel": {"snr_db": 3.0}},
+        phy={**result.phy, "half_snr_db": 6.1},
+    )
+    trace = empty_trace()
+    assert any("3 dB of SNR, and this radio needs about 6 dB" in line for line in headline(deaf, trace))
+    assert not any("dB" in line for line in headline(replace(deaf, topics=result.topics), trace))
+
+
+@pytest.mark.parametrize("name", ["demo", "team", "line"])
+def test_no_run_ends_in_more_lines_than_fit(name: str) -> None:
+    outcome = run_scenario(load_scenario(name, ("time=packets",), duration_s=2))
+    grid = topics_grid(outcome.result)
+    rows = 0 if grid is None else 1 + len(grid.sections[0])
+    assert len(headline(outcome.result, outcome.trace)) + rows <= MOST_LINES - 4
