@@ -80,6 +80,8 @@ def rows() -> Iterator[Row]:
     for line in PAGE.read_text(encoding="utf-8").partition("\n## Back-ends")[0].splitlines():
         if line.startswith("## "):
             section = line.removeprefix("## ")
+        elif line.startswith("As in ["):
+            yield from ((section, name) for name in re.findall(r"`(\w+)`", line.partition("): ")[2]))
         elif found := re.match(r"\| `(\w+)` \|", line):
             yield section, found[1]
 
