@@ -31,7 +31,16 @@ from gr_ros2.link.endpoint import LIVE_OPTIONS
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
 from gr_ros2.phy.wifi_frames import DataFrames
-from gr_ros2.settings.config import CloudOptions, DiagnosticsConfig, SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.settings.config import (
+    CameraOptions,
+    CloudOptions,
+    DepthOptions,
+    DiagnosticsConfig,
+    SinkConfig,
+    SourceConfig,
+    TopicOptions,
+    build,
+)
 from gr_ros2.settings.fields import AUTO, Setting, settings_of
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2_lab.cli.medium import medium
@@ -210,10 +219,26 @@ effects(
     to=run(OPTION + "odom.to=3"),
     keep_s=Elsewhere("link/v1/test_latest_state.py::test_keep_s_says_how_long_a_robot_out_of_range_can_still_get_it"),
     quantize=run(OPTION + "odom.quantize=pose.pose.position=0.1"),
+    camera=Elsewhere("codecs/test_frames.py::test_the_options_of_a_camera_say_what_comes_out"),
+    depth_image=Elsewhere("codecs/test_frames.py::test_depth_comes_out_as_depth"),
     cloud=Elsewhere("codecs/test_whole.py::test_cells_come_out_as_they_were_said_to"),
     depth=run(OPTION + "odom.depth=1", OPTION + "odom={queue: auto}"),
     reliability=run(OPTION + "odom.reliability=best_effort", LOSSY, REPORTING, scenario="paper-ofdm-paced"),
     durability=run(OPTION + "odom.durability=transient_local", "repeat_s=0.5"),
+)
+effects(
+    "Cameras",
+    **{
+        name: Elsewhere("codecs/test_frames.py::test_the_options_of_a_camera_say_what_comes_out")
+        for name in ("off", "size", "fps", "output")
+    },
+)
+effects(
+    "Depth images",
+    **{
+        name: Elsewhere("codecs/test_frames.py::test_depth_comes_out_as_depth")
+        for name in ("off", "mode", "near", "far")
+    },
 )
 effects(
     "Clouds",
@@ -757,8 +782,10 @@ def other(setting: Setting) -> Any:
         return type(setting.default)()
     if setting.kinds == (str,):
         return "other"
-    if setting.name == "cloud":
-        return CloudOptions(voxel=0.1)
+    if setting.name in (made := {"cloud": CloudOptions(voxel=0.1), "camera": CameraOptions(off=True)}):
+        return made[setting.name]
+    if setting.name == "depth_image":
+        return DepthOptions(off=True)
     choices = [choice for choice in setting.choices if choice not in (setting.default, AUTO)]
     if choices:
         return choices[0]

@@ -3,7 +3,7 @@
 First byte of a coded message: high nibble, the dictionaries used (0 none, 1..13 a shipped set; 14 the structure of the
 type, as the sender has announced it, and 15 a user's own dictionary, whose two-byte id follows); low nibble, the codec
 (0 stored, 1 zstd, 2 fields, 3 fields with a second part, 4 a frame of a codec for this type alone, such as that of
-clouds). 0x00 is stored as it is.
+clouds, 5 a frame of a coded topic, which the receiver's chain of frames decodes). 0x00 is stored as it is.
 
 A sender announces in its table of topics how a topic is coded: the option ``codec`` and, where it has learned the
 definition of the type, a blank and the structure (``compression.structure``).
@@ -31,6 +31,8 @@ from gr_ros2.compression.schema import Composite, Types, tree_of
 from gr_ros2.compression.structure import read_structure, write_structure
 from gr_ros2.compression.zstd_frames import Zstd
 from gr_ros2.core.errors import CodecError, ConfigError, DamagedError, UnknownDictionaryError
+from gr_ros2.link.frames import MARK
+from gr_ros2.link.message_codec import FRAME
 from gr_ros2.settings.registry import Topic
 from gr_ros2.wire import FORMATS
 
@@ -167,6 +169,8 @@ class TopicCodec:
 
     def __init__(self, topic: Topic, sets: Sequence[Dictionary], max_size: int, whole: Whole | None = None) -> None:
         self._whole = whole
+        self._frames = False
+        """Whether its sender has announced frames of a chain."""
         self._foreseen: tuple[bytes, tuple[bytes, bytes]] | None = None
         """What ``canonical`` made of a message, for ``encode``, which follows it."""
         self._mode: str = topic.options.codec
@@ -209,7 +213,11 @@ class TopicCodec:
 
     def told(self, announcement: str) -> TopicCodec:
         """The same, for messages of a sender that has announced this."""
-        text = announcement.partition(" ")[2]
+        mode, _, text = announcement.partition(" ")
+        if mode == MARK:
+            made = copy(self)
+            made._frames = True
+            return made
         if not text:
             return self
         try:
@@ -247,7 +255,7 @@ class TopicCodec:
         if not coded:
             raise DamagedError("damaged message: it is empty")
         number, codec = coded[0] >> 4, coded[0] & 15
-        if coded[0] == STORED:
+        if coded[0] == STORED or (self._frames and coded[:1] == FRAME):
             if len(coded) - 1 > self._max_size:
                 raise DamagedError(f"damaged message: larger than {self._max_size} bytes")
             return coded[1:]

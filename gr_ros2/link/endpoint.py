@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SentPacket
+from gr_ros2.link.frames import FrameSide
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
@@ -260,6 +261,10 @@ class Endpoint(PacketSide, Protocol):
 
         :raises ConfigError: it sends nothing
         """
+
+    @property
+    def frames(self) -> FrameSide | None:
+        """Its coded topics; None in a version without them."""
 
     @property
     def boot(self) -> int:

@@ -10,6 +10,9 @@ from typing import Any, Protocol
 
 from gr_ros2.settings.registry import Topic
 
+FRAME = b"\5"
+"""What the message of a coded topic (:mod:`gr_ros2.link.frames`) begins with: the frame follows as it is."""
+
 
 class MessageCodec(Protocol):
     """Codes the messages of one link; on such a link every packet carries C = 1 and every message begins with one

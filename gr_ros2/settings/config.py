@@ -157,6 +157,70 @@ class CloudOptions:
         return self
 
 
+BY_TYPE = (
+    *("cloud.voxel", "camera.size", "camera.fps", "camera.output"),
+    *("depth_image.mode", "depth_image.near", "depth_image.far"),
+)
+"""Options of a topic that say how its type alone is coded."""
+CODING = ("codec", "quantize", *BY_TYPE)
+
+
+def _off(given: object) -> object:
+    """``off`` instead of options; YAML 1.1 reads it as false."""
+    return {"off": True} if given is False or given == "off" else given
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class CameraOptions:
+    """What leaves of pictures.
+
+    :param off: pictures pass exactly
+    :param size: pixels at most, such as 320x240; full = as they come, auto = halved while the air has too few bytes
+    :param fps: pictures/s at most; auto = as many as the air carries, and as max_rate allows
+    :param output: what comes out: same, CompressedImage, CompressedVideo (foxglove_msgs) or FFMPEGPacket
+        (ffmpeg_image_transport_msgs)
+    """
+
+    off: bool = False
+    size: Annotated[str, Field(pattern=r"^(auto|full|[1-9]\d{0,4}x[1-9]\d{0,4})$")] = AUTO
+    fps: Annotated[float, Field(gt=0, le=1000)] | Auto = AUTO
+    output: Literal["same", "CompressedImage", "CompressedVideo", "FFMPEGPacket"] = "same"
+    conditions: ClassVar[Any] = (
+        ActsWhere(("size", "fps", "output"), lambda camera: not camera.off, "it is off; leave off out"),
+    )
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> CameraOptions:
+        refuse_without_effect(self)
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class DepthOptions:
+    """What leaves of depth images (16UC1, 32FC1, compressedDepth).
+
+    :param off: they pass exactly
+    :param mode: auto = video of inverse distances within what the air has; 8, 10 or 12 bits; exact
+    :param near: m, the nearest distance; 0 = found from the images
+    :param far: m, the farthest distance; 0 = found from the images
+    """
+
+    off: bool = False
+    mode: Literal["auto", "8", "10", "12", "exact"] = AUTO
+    near: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Nearest (m)")] = 0.0
+    far: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Farthest (m)")] = 0.0
+    conditions: ClassVar[Any] = (
+        ActsWhere(("mode", "near", "far"), lambda depth: not depth.off, "it is off; leave off out"),
+    )
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> DepthOptions:
+        refuse_without_effect(self)
+        if 0 < self.far <= self.near:
+            raise ValueError(f"far = {self.far:g} is not beyond near = {self.near:g}")
+        return self
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SendOptions:
     """Options of one topic that a robot sends.
@@ -184,6 +248,9 @@ class SendOptions:
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
     :param cloud: what leaves of a PointCloud2: exact, or cells of so many m, such as {voxel: 0.1, range: 30}
         (docs/explanation/codecs.md)
+    :param camera: what leaves of an Image or CompressedImage: video that fits the air, such as {size: 320x240, fps:
+        10}; off = exactly (docs/how-to/cameras.md)
+    :param depth_image: the same of depth images, such as {mode: 10}
     """
 
     qos: Annotated[QosClass | Auto, OnlyAt("source")] = AUTO
@@ -201,13 +268,15 @@ class SendOptions:
     codec: Annotated[str, OnlyAt("source")] = AUTO
     quantize: Annotated[str, OnlyAt("source")] = ""
     cloud: Annotated[CloudOptions, OnlyAt("source")] = Field(default_factory=CloudOptions)
+    camera: Annotated[CameraOptions, OnlyAt("source"), BeforeValidator(_off)] = Field(default_factory=CameraOptions)
+    depth_image: Annotated[DepthOptions, OnlyAt("source"), BeforeValidator(_off)] = Field(default_factory=DepthOptions)
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("queue_depth",),
             lambda topic: topic.queue != "latest",
             "queue latest keeps the newest message alone; leave it out, or set another queue",
         ),
-        ActsWhere(("cloud.voxel",), lambda topic: topic.codec == AUTO, "codec has to be auto for cells; leave it out"),
+        ActsWhere(BY_TYPE, lambda topic: topic.codec == AUTO, "codec has to be auto for it; leave codec out"),
     )
 
     @model_validator(mode="after")
@@ -331,7 +400,7 @@ class SourceConfig(EndConfig):
     end: ClassVar[Any] = "source"
     conditions: ClassVar[Any] = (
         ActsWhere(
-            ("topic_options.*.codec", "topic_options.*.quantize", "topic_options.*.cloud.voxel"),
+            tuple(f"topic_options.*.{option}" for option in CODING),
             lambda source: source.compresses,
             "no message is coded without compression; set compression: true, or leave it out",
         ),

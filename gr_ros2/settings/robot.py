@@ -16,6 +16,7 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.commands import COMMAND_TYPES, checked_commands
 from gr_ros2.settings.config import (
+    CODING,
     DEFAULT_MIDDLEWARE,
     MAX_PACKET_LEN,
     MIN_PACKET_LEN,
@@ -193,7 +194,7 @@ class RobotConfig:
             "nothing is sealed without a key; set key, or leave it out",
         ),
         ActsWhere(
-            ("topics.*.codec", "topics.*.quantize", "topics.*.cloud.voxel"),
+            tuple(f"topics.*.{option}" for option in CODING),
             lambda robot: robot.compression,
             "no message is coded without compression; set compression: true, or leave it out",
         ),

@@ -3,176 +3,185 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from math import inf
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.codecs.pull import (
-    KEY_S,
-    LEAST_BYTES,
-    MOST_UNCONFIRMED,
-    PATIENCE_S,
-    WINDOW_S,
-    FramePull,
-    FreeRate,
-)
+from gr_ros2.codecs.pull import KEY_S, LEAST_BYTES, PATIENCE_S, FramePull
+from gr_ros2.link.frames import FrameState
 
-CAPACITY = 10_000.0
+RATE = 10_000.0
 PERIOD = 0.1
+FREE = FrameState(RATE, 0, inf, inf, -inf, 1, reports=True)
+"""All that has left is confirmed."""
 
 
-def running(frames: int = 3, **settings: float | bool) -> tuple[FramePull, float]:
+def running(frames: int = 3, **settings: float) -> tuple[FramePull, float]:
     """A topic with a message each 0.1 s whose frames were confirmed at once, and the time of the newest message."""
-    pull = FramePull(FreeRate(CAPACITY), **settings)  # type: ignore[arg-type]
+    pull = FramePull(**settings)
     for number in range(frames):
         pull.offer(b"old", number * PERIOD)
-        if pull.pull(number * PERIOD, 0):
-            pull.coded(number, number * PERIOD)
-            pull.confirmed(number)
+        if pull.pull(number * PERIOD, FREE):
+            pull.done()
     pull.offer(b"new", frames * PERIOD)
     return pull, frames * PERIOD
 
 
 def test_the_newest_message_is_coded_into_what_is_free_until_the_next() -> None:
     pull, now = running()
-    request = pull.pull(now, 0)
+    request = pull.pull(now, FREE)
     assert request is not None
-    assert request.message == b"new"
-    assert request.budget == pytest.approx(CAPACITY * PERIOD, abs=1)
+    assert (request.message, request.came) == (b"new", now)
+    assert request.budget == pytest.approx(RATE * PERIOD, abs=1)
     assert not request.key
+
+
+def test_several_topics_share_what_is_free() -> None:
+    pull, now = running()
+    request = pull.pull(now, FREE, 0.25)
+    assert request is not None
+    assert request.budget == pytest.approx(RATE * PERIOD / 4, abs=1)
+
+
+def test_a_channel_whose_rate_is_not_known_sets_no_budget() -> None:
+    pull, now = running()
+    assert pull.pull(now, FREE._replace(rate=inf, waiting=1)) is None
+    request = pull.pull(now, FREE._replace(rate=inf))
+    assert request is not None
+    assert request.budget is None
 
 
 def test_a_message_that_is_taken_late_has_the_bytes_that_are_left() -> None:
     pull, now = running()
-    request = pull.pull(now + 0.04, 0)
+    request = pull.pull(now + 0.04, FREE)
     assert request is not None
-    assert request.budget == pytest.approx(CAPACITY * 0.06, abs=1)
+    assert request.budget == pytest.approx(RATE * 0.06, abs=1)
 
 
 def test_a_newer_message_takes_the_place_of_one_that_was_not_coded() -> None:
     pull, now = running()
-    pull.offer(b"newer", now + PERIOD)
-    request = pull.pull(now + PERIOD, 0)
+    assert pull.offer(b"newer", now + PERIOD)
+    request = pull.pull(now + PERIOD, FREE)
     assert request is not None
     assert request.message == b"newer"
-    assert pull.superseded == 1
-    assert pull.pull(now + PERIOD, 0) is None
+    assert pull.pull(now + PERIOD, FREE) is None
+    pull.done()
+    assert not pull.offer(b"last", now + 2 * PERIOD)
 
 
 def test_it_waits_until_the_frame_before_will_have_left_when_coding_is_done() -> None:
     pull, now = running(coding_s=0.008)
-    assert pull.pull(now, 81) is None
-    request = pull.pull(now, 80)
+    assert pull.pull(now, FREE._replace(waiting=81)) is None
+    request = pull.pull(now, FREE._replace(waiting=80))
     assert request is not None
-    assert request.budget == pytest.approx(CAPACITY * PERIOD - 80, abs=1)
+    assert request.budget == pytest.approx(RATE * PERIOD - 80, abs=1)
 
 
 def test_one_frame_is_coded_at_a_time() -> None:
     pull, now = running()
-    assert pull.pull(now, 0)
+    assert pull.pull(now, FREE)
     pull.offer(b"next", now + PERIOD)
-    assert pull.pull(now + PERIOD, 0) is None
-    pull.failed()
-    assert pull.pull(now + PERIOD, 0)
+    assert pull.pull(now + PERIOD, FREE) is None
+    pull.done()
+    assert pull.pull(now + PERIOD, FREE)
 
 
 def test_a_longest_rate_leaves_messages_out() -> None:
-    pull = FramePull(FreeRate(CAPACITY), period_s=0.2)
+    pull = FramePull(period_s=0.2)
     taken = []
     for number in range(20):
         pull.offer(b"message", number * PERIOD)
-        if request := pull.pull(number * PERIOD, 0):
+        if request := pull.pull(number * PERIOD, FREE):
             taken.append((number, request.budget))
-            pull.coded(number, number * PERIOD)
-            pull.confirmed(number)
+            pull.done()
     assert [number for number, _ in taken] == list(range(0, 20, 2))
-    assert taken[-1][1] == pytest.approx(CAPACITY * 0.2, abs=1)
+    assert taken[-1][1] == pytest.approx(RATE * 0.2, abs=1)
 
 
-def test_none_is_begun_while_one_is_unconfirmed_for_long() -> None:
+def test_none_is_begun_while_all_robots_have_lacked_one_for_long() -> None:
     pull, now = running()
-    assert pull.pull(now, 0)
-    pull.coded(77, now)
-    pull.offer(b"next", now + PERIOD)
-    assert pull.pull(now + PATIENCE_S, 0)
-    pull.coded(78, now + PATIENCE_S)
-    pull.offer(b"last", now + PATIENCE_S + PERIOD)
-    assert pull.pull(now + PATIENCE_S + PERIOD, 0) is None
-    pull.confirmed(77)
-    assert pull.pull(now + PATIENCE_S + PERIOD, 0)
+    assert pull.pull(now + PATIENCE_S + 0.01, FREE._replace(since=now, behind=now)) is None
+    assert pull.pull(now + PATIENCE_S - 0.01, FREE._replace(since=now, behind=now))
 
 
-@pytest.mark.parametrize("event", ["broken", "joined"])
-def test_a_key_frame_follows_what_breaks_the_chain_one_in_a_while(event: str) -> None:
+def test_when_somebody_is_heard_again_a_key_frame_goes_on() -> None:
+    pull, now = running()
+    stuck = FREE._replace(since=now, behind=now, heard=now + 0.1)
+    assert pull.pull(now + 3, stuck) is None
+    request = pull.pull(now + 3, stuck._replace(heard=now + 3))
+    assert request is not None
+    assert request.key
+
+
+def test_a_robot_that_cannot_follow_gets_key_frames_and_holds_nobody_back() -> None:
     pull, now = running()
     keys = []
     for number in range(60):
         at = now + number * PERIOD
         pull.offer(b"message", at)
-        getattr(pull, event)()
-        request = pull.pull(at, 0)
+        request = pull.pull(at, FREE._replace(since=at - 0.1, behind=at - 0.6))
         assert request is not None
         keys += [at] * request.key
-        pull.coded(number, at)
-        pull.confirmed(number)
+        pull.done()
+    assert len(keys) == 3
+
+
+def test_a_key_frame_follows_whoever_joins_one_in_a_while() -> None:
+    pull, now = running()
+    keys = []
+    for number in range(60):
+        at = now + number * PERIOD
+        pull.offer(b"message", at)
+        request = pull.pull(at, FREE._replace(joined=number))
+        assert request is not None
+        keys += [at] * request.key
+        pull.done()
     assert len(keys) == 3
     assert min(after - before for before, after in pairwise(keys)) >= KEY_S - 1e-9
 
 
+def test_a_key_frame_that_could_not_be_coded_is_asked_for_again() -> None:
+    pull = FramePull()
+    pull.offer(b"broken", 0.0)
+    request = pull.pull(0.0, FREE)
+    assert request is not None
+    assert request.key
+    pull.done(key=True)
+    pull.offer(b"whole", PERIOD)
+    request = pull.pull(PERIOD, FREE)
+    assert request is not None
+    assert request.key
+
+
 def test_the_first_frame_is_a_key_frame_and_without_reports_they_come_again() -> None:
-    pull = FramePull(FreeRate(CAPACITY), reports=False)
+    pull = FramePull()
     keys = []
     for number in range(50):
         pull.offer(b"message", number * PERIOD)
-        request = pull.pull(number * PERIOD, 0)
+        request = pull.pull(number * PERIOD, FREE._replace(reports=False))
         assert request is not None
-        pull.coded(number, number * PERIOD)
+        pull.done()
         keys += [number] * request.key
     assert keys == [0, 20, 40]
 
 
-def test_nothing_waits_for_receivers_that_are_silent() -> None:
-    pull, now = running()
-    assert pull.pull(now, 0)
-    pull.coded(5, now)
-    pull.silent()
-    pull.offer(b"next", now + 2)
-    assert pull.pull(now + 2, 0)
-
-
-def test_the_free_rate_is_what_others_leave_of_the_last_seconds() -> None:
-    free = FreeRate(1000.0)
-    assert free.rate(0) == 1000
-    for number in range(40):
-        free.left(number * 0.1, 30)
-    assert free.rate(4.0) == pytest.approx(700, rel=0.06)
-    for number in range(40):
-        free.left(4 + number * 0.1, 500)
-    assert free.rate(8.0) == 100
-    free.left(8 + 2 * WINDOW_S, 0)
-    assert free.rate(8 + 2 * WINDOW_S) == 1000
-
-
-@given(st.lists(st.sampled_from(["offer", "pull", "coded", "failed", "confirm", "broken", "joined", "silent"])))
-def test_memory_is_bounded_and_budgets_are_whatever_happens(events: list[str]) -> None:
-    pull, now, coding, name = FramePull(FreeRate(CAPACITY)), 0.0, False, 0
-    for event in events * 5:
+@given(st.lists(st.tuples(st.sampled_from(["offer", "pull", "done", "join"]), st.floats(0, 9), st.integers(0, 99))))
+def test_budgets_are_bounded_whatever_happens(events: list[tuple[str, float, int]]) -> None:
+    pull, now, coding, joined = FramePull(), 0.0, False, 0
+    for event, since, waiting in events * 5:
         now += 0.013
         if event == "offer":
             pull.offer(b"message", now)
         elif event == "pull":
-            request = pull.pull(now, 0)
-            assert request is None or (not coding and LEAST_BYTES <= request.budget <= CAPACITY * 20)
+            request = pull.pull(
+                now, FrameState(RATE, waiting, now - since, now - since, now, joined, reports=since < 5)
+            )
+            assert request is None or (not coding and LEAST_BYTES <= (request.budget or 0) <= RATE * 20)
             coding = coding or request is not None
-        elif event == "coded" and coding:
-            name, coding = name + 1, False
-            pull.coded(name, now)
-        elif event == "failed" and coding:
+        elif event == "done" and coding:
             coding = False
-            pull.failed()
-        elif event == "confirm":
-            pull.confirmed(name)
-        elif event in ("broken", "joined", "silent"):
-            getattr(pull, event)()
-        assert len(pull._unconfirmed) <= MOST_UNCONFIRMED
+            pull.done()
+        elif event == "join":
+            joined += 1

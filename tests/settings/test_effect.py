@@ -14,7 +14,9 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.settings.airtime import AirtimeConfig
 from gr_ros2.settings.config import (
+    CameraOptions,
     CloudOptions,
+    DepthOptions,
     PhyConfig,
     ScenarioChannel,
     SendOptions,
@@ -40,6 +42,13 @@ BASE: Mapping[type[Any], Mapping[str, Any]] = {
 TWO = {"time": "packets"}
 PLACED = {"channel": {"from": "positions"}}
 COMPRESSES = "set compression: true, or leave it out"
+CAMERA: dict[str, Any] = {"size": "full", "fps": 5.0, "output": "FFMPEGPacket"}
+DEPTH: dict[str, Any] = {"mode": "exact", "near": 0.5, "far": 9.0}
+BY_TYPE: dict[str, Any] = {
+    "cloud.voxel": {"cloud": {"voxel": 0.1}},
+    **{f"camera.{name}": {"camera": {name: value}} for name, value in CAMERA.items()},
+    **{f"depth_image.{name}": {"depth_image": {name: value}} for name, value in DEPTH.items()},
+}
 
 Values = Mapping[str, Any]
 IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
@@ -99,7 +108,7 @@ for cls in (ScenarioRobot, LinkConfig):
     for option, given in {
         "codec": {"codec": "zstd"},
         "quantize": {"quantize": "pose=0.1"},
-        "cloud.voxel": {"cloud": {"voxel": 0.1}},
+        **BY_TYPE,
     }.items():
         IDLE[cls, f"topics.*.{option}"] = ({"topics": {"odom": given}}, {"compression": False}, {}, COMPRESSES)
     IDLE[cls, "expected_loss"] = ({"expected_loss": 0.5}, {"repair": "off"}, {"repair": "idle"}, "set repair to")
@@ -114,7 +123,11 @@ for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
         IDLE[cls, name] = (given, beside, {**beside, "gains_db": -90.0}, "set gains_db, or channel.from: positions")
     IDLE[cls, "channel.snr_db"] = ({"channel": {"snr_db": 9.0}}, {**beside, "gains_db": -90.0}, beside, "leave one")
 for cls in (SendOptions, TopicOptions):
-    IDLE[cls, "cloud.voxel"] = ({"cloud": {"voxel": 0.1}}, {"codec": "zstd"}, {}, "leave it out")
+    for option, given in BY_TYPE.items():
+        IDLE[cls, option] = (given, {"codec": "zstd"}, {}, "leave codec out")
+for cls, values in ((CameraOptions, CAMERA), (DepthOptions, DEPTH)):
+    for name, value in values.items():
+        IDLE[cls, name] = ({name: value}, {"off": True}, {}, "leave off out")
 for name, value in {"range": 30.0, "keep": "rgb"}.items():
     IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
 IDLE[TopicOptions, "queue_depth"] = IDLE[SendOptions, "queue_depth"]

@@ -32,6 +32,7 @@ class EndpointV0:
 
     answers = urged = False
     boot = 0
+    frames = None
     mcs_table: Sequence[Mcs] = ()
     live_settings = ("packet_rate", "dst_id", "repeat_s", "queue_depth")
     live_options = ()

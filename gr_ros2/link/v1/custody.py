@@ -213,7 +213,7 @@ class Custody:
         for topic in self._topics.named():
             queue = topic.queue
             queue.closed = False
-            if not queue or not topic.in_order:
+            if not queue or not topic.in_order or topic.coded:
                 continue
             full = set[int]()
             for message in [waiting for waiting in queue if not waiting.started]:

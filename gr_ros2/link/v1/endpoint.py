@@ -24,6 +24,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.frames import SentFrames
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.inbox import Inbox
@@ -63,6 +64,7 @@ class EndpointV1:
     :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
     :ivar answers: whether what it receives can change what it sends
     :ivar window: the packets that are worth repairing
+    :ivar frames: its coded topics
     :ivar neighbours: the robots that are heard
     :ivar pings: its questions to other robots, and its answers
     """
@@ -151,6 +153,16 @@ class EndpointV1:
             messages.relayed_left, relaying.found = relaying.left, messages.found
         self._receiving.tell(self._sending, messages, window, rate)
         self.pace, self.pings = self._sending.pace, self._sending.pings
+        self.frames = SentFrames(
+            messages.sent,
+            messages,
+            window.packets,
+            window.peers,
+            self.pace,
+            room=room,
+            turn_s=settings.turn_s,
+            fixed=settings.fixed,
+        )
 
     def submitted(self, topic_id: int, now: float) -> None:
         self._now = now if now > self._now else self._now
@@ -247,6 +259,7 @@ class EndpointV1:
         if sent is None:
             return None
         self.pace.left(now, waiting=True)
+        self.frames.left(sent, now)
         return sent
 
     def _may_begin(self, access: Access, now: float) -> bool:

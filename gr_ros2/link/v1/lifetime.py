@@ -30,6 +30,7 @@ class Lifetime:
     :param long: whether it takes many packets, so that others go before it
     :param awaited: whether a later message of its topic waits already
     :param left: whether it has left whole
+    :param chained: whether it is of use only to who has followed so far: it is not kept for those out of range
     :param fresh: whether the next message of its topic is its repair on a channel that many share
     """
 
@@ -39,6 +40,7 @@ class Lifetime:
     awaited: bool = False
     left: bool = False
     fresh: bool = False
+    chained: bool = False
 
     def end(self) -> None:
         """It was replaced by a newer message, or needs no repair."""
@@ -68,3 +70,8 @@ class Lifetimes:
         earlier.append(lifetime)
         while len(earlier) > most:
             earlier.popleft().end()
+
+    def restart(self) -> None:
+        """The newest message needs no earlier one, and whoever has it needs none."""
+        while len(self._left) > 1:
+            self._left.popleft().end()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 
 from gr_ros2.link.queues import Outgoing
 from gr_ros2.link.v1.key import Key
@@ -16,6 +17,9 @@ class Message(Outgoing):
     ``place``: its place among the entries there, -1 for one that is sent again.
 
     :param dst_id: the robot for which it is, 255 for all
+    :param numbers: the packets that carry a frame of a coded topic, as far as somebody lacks them
+    :param began: when its first fragment left, s
+    :param key: it needs no earlier message of its topic, and these are of no more use when it has left
     :param carried: its topic and key at the robot that made it, while it is carried over others
     """
 
@@ -25,6 +29,9 @@ class Message(Outgoing):
     coded: bool = False
     dst_id: int = BROADCAST
     carried: tuple[int, Key] | None = None
+    numbers: list[int] = field(default_factory=list)
+    began: float = inf
+    key: bool = False
 
     def back(self, number: int) -> int:
         """How many packets before this one it began; 0 if it begins there."""

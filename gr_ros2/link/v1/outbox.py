@@ -18,7 +18,7 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.endpoint import check_live_options
 from gr_ros2.link.events import Accepted, Ended, Missed, Refused
 from gr_ros2.link.fates import Fate
-from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.message_codec import FRAME, MessageCodec
 from gr_ros2.link.queues import OVERLOAD_S, OVERLOADED, Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.custody import Custody
@@ -124,20 +124,17 @@ class Outbox:
         if self._codec is None:
             return
         self._codec.learn(type_name, definitions)
-        if self._tabulate():
-            self._owner.topics_changed()
+        self.tabulate()
 
     def offer(self, topic_id: int, *, offered: bool) -> None:
         self.sent[topic_id].hidden = not offered
-        if self._tabulate():
-            self._owner.topics_changed()
+        self.tabulate()
 
     def follow(self, topic_id: int, publishers: PublisherQos) -> bool:
         before = self.queue(topic_id)
         self.sent[topic_id].follow(publishers)
         self.sent.find_deadlines()
-        if self._tabulate():
-            self._owner.topics_changed()
+        self.tabulate()
         return self.queue(topic_id) != before
 
     def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:
@@ -184,9 +181,7 @@ class Outbox:
             waited_s = 0.0  # one delay of a computer that keeps up costs no message
         over = waited_s > OVERLOAD_S
         self.packing.turns.join(topic_id)
-        serial = self._serial
-        self._serial += 1
-        self.stats.submitted[topic_id] += 1
+        serial = self._new(topic_id)
         codec = None if over else self._codec
         if self._observer is not None:
             expected = None if codec is None else codec.canonical(topic_id, payload)
@@ -246,6 +241,38 @@ class Outbox:
         """Make the table of topics; returns whether it has changed."""
         return self.kept.tabulate(self.sent.table())
 
+    def tabulate(self) -> None:
+        """Announce the topics anew, if they have changed."""
+        if self._tabulate():
+            self._owner.topics_changed()
+
+    def submit_frame(self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool) -> Message | None:
+        """See :class:`gr_ros2.link.v1.frames.Outlet`."""
+        topic_id = topic.topic.topic_id
+        self._owner.submitted(topic_id, now)
+        self.packing.turns.join(topic_id)
+        serial = self._new(topic_id)
+        if self._observer is not None:
+            self._observer(Accepted(serial, topic_id, frame, came))
+        payload = FRAME + frame
+        if len(payload) > MAX_MESSAGE:
+            self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            return None
+        message = Message(serial, topic_id, payload, topic.qos, came, topic.weight, coded=True, key=key)
+        message.dst_id = topic.dst_id
+        topic.queue.append(message)
+        return message
+
+    def refuse_new(self, topic_id: int, fate: Fate, detail: str) -> None:
+        """See :class:`gr_ros2.link.v1.frames.Outlet`."""
+        self._refuse(self._new(topic_id), topic_id, fate, detail)
+
+    def _new(self, topic_id: int) -> int:
+        """The serial of a message that is submitted."""
+        self._serial += 1
+        self.stats.submitted[topic_id] += 1
+        return self._serial - 1
+
     def _admit(self, topic: SentTopic, message: Message) -> None:
         if dropped := topic.queue.admit(message, self.depth(message.topic_id)):
             self.drop(dropped)
@@ -261,6 +288,8 @@ class Outbox:
             reported=reported,
             waited_for=inf if message.repeat else now + WORTH * self._settings.hold_s,
         )
+        if message.key:
+            topic.lifetimes.restart()
         self.kept.left(message, now, reported=reported)
         if message.topic_id == RELAYED_TOPIC:
             self.relayed_left(now)

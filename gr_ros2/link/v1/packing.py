@@ -173,6 +173,7 @@ class Packing:
             if not message.index:
                 message.begin, message.place = number - back, -1 if back else place
                 lifetime.expires = message.expires
+                message.began, lifetime.chained = now, topic.coded
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
                 lifetime.long = self._long(message)
                 lifetime.fresh = not (lifetime.in_order or topic.kept or topic_id > TABLE_TOPIC)
@@ -180,6 +181,8 @@ class Packing:
             if message.submitted < since and not topic.topic.options.max_rate:
                 since = message.submitted
             lifetime.awaited = len(topic.queue) > 1
+            if topic.coded:
+                message.numbers.append(number)
             payload = message.take(taken)
             last = message.offset == len(message.payload)
             on_air = min(topic_id, CARRIED_TOPIC)

@@ -103,6 +103,7 @@ class Peers:
     :ivar loss: share of packets that the peer with the most losses loses, as far as it is known or expected
     :ivar proven: some peer may take packets up to this number for replays
     :ivar provens: the same of each peer, the highest first
+    :ivar joined: how often a peer has come, or has come back
     :ivar in_vain: whether a peer waits for a packet in vain
     :ivar urges: heap of the packets that some peer lacks and for which later messages wait, or may wait soon: whether
         all in it are long, and its number
@@ -119,6 +120,7 @@ class Peers:
         self.loss = unreported.loss
         self.proven, self.provens = 0, [0]
         self.in_vain = False
+        self.joined = 0
         self.once: set[int] = set()
         self._packets, self._unreported, self._shared = packets, unreported, shared
         self._resend: list[int] = []
@@ -166,6 +168,7 @@ class Peers:
                 free = next(bit for bit in range(256) if not (packets.everybody | packets.away) >> bit & 1)
                 peer = Peer(1 << free, now, interval=self._interval)
             self.all[src_id] = peer
+            self.joined += 1
             packets.here(peer.bit)
             self._note()
         return peer

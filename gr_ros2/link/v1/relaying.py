@@ -30,6 +30,7 @@ from gr_ros2.core.errors import WireError
 from gr_ros2.link.endpoint import HeardRobot
 from gr_ros2.link.events import Gone, Met
 from gr_ros2.link.fates import Fate
+from gr_ros2.link.message_codec import FRAME
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.delivery import UNKNOWN_S
 from gr_ros2.link.v1.inbox import Inbox
@@ -182,6 +183,8 @@ class Relaying:
             if self._tables.get(src_id, (0, b"", 0.0))[:2] != (boot, ready.payload):
                 self._table(src_id, boot, ready.payload, number, now)
             return
+        if ready.payload[:1] == FRAME and ready.coded:
+            return  # a chain of frames is not passed on: who lacks one of them would have no use for the others
         if self._carried(src_id, ready.topic_id):
             return
         message = Relayed(src_id, boot & 0xFFFF, number, place, ready.topic_id, 0, ready.payload, ready.coded)

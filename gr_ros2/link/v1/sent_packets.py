@@ -40,8 +40,8 @@ class Sent:
 
     @property
     def in_order(self) -> bool:
-        """Whether a message in it is delivered in order."""
-        return any(lifetime.in_order for lifetime in self.lifetimes)
+        """Whether a message in it is delivered in order, and kept for who is out of range."""
+        return any(lifetime.in_order and not lifetime.chained for lifetime in self.lifetimes)
 
     def alive(self, now: float) -> bool:
         """Whether a message in it is still worth something."""

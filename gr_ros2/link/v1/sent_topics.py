@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from math import inf
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.frames import MARK
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
 from gr_ros2.link.v1.lifetime import Lifetimes
@@ -15,6 +16,7 @@ from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.config import TopicOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
+from gr_ros2.wire import QOS_BULK
 from gr_ros2.wire.relayed import NO_AGE, age_code
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
@@ -34,6 +36,8 @@ class SentTopic:
     :param publishers: the QoS that its publishers offer
     :param newest: when the newest of its messages that have left was submitted, s
     :param lifetimes: its messages that have left
+    :param coded: whether its messages are frames (:mod:`gr_ros2.link.frames`)
+    :param output: of frames, the type that comes out, '' = the topic's
     :ivar dst_id: the robot for which its messages are, 255 for all
     """
 
@@ -47,6 +51,8 @@ class SentTopic:
     publishers: PublisherQos = UNKNOWN_QOS
     newest: float = -inf
     lifetimes: Lifetimes = field(default_factory=Lifetimes)
+    coded: bool = False
+    output: str = ""
     dst_id: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -79,6 +85,8 @@ class SentTopic:
     @property
     def in_order(self) -> bool:
         """Whether its messages are delivered in order, each after all earlier ones."""
+        if self.coded:
+            return True
         wanted = self.topic.options.reliability
         reliable = self.publishers.reliable if wanted == AUTO else wanted == "reliable"
         return reliable and self.queue.policy != "latest"
@@ -87,7 +95,10 @@ class SentTopic:
         """Adapt to the QoS of its publishers, where the configuration leaves it open."""
         topic, self.publishers = self.topic, publishers
         self.latched = topic.latched or (publishers.latched and topic.options.durability == AUTO)
-        self.queue.change(*queue_for(topic.options, publishers, command=self.command))
+        if self.coded:
+            self.become_frames(self.output)
+        else:
+            self.queue.change(*queue_for(topic.options, publishers, command=self.command))
 
     def change(self, options: TopicOptions) -> None:
         """Use other options from now on, for the same robot."""
@@ -96,6 +107,15 @@ class SentTopic:
         self.qos, self.weight = qos_class(options, command=self.command), options.weight
         self.queue.limit(options.max_rate)
         self.follow(self.publishers)
+
+    def become_frames(self, output: str) -> None:
+        """Its messages are frames from now on: all leave, in the lowest class unless it is configured, and the coder
+        heeds ``max_rate``."""
+        self.coded, self.output = True, output
+        self.queue.change("fifo", 0.0)
+        self.queue.limit(0.0)
+        if self.topic.options.qos == AUTO:
+            self.qos = QOS_BULK
 
     def _check(self, options: TopicOptions) -> None:
         if self.command and options.keep_s:
@@ -111,6 +131,8 @@ class SentTopic:
         """
         topic, options = self.topic, self.topic.options
         depth = self.publishers.depth if options.depth == AUTO else options.depth
+        if self.coded:
+            codec = f"{MARK} {self.output}".rstrip()
         fresh = self.queue.deadline_s > 0 or topic.type_name == CALLS_TYPE
         if options.max_age_s != AUTO:
             fresh = options.max_age_s > 0

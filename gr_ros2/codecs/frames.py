@@ -1,0 +1,222 @@
+"""Topics as chains of frames on a link: cameras and depth.
+
+:class:`FrameSender` decides when the newest message of each topic is coded and keeps the encoders, whoever runs them:
+a thread of a link, or a simulation at once. :class:`FrameReceiver` keeps one decoder for each topic of each robot.
+
+Invariants: sans-IO; encoding needs no lock, and one message of a topic is encoded at a time; every message that is
+offered becomes a frame or is refused by name; a message that no codec takes passes exactly, and is named once; one that
+cannot be coded ends nothing but itself.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from gr_ros2.codecs.base import MAX_SIZE, Coded
+from gr_ros2.codecs.messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, read
+from gr_ros2.codecs.pull import FramePull, Pull
+from gr_ros2.codecs.topic import CODECS, OFF, CodedTopic, TopicDecoder, TopicEncoder
+from gr_ros2.core.errors import BackendMissingError, CodecError
+from gr_ros2.link.fates import Fate
+from gr_ros2.link.frames import MARK, FrameSide
+from gr_ros2.settings.config import DepthOptions
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Topic
+from gr_ros2.wire import AnnouncedTopic
+
+CODING_S = 0.008
+"""s that coding takes: one of 640 × 480 pixels needs half of it, and the computer has more to do."""
+_SECONDS = 2.0
+"""s over which what is said of a topic is a mean."""
+_log = logging.getLogger(__name__)
+
+
+class Job(NamedTuple):
+    """A message to be encoded.
+
+    :param encoder: whose ``encode`` it is for, without a lock
+    """
+
+    topic_id: int
+    pull: Pull
+    encoder: TopicEncoder
+
+    def run(self) -> Coded | CodecError:
+        """The frame, or why there is none."""
+        try:
+            return self.encoder.encode(self.pull.message, self.pull.budget, self.pull.key)
+        except CodecError as error:
+            return error
+        except (ValueError, OverflowError, MemoryError) as error:  # it contradicts itself
+            return CodecError(f"image: {error}")
+
+
+class _Sent:
+    """A topic that is sent as frames."""
+
+    def __init__(self, topic: Topic, coded: CodedTopic) -> None:
+        options = topic.options
+        fps = options.max_rate if options.camera.fps == AUTO else options.camera.fps
+        self.name, self.weight = topic.name, options.weight
+        self.encoder = coded.encoder()
+        self.pull = FramePull(period_s=1 / fps if fps else 0.0, coding_s=CODING_S)
+        self.said: set[str] = set()
+        self.offered_bytes = self.frames = self.bytes = self.failed = 0
+        self.what = ""
+
+
+class FrameSender:
+    """The topics that one robot sends as frames.
+
+    :param frames: of its endpoint
+    """
+
+    def __init__(self, frames: FrameSide) -> None:
+        self._frames = frames
+        self._sent: dict[int, _Sent] = {}
+
+    def add(self, topic: Topic) -> bool:
+        """Send a topic as frames if it is a camera or depth, and its options do not say otherwise. Returns whether it
+        is sent so."""
+        coded = coded_topic(topic)
+        if coded is None or topic.topic_id in self._sent:
+            return coded is not None
+        self._sent[topic.topic_id] = _Sent(topic, coded)
+        output = topic.options.camera.output
+        self._frames.begin(topic.topic_id, "" if output == "same" else output)
+        return True
+
+    def __contains__(self, topic_id: int) -> bool:
+        return topic_id in self._sent
+
+    def offer(self, topic_id: int, message: bytes, now: float) -> None:
+        """A message has come."""
+        sent = self._sent[topic_id]
+        sent.offered_bytes += len(message)
+        if sent.pull.offer(message, now):
+            self._frames.refuse(topic_id, Fate.SUPERSEDED, "a newer picture came before the air was free for it")
+
+    def next(self, now: float) -> Job | None:
+        """A message that is to be encoded now. ``done`` has to follow."""
+        for topic_id, sent in self._sent.items():
+            if sent.pull.waits(now):
+                share = sent.weight / sum(other.weight for other in self._sent.values())
+                pull = sent.pull.pull(now, self._frames.progress(topic_id, now), share)
+                if pull is not None:
+                    return Job(topic_id, pull, sent.encoder)
+        return None
+
+    def done(self, job: Job, made: Coded | CodecError, now: float) -> None:
+        """What has become of a message."""
+        sent = self._sent[job.topic_id]
+        failed = isinstance(made, CodecError)
+        sent.pull.done(key=failed and job.pull.key)
+        if isinstance(made, CodecError):
+            sent.failed += 1
+            self._frames.refuse(job.topic_id, Fate.DAMAGED, str(made))
+            return
+        if made.data[0] == 0 and made.said not in sent.said:
+            sent.said.add(made.said)
+            _log.warning("topic %s: passes exactly, not as pictures: %s", sent.name, made.said)
+        sent.frames, sent.bytes, sent.what = sent.frames + 1, sent.bytes + len(made.data), made.said
+        self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=made.before is None)
+
+    def stats(self, topic_id: int) -> dict[str, Any]:
+        """What is made of a topic: bytes offered, frames and their bytes, messages that could not be coded, and what
+        the newest frame leaves out, in words."""
+        sent = self._sent[topic_id]
+        return {
+            "offered_bytes": sent.offered_bytes,
+            "frames": sent.frames,
+            "frame_bytes": sent.bytes,
+            "not_coded": sent.failed,
+            "made": sent.what,
+        }
+
+
+def coded_topic(topic: Topic) -> CodedTopic | None:
+    """How a topic is coded as frames; None if it is not. What has to be installed for it is said."""
+    options, depth = topic.options, topic.options.depth_image
+    kept = topic.latched or options.keep_s > 0
+    if topic.type_name not in CODECS["camera"].types or options.codec != AUTO or kept:
+        return None
+    if options.camera.off and depth in (DepthOptions(), DepthOptions(off=True)):
+        return None
+    chosen: dict[str, Mapping[str, Any] | str] = {
+        "camera": OFF if options.camera.off else {"size": options.camera.size},
+        "depth": OFF if depth.off else {"mode": depth.mode, "near": depth.near, "far": depth.far},
+    }
+    coded = CodedTopic(topic.type_name, chosen)
+    if coded.missing:
+        _log.warning("topic %s: passes as it is, and is not made small: %s", topic.name, coded.missing)
+        return None
+    return coded
+
+
+def frames_output(told: AnnouncedTopic) -> str | None:
+    """The option ``output`` of a topic that comes as frames; None if it does not."""
+    mark, _, output = told.codec.partition(" ")
+    return (output or "same") if mark == MARK else None
+
+
+class FrameReceiver:
+    """The frames of other robots to messages.
+
+    :param max_size: bytes of the largest message that is made
+    """
+
+    def __init__(self, max_size: int = MAX_SIZE) -> None:
+        self._max_size = max_size
+        self._decoders: dict[tuple[int, int], tuple[str, str, TopicDecoder]] = {}
+        self._sizes: dict[tuple[int, str], tuple[int, int]] = {}
+        """Width and height of the newest picture in a namespace of a robot."""
+
+    def announce(self, key: tuple[int, int], told: AnnouncedTopic) -> str:
+        """A robot has announced a topic. Returns the type of the messages that come out.
+
+        :param key: of the robot and the topic
+        :raises ConfigError: for an output that is not known here
+        :raises BackendMissingError: when what decodes it is not installed
+        """
+        output = frames_output(told)
+        if output is None:
+            self._decoders.pop(key, None)
+            return told.type_name
+        if key not in self._decoders or self._decoders[key][:2] != (told.type_name, output):
+            coded = CodedTopic(told.type_name, {"camera": {"output_type": output}})
+            if coded.missing:
+                raise BackendMissingError(f"topic {told.name} comes as video: {coded.missing}")
+            self._decoders[key] = told.type_name, output, coded.decoder(self._max_size)
+        from gr_ros2.codecs.camera import OUTPUTS
+
+        return OUTPUTS.get(output, told.type_name)
+
+    def decode(self, key: tuple[int, int], name: str, payload: bytes) -> bytes:
+        """The message of a frame, and any other as it is.
+
+        :param name: of its topic
+        :raises CodecError: the frame before is missing, or it is damaged
+        """
+        known = self._decoders.get(key)
+        if known is None:
+            return payload
+        message = known[2].decode(payload)
+        space = (key[0], name.rpartition("/")[0])
+        if known[:2] == (IMAGE, "same"):
+            image = read(IMAGE, message)
+            self._sizes[space] = image.width, image.height
+        return message
+
+    def scaled(self, src_id: int, name: str, type_name: str, message: bytes) -> bytes:
+        """A CameraInfo for the picture beside it, as large as that came out; any other message as it is."""
+        size = self._sizes.get((src_id, name.rpartition("/")[0])) if type_name == CAMERA_INFO else None
+        if size is None:
+            return message
+        from gr_ros2.codecs.camera import scaled_camera_info
+
+        return scaled_camera_info(message, *size)
+
+
+__all__ = ["CODING_S", "COMPRESSED_IMAGE", "FrameReceiver", "FrameSender", "Job", "coded_topic", "frames_output"]

@@ -1,0 +1,63 @@
+"""Topics whose messages are coded when the air is about to be free for them: what a coder has to know and to tell.
+
+Each coded message is a *frame*. Most frames need the one before, so the frames of a topic are a chain: they leave in
+order, and are repaired until all who report have them, or until a key frame has left, which needs none.
+
+Invariant: a frame that is submitted leaves; a message that is not coded ends in a Refused.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from gr_ros2.link.fates import Fate
+
+LONG_S = 0.3
+MARK = "frames"
+"""What the table of topics says about the coding of such a topic. A blank and the type that comes out may follow."""
+
+
+class FrameState(NamedTuple):
+    """How it stands with the frames of one topic.
+
+    :param rate: bytes/s that other topics leave free; infinite where the rate of the channel is not known
+    :param waiting: bytes that have not left
+    :param since: when the oldest frame began to leave that a robot lacks which reports: of the robot that follows best,
+        s; infinite if it lacks none
+    :param behind: the same, of the robot that follows worst
+    :param heard: when the newest report came, s; -inf for none
+    :param joined: how often a robot that may report has come, or has come back
+    :param reports: whether any robot reports
+    """
+
+    rate: float
+    waiting: int
+    since: float
+    behind: float
+    heard: float
+    joined: int
+    reports: bool
+
+
+class FrameSide(Protocol):
+    """The coded topics of one sender."""
+
+    def begin(self, topic_id: int, output: str = "") -> None:
+        """Send frames of a topic from now on, in the class bulk unless its options say otherwise.
+
+        :param output: type of the messages that receivers make of them; '' = the topic's
+        """
+
+    def progress(self, topic_id: int, now: float) -> FrameState:
+        """How it stands."""
+
+    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
+        """Send a frame.
+
+        :param came: when its message came, s
+        :param key: it needs no other frame: all before it are of no more use when it has left, and those that somebody
+            has lacked for ``LONG_S`` at once
+        """
+
+    def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
+        """A message of a topic is not coded."""

@@ -1,0 +1,143 @@
+"""The frames of a sender's coded topics (:mod:`gr_ros2.link.frames`): what of them has left, and who has them.
+
+Invariants: memory is the numbers of the packets that carry frames which somebody who reports lacks; a packet without
+frames costs nothing but its count.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from math import inf
+from typing import Protocol
+
+from gr_ros2.link.events import SentPacket
+from gr_ros2.link.fates import Fate
+from gr_ros2.link.frames import LONG_S, FrameState
+from gr_ros2.link.pace import Pace
+from gr_ros2.link.v1.message import Message
+from gr_ros2.link.v1.packing import ENTRY
+from gr_ros2.link.v1.peers import Peers
+from gr_ros2.link.v1.sent_packets import SentPackets
+from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
+from gr_ros2.wire.v1 import Part
+
+WINDOW_S = 2.0
+"""s over which the rate that other topics leave free is a mean."""
+_LEAST_FREE = 0.1
+"""Part of the channel that coded topics may count on; else they would never learn that more is free."""
+_FEW_S = 0.3
+"""s of a window at least, so that the first packets do not stand for a rate."""
+
+
+class Outlet(Protocol):
+    """What frames need of the message side."""
+
+    def submit_frame(self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool) -> Message | None:
+        """Put a frame into the queue of its topic; None if it is too large."""
+
+    def refuse_new(self, topic_id: int, fate: Fate, detail: str) -> None:
+        """Count a message that was not submitted."""
+
+    def tabulate(self) -> None:
+        """Announce the topics anew."""
+
+
+class SentFrames:
+    """The coded topics of one sender.
+
+    :param packets, peers: what has left, and what reports tell of it
+    :param room: bytes of the longest body
+    :param turn_s: tells s from one packet to the next, 0 = not known
+    :param fixed: whether every packet is as long as the longest
+    """
+
+    def __init__(
+        self,
+        topics: SentTopics,
+        outlet: Outlet,
+        packets: SentPackets,
+        peers: Peers,
+        pace: Pace,
+        *,
+        room: int,
+        turn_s: Callable[[], float],
+        fixed: bool,
+    ) -> None:
+        self._topics, self._outlet, self._packets, self._peers, self._pace = topics, outlet, packets, peers, pace
+        self._room, self._turn_s, self._fixed = room, turn_s, fixed
+        self._sent: dict[int, deque[Message]] = {}
+        """Frames of each topic that have begun to leave or wait, oldest first, until all who report have them."""
+        self._others: deque[tuple[float, int]] = deque()
+        self._sum = 0
+
+    def begin(self, topic_id: int, output: str = "") -> None:
+        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        self._topics[topic_id].become_frames(output)
+        self._sent.setdefault(topic_id, deque())
+        self._outlet.tabulate()
+
+    def progress(self, topic_id: int, now: float) -> FrameState:
+        """How it stands."""
+        queue = self._topics[topic_id].queue
+        waiting = sum(message.remaining for message in queue)
+        since, behind = self._lacked(topic_id)
+        heard = max((peer.heard for peer in self._peers.all.values()), default=-inf)
+        return FrameState(self._free(now), waiting, since, behind, heard, self._peers.joined, bool(self._peers))
+
+    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
+        """Send a frame."""
+        for before in self._sent[topic_id] if key else ():
+            if before.lifetime.left and now - before.began > LONG_S:
+                before.lifetime.end()
+        message = self._outlet.submit_frame(self._topics[topic_id], frame, came, now, key=key)
+        if message is not None:
+            self._sent[topic_id].append(message)
+
+    def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
+        """A message is not coded."""
+        self._outlet.refuse_new(topic_id, fate, detail)
+
+    def left(self, sent: SentPacket, now: float) -> None:
+        """A packet has left."""
+        if not self._sent:
+            return
+        others = self._room if self._fixed else len(sent.data)
+        if sent.kind == "new":
+            entries = [entry for entry in sent.packet.entries if isinstance(entry, Part)]
+            others = sum(len(part.payload) + ENTRY for part in entries if part.topic_id not in self._sent)
+        self._others.append((now, others))
+        self._sum += others
+        while self._others[0][0] < now - WINDOW_S:
+            self._sum -= self._others.popleft()[1]
+
+    def _free(self, now: float) -> float:
+        """bytes/s that other topics leave."""
+        turn_s = max(self._turn_s(), self._pace.sure_interval(now))
+        if not turn_s:
+            return inf
+        capacity = self._room / turn_s
+        if not self._others:
+            return capacity
+        return max(_LEAST_FREE * capacity, capacity - self._sum / max(now - self._others[0][0], _FEW_S))
+
+    def _lacked(self, topic_id: int) -> tuple[float, float]:
+        """``since`` and ``behind`` of :class:`FrameState`."""
+        sent, records, everybody = self._sent[topic_id], self._packets.records, self._packets.everybody
+        oldest = dict.fromkeys((peer.bit for peer in self._peers.all.values()), inf)
+        for message in list(sent):
+            lacking = 0
+            for number in list(message.numbers):
+                record = records.get(number)
+                missing = 0 if record is None else everybody & ~record.confirmed
+                if missing:
+                    lacking |= missing
+                else:
+                    message.numbers.remove(number)
+            if message.lifetime.left and (not message.numbers or message.lifetime.expires == -inf):
+                sent.remove(message)
+            elif lacking:
+                for bit in oldest:
+                    if lacking & bit:
+                        oldest[bit] = min(oldest[bit], message.began)
+        return max(oldest.values(), default=inf), min(oldest.values(), default=inf)

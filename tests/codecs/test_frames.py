@@ -1,0 +1,255 @@
+"""Cameras over the engine of a link: what comes out, how old, and what becomes of joiners, outages and bad pictures."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("av", reason="needs PyAV")
+
+from gr_ros2.codecs.messages import IMAGE, VIDEO, read
+from gr_ros2.link.events import Accepted, Delivered, Refused
+from gr_ros2.link.fates import Fate
+from tests.codecs import scenes
+from tests.codecs.camera_link import CAMERA, ODOMETRY, Air, Robot, registry
+
+FPS = 15
+ZERO = {"header": scenes.header(), "height": 0, "width": 0, "encoding": "rgb8", "is_bigendian": 0, "step": 0} | {
+    "data": np.zeros(0, np.uint8)
+}
+_PICTURES: dict[int, bytes] = {}
+
+
+def picture(number: int) -> bytes:
+    """A picture of a scene in motion that carries its number as its time."""
+    if number not in _PICTURES:
+        _PICTURES[number] = scenes.image(scenes.view(number, 320, 240), "rgb8", number)
+    return _PICTURES[number]
+
+
+def number_of(message: bytes) -> int:
+    stamp = read(IMAGE, message).header.stamp
+    return round((stamp.sec - 1_700_000_000) * 10 + stamp.nanosec / 1e8)
+
+
+def odometry(number: int) -> bytes:
+    return number.to_bytes(4, "big") * 12
+
+
+def link(*, loss: float = 0.0, kbit_s: float = 128, receivers: int = 1, seed: int = 1, **options: Any) -> Air:
+    """A robot with a camera, and others that hear it."""
+    camera = Robot(1, registry(**options), kbit_s)
+    air = Air(camera, *(Robot(2 + number, None, kbit_s) for number in range(receivers)), loss=loss, seed=seed)
+    air.feed(camera, CAMERA, FPS, picture)
+    air.feed(camera, ODOMETRY, 20, odometry)
+    return air
+
+
+def ages(robot: Robot, begin: float, end: float) -> np.ndarray[Any, Any]:
+    """How old the newest picture is, s, each 5 ms."""
+    seen = [(-1.0, -10.0), *((now, number_of(message) / FPS) for now, message in robot.of(1))]
+    when, taken = np.array(seen).T
+    at = np.arange(begin, end, 0.005)
+    made: np.ndarray[Any, Any] = at - taken[np.searchsorted(when, at, "right") - 1]
+    return made
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_pictures_cross_in_order_and_are_young(loss: float) -> None:
+    air = link(loss=loss)
+    air.run(6.0)
+    sender, receiver = air.robots
+    numbers = [number_of(message) for _, message in receiver.of(1)]
+    assert numbers == sorted(set(numbers))
+    assert not receiver.failed
+    assert len([now for now, _ in receiver.of(1) if now > 2]) >= 4 * 13
+    assert ages(receiver, 2, 6).mean() < (0.2 if loss else 0.12)
+    refused = [event for event in sender.events if isinstance(event, Refused) and event.topic_id == CAMERA]
+    assert {event.reason for event in refused} <= {Fate.SUPERSEDED}
+
+
+def test_what_leaves_is_what_arrives() -> None:
+    air = link(loss=0.1)
+    arrived: list[bytes] = []
+    receiver = air.robots[1]
+    take = receiver.take
+    receiver.take = lambda events, now: (  # type: ignore[method-assign]
+        arrived.extend(e.payload for e in events if isinstance(e, Delivered) and e.topic_id == CAMERA),
+        take(events, now),
+    )[1]
+    air.run(4.0)
+    events = air.robots[0].events
+    sent = [event.payload for event in events if isinstance(event, Accepted) and event.topic_id == CAMERA]
+    assert len(arrived) > 30
+    assert arrived == sent[: len(arrived)]
+
+
+def test_odometry_is_not_much_older_for_it() -> None:
+    def age(air: Air) -> float:
+        air.run(5.0)
+        seen = [(now, int.from_bytes(message[:4], "big") / 20) for now, message in air.robots[1].of(1, ODOMETRY)]
+        when, made = np.array([(0.0, 0.0), *seen]).T
+        at = np.arange(1.0, 5.0, 0.005)
+        return float((at - made[np.searchsorted(when, at, "right") - 1]).mean())
+
+    alone = Robot(1, registry(), 128)
+    without = Air(alone, Robot(2, None, 128))
+    without.feed(alone, ODOMETRY, 20, odometry)
+    assert age(link()) < 1.5 * age(without)
+
+
+@pytest.mark.parametrize("ways", [1, 2])
+def test_after_an_outage_a_young_picture_is_there_at_once(ways: int) -> None:
+    air = link(loss=0.05)
+    air.run(4.0)
+    lost, air.lost = air.lost, lambda sender, _: ways == 2 or sender is air.robots[0]
+    air.run(6.0)
+    air.lost = lost
+    air.run(7.0)
+    fresh = np.flatnonzero(ages(air.robots[1], 6.0, 7.0) < 0.2)
+    assert len(fresh)
+    assert fresh[0] * 0.005 < 0.3
+    assert not air.robots[1].failed
+
+
+def test_a_robot_that_joins_sees_a_picture_soon() -> None:
+    air = link(receivers=2)
+    late = air.robots[2]
+    late.on = False
+    air.run(4.0)
+    late.on = True
+    air.run(6.5)
+    first = late.of(1)[0][0]
+    assert first < 4.0 + 1.5
+    numbers = [number_of(message) for _, message in late.of(1)]
+    assert len(numbers) > 10
+    assert numbers == sorted(set(numbers))
+
+
+def test_a_receiver_that_starts_again_sees_pictures_again() -> None:
+    air = link()
+    air.run(4.0)
+    receiver = air.robots[1]
+    receiver.start()
+    receiver.seen.clear()
+    air.run(8.0)
+    assert receiver.of(1)[0][0] < 7.0
+    assert len(receiver.of(1)) > 12
+
+
+def test_a_camera_that_starts_again_is_seen_again() -> None:
+    air = link()
+    air.run(4.0)
+    air.robots[0].start()
+    air.robots[1].seen.clear()
+    air.run(7.0)
+    assert len(air.robots[1].of(1)) > 15
+
+
+def test_one_that_cannot_follow_does_not_hold_others_back() -> None:
+    air = link(receivers=2)
+    rng = random.Random(3)
+    good, bad = air.robots[1:]
+    air.lost = lambda _, receiver: receiver is bad and rng.random() < 0.9
+    air.run(8.0)
+    assert len([now for now, _ in good.of(1) if now > 3]) > 5 * 10
+    assert ages(good, 3, 8).mean() < 0.25
+
+
+def test_without_reports_key_frames_come_in_a_period() -> None:
+    air = link(loss=0.02)
+    receiver = air.robots[1]
+    air.lost = lambda robot, _: robot is receiver
+    air.run(8.0)
+    assert len([now for now, _ in receiver.of(1) if now > 3]) > 20
+
+
+@pytest.mark.parametrize("bad", ["short", "zero", "resized"])
+def test_a_bad_picture_is_counted_once_and_the_next_passes(bad: str) -> None:
+    air = link()
+    sender, receiver = air.robots
+    good = picture(0)
+    pictures = {
+        "short": good[:-1000],
+        "zero": scenes.write(IMAGE, **ZERO),
+        "resized": scenes.image(scenes.view(0, 160, 120), "rgb8", 15),
+    }
+    air._feeds[0] = sender, CAMERA, FPS, lambda n: pictures[bad] if n == 15 else picture(n), 0
+    air.run(3.0)
+    refused = [event for event in sender.events if isinstance(event, Refused) and event.reason == Fate.DAMAGED]
+    assert len(refused) == (bad != "resized")
+    assert [number_of(message) for _, message in receiver.of(1)][-1] > 30
+    assert not receiver.failed
+
+
+def test_an_unknown_encoding_passes_exactly_and_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    air = link(kbit_s=2000)
+    odd = [scenes.image(np.full((24, 32, 6), n, np.uint8), "rgb16", n) for n in range(60)]
+    air._feeds[0] = air.robots[0], CAMERA, FPS, odd.__getitem__, 0
+    air.run(3.0)
+    assert len(air.robots[1].of(1)) > 30
+    assert {message for _, message in air.robots[1].of(1)} <= set(odd)
+    assert [record.message for record in caplog.records if "rgb16" in record.message] != []
+    assert len([record for record in caplog.records if "rgb16" in record.message]) == 1
+
+
+def pictures_of(air: Air) -> list[Any]:
+    return [read(IMAGE, message) for _, message in air.robots[1].of(1)]
+
+
+def test_the_options_of_a_camera_say_what_comes_out() -> None:
+    """The option ``camera`` of a topic."""
+    small = link(kbit_s=1000, size="160x120")
+    small.run(2.0)
+    assert {(shown.width, shown.height) for shown in pictures_of(small)} == {(160, 120)}
+    few = link(fps=5.0)
+    few.run(4.0)
+    assert 3 * 4 <= len([now for now, _ in few.robots[1].of(1) if now > 1]) <= 3 * 5 + 1
+    other = link(output="CompressedVideo")
+    other.run(2.0)
+    packets = [read(VIDEO, message) for _, message in other.robots[1].of(1)]
+    assert {packet.format for packet in packets} == {"h264"}
+    assert other.robots[1].types[1, CAMERA] == VIDEO
+    assert CAMERA not in link(off=True).robots[0].sender
+    assert CAMERA not in link(options={"codec": "zstd"}).robots[0].sender
+
+
+def test_a_longest_rate_of_the_topic_is_heeded() -> None:
+    air = link(options={"max_rate": 5.0})
+    air.run(4.0)
+    assert 3 * 4 <= len([now for now, _ in air.robots[1].of(1) if now > 1]) <= 3 * 5 + 1
+
+
+def test_depth_comes_out_as_depth() -> None:
+    rooms = [scenes.room(number, 160, 120) for number in range(30)]
+
+    def error(kbit_s: float, **depth_image: Any) -> float:
+        """Median of the errors of the newest image that came out, m; of those within 2 to 3 m."""
+        air = link(kbit_s=kbit_s, options={"depth_image": depth_image})
+        depths = [scenes.image((room * 1000).astype(np.uint16), "16UC1", n) for n, room in enumerate(rooms)]
+        air._feeds[0] = air.robots[0], CAMERA, 10, lambda n: depths[min(n, 29)], 0
+        air.run(3.0)
+        shown = pictures_of(air)[-1]
+        assert shown.encoding == "16UC1"
+        found = shown.data.view(np.uint16).reshape(120, 160) / 1000
+        truth = rooms[number_of(air.robots[1].of(1)[-1][1])]
+        some = (truth > 2) & (truth < 3)
+        return float(np.median(np.abs(found - truth)[some]))
+
+    assert error(2000, mode="exact") <= 0.001
+    assert error(2000, off=True) <= 0.001
+    assert 0.001 < error(2000, mode="8") < 0.05
+    assert error(256) < 0.1
+    assert error(256, near=2.0, far=3.0) < error(256)
+
+
+def test_what_is_said_of_a_topic() -> None:
+    air = link()
+    air.run(2.0)
+    said = air.robots[0].sender.stats(CAMERA)
+    assert said["frames"] > 20
+    assert said["frame_bytes"] < said["offered_bytes"] / 100
+    assert said["made"].startswith("H.264 of")
