@@ -12,6 +12,7 @@ from typing import Any
 from gr_ros2.link.fates import Fate, fate_order
 from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.trace import Messages
+from gr_ros2_lab.report.explain import lateness_lines
 from gr_ros2_lab.report.figures import latency_figure, ledger_figure
 from gr_ros2_lab.report.page import (
     Drawings,
@@ -110,6 +111,11 @@ def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str
             yield above + key, str(value)
 
 
+def lateness_of(runs: Sequence[Run]) -> list[str]:
+    """The runs in which the computer did not keep up: what differs may be an effect of that."""
+    return [f"{run.label}: {line}" for run in runs for line in lateness_lines(run.result)]
+
+
 def write_comparison(
     runs: Sequence[Run], out: Path, first: Sequence[Grid] = (), *, pictures: bool = False
 ) -> list[Path]:
@@ -123,7 +129,10 @@ def write_comparison(
     title = " · ".join(run.label for run in runs)
     with drawing(out, pictures) as drawn:
         sections = [
-            Section(sentences=[f"{run.label}: {lead_of(run)}" for run in runs], grids=[*first, compare_grid(runs)]),
+            Section(
+                sentences=[*lateness_of(runs), *(f"{run.label}: {lead_of(run)}" for run in runs)],
+                grids=[*first, compare_grid(runs)],
+            ),
             Section(pictures=_draw(runs, drawn)),
         ]
         return render_page(

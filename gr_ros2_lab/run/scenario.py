@@ -7,6 +7,7 @@ the same scenario again.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from functools import cached_property
@@ -376,4 +377,26 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
             )
     values = read_settings(path, overrides)
     values.update((key, value) for key, value in settings.items() if value is not None)
-    return scenario_from(values, str(name_or_path))
+    scenario = scenario_from(values, str(name_or_path))
+    if _contradicted(overrides):
+        return scenario_from({**values, "description": _described(scenario, overrides)}, str(name_or_path))
+    return scenario
+
+
+_DESCRIBED = ("phy", "medium", "relay", "channel", "paths", "robots", "repair", "duplex", "gains_db", "paper", "task")
+"""Settings of which the description of a scenario may speak."""
+
+
+def _contradicted(overrides: Sequence[str]) -> bool:
+    """Whether the description of a scenario may not be true any more."""
+    return any(re.split(r"[.=]", override, maxsplit=1)[0].strip() in _DESCRIBED for override in overrides)
+
+
+def _described(scenario: Scenario, overrides: Sequence[str]) -> str:
+    """A description made of the settings."""
+    phy, channel, robots = scenario.phy, scenario.channel, len(scenario.robots)
+    rate = "" if phy.sample_rate == AUTO else f" at {phy.sample_rate:,.0f} samples/s"
+    snr = "" if channel.snr_db is None else f", SNR {channel.snr_db:g} dB"
+    lost = f", {channel.packet_loss:.0%} of the packets lost" if channel.packet_loss else ""
+    shared = f", one channel, {scenario.medium}" if scenario.duplex == "half" else ""
+    return f"{robots} robots, {phy.name}{rate}{snr}{lost}{shared}; {scenario.name} with {', '.join(overrides)}"

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from gr_ros2_lab.report.compare import compare_grid, write_comparison
+from gr_ros2_lab.record.result import LatenessResult
+from gr_ros2_lab.report.compare import compare_grid, lateness_of, write_comparison
 from gr_ros2_lab.report.page import Run
 from tests.lab.record.runs import make_run
 
@@ -54,3 +55,13 @@ def test_settings_that_differ_stand_first(tmp_path: Path) -> None:
     ]
     assert compare_grid(runs).sections == ((("setting", "packet_len", "64", "220"),),)
     assert compare_grid([one, one]).title == "Nothing differs"
+
+
+def test_a_run_in_which_the_computer_was_late_is_named_first(tmp_path: Path) -> None:
+    one, other = _two(tmp_path)
+    late = replace(other, result=replace(other.result, lateness=LatenessResult({"gate": 0.4}, 9, 0.86, 1, 1, 9, 9)))
+    assert lateness_of([one, other]) == []
+    [line] = lateness_of([one, late])
+    assert line.startswith("two: The computer did not keep up with the clock: 9 times")
+    page, *_ = write_comparison([one, late], tmp_path / "out")
+    assert page.read_text().index("did not keep up") < page.read_text().index("What differs")

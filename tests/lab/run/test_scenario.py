@@ -202,3 +202,11 @@ def test_neither_a_file_nor_built_in() -> None:
         ConfigError, match=r"'dmeo' is neither a file nor built in; built in are channel-awgn, .*paper-direct"
     ):
         load_scenario("dmeo")
+
+
+def test_a_description_that_settings_contradict_is_made_from_them() -> None:
+    assert load_scenario("team", ("time=packets", "seed=3")).description == "four robots on one channel, in slots"
+    assert load_scenario("team", ("medium=exclusive", "phy.name=lora", "robots=3")).description == (
+        "3 robots, lora at 200,000 samples/s, one channel, exclusive; "
+        "team with medium=exclusive, phy.name=lora, robots=3"
+    )
