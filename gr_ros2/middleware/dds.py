@@ -80,10 +80,12 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         self._closing = threading.Lock()
         self._lock = threading.Lock()  # for the tables below; held only briefly, never during a callback
         self._announcing = threading.Lock()
+        self._offering = threading.Lock()  # for the servers
         self._topics: dict[tuple[str, str], Entity] = {}
         self._subscriptions: list[DdsSubscription] = []
         self._advertised: list[DdsPublisher] = []
         self._pairs: list[DdsServer | DdsClient] = []
+        self._servers: list[DdsServer] = []
         self._participant = POOL.join(self.domain_id, options, ros_graph.PARTICIPANT_USER_DATA)
         try:
             self._guid = guid(self._participant)
@@ -137,7 +139,11 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
 
     def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> DdsServer:
         self._check_open(f"serve {service}")
-        return DdsServer(self, ros_graph.check_topic(service), type_name, on_request, node)
+        server = DdsServer(self, ros_graph.check_topic(service), type_name, on_request, node)
+        with self._offering:
+            self._servers.append(server)
+            server.offer(on=self._others.takes_replies())
+        return server
 
     def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> DdsClient:
         self._check_open(f"call {service}")
@@ -222,11 +228,18 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         if self._closed:
             return
         with self._lock:
+            if end not in self._pairs:
+                return
             self._pairs.remove(end)
         self._events.detach(end.reader.entity)
         end.reader.delete()
         end.writer.delete()
         self.announce()
+
+    def forget_server(self, server: DdsServer) -> None:
+        with self._offering:
+            if server in self._servers:
+                self._servers.remove(server)
 
     def announce(self) -> None:
         with self._announcing:
@@ -284,6 +297,10 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         if self._gid_bytes == 24 and ros_graph.DISCOVERY_TOPIC in changed and self._others.has_short_gids():
             self._gid_bytes = 16
             self.announce()
+        if ros_graph.DISCOVERY_TOPIC in changed:
+            with self._offering:
+                for server in self._servers:
+                    server.offer(on=self._others.takes_replies())
         if publishers:
             with self._lock:
                 affected = [s for s in self._subscriptions if ros_graph.dds_topic(s.topic) in changed]

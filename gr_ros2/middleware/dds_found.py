@@ -92,6 +92,12 @@ class FoundEndpoints:
         """Whether anybody writes the numbers of endpoints with 16 bytes."""
         return any(ros_graph.has_short_gids(one.topic, one.user_data) for table in self._tables() for one in table)
 
+    def takes_replies(self) -> bool:
+        """Whether clients of services may be here that understand replies: where all nodes have another RMW, none
+        does."""
+        nodes = [one for one in self._others() if ros_graph.is_node(one.topic, one.user_data)]
+        return not nodes or any(node.is_cyclone for node in nodes)
+
     def _tables(self) -> tuple[list[DiscoveredEndpoint], list[DiscoveredEndpoint]]:
         with self._lock:
             return list(self._writers.values()), list(self._readers.values())

@@ -3,7 +3,8 @@
 A request begins with 16 bytes that name it: 8 of the client, and a number of its own. The reply begins with the same.
 The message follows. rmw_fastrtps has neither: there the identity is in inline QoS parameters of the DDS, which the
 library does not give out. So its clients and servers are refused and counted as ``other_rmw:/service``; with the
-middleware ``rclpy`` they take part.
+middleware ``rclpy`` they take part. A client that finds a server expects an answer: where all nodes have another RMW,
+no server is on the graph.
 
 Invariants: a server's reader exists only together with its writer, since a client of Fast DDS that finds a reader alone
 waits for ever; a client says that a server is there only when both its endpoints match those of one server.
@@ -67,7 +68,11 @@ class ServiceParticipant(ServiceGraph):
 
     @abstractmethod
     def drop_pair(self, end: DdsServer | DdsClient) -> None:
-        """Delete the endpoints of a server or a client."""
+        """Delete the endpoints of a server or a client, where it has any."""
+
+    @abstractmethod
+    def forget_server(self, server: DdsServer) -> None:
+        """The server is closed: it is not offered any more."""
 
 
 class _DdsEnd:
@@ -121,7 +126,20 @@ class DdsServer(_DdsEnd, ServiceServer):
     ) -> None:
         super().__init__(participant, service, type_name, node)
         self._on_request = on_request
-        participant.make_pair(self)
+        self._offered = False
+
+    def offer(self, *, on: bool) -> None:
+        """Put its endpoints on the graph, or take them off it."""
+        with self._calling:
+            if on == self._offered or self._closed:
+                return
+            self._offered = on
+            if on:
+                self._participant.make_pair(self)
+            else:
+                text = f"{self.name}: not offered, since every node here {OTHER_RMW}"
+                self._participant.count_once(f"not_offered:{self.name}", text)
+                self._participant.drop_pair(self)
 
     def service(self) -> None:
         """Take requests. Called by the participant's thread."""
@@ -141,9 +159,12 @@ class DdsServer(_DdsEnd, ServiceServer):
 
     def reply(self, client: Hashable, payload: bytes) -> None:
         assert isinstance(client, bytes)
+        if not self._offered and not self._closed:
+            return  # its client has left
         self._write(self.writer, client, payload, "reply of")
 
     def close(self) -> None:
+        self._participant.forget_server(self)
         self._close()
 
 

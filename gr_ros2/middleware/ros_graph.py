@@ -180,7 +180,12 @@ def has_short_gids(topic: str, user_data: bytes) -> bool:
 
     :param topic: its name on DDS
     """
-    return topic == DISCOVERY_TOPIC and bool(announced_hash(user_data)) and _OURS not in user_data
+    return is_node(topic, user_data) and bool(announced_hash(user_data))
+
+
+def is_node(topic: str, user_data: bytes) -> bool:
+    """Whether an endpoint belongs to nodes of ROS: one of another program on ros_discovery_info."""
+    return topic == DISCOVERY_TOPIC and _OURS not in user_data
 
 
 def endpoint_user_data(type_hash: str) -> bytes:

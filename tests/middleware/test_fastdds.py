@@ -249,6 +249,26 @@ def test_clients_and_servers_of_fast_dds_are_refused_by_name(
     assert not there
 
 
+def test_no_service_is_offered_where_every_node_would_wait_in_vain(
+    middleware: DdsMiddleware, peer: Callable[..., Peer]
+) -> None:
+    """A node of Fast DDS that finds a server expects an answer."""
+    server = middleware.serve("/served", ADD, lambda *_: None)
+    names = (ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
+    with DdsMiddleware(domain_id=domain(2), node_name="link") as another_link:  # no node of ROS
+        wait_for(lambda: "/served" in another_link.discover_services(), "the service")
+        node = peer("pub", "", Qos("reliable", "transient_local", 1), names=names)
+        wait_for(lambda: "/served" not in another_link.discover_services(), "the service to go")
+        assert middleware.counters["not_offered:/served"] == 1
+        later = middleware.serve("/later", ADD, lambda *_: None)
+        client = peer("pub", "", RELIABLE, names=ros_graph.dds_service("/later", ADD)[0])
+        assert not client.matched
+        node.close()
+        wait_for(lambda: {"/served", "/later"} <= another_link.discover_services().keys(), "both, without that node")
+    server.close()
+    later.close()
+
+
 def test_nodes_of_fast_dds_find_each_other_beside_a_link(
     middleware: DdsMiddleware, peer: Callable[..., Peer], capfd: pytest.CaptureFixture[str]
 ) -> None:
