@@ -4,6 +4,7 @@ Each packet names the number of its slot mod 256 and begins when this slot begin
 clock expects by less than ``TOLERANCE`` moves it by ``GAIN`` of the difference, so clocks of ±50 ppm stay together. A
 greater difference means that the other robot belongs to another group, or that a clock has jumped:
 
+- *Nobody can have followed this clock yet*: move.
 - *A robot that did not agree before is ahead* (numbers are compared as on a circle): move to its slots, so that one of
   two groups moves and the other stays.
 - *Two robots that agreed before differ by the same, and nobody has agreed since*: this clock has jumped. Move.
@@ -59,6 +60,8 @@ class SlotClock:
         self._zero: float | None = None
         self._doubtful = False
         """Whether only packets that were not checked have said where the slots are."""
+        self._unsaid = False
+        """Whether this robot has begun these slots itself, and no packet of it has named one yet."""
         self._agreed: dict[int, float] = {}
         self._agreed_at = float("-inf")
         self._odd: dict[int, _Odd] = {}
@@ -72,7 +75,11 @@ class SlotClock:
 
     def start(self, now: float) -> None:
         """Let slot 0 begin now, because nobody is heard."""
-        self._zero = now
+        self._zero, self._unsaid = now, True
+
+    def said(self) -> None:
+        """A packet of this robot names its slot: others may follow it."""
+        self._unsaid = False
 
     def begin(self, slot: int) -> float:
         """s, when a slot begins."""
@@ -109,16 +116,17 @@ class SlotClock:
             return slot
         if not checked or began < self._stays_until:
             return None
-        if not self._doubtful and not self._moves(src_id, error, began, trusted=trusted):
+        doubtful = self._doubtful or self._unsaid
+        if not doubtful and not self._moves(src_id, error, began, trusted=trusted):
             return None
-        if error > 0 and not self._doubtful:
+        if error > 0 and not doubtful:
             self._stays_until = began + STAYS * self.slot_s
         self._zero += error * self.slot_s
         self.jumps += 1
         self._agreed = {src_id: began} if trusted else {}
         self._agreed_at = began if trusted else float("-inf")
         self._odd.clear()
-        self._doubtful = False
+        self._doubtful = self._unsaid = False
         return slot
 
     def agreeing(self, now: float) -> bool:

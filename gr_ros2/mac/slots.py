@@ -13,9 +13,10 @@ of the messages.
 only if nobody else is known to send in the slot one frame before (without this 6 instead of 2 % of the receptions in a
 grid of 5 × 4 collide).
 
-*Entry.* A robot without slots sends in a free slot with probability 1 / v. v grows when neighbours have sent by its
-next send and none names the robot, and shrinks with each newcomer that gets in. A neighbour names two robots a packet,
-newcomers first. A robot that was alone enters anew when it hears somebody: until then it sends more and more seldom.
+*Entry.* A robot listens first, for a moment where nobody is heard. Without slots it sends in a free slot with
+probability 1 / v. v grows when neighbours have sent by its next send and none names the robot, and shrinks with each
+newcomer that gets in. A neighbour names two robots a packet, newcomers first. A robot that was alone enters anew when
+it hears somebody, even in other slots: until then it sends more and more seldom.
 
 *Who is not heard.* Two robots that always collide at a third one are never heard by it: its map lacks their slots. A
 robot whose next slot three maps in a row of a neighbour lack, or that nobody names for a while, picks at random among
@@ -47,9 +48,11 @@ from gr_ros2.wire.mac_block import (
     write_block,
 )
 
-LISTEN = 24
-"""Slots for which a robot listens before it enters. With 12, one of 20 whose clock has jumped by 1 s may collide with
-others 5 s later; with 35, every start takes 11 slots longer, and nothing is better for it."""
+LISTEN, QUIET, FRAMES = 24, 6, 2
+"""Slots for which a robot listens before it enters: two frames of those it hears, since each has announced its slots
+in one, but ``LISTEN`` at most; ``QUIET`` at least, and where nobody is heard. With a ``LISTEN`` of 12, one of 20 whose
+clock has jumped by 1 s may collide with others 5 s later; with a ``QUIET`` of 24, two robots hear each other after 31
+slots instead of 15 (median), 50 from cold after 521 instead of 548."""
 HEARD = 210
 """Slots for which a robot that was heard counts as heard; more where robots send less than three times in them."""
 CHOICE = 4
@@ -190,7 +193,8 @@ class Slots:
     def _listened(self) -> float:
         """s, when it has listened for long enough."""
         assert self._since is not None
-        return self._since + LISTEN * self.clock.slot_s
+        frame = max(self._loads(_NEVER)) + 2 if self._robots else 0
+        return self._since + min(max(FRAMES * frame, QUIET), LISTEN) * self.clock.slot_s
 
     def block(self, weight: int = 1) -> bytes | None:
         self._weight = weight
@@ -205,6 +209,7 @@ class Slots:
             if not self._free(slot):
                 return None
             self._entered_at = slot
+            self.clock.said()
         elif not alone and self._unwelcome(now):
             self._leave()
             self._rate = min(VAIN * self._rate, _LEAST_RATE)
@@ -376,9 +381,7 @@ class Slots:
             self._rate = max(1.0, self._rate - 1)
         elif slot not in robot.ahead:
             robot.named = _NEVER
-        if self._entered_at is not None and self._alone(slot):
-            self._leave()
-            self._rate = min(self._rate, _ENTRY_RATE)
+        self._answer(slot)
         self._heard_at = max(self._heard_at, slot)
         if slot > self._base + _SILENT:
             self._sweep(slot)
@@ -389,6 +392,12 @@ class Slots:
         robot.last, robot.ahead = slot, ahead
         return robot
 
+    def _answer(self, slot: int) -> None:
+        """Somebody is heard: who was alone lets itself be heard soon."""
+        if self._entered_at is not None and self._alone(slot):
+            self._leave()
+            self._rate = min(self._rate, _ENTRY_RATE)
+
     def _placed(self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool) -> int | None:
         """The slot of a packet; None where its sender has other slots."""
         jumps = self.clock.jumps
@@ -398,6 +407,8 @@ class Slots:
             self._elsewhere = dict.fromkeys(self._robots, began)
             self._start_over(slot)
         if trusted and slot is None and src_id != self.src_id:
+            if not self._elsewhere:
+                self._answer(self.clock.slot(began))
             self._elsewhere[src_id] = began
         elif trusted and self._elsewhere:
             self._elsewhere.pop(src_id, None)

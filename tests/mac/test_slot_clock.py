@@ -14,6 +14,7 @@ SLOT = 0.015
 def clock(now: float = 100.0) -> SlotClock:
     made = SlotClock(SLOT)
     made.start(now)
+    made.said()
     return made
 
 
@@ -118,3 +119,11 @@ def test_a_group_that_stays_behind_is_told_in_its_own_slots() -> None:
     assert made.jumps == 1
     assert hear(made, 1, n + stays - 9, -0.4) is None, "it would leave before it is heard"
     assert hear(made, 1, n + MEMORY + 40, -0.4) is not None
+
+
+def test_a_clock_that_nobody_can_follow_yet_moves_to_whoever_is_heard() -> None:
+    for error in (-0.5, 0.5):
+        made = SlotClock(1.0)
+        made.start(100.0)
+        assert made.heard(2, 0, 110.0 + error, trusted=True) is not None
+        assert made.jumps == 1

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fuzz.loop import work
 from gr_ros2.core.errors import EntryBoundsError
-from gr_ros2.mac.slots import CHOICE, HEARD, LISTEN, NEWCOMER, Slots
+from gr_ros2.mac.slots import CHOICE, HEARD, NEWCOMER, QUIET, Slots
 from gr_ros2.wire.mac_block import NOBODY, Block, read_block
 
 SLOT = 0.0145
@@ -244,7 +244,7 @@ def test_a_robot_that_none_of_those_it_hears_names_knows_it(names: bool) -> None
 def test_a_robot_that_asks_ahead_of_the_end_of_its_silence_gets_a_slot_after_it() -> None:
     made = Slots(5, SLOT, random.Random(1))
     at = made.departure(3.0)
-    assert at == pytest.approx(3.0 + LISTEN * SLOT)
+    assert at == pytest.approx(3.0 + QUIET * SLOT)
     assert made.block() is None
     assert made.departure(at - 0.005) > at
 
