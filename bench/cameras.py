@@ -81,9 +81,9 @@ class Scheme:
 
 
 class Jpeg(Scheme):
-    """JPEG of quality 50, the newest kept."""
+    """JPEG of quality 50, the newest kept, repaired."""
 
-    options = TopicOptions(queue="latest", qos="bulk", codec="none")
+    options = TopicOptions(queue="fifo", queue_depth=1, qos="bulk", codec="none", reliability="reliable")
 
     def message(self, number: int) -> bytes:
         pixels = read(IMAGE, _pictures()[number * TRUTH]).data.reshape(HEIGHT, -1)

@@ -57,14 +57,19 @@ class _Sent:
     """A topic that is sent as frames."""
 
     def __init__(self, topic: Topic, coded: CodedTopic) -> None:
-        options = topic.options
-        fps = options.max_rate if options.camera.fps == AUTO else options.camera.fps
-        self.name, self.weight = topic.name, options.weight
+        self.name = topic.name
         self.encoder = coded.encoder()
-        self.pull = FramePull(period_s=1 / fps if fps else 0.0, coding_s=CODING_S)
+        self.pull = FramePull(coding_s=CODING_S)
+        self.limit(topic)
         self.said: set[str] = set()
         self.offered_bytes = self.frames = self.bytes = self.failed = 0
         self.what = ""
+
+    def limit(self, topic: Topic) -> None:
+        """Heed the options of the topic that may change while it is sent."""
+        options = topic.options
+        fps = options.max_rate if options.camera.fps == AUTO else options.camera.fps
+        self.weight, self.pull.period_s = options.weight, 1 / fps if fps else 0.0
 
 
 class FrameSender:
@@ -80,9 +85,13 @@ class FrameSender:
     def add(self, topic: Topic) -> bool:
         """Send a topic as frames if it is a camera or depth, and its options do not say otherwise. Returns whether it
         is sent so."""
+        known = self._sent.get(topic.topic_id)
+        if known is not None:
+            known.limit(topic)
+            return True
         coded = coded_topic(topic)
-        if coded is None or topic.topic_id in self._sent:
-            return coded is not None
+        if coded is None:
+            return False
         self._sent[topic.topic_id] = _Sent(topic, coded)
         output = topic.options.camera.output
         self._frames.begin(topic.topic_id, "" if output == "same" else output)

@@ -45,12 +45,12 @@ class Pull(NamedTuple):
 class FramePull:
     """The frames of one topic at its sender.
 
-    :param period_s: s between two frames at least, 0 = each message
+    :param period_s: s between two frames at least, 0 = each message; may change
     :param coding_s: s that coding takes
     """
 
     def __init__(self, *, period_s: float = 0.0, coding_s: float = 0.008) -> None:
-        self._least_s, self._coding_s = period_s, coding_s
+        self.period_s, self._coding_s = period_s, coding_s
         self._newest: bytes | None = None
         self._came = self._taken = self._keyed = -inf
         self._period = 0.0
@@ -71,7 +71,7 @@ class FramePull:
 
     def waits(self, now: float) -> bool:
         """Whether a message waits that may be coded now, if the air and the receivers allow it."""
-        opens = self._taken + self._least_s - self._period / 2
+        opens = self._taken + self.period_s - self._period / 2
         return self._newest is not None and not self._coding and now >= opens
 
     def pull(self, now: float, progress: FrameState, share: float = 1.0) -> Pull | None:
@@ -88,7 +88,7 @@ class FramePull:
         if progress.joined != self._joined or now - progress.behind > PATIENCE_S:
             self._key, self._joined = True, progress.joined
         # Until the message after this one has come, which is a whole number of periods away.
-        next_s = max(self._period, self._least_s) or _FIRST_S
+        next_s = max(self._period, self.period_s) or _FIRST_S
         until = max(self._came + next_s - now, next_s / 2)
         budget = None if rate == inf else max(LEAST_BYTES, int(rate * until) - waiting)
         key = (self._key or not progress.reports) and now - self._keyed >= KEY_S

@@ -27,6 +27,8 @@ class LiveEnd:
         self.lock = threading.Lock()
         self.work = threading.Condition(self.lock)
         self.sleeps_until = self.looked = -inf
+        self.look: Callable[[], None] = lambda: None
+        """Called when packets have left or come, with the lock held: a picture may have to be encoded."""
         self._foreseen = False
         """Whether the sending thread sleeps until the next packet may leave, a credit for it provided."""
         self.observer: Callable[[SenderEvent], None] | None = None

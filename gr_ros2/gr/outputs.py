@@ -10,10 +10,11 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gr_ros2.core.errors import ConfigError, DescriptionError, GrRos2Error
+from gr_ros2.codecs.frames import FrameReceiver
+from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError, DescriptionError, GrRos2Error
 from gr_ros2.core.names import topic_fault
 from gr_ros2.gr.early import EarlyMessages
 from gr_ros2.gr.failures import Failures
@@ -64,6 +65,7 @@ class Outputs:
     :param tell: called with what became of each message
     :param clock: s, monotonic
     :ivar heard: what topic ids mean
+    :ivar frames: decodes the topics that come as frames
     :ivar opening: the outputs in which something may wait for subscribers
     :ivar running: whether messages may wait, because somebody looks at ``opening``
     :ivar due: notified when something waits; uses the lock of ``live``
@@ -90,6 +92,7 @@ class Outputs:
         self._lock = live.lock
         self._tell, self._clock, self._failures, self._log = tell, clock, failures, log
         self._outputs: dict[Key, Output] = {}
+        self.frames = FrameReceiver()
         self._prefix = FramePrefix(config.frame_prefix, failures.counters)
         self._transforms: MergedTransforms | None = None
         if config.merge_tf:
@@ -129,12 +132,14 @@ class Outputs:
             key = (event.src_id, told.topic_id)
             try:
                 topic = announced(told, self._config.topic_options)
+                if (output := self.frames.announce(key, told)) != told.type_name:
+                    topic = replace(topic, type_name=output)
                 name = topic.republished(self._config.namespace_format, event.src_id)
                 if topic.is_topic:
                     LOOP_GUARD.add_output(self._owner, self._graph, key, name)
                 if fault := topic_fault(name):
                     raise ConfigError(f"topic {name!r}: {fault}")
-            except ConfigError as error:
+            except (ConfigError, BackendMissingError) as error:
                 self._failures.note(
                     "bad_announcement", f"ros2_sink: a topic of robot {event.src_id} cannot be published", error
                 )
@@ -232,7 +237,8 @@ class Outputs:
         try:
             output = self._outputs.get(key) or self._output(key)
             topic = output.topic
-            payload = self._prefix.apply(topic.type_name, event.src_id, event.payload)
+            shown = self._shown(event, topic)
+            payload = self._prefix.apply(topic.type_name, event.src_id, shown)
             publisher = output.publisher or self._advertise(key, output)
             publisher.publish(payload)
         except Exception as error:  # noqa: BLE001 - whatever the reason, nobody got the message
@@ -244,10 +250,24 @@ class Outputs:
             output.published += 1
             output.delivered_at, output.way = self._clock(), (event.hops, event.over)
             if self._latencies.has(topic.type_name):
-                self._measure(output, event.payload)
+                self._measure(output, shown)
         if self._transforms is not None and topic.type_name == TF_TYPE:
             self._merge(self._transforms, payload, static=topic.latched)
-        return event
+        return event if shown is event.payload else event._replace(shown=shown)
+
+    def _shown(self, event: Delivered, topic: Topic) -> bytes:
+        """The message that a delivered one is: a frame is decoded, and a CameraInfo fitted to its picture.
+
+        :raises CodecError: a frame that cannot be decoded; its robot is asked for a key frame
+        """
+        try:
+            message = self.frames.decode((event.src_id, event.topic_id), topic.name, event.payload)
+            return self.frames.scaled(event.src_id, topic.name, topic.type_name, message)
+        except CodecError:
+            with self._lock:
+                if self._end.frames is not None:
+                    self._end.frames.lost(event.src_id, event.topic_id)
+            raise
 
     def _merge(self, transforms: MergedTransforms, payload: bytes, *, static: bool) -> None:
         try:

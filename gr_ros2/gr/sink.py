@@ -268,6 +268,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             if self._timer_idle and self._end.next_timeout() is not None:
                 self.outputs.due.notify_all()
             if self._end.answers:
+                self.live.look()
                 self.live.wake()
         self._settle(events)
 

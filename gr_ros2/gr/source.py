@@ -304,6 +304,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
             while self._running and len(packets) < _BATCH and (sent := self._end.next_packet(self.clock())) is not None:
                 packets.append(sent)
             if packets:
+                self.live.look()
                 self.composed += len(packets)
                 self._mcs = packets[-1].mcs
                 self._room.notify_all()

@@ -12,8 +12,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from gr_ros2.codecs.frames import FrameSender
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
+from gr_ros2.gr.frame_worker import FrameWorker
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.loops import LOOP_GUARD, Graph
 from gr_ros2.link.endpoint import check_live_options
@@ -35,6 +37,7 @@ class Subscriptions:
     :param clock: s, monotonic
     :param counters: counts ``held_back_at_close``, and what static transforms count
     :ivar registry: all topics so far
+    :ivar frames: the topics that are sent as frames; None in a version, or with a setting, without them
     :ivar options: the options of single topics, by name
     :ivar room: notified when a message that is held back may be submitted; uses the lock of ``live``
     :ivar subscribed: topics by their absolute names on the ROS graph, as they were subscribed. The mapping is replaced
@@ -65,6 +68,9 @@ class Subscriptions:
         self._static = {topic.topic_id: StaticTransforms(counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
         self._shared_said: set[str] = set()
+        frames = live.endpoint.frames if config.compresses else None
+        self.frames = None if frames is None else FrameSender(frames)
+        self._worker = None if self.frames is None else FrameWorker(self.frames, live, clock, log)
         self._moved: dict[int, int] = {}
         """Topic ids under which messages leave now, by those that were subscribed, where ``to`` has changed."""
         chosen = registry.chosen(config.topics) if registry else []
@@ -77,6 +83,8 @@ class Subscriptions:
         :raises GrRos2Error: when a topic cannot be subscribed
         """
         self._guard_loops()
+        for topic in self.subscribed.values():
+            self._code(topic)
         for name, topic in self.subscribed.items():
             self._subscribe(name, topic)
         if self._graph.owned:
@@ -89,6 +97,8 @@ class Subscriptions:
             self.room.notify_all()
         for subscription in self._subscriptions.values():
             subscription.close()
+        if self._worker is not None:
+            self._worker.close()
         with self._live.lock:
             self.take_losses()
         self._subscriptions.clear()
@@ -204,6 +214,7 @@ class Subscriptions:
                 known = [self.registry[-1]]
             topic = known[0]
             self._change(topic.topic_id, options)
+            self._code(topic)
             self._adapt(topic, info.publishers)
             if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
                 self._static[topic.topic_id] = StaticTransforms(self._counters)
@@ -228,6 +239,13 @@ class Subscriptions:
     def _change(self, topic_id: int, options: TopicOptions) -> None:
         self.registry, after = self._messages.change(self._now(topic_id), options)
         self._moved[topic_id] = after.topic_id
+        if self.frames is not None and topic_id in self.frames:
+            self._code(after)
+
+    def _code(self, topic: Topic) -> None:
+        """Send a topic as frames if it is one of pictures."""
+        if self.frames is not None and topic.is_topic:
+            self.frames.add(topic)
 
     def _guard_loops(self) -> None:
         LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
@@ -290,17 +308,24 @@ class Subscriptions:
     def _take(self, topic_id: int, payload: bytes) -> None:
         """Accept a message of the ROS graph, in a thread of the middleware."""
         with self._live.lock:
-            while self._config.backpressure and not self._closed and not self._messages.room(self._now(topic_id)):
+            now_id = self._now(topic_id)
+            frames = self.frames if self.frames is not None and now_id in self.frames else None
+            while self._config.backpressure and frames is None and not self._closed and not self._messages.room(now_id):
                 self.room.wait()
+                now_id = self._now(topic_id)
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
             subscription = self._subscriptions.get(topic_id)
             if subscription is not None and subscription.lost:
                 self._messages.missed(topic_id, subscription.lost)
+            if frames is not None:
+                frames.offer(now_id, payload, self._clock())
+                self._live.look()
+                return
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
             waited_s = 0.0 if subscription is None else subscription.waited_s
-            self._messages.submit(self._now(topic_id), whole or payload, self._clock(), waited_s=waited_s)
+            self._messages.submit(now_id, whole or payload, self._clock(), waited_s=waited_s)
             self._live.wake()

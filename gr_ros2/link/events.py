@@ -78,7 +78,8 @@ class Rejected(NamedTuple):
 class Delivered(NamedTuple):
     """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: at least one of its
     packets was lost at first and recovered later; ``hops``: robots that have sent it on, and ``over``: the last of
-    them, None where there were none; ``age_s``: s for which it has been under way at least."""
+    them, None where there were none; ``age_s``: s for which it has been under way at least; ``shown``: the message
+    that was published, where a frame was decoded for it (:mod:`gr_ros2.link.frames`), None: the payload."""
 
     src_id: int
     topic_id: int
@@ -89,6 +90,12 @@ class Delivered(NamedTuple):
     hops: int = 0
     over: int | None = None
     age_s: float = 0.0
+    shown: bytes | None = None
+
+    @property
+    def message(self) -> bytes:
+        """What was published."""
+        return self.payload if self.shown is None else self.shown
 
 
 class Lost(NamedTuple):

@@ -26,7 +26,7 @@ class FrameState(NamedTuple):
         s; infinite if it lacks none
     :param behind: the same, of the robot that follows worst
     :param heard: when the newest report came, s; -inf for none
-    :param joined: how often a robot that may report has come, or has come back
+    :param joined: how often a robot that may report has come, or has come back, or has asked for a key frame
     :param reports: whether any robot reports
     """
 
@@ -61,3 +61,6 @@ class FrameSide(Protocol):
 
     def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
         """A message of a topic is not coded."""
+
+    def lost(self, src_id: int, topic_id: int) -> None:
+        """A frame of another robot could not be decoded: that robot is asked for a key frame."""

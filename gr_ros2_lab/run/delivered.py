@@ -77,7 +77,7 @@ class DeliveredBag:
             return
         arrival_ns = self._origin_ns + round(now * 1e9)
         sent_ns = arrival_ns if submitted is None else self._origin_ns + round(submitted * 1e9)
-        self._recorder.write(channel, arrival_ns, event.payload, sent_ns)
+        self._recorder.write(channel, arrival_ns, event.message, sent_ns)
         self.written[channel.topic] += 1
 
     def close(self) -> None:

@@ -101,6 +101,7 @@ class Robot:
                     self.seen.append((now, key, self.receiver.decode(key, "camera/image", event.payload)))
                 except CodecError as error:
                     self.failed.append((now, error))
+                    self.end.frames.lost(*key)
 
     def of(self, src_id: int, topic_id: int = CAMERA) -> list[tuple[float, bytes]]:
         return [(now, message) for now, key, message in self.seen if key == (src_id, topic_id)]

@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("av", reason="needs PyAV")
 
+from gr_ros2.codecs.frames import FrameReceiver
 from gr_ros2.codecs.messages import IMAGE, VIDEO, read
 from gr_ros2.link.events import Accepted, Delivered, Refused
 from gr_ros2.link.fates import Fate
@@ -147,6 +148,20 @@ def test_a_camera_that_starts_again_is_seen_again() -> None:
     air.robots[1].seen.clear()
     air.run(7.0)
     assert len(air.robots[1].of(1)) > 15
+
+
+def test_a_receiver_that_lost_its_place_asks_for_a_key_frame() -> None:
+    air = link(loss=0.1)
+    air.run(4.0)
+    receiver = air.robots[1]
+    receiver.receiver = FrameReceiver()
+    for row in receiver.end.topics_of(1).values():
+        receiver.receiver.announce((1, row.topic_id), row)
+    receiver.seen.clear()
+    air.run(6.0)
+    assert receiver.failed
+    assert receiver.of(1)[0][0] < 5.0
+    assert len(receiver.of(1)) > 12
 
 
 def test_one_that_cannot_follow_does_not_hold_others_back() -> None:

@@ -162,6 +162,7 @@ class EndpointV1:
             room=room,
             turn_s=settings.turn_s,
             fixed=settings.fixed,
+            neighbours=neighbours.all,
         )
 
     def submitted(self, topic_id: int, now: float) -> None:

@@ -6,8 +6,8 @@ frames costs nothing but its count.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from math import inf
 from typing import Protocol
 
@@ -16,6 +16,7 @@ from gr_ros2.link.fates import Fate
 from gr_ros2.link.frames import LONG_S, FrameState
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.v1.message import Message
+from gr_ros2.link.v1.neighbours import Neighbour
 from gr_ros2.link.v1.packing import ENTRY
 from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import SentPackets
@@ -31,7 +32,12 @@ _FEW_S = 0.3
 
 
 class Outlet(Protocol):
-    """What frames need of the message side."""
+    """What frames need of the message side.
+
+    :ivar asks: how often others have asked for what is kept of a topic, or for a key frame
+    """
+
+    asks: Counter[int]
 
     def submit_frame(self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool) -> Message | None:
         """Put a frame into the queue of its topic; None if it is too large."""
@@ -49,6 +55,7 @@ class SentFrames:
     :param packets, peers: what has left, and what reports tell of it
     :param room: bytes of the longest body
     :param turn_s: tells s from one packet to the next, 0 = not known
+    :param neighbours: the robots that are heard
     :param fixed: whether every packet is as long as the longest
     """
 
@@ -63,9 +70,10 @@ class SentFrames:
         room: int,
         turn_s: Callable[[], float],
         fixed: bool,
+        neighbours: Mapping[int, Neighbour],
     ) -> None:
         self._topics, self._outlet, self._packets, self._peers, self._pace = topics, outlet, packets, peers, pace
-        self._room, self._turn_s, self._fixed = room, turn_s, fixed
+        self._room, self._turn_s, self._fixed, self._neighbours = room, turn_s, fixed, neighbours
         self._sent: dict[int, deque[Message]] = {}
         """Frames of each topic that have begun to leave or wait, oldest first, until all who report have them."""
         self._others: deque[tuple[float, int]] = deque()
@@ -83,7 +91,8 @@ class SentFrames:
         waiting = sum(message.remaining for message in queue)
         since, behind = self._lacked(topic_id)
         heard = max((peer.heard for peer in self._peers.all.values()), default=-inf)
-        return FrameState(self._free(now), waiting, since, behind, heard, self._peers.joined, bool(self._peers))
+        joined = self._peers.joined + self._outlet.asks[topic_id]
+        return FrameState(self._free(now), waiting, since, behind, heard, joined, bool(self._peers))
 
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
         """Send a frame."""
@@ -97,6 +106,11 @@ class SentFrames:
     def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
         """A message is not coded."""
         self._outlet.refuse_new(topic_id, fate, detail)
+
+    def lost(self, src_id: int, topic_id: int) -> None:
+        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        if (neighbour := self._neighbours.get(src_id)) is not None:
+            neighbour.lost_frames.add(topic_id)
 
     def left(self, sent: SentPacket, now: float) -> None:
         """A packet has left."""

@@ -97,6 +97,8 @@ class Neighbour:
     """Repair ids of packets that carried entries, as bits, by packet number."""
     asked: dict[int, float] = field(default_factory=dict)
     """When each topic was requested."""
+    lost_frames: set[int] = field(default_factory=set)
+    """Topics of which a frame could not be decoded, so that a key frame is to be requested."""
     echo: tuple[bytes, int] | None = None
     """The end of its newest hello, and the number that this robot had reached then."""
     timeout: float | None = None

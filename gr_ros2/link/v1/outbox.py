@@ -9,6 +9,7 @@ start lasts, so that no older table of a receiver lets it deliver what is for an
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from typing import Any, Protocol
@@ -64,6 +65,7 @@ class Outbox:
     :param room: bytes of the longest body
     :ivar topics: what it sends
     :ivar sent: the same, with what waits
+    :ivar asks: how often others have asked for what is kept of a topic, or for a key frame
     :ivar kept: what it keeps for robots that join late
     :ivar packing: what goes into the next packet
     """
@@ -88,6 +90,7 @@ class Outbox:
         self._codec = codec
         self._observer = observer
         self._serial = 0
+        self.asks: Counter[int] = Counter()
         self.sent = SentTopics(codec, settings.commands)
         self.kept = KeptMessages(self.sent, room, settings, self.stats, self._admit)
         self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)

@@ -314,6 +314,7 @@ class ReceivingSide:
                 self.relaying.newest(self._sender.src_id, entry)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
             for topic_id in dict.fromkeys(entry.topic_ids):
+                self._messages.asks[topic_id] += 1
                 if not self._messages.kept.asked(topic_id, self._now):
                     self.stats.dropped["asked_too_often"] += 1
 

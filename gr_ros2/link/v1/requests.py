@@ -1,4 +1,5 @@
-"""What a robot requests from others: messages that they keep for robots that join late, and this one lacks."""
+"""What a robot requests from others: messages that they keep for robots that join late, and this one lacks;
+and key frames of topics of which a frame could not be decoded."""
 
 from __future__ import annotations
 
@@ -43,10 +44,12 @@ class Requests:
             if hello.digest and hello.digest != inbox.announced.digest:
                 marks.append((TABLE_TOPIC, hello.digest))
             lacking = [mark[0] for mark in marks if inbox.lacks(mark, neighbour.hello_number, now)]
+            lacking += neighbour.lost_frames
             self.lacking = self.lacking or bool(lacking)
             wanted = bytes(topic for topic in dict.fromkeys(lacking) if now >= asked.get(topic, -inf))
             if wanted and room >= ASK_LEN + len(wanted):
                 room -= ASK_LEN + len(wanted)
                 found.append(Ask(neighbour.src_id, wanted))
+                neighbour.lost_frames.difference_update(wanted)
                 asked.update(dict.fromkeys(wanted, now + ASK_S * self._settings.slower))
         return found
