@@ -33,7 +33,9 @@ def tables(stats: Stats) -> Group:
 
     :param stats: from :meth:`gr_ros2.radio.robot_link.RobotLink.stats`
     """
-    return Group(_heading(stats), peer_table(stats["peers"]), _topic_table(stats), *_air(stats), *_troubles(stats))
+    return Group(
+        _heading(stats), peer_table(stats["peers"]), _topic_table(stats), *_made(stats), *_air(stats), *_troubles(stats)
+    )
 
 
 def _heading(stats: Stats) -> str:
@@ -88,6 +90,11 @@ def _topic_table(stats: Stats) -> Table | str:
         age = "" if topic["age_s"] is None else _seconds(topic["age_s"])
         table.add_row(f"← {name}", str(topic["delivered"]), age, latency, "", _reasons(topic["lost"]))
     return table if table.row_count else "no topics yet"
+
+
+def _made(stats: Stats) -> list[str]:
+    """What becomes of topics that are not sent as they are."""
+    return [topic["frames"]["words"] for topic in stats["source"]["topics"].values() if topic["frames"]]
 
 
 def _air(stats: Stats) -> list[str]:

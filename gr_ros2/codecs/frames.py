@@ -11,7 +11,9 @@ cannot be coded ends nothing but itself.
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Mapping
+from math import inf
 from typing import Any, NamedTuple
 
 from gr_ros2.codecs.base import MAX_SIZE, Coded
@@ -62,8 +64,27 @@ class _Sent:
         self.pull = FramePull(coding_s=CODING_S)
         self.limit(topic)
         self.said: set[str] = set()
-        self.offered_bytes = self.frames = self.bytes = self.failed = 0
+        self.frames = self.failed = 0
+        self._lately: deque[tuple[float, int, int]] = deque()
+        """When, bytes that came, and bytes of a frame that was sent."""
         self.what = ""
+
+    def note(self, now: float, came: int = 0, frame: int = 0) -> None:
+        """So many bytes came, or were sent."""
+        self._lately.append((now, came, frame))
+        while self._lately[0][0] < now - _SECONDS:
+            self._lately.popleft()
+
+    def words(self, now: float, age_s: float) -> str:
+        """What has become of the topic lately."""
+        lately = [item for item in self._lately if item[0] >= now - _SECONDS]
+        whole = sum(came for _, came, _ in lately) / _SECONDS
+        frames = [frame for _, _, frame in lately if frame]
+        rate = f"{whole / 1e6:.1f} MB/s" if whole >= 1e5 else f"{whole / 1e3:.1f} kB/s"
+        return (
+            f"{self.name}: {rate} as it is, sent as {len(frames) / _SECONDS:.0f} frames/s in "
+            f"{sum(frames) / _SECONDS * 8e-3:.0f} kbit/s, {age_s:.1f} s old"
+        )
 
     def limit(self, topic: Topic) -> None:
         """Heed the options of the topic that may change while it is sent."""
@@ -103,7 +124,7 @@ class FrameSender:
     def offer(self, topic_id: int, message: bytes, now: float) -> None:
         """A message has come."""
         sent = self._sent[topic_id]
-        sent.offered_bytes += len(message)
+        sent.note(now, came=len(message))
         if sent.pull.offer(message, now):
             self._frames.refuse(topic_id, Fate.SUPERSEDED, "a newer picture came before the air was free for it")
 
@@ -129,20 +150,42 @@ class FrameSender:
         if made.data[0] == 0 and made.said not in sent.said:
             sent.said.add(made.said)
             _log.warning("topic %s: passes exactly, not as pictures: %s", sent.name, made.said)
-        sent.frames, sent.bytes, sent.what = sent.frames + 1, sent.bytes + len(made.data), made.said
+        sent.frames, sent.what = sent.frames + 1, made.said
+        sent.note(now, frame=len(made.data))
         self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=made.before is None)
 
-    def stats(self, topic_id: int) -> dict[str, Any]:
-        """What is made of a topic: bytes offered, frames and their bytes, messages that could not be coded, and what
-        the newest frame leaves out, in words."""
-        sent = self._sent[topic_id]
-        return {
-            "offered_bytes": sent.offered_bytes,
-            "frames": sent.frames,
-            "frame_bytes": sent.bytes,
-            "not_coded": sent.failed,
-            "made": sent.what,
-        }
+    def stats(self, topic_id: int, now: float) -> dict[str, Any] | None:
+        """What is made of a topic: frames so far, messages that could not be coded, and in words what the newest frame
+        leaves out and what the topic has become lately; None for one that is not sent as frames."""
+        sent = self._sent.get(topic_id)
+        if sent is None:
+            return None
+        state = self._frames.progress(topic_id, now)
+        return {"frames": sent.frames, "not_coded": sent.failed, "made": sent.what, "words": sent.words(now, state.age)}
+
+
+class TimedCoder:
+    """Encodes what a sender asks for in simulated time: at once, and each frame is there ``CODING_S`` later, so that
+    equal runs have equal frames.
+
+    :ivar due: when the next frame is there, s; infinite for none
+    """
+
+    def __init__(self, sender: FrameSender) -> None:
+        self._sender = sender
+        self._jobs: deque[tuple[float, Job, Coded | CodecError]] = deque()
+
+    @property
+    def due(self) -> float:
+        return self._jobs[0][0] if self._jobs else inf
+
+    def look(self, now: float) -> None:
+        """Hand over what is there, and encode what is due now."""
+        while self.due <= now:
+            _, job, made = self._jobs.popleft()
+            self._sender.done(job, made, now)
+        while (following := self._sender.next(now)) is not None:
+            self._jobs.append((now + CODING_S, following, following.run()))
 
 
 def coded_topic(topic: Topic) -> CodedTopic | None:

@@ -134,6 +134,7 @@ class Subscriptions:
                 "sent": sum(stats.sent[topic_id] for topic_id in ids[topic.name]),
                 "arrived": sum(stats.ended[topic_id, True] for topic_id in ids[topic.name]),
                 "unconfirmed": sum(stats.ended[topic_id, False] for topic_id in ids[topic.name]),
+                "frames": self.frames and self.frames.stats(now[topic.topic_id], self._clock()),
                 "queued": sum(queued[topic_id] for topic_id in ids[topic.name]),
                 "queue": self._messages.queue(now[topic.topic_id])[0],
                 "queue_depth": self._messages.depth(now[topic.topic_id]),

@@ -26,6 +26,8 @@ class FrameState(NamedTuple):
         s; infinite if it lacks none
     :param behind: the same, of the robot that follows worst
     :param heard: when the newest report came, s; -inf for none
+    :param age: s from the coming of the newest message that all who report have, until that was known; where nobody
+        reports, until it had left
     :param joined: how often a robot that may report has come, or has come back, or has asked for a key frame
     :param reports: whether any robot reports
     """
@@ -35,6 +37,7 @@ class FrameState(NamedTuple):
     since: float
     behind: float
     heard: float
+    age: float
     joined: int
     reports: bool
 

@@ -150,7 +150,11 @@ def outrun(before: Mapping[str, int], topics: Mapping[str, Any]) -> tuple[str | 
     :param before: messages of each topic that did not find their turn, at the look before
     :param topics: counters of the source, by topic
     """
-    now = {name: sum(topic["refused"].get(reason, 0) for reason in OUTRUN) for name, topic in topics.items()}
+    now = {
+        name: sum(topic["refused"].get(reason, 0) for reason in OUTRUN)
+        for name, topic in topics.items()
+        if not topic["frames"]  # pictures are left out on purpose
+    }
     old = sorted(name for name, count in now.items() if count > before.get(name, 0))
     if not old:
         return None, now

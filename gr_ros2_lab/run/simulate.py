@@ -20,17 +20,20 @@ from functools import lru_cache
 from math import inf
 from typing import Any, Protocol
 
-from gr_ros2.core.errors import BagError, ConfigError, RunError
+from gr_ros2.codecs.frames import FrameReceiver, FrameSender, TimedCoder
+from gr_ros2.core.errors import BagError, CodecError, ConfigError, RunError
 from gr_ros2.gr.factory import make_endpoint
 from gr_ros2.link import Delivered, Lost, Received, ReceiverEvent, SenderEvent, SenderStats, SentPacket
 from gr_ros2.link.airtime import AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit, at_full_load
 from gr_ros2.link.endpoint import Endpoint
+from gr_ros2.link.events import Announced
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.observe.result import TopicResult
 from gr_ros2.phy import Phy
+from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.medium import FixedPaths, Medium, Reception, Transmission, make_medium
 from gr_ros2_lab.medium.packets import PacketMedium
@@ -317,9 +320,19 @@ def _robots(
             messages=iter(()) if settings.source is None else next(coming),
             start_s=settings.start_s,
             busy=busy,
+            frames=frames_of(endpoint, settings.source, registry),
         )
         robots.append(robot)
     return robots
+
+
+def frames_of(endpoint: Endpoint, source: SourceConfig | None, registry: Registry) -> FrameSender | None:
+    """The topics of a robot that are sent as frames; None where none is."""
+    if endpoint.frames is None or source is None or not source.compresses:
+        return None
+    sender = FrameSender(endpoint.frames)
+    sent = [sender.add(topic) for topic in registry.with_options(source.topic_options) if topic.is_topic]
+    return sender if any(sent) else None
 
 
 class _Unheard(Medium):
@@ -357,6 +370,7 @@ class Robot:
     :param messages: in the order of time
     :param start_s: s, when it begins to send
     :param busy: whether it has had more to send than its airtime allows before the run
+    :param frames: its topics that are sent as frames; None where none is
     """
 
     def __init__(
@@ -371,8 +385,11 @@ class Robot:
         messages: Iterator[Upcoming],
         start_s: float = 0.0,
         busy: bool = False,
+        frames: FrameSender | None = None,
     ) -> None:
         self._start_s = start_s
+        self._frames, self._received = frames, FrameReceiver()
+        self._coder = None if frames is None else TimedCoder(frames)
         self.number, self.endpoint, self.src_id = number, endpoint, src_id
         self.over = False
         """Whether it has nothing more to send, as far as is known: a robot that answers may send later."""
@@ -407,11 +424,17 @@ class Robot:
             credits = self._clock.grants(now)
             self.endpoint.pace.credit(credits, inf if credits and self._clock.held else None)
         while self._coming is not None and self._coming.t <= now:
-            self.endpoint.messages.submit(self._coming.topic_id, self._coming.payload, now)
+            topic_id, payload = self._coming.topic_id, self._coming.payload
+            if self._frames is not None and topic_id in self._frames:
+                self._frames.offer(topic_id, payload, now)
+            else:
+                self.endpoint.messages.submit(topic_id, payload, now)
             if not self._until:
                 self.duration_s = now
             self._coming = next(self._messages, None)
+        self._code(now)
         while (sent := self.endpoint.next_packet(now)) is not None:
+            self._code(now)
             airtime = self._airtime(len(sent.data), sent.mcs)
             start = now if self._clock is None else self._clock.offer(None, now, airtime)
             assert start is not None, "a packet with a credit was refused"
@@ -428,16 +451,39 @@ class Robot:
     def receive(self, reception: Reception) -> Iterator[TimedEvent]:
         """Take what has come out of the receiver."""
         for event in self.endpoint.receive(reception.packet, reception.at):
-            yield reception.at, self, event
+            yield reception.at, self, self._shown(event)
+        self._code(reception.at)
 
     def expire(self, now: float) -> Iterator[TimedEvent]:
         """Do what is due by ``now`` other than to send."""
         at = self.endpoint.next_timeout()
         if at is not None and at <= now:
-            yield from ((now, self, event) for event in self.endpoint.handle_timeout(now))
+            yield from ((now, self, self._shown(event)) for event in self.endpoint.handle_timeout(now))
+
+    def _code(self, now: float) -> None:
+        """Encode the pictures that are due."""
+        if self._coder is not None:
+            self._coder.look(now)
+
+    def _shown(self, event: ReceiverEvent) -> ReceiverEvent:
+        """An event with the message that a frame is. One that cannot be decoded stays a frame."""
+        if isinstance(event, Announced):
+            for told in event.topics:
+                self._received.announce((event.src_id, told.topic_id), told)
+        elif isinstance(event, Delivered):
+            try:
+                shown = self._received.decode((event.src_id, event.topic_id), "", event.payload)
+            except CodecError:
+                if self.endpoint.frames is not None:
+                    self.endpoint.frames.lost(event.src_id, event.topic_id)
+                return event
+            return event if shown is event.payload else event._replace(shown=shown)
+        return event
 
     def wake(self, now: float) -> None:
         """Look again at when there is a packet. Something has just been received and may let one leave earlier."""
+        if self._coder is not None:
+            self.due = min(self.due, max(now, self._coder.due))
         at = self.endpoint.next_departure() if self.endpoint.answers else None
         if at is not None:
             self.due = min(self.due, max(now, at, self._start_s))
@@ -453,7 +499,8 @@ class Robot:
             self.over = True
             return inf
         clock = self._clock.next_timeout(now) if self._clock is not None else None
-        times = (None if coming is None else coming.t, clock, self.endpoint.next_departure())
+        coded = None if self._coder is None else self._coder.due
+        times = (None if coming is None else coming.t, clock, coded, self.endpoint.next_departure())
         soonest = min((at for at in times if at is not None), default=inf)
         if soonest == inf and now < self.duration_s:
             soonest = self.duration_s  # nothing more happens before the end of the run

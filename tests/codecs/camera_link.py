@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from gr_ros2.codecs.frames import CODING_S, FrameReceiver, FrameSender
+from gr_ros2.codecs.frames import FrameReceiver, FrameSender, TimedCoder
 from gr_ros2.codecs.messages import IMAGE
 from gr_ros2.core.errors import CodecError
 from gr_ros2.gr.factory import message_codec
@@ -24,7 +24,7 @@ STEP_S = 0.0005
 PACKET_LEN = 220
 
 
-@dataclass
+@dataclass(eq=False)
 class Robot:
     """One robot, and what it has seen: when, and the message, of each topic of each robot."""
 
@@ -70,22 +70,14 @@ class Robot:
         for topic in self.topics or ():
             self.sender.add(topic)
         self.boot += 1
-        self.jobs: list[tuple[float, Any, Any]] = []
+        self.coder = TimedCoder(self.sender)
 
     def submit(self, topic_id: int, message: bytes, now: float) -> None:
         if topic_id in self.sender:
             self.sender.offer(topic_id, message, now)
-            self.look(now)
+            self.coder.look(now)
         else:
             self.end.messages.submit(topic_id, message, now)
-
-    def look(self, now: float) -> None:
-        """Encode what is due. It takes ``CODING_S``."""
-        while self.jobs and self.jobs[0][0] <= now:
-            _, job, made = self.jobs.pop(0)
-            self.sender.done(job, made, now)
-        while (job := self.sender.next(now)) is not None:
-            self.jobs.append((now + CODING_S, job, job.run()))
 
     def receive(self, data: bytes, now: float) -> None:
         self.take(self.end.receive(AirPacket(data), now), now)
@@ -141,12 +133,12 @@ class Air:
             for other in self.robots:
                 if other is not sender and other.on and not self.lost(sender, other):
                     other.receive(data, now)
-                    other.look(now)
+                    other.coder.look(now)
         for robot in self.robots:
             if not robot.on:
                 continue
             robot.take(robot.end.handle_timeout(now), now)
-            robot.look(now)
+            robot.coder.look(now)
             if robot.free <= now:
                 if robot.end.pace.out_of_credit:
                     robot.end.pace.credit(1, robot.free)
@@ -154,7 +146,7 @@ class Air:
                     robot.free = max(robot.free, now - STEP_S) + len(sent.data) * 8e-3 / robot.kbit_s
                     self._count += 1
                     heapq.heappush(self._under_way, (robot.free + self.delay_s, self._count, robot, sent.data))
-                    robot.look(now)
+                    robot.coder.look(now)
 
 
 def registry(**camera: Any) -> Registry:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gr_ros2.codecs import video
-from gr_ros2.codecs.messages import CLOUD, COMPRESSED_IMAGE, GRID, IMAGE, header_of, store, write
+from gr_ros2.codecs.messages import CAMERA_INFO, CLOUD, COMPRESSED_IMAGE, GRID, IMAGE, header_of, store, write
 
 Array = npt.NDArray[Any]
 _TYPES = store().types
@@ -245,3 +245,22 @@ def room(number: int = 0, width: int = 640, height: int = 480) -> Array:
     found[(blotches < 0.01) | (found > 6) | (found < 0.4)] = 0
     found[:, : width // 80] = 0
     return found.astype(np.float32)
+
+
+def camera_info(width: int = 640, height: int = 480, number: int = 4) -> bytes:
+    """What a camera says of itself."""
+    roi = _TYPES["sensor_msgs/msg/RegionOfInterest"](x_offset=100, y_offset=50, height=200, width=300, do_rectify=True)
+    return write(
+        CAMERA_INFO,
+        header=header(number),
+        height=height,
+        width=width,
+        distortion_model="plumb_bob",
+        d=np.array([0.1, -0.2, 0.001, 0.002, 0.0]),
+        k=np.array([600.0, 0, 320, 0, 610, 239, 0, 0, 1]),
+        r=np.eye(3).ravel(),
+        p=np.array([590.0, 0, 321, -12, 0, 600, 240, 0, 0, 0, 1, 0]),
+        binning_x=0,
+        binning_y=0,
+        roi=roi,
+    )

@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from gr_ros2.codecs import CodedTopic, video
 from gr_ros2.codecs.base import KEY_TIMES
 from gr_ros2.codecs.camera import ENCODINGS, scaled_camera_info
-from gr_ros2.codecs.messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, PACKET, VIDEO, read, store, write
+from gr_ros2.codecs.messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, PACKET, VIDEO, read, write
 from gr_ros2.compression.zstd_frames import read_varint
 from gr_ros2.core.errors import ConfigError, DamagedError, MissingFrameError
 from gr_ros2.wire import varint
-from tests.codecs.scenes import Array, compressed, header, image, picture, view
+from tests.codecs.scenes import Array, camera_info, compressed, header, image, picture, view
 
 WIDTH, HEIGHT, BUDGET = 160, 120, 2000
 
@@ -319,29 +319,9 @@ def test_budgets_hold_when_they_change_with_each_frame() -> None:
     assert np.percentile(shares, 99) <= 1.1
 
 
-def info(width: int = 640, height: int = 480) -> bytes:
-    roi = store().types["sensor_msgs/msg/RegionOfInterest"](
-        x_offset=100, y_offset=50, height=200, width=300, do_rectify=True
-    )
-    return write(
-        CAMERA_INFO,
-        header=header(4),
-        height=height,
-        width=width,
-        distortion_model="plumb_bob",
-        d=np.array([0.1, -0.2, 0.001, 0.002, 0.0]),
-        k=np.array([600.0, 0, 320, 0, 610, 239, 0, 0, 1]),
-        r=np.eye(3).ravel(),
-        p=np.array([590.0, 0, 321, -12, 0, 600, 240, 0, 0, 0, 1, 0]),
-        binning_x=0,
-        binning_y=0,
-        roi=roi,
-    )
-
-
 def test_a_camera_info_is_scaled_with_its_image() -> None:
-    small = read(CAMERA_INFO, scaled_camera_info(info(), 320, 120))
-    whole = read(CAMERA_INFO, info())
+    small = read(CAMERA_INFO, scaled_camera_info(camera_info(), 320, 120))
+    whole = read(CAMERA_INFO, camera_info())
     point = np.array([0.3, -0.2, 2.0])
     before, after = (np.asarray(each.k).reshape(3, 3) @ point / point[2] for each in (whole, small))
     # A corner of the picture stays a corner: it lies half a pixel before the centre of the first one.
@@ -349,7 +329,7 @@ def test_a_camera_info_is_scaled_with_its_image() -> None:
     assert np.asarray(small.p).reshape(3, 4)[0, 3] == pytest.approx(-6)
     assert (small.width, small.height, small.header) == (320, 120, whole.header)
     assert (small.roi.x_offset, small.roi.y_offset, small.roi.width, small.roi.height) == (50, 12, 150, 50)
-    assert scaled_camera_info(info(), 640, 480) == info()
+    assert scaled_camera_info(camera_info(), 640, 480) == camera_info()
     with pytest.raises(DamagedError):
         scaled_camera_info(b"\0\1\0\0", 1, 1)
 

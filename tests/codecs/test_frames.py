@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from gr_ros2.codecs.frames import FrameReceiver
 from gr_ros2.codecs.messages import IMAGE, VIDEO, read
 from gr_ros2.link.events import Accepted, Delivered, Refused
 from gr_ros2.link.fates import Fate
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
 from tests.codecs import scenes
 from tests.codecs.camera_link import CAMERA, ODOMETRY, Air, Robot, registry
 
@@ -43,7 +46,8 @@ def odometry(number: int) -> bytes:
 def link(*, loss: float = 0.0, kbit_s: float = 128, receivers: int = 1, seed: int = 1, **options: Any) -> Air:
     """A robot with a camera, and others that hear it."""
     camera = Robot(1, registry(**options), kbit_s)
-    air = Air(camera, *(Robot(2 + number, None, kbit_s) for number in range(receivers)), loss=loss, seed=seed)
+    others = (Robot(2 + number, None, kbit_s) for number in range(receivers))
+    air = Air(camera, *others, loss=loss, seed=seed)
     air.feed(camera, CAMERA, FPS, picture)
     air.feed(camera, ODOMETRY, 20, odometry)
     return air
@@ -263,8 +267,24 @@ def test_depth_comes_out_as_depth() -> None:
 
 def test_what_is_said_of_a_topic() -> None:
     air = link()
-    air.run(2.0)
-    said = air.robots[0].sender.stats(CAMERA)
-    assert said["frames"] > 20
-    assert said["frame_bytes"] < said["offered_bytes"] / 100
+    air.run(4.0)
+    said = air.robots[0].sender.stats(CAMERA, air.now)
+    assert said is not None
+    assert said["frames"] > 40
     assert said["made"].startswith("H.264 of")
+    pattern = r"camera/image: 3\.\d MB/s as it is, sent as 1[456] frames/s in \d+ kbit/s, 0\.1 s old"
+    assert re.fullmatch(pattern, said["words"]), said["words"]
+
+
+def test_two_cameras_share_what_is_free_by_weight() -> None:
+    rows = [Topic(0, "camera/image", IMAGE), Topic(1, "rear/image", IMAGE, TopicOptions(weight=3.0))]
+    sender, receiver = Robot(1, Registry(rows), 256), Robot(2, None, 256)
+    air = Air(sender, receiver)
+    for topic_id in (0, 1):
+        air.feed(sender, topic_id, 10, picture)
+    air.run(5.0)
+    sizes = [
+        sum(len(e.payload) for e in sender.events if isinstance(e, Accepted) and e.topic_id == topic_id and e.now > 2)
+        for topic_id in (0, 1)
+    ]
+    assert 2 < sizes[1] / sizes[0] < 4

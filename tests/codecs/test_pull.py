@@ -14,7 +14,7 @@ from gr_ros2.link.frames import FrameState
 
 RATE = 10_000.0
 PERIOD = 0.1
-FREE = FrameState(RATE, 0, inf, inf, -inf, 1, reports=True)
+FREE = FrameState(RATE, 0, inf, inf, -inf, 0.1, 1, reports=True)
 """All that has left is confirmed."""
 
 
@@ -176,7 +176,7 @@ def test_budgets_are_bounded_whatever_happens(events: list[tuple[str, float, int
             pull.offer(b"message", now)
         elif event == "pull":
             request = pull.pull(
-                now, FrameState(RATE, waiting, now - since, now - since, now, joined, reports=since < 5)
+                now, FrameState(RATE, waiting, now - since, now - since, now, 0.1, joined, reports=since < 5)
             )
             assert request is None or (not coding and LEAST_BYTES <= (request.budget or 0) <= RATE * 20)
             coding = coding or request is not None

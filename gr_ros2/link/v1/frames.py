@@ -76,6 +76,7 @@ class SentFrames:
         self._room, self._turn_s, self._fixed, self._neighbours = room, turn_s, fixed, neighbours
         self._sent: dict[int, deque[Message]] = {}
         """Frames of each topic that have begun to leave or wait, oldest first, until all who report have them."""
+        self._ages: dict[int, float] = {}
         self._others: deque[tuple[float, int]] = deque()
         self._sum = 0
 
@@ -83,16 +84,19 @@ class SentFrames:
         """See :class:`gr_ros2.link.frames.FrameSide`."""
         self._topics[topic_id].become_frames(output)
         self._sent.setdefault(topic_id, deque())
+        self._ages.setdefault(topic_id, 0.0)
         self._outlet.tabulate()
 
     def progress(self, topic_id: int, now: float) -> FrameState:
         """How it stands."""
         queue = self._topics[topic_id].queue
         waiting = sum(message.remaining for message in queue)
-        since, behind = self._lacked(topic_id)
+        since, behind = self._lacked(topic_id, now)
         heard = max((peer.heard for peer in self._peers.all.values()), default=-inf)
         joined = self._peers.joined + self._outlet.asks[topic_id]
-        return FrameState(self._free(now), waiting, since, behind, heard, joined, bool(self._peers))
+        return FrameState(
+            self._free(now), waiting, since, behind, heard, self._ages[topic_id], joined, bool(self._peers)
+        )
 
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
         """Send a frame."""
@@ -135,7 +139,7 @@ class SentFrames:
             return capacity
         return max(_LEAST_FREE * capacity, capacity - self._sum / max(now - self._others[0][0], _FEW_S))
 
-    def _lacked(self, topic_id: int) -> tuple[float, float]:
+    def _lacked(self, topic_id: int, now: float) -> tuple[float, float]:
         """``since`` and ``behind`` of :class:`FrameState`."""
         sent, records, everybody = self._sent[topic_id], self._packets.records, self._packets.everybody
         oldest = dict.fromkeys((peer.bit for peer in self._peers.all.values()), inf)
@@ -150,6 +154,7 @@ class SentFrames:
                     message.numbers.remove(number)
             if message.lifetime.left and (not message.numbers or message.lifetime.expires == -inf):
                 sent.remove(message)
+                self._ages[topic_id] = now - message.submitted
             elif lacking:
                 for bit in oldest:
                     if lacking & bit:

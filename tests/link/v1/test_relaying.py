@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
+from gr_ros2.gr.factory import message_codec
 from gr_ros2.link.events import Announced, Delivered
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.mac import Slots
 from gr_ros2.settings.config import TopicOptions
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.wire import AnnouncedTopic
 from tests.link.v1.air import SLOT_S, Robot, registry
 from tests.link.v1.invariants import PacketsEnd
 
@@ -148,3 +150,25 @@ def test_packets_for_others_keep_their_slots_and_are_confirmed_by_that_robot_onl
     assert everybody[2].delivered(4)
     assert everybody[0].end.window.peers.all.keys() == {2}
     assert everybody[2].end.received.dropped["not_for_us"] > 100
+
+
+def test_frames_are_not_passed_on() -> None:
+    """A chain of frames would be of no use to who lacks one of them."""
+    topics = registry(odom=TopicOptions(queue="latest"), image=TopicOptions())
+    known = message_codec()
+
+    def decoder_for(rows: tuple[AnnouncedTopic, ...]) -> Any:
+        told = [Topic(row.topic_id, row.name, row.type_name) for row in rows]
+        return known.of(told, {row.topic_id: row.codec for row in rows})
+
+    made = [robot(src_id, topics=topics, coding=(message_codec(topics), decoder_for)) for src_id in range(1, 4)]
+    line = Line(*made)
+    camera, near, far = line.robots
+    camera.end.frames.begin(1)
+    for number in range(30):
+        camera.end.frames.submit(1, b"frame %d" % number, line.now, line.now, key=number == 0)
+        line.run(0.5)
+    frames = [b"frame %d" % number for number in range(30)]
+    assert [payload for payload in near.delivered(1) if payload in frames] == frames
+    assert len(far.delivered(1)) > 10
+    assert not set(far.delivered(1)) & set(frames)
