@@ -29,6 +29,7 @@ from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.findings import about, doubled, introduce, outrun, peers, ping, same_id, unheard
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.limits import open_limit
+from gr_ros2.radio.mismatch import Mismatch
 from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.ros_side import RosSide
@@ -111,7 +112,9 @@ class RobotLink(Flowgraph):
         self.source, self.sink, self.end, self.calls = self._ros.source, self._ros.sink, self._ros.end, self._ros.calls
         self._connect_radio()
         self.source.use_credit()
-        introduce(self.end, about(config, self.phy), lambda: self.radio.snr_db, self._clock())
+        told = about(config, self.phy)
+        introduce(self.end, told, lambda: self.radio.snr_db, self._clock())
+        self._mismatch = Mismatch(told, self.ping)
         if isinstance(graph, ServiceGraph):
             switch = TransmitSwitch(graph, self.node_name, lambda on: self.transmit(on=on))
             self._stack.callback(switch.close)
@@ -300,6 +303,7 @@ class RobotLink(Flowgraph):
             *self._same_numbers(heard),
             *without_table(peer["robot"] for peer in heard if peer["no_table"]),
             full if self._ros.shares else None,
+            *self._mismatch.lines(self.stats(), robots, now),
         ]
         with self.end.lock:
             if self._ros.slots is not None and self._ros.slots.unheard(now):

@@ -1,0 +1,67 @@
+"""Why most of what arrives is of no use: what the other ends have set differently, without being told to check.
+
+Invariant: others are asked only while most of what arrives cannot be used, and at most once in ``LOOK_S``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
+from typing import Any
+
+from gr_ros2.radio.findings import differences, heard_nobody
+
+LOOK_S = 5.0
+"""s over which packets are counted: ten of a slow radio."""
+_FEW = 10
+"""Useless packets and bursts in that time that say nothing yet."""
+
+
+class Mismatch:
+    """See the module.
+
+    :param own: what this end tells those who ask, as :func:`gr_ros2.radio.findings.about` returns it
+    :param ask: asks a robot; returns what has come of all questions to it, with what it is as ``about``
+    """
+
+    def __init__(self, own: Mapping[str, Any], ask: Callable[[int], Mapping[str, Any]]) -> None:
+        self._own, self._ask = own, ask
+        self._looked = -inf
+        self._before = 0, 0
+        self._lines: list[str] = []
+        self._asked: set[int] = set()
+
+    def lines(self, stats: Mapping[str, Any], robots: Sequence[int], now: float) -> list[str]:
+        """One line for each difference that explains why most of what arrives cannot be used; mostly none.
+
+        :param stats: of the link
+        :param robots: those that are heard
+        """
+        if now < self._looked + LOOK_S:
+            return self._lines
+        refused = sum(stats["sink"]["rejected"].values())
+        useless, useful = refused + stats["packets"]["damaged"], stats["packets"]["in"] - refused
+        more_useless, more_useful = useless - self._before[0], useful - self._before[1]
+        self._looked, self._before = now, (useless, useful)
+        if more_useless < _FEW:
+            self._lines = self._lines if more_useless else []
+        elif more_useless > more_useful:
+            self._lines = self._found(stats, robots)
+        else:
+            self._lines = []
+        return self._lines
+
+    def _found(self, stats: Mapping[str, Any], robots: Sequence[int]) -> list[str]:
+        lines, silent = [], []
+        for robot in robots:
+            other = self._ask(robot)["about"]
+            if other is None and robot not in self._asked:
+                self._asked.add(robot)  # the answer is on its way
+            elif other is None:
+                silent.append(f"of robot {robot}, most is of no use")  # its answer is in what cannot be used
+            else:
+                lines += [f"robot {robot}: {line}" for line in differences(self._own, other)]
+        whose = silent if robots else ["no other robot is understood"]
+        signs = [re.sub("^[0-9]+ ", "", line) for line in heard_nobody(stats) if not line.startswith("nothing")]
+        return lines + [f"{who}: {'; '.join(signs)} (here packet_len is {self._own['packet_len']})" for who in whose]

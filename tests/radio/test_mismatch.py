@@ -1,0 +1,58 @@
+"""Why most of what arrives is of no use, said without being asked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gr_ros2.radio.mismatch import LOOK_S, Mismatch
+
+OWN = {"packet_len": 96, "phy": 1, "key": 0, "text": "0.1.0 psk 200000"}
+
+
+def stats(arrived: int = 0, damaged: int = 0, **refused: int) -> dict[str, Any]:
+    return {
+        "sink": {"rejected": refused, "dropped": {}},
+        "packets": {"in": arrived, "damaged": damaged, "foreign": 0},
+        "front_end": {"passed": {}, "lost": {}},
+    }
+
+
+def asked(about: dict[str, Any] | None) -> tuple[Mismatch, list[int]]:
+    robots: list[int] = []
+
+    def ask(robot: int) -> dict[str, Any]:
+        robots.append(robot)
+        return {"about": about}
+
+    return Mismatch(OWN, ask), robots
+
+
+def test_a_robot_that_is_set_differently_says_what_it_has() -> None:
+    mismatch, robots = asked({**OWN, "packet_len": 220, "phy": 2})
+    assert mismatch.lines(stats(arrived=100, entry_kind=80), [2], 0.0) == [
+        "robot 2: packet_len is 220 there and 96 here; set the same at both ends",
+        "robot 2: phy has other settings there; set the same name, sample_rate and options at both ends",
+    ]
+    assert len(mismatch.lines(stats(arrived=100, entry_kind=80), [2], LOOK_S / 2)) == 2
+    assert robots == [2], "it is asked once in a while"
+    assert mismatch.lines(stats(arrived=200, entry_kind=80), [2], 2 * LOOK_S) == []
+    assert robots == [2]
+
+
+def test_where_no_answer_arrives_the_signs_are_named() -> None:
+    mismatch, _ = asked(None)
+    assert not mismatch.lines(stats(arrived=20, damaged=180), [2], -LOOK_S), "it may still answer"
+    [line] = mismatch.lines(stats(arrived=20, damaged=366), [2], 0.0)
+    assert line == (
+        "of robot 2, most is of no use: bursts found, with errors: too weak, overlapped, or of another phy, options or "
+        "packet_len (here packet_len is 96)"
+    )
+    [line] = mismatch.lines(stats(arrived=20, damaged=500), [], 2 * LOOK_S)
+    assert line.startswith("no other robot is understood: bursts found, with errors")
+
+
+def test_a_link_that_works_asks_nobody() -> None:
+    mismatch, robots = asked({**OWN, "packet_len": 220})
+    assert mismatch.lines(stats(arrived=300, damaged=120), [2], 0.0) == []
+    assert mismatch.lines(stats(arrived=300, damaged=125), [2], LOOK_S) == []
+    assert not robots
