@@ -199,6 +199,18 @@ def _qualities(run: Run, times: Any) -> Iterator[float]:
             yield float(10 * np.log10(255**2 / np.mean((large - _luma(number)) ** 2)))
 
 
+def _joins(kbit_s: float, loss: float, seed: int) -> float:
+    """s until a robot that joins two others sees a picture."""
+    sender, late = Robot(1, registry(), kbit_s), Robot(3, None, kbit_s)
+    air = Air(sender, Robot(2, None, kbit_s), late, loss=loss, seed=seed)
+    air.feed(sender, CAMERA, FPS, Scheme(kbit_s).message)
+    late.on = False
+    air.run(5 + 0.13 * seed)
+    late.on, begin = True, air.now
+    air.run(SECONDS)
+    return late.of(1)[0][0] - begin
+
+
 SEEDS = (1, 2, 3)
 """Draws of losses, of which each figure is the mean."""
 MOST_MS: dict[tuple[int, float], tuple[int, int | None]] = {
@@ -232,8 +244,10 @@ def cameras() -> list[Row]:
                 rows.append(Row(f"{what}, frames", pull.per_s, "/s", "≥", 14, "{:.1f}"))
             older = pull.odometry_ms / alone.odometry_ms
             rows.append(Row(f"{what}, odometry older than alone", older, "times", "≤", 1.5, "{:.2f}"))
+    joined = np.mean([_joins(128, loss, seed) for loss in (0.0, 0.2) for seed in SEEDS])
     back = np.mean([judged(simulate("pull", 128, 0.05, seed, outage=OUTAGE)).back_s for seed in SEEDS])
     return [
         *rows,
+        Row("cameras: who joins (128 kbit/s, 0 and 20 %) sees one within", float(joined), "s", "≤", 0.75, "{:.2f}"),
         Row("cameras: after 2 s of outage, a picture < .2 s old within", float(back), "s", "≤", 0.3, "{:.2f}"),
     ]

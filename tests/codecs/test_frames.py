@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import random
 import re
+import sys
 from typing import Any
 
 import numpy as np
@@ -120,15 +122,18 @@ def test_after_an_outage_a_young_picture_is_there_at_once(ways: int) -> None:
     assert not air.robots[1].failed
 
 
-def test_a_robot_that_joins_sees_a_picture_soon() -> None:
-    air = link(receivers=2)
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+@pytest.mark.parametrize("kbit_s", [128, 512])
+def test_a_robot_that_joins_sees_a_picture_soon(kbit_s: float, loss: float) -> None:
+    """Within the airtime of a key frame and half a second."""
+    air = link(receivers=2, kbit_s=kbit_s, loss=loss, seed=4)
     late = air.robots[2]
     late.on = False
-    air.run(4.0)
+    air.run(5.26)
     late.on = True
-    air.run(6.5)
+    air.run(7.0)
     first = late.of(1)[0][0]
-    assert first < 4.0 + 1.5
+    assert first < 5.26 + 0.5 + 0.25
     numbers = [number_of(message) for _, message in late.of(1)]
     assert len(numbers) > 10
     assert numbers == sorted(set(numbers))
@@ -288,3 +293,34 @@ def test_two_cameras_share_what_is_free_by_weight() -> None:
         for topic_id in (0, 1)
     ]
     assert 2 < sizes[1] / sizes[0] < 4
+
+
+def test_a_thousand_frames_of_any_size_arrive_whole_and_in_order() -> None:
+    sender, receiver = Robot(1, registry(off=True), 1000), Robot(2, None, 1000)
+    air = Air(sender, receiver, loss=0.2)
+    frames, rng = sender.end.frames, random.Random(1)
+    frames.begin(CAMERA)
+    receiver.receiver.decode = lambda *args: args[2]  # type: ignore[method-assign]
+    air.run(0.5)
+    sent = [b"first"]
+    frames.submit(CAMERA, sent[0], air.now, air.now, key=True)
+    for _ in range(1000):
+        sent.append(rng.randbytes(min(9000, int(rng.expovariate(1 / 300)))))
+        frames.submit(CAMERA, sent[-1], air.now, air.now, key=False)
+        air.run(air.now + 0.005)
+    air.run(air.now + 5)
+    assert [message for _, message in receiver.of(1)] == sent
+    assert frames.progress(CAMERA, air.now).since == math.inf
+
+
+def test_without_its_package_pictures_pass_as_they_are_and_a_line_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    air = link(kbit_s=4000)
+    assert CAMERA not in air.robots[0].sender
+    air.run(2.0)
+    assert {message for _, message in air.robots[1].of(1)} <= {picture(number) for number in range(40)}
+    assert len(air.robots[1].of(1)) > 2
+    assert [record.message for record in caplog.records if "gr-ros2[video]" in record.message][1:] == []
+    assert "pip install 'gr-ros2[video]'" in caplog.text

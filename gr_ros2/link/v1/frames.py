@@ -142,7 +142,7 @@ class SentFrames:
     def _lacked(self, topic_id: int, now: float) -> tuple[float, float]:
         """``since`` and ``behind`` of :class:`FrameState`."""
         sent, records, everybody = self._sent[topic_id], self._packets.records, self._packets.everybody
-        oldest = dict.fromkeys((peer.bit for peer in self._peers.all.values()), inf)
+        oldest = dict.fromkeys((peer.bit for peer in self._peers.all.values() if not peer.joins), inf)
         for message in list(sent):
             lacking = 0
             for number in list(message.numbers):

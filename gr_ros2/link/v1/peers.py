@@ -50,6 +50,8 @@ class Peer:
     bit: int
     heard: float
     loss: float = 0.0
+    joins: bool = True
+    """Whether it has not reported since it came, or came back."""
     newest: int = -1
     proven: int = 0
     """It may take packets up to this number for replays. A combination that stands at a later one brings them back."""
@@ -103,7 +105,7 @@ class Peers:
     :ivar loss: share of packets that the peer with the most losses loses, as far as it is known or expected
     :ivar proven: some peer may take packets up to this number for replays
     :ivar provens: the same of each peer, the highest first
-    :ivar joined: how often a peer has come, or has come back
+    :ivar joined: how often a peer that has come, or has come back, has reported for the first time
     :ivar in_vain: whether a peer waits for a packet in vain
     :ivar urges: heap of the packets that some peer lacks and for which later messages wait, or may wait soon: whether
         all in it are long, and its number
@@ -167,8 +169,7 @@ class Peers:
             else:
                 free = next(bit for bit in range(256) if not (packets.everybody | packets.away) >> bit & 1)
                 peer = Peer(1 << free, now, interval=self._interval)
-            self.all[src_id] = peer
-            self.joined += 1
+            self.all[src_id], peer.joins = peer, True
             packets.here(peer.bit)
             self._note()
         return peer
@@ -218,6 +219,8 @@ class Peers:
         if number > self._packets.newest:
             return
         peer = self.meet(src_id, now)
+        self.joined += peer.joins
+        peer.joins = False
         if peer.newest < 0:
             peer.lost.clear()  # what it was expected to lack
         self._note_times(peer, number, loss, now)
