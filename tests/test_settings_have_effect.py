@@ -219,6 +219,9 @@ effects(
     to=run(OPTION + "odom.to=3"),
     keep_s=Elsewhere("link/v1/test_latest_state.py::test_keep_s_says_how_long_a_robot_out_of_range_can_still_get_it"),
     quantize=run(OPTION + "odom.quantize=pose.pose.position=0.1"),
+    instance=Elsewhere(
+        "link/v1/test_instances.py::test_of_a_type_whose_instances_are_not_told_apart_the_newest_message_is_sent"
+    ),
     camera=Elsewhere("codecs/test_frames.py::test_the_options_of_a_camera_say_what_comes_out"),
     depth_image=Elsewhere("codecs/test_frames.py::test_depth_comes_out_as_depth"),
     cloud=Elsewhere("codecs/test_whole.py::test_cells_come_out_as_they_were_said_to"),

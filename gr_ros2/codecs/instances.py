@@ -11,18 +11,21 @@ numbers, texts and tuples of such.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+import logging
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from gr_ros2.codecs.messages import store
 from gr_ros2.core.errors import ConfigError, DamagedError
 from gr_ros2.middleware.type_definitions import DAMAGED
+from gr_ros2.settings.registry import Topic
 
 FIELDS = {
     "tf2_msgs/msg/TFMessage": "transforms[].child_frame_id",
@@ -35,6 +38,9 @@ FIELDS = {
 """The fields that tell the instances of a type apart, by type."""
 
 Key = Hashable
+NONE = "none"
+"""Instead of fields: messages are not told apart."""
+_log = logging.getLogger(__name__)
 
 
 class InstancePart(NamedTuple):
@@ -87,6 +93,7 @@ class Instances:
             raise ConfigError(f"instance: {text!r} is not one list of the message, or fields beside any list")
         self._list, self._paths = heads[0], paths
         self._check(text)
+        self.separate = not self._list or len(self._types.fielddefs[type_name][1]) > 1
 
     def keys(self, message: bytes) -> tuple[Key, ...]:
         """The key of each instance of a message, in order.
@@ -122,11 +129,8 @@ class Instances:
         groups: dict[bytes, tuple[Any, dict[Key, Any]]] = {}
         for part in parts:
             value = self._read(part.message)
-            elements = getattr(value, self._list)
-            setattr(value, self._list, [])
-            rest = bytes(self._types.serialize_cdr(value, self._type))
-            _, found = groups.setdefault(rest, (value, {}))
-            for element in elements:
+            _, found = groups.setdefault(self._rest(value), (value, {}))
+            for element in getattr(value, self._list):
                 found.pop(self._key(element), None)
                 found[self._key(element)] = element
         made = []
@@ -134,6 +138,32 @@ class Instances:
             setattr(value, self._list, list(found.values()))
             made.append(bytes(self._types.serialize_cdr(value, self._type)))
         return made
+
+    def merged(self, waiting: Sequence[bytes], message: bytes) -> bytes:
+        """See :class:`gr_ros2.link.instances.InstanceKeys`. Messages whose other fields differ are left out.
+
+        :raises DamagedError: not messages of the type
+        """
+        if not self._list:
+            return message
+        value = self._read(message)
+        rest, elements = self._rest(value), getattr(value, self._list)
+        found: dict[Key, Any] = {}
+        for earlier in map(self._read, waiting):
+            if self._rest(earlier) == rest:
+                found |= {self._key(element): element for element in getattr(earlier, self._list)}
+        new = {self._key(element) for element in elements}
+        older = [element for key, element in found.items() if key not in new]
+        if not older:
+            return message
+        setattr(value, self._list, [*older, *elements])
+        return bytes(self._types.serialize_cdr(value, self._type))
+
+    def _rest(self, value: Any) -> bytes:
+        """What a message says beside its elements."""
+        alone = copy(value)
+        setattr(alone, self._list, [])
+        return bytes(self._types.serialize_cdr(alone, self._type))
 
     def _key(self, value: Any) -> Key:
         found = tuple(path.of(value) for path in self._paths)
@@ -161,3 +191,27 @@ class Instances:
                     kind = kind[1][0]
             if kind[0] == Nodetype.NAME or (kind[0] != Nodetype.BASE and kind[1][0][0] == Nodetype.NAME):
                 raise ConfigError(f"instance: {text!r} of {self._type} is a message, not a number or a text")
+
+
+def instances_of(topic: Topic, definitions: Mapping[str, Any] | None = None) -> Instances | None:
+    """The instances of a topic that a robot sends; None where it has none, or its type is not known yet.
+
+    :param definitions: of its type and of those that it is made of, in the form of rosbags; None = those that ROS ships
+    :raises ConfigError: for a path that the type does not have
+    """
+    fields = topic.options.instance
+    if fields == NONE or not (fields or topic.type_name in FIELDS):
+        return None
+    types = store()
+    if definitions is not None:
+        types = get_typestore(Stores.EMPTY)
+        types.register(dict(definitions))
+    if topic.type_name not in types.fielddefs:
+        return None
+    try:
+        return Instances(topic.type_name, fields, types)
+    except ConfigError as error:
+        if definitions is None:
+            raise ConfigError(f"topic {topic.name}: {error}") from None
+        _log.warning("topic %s: %s; its messages are not told apart", topic.name, error)
+        return None

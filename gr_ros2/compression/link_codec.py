@@ -4,6 +4,8 @@ First byte of a coded message: high nibble, the dictionaries used (0 none, 1..13
 type, as the sender has announced it, and 15 a user's own dictionary, whose two-byte id follows); low nibble, the codec
 (0 stored, 1 zstd, 2 fields, 3 fields with a second part, 4 a frame of a codec for this type alone, such as that of
 clouds, 5 a frame of a coded topic, which the receiver's chain of frames decodes). 0x00 is stored as it is.
+After 0x06 a byte follows that has no meaning, and then a coded message: so a message that says the same as an earlier
+one is not taken for its repeat.
 
 A sender announces in its table of topics how a topic is coded: the option ``codec`` and, where it has learned the
 definition of the type, a blank and the structure (``compression.structure``).
@@ -43,6 +45,7 @@ MAX_MESSAGE = max(version.largest_message(version.max_packet_len) for version in
 """Bytes; what a link can carry uncompressed."""
 
 STORED, ZSTD, FIELDS, FIELDS_AND_MORE, WHOLE = range(5)
+NUMBERED = 6
 ANNOUNCED = 14
 """Number in the first byte for the structure that the sender has announced; two bytes of its CRC follow."""
 MAX_ANNOUNCEMENT = 255
@@ -131,7 +134,7 @@ class LinkCodec:
         return self._topics[topic_id].announcement
 
     def lacks(self, topic_id: int, coded: bytes) -> bool:
-        return self._topics[topic_id].lacks(coded)
+        return self._topics[topic_id].lacks(_inner(coded))
 
     def canonical(self, topic_id: int, payload: bytes) -> bytes:
         """The message that the other end gets: alignment gaps are zero, quantised fields are rounded, the rest is
@@ -151,13 +154,16 @@ class LinkCodec:
         """
         return self._topics[topic_id].encode(payload)
 
+    def numbered(self, coded: bytes, number: int) -> bytes:
+        return bytes([NUMBERED, number & 0xFF]) + coded
+
     def decode(self, topic_id: int, coded: bytes) -> bytes:
         """The message.
 
         :raises CodecError: ``fate`` is unknown_dictionary, damaged or unsupported (a codec we do not know)
         :raises KeyError: a topic id that it was not made for
         """
-        return self._topics[topic_id].decode(coded)
+        return self._topics[topic_id].decode(_inner(coded))
 
 
 class TopicCodec:
@@ -379,6 +385,10 @@ class _Coders:
     def announced(cls, tree: Composite, text: str) -> _Coders:
         """The coders of a structure. Types have no names there, so nothing is known about this one in particular."""
         return cls("", bytes([ANNOUNCED]) + _mark(text), shipped(GENERAL), tree)
+
+
+def _inner(coded: bytes) -> bytes:
+    return coded[2:] if coded[:1] == bytes([NUMBERED]) else coded
 
 
 def _mark(text: str) -> bytes:

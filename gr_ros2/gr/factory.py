@@ -118,6 +118,8 @@ def make_endpoint(
         from_air = None if sink is None else codec or message_codec(registry)
         return EndpointV0(registry, source, sink, codecs=(to_air, from_air), rng=rng, observer=observer)
     start = start or EndpointSetup()
+    from gr_ros2.codecs.instances import instances_of  # as in message_codec
+
     known = message_codec()
     return EndpointV1(
         None if source is None or not topics else topics,
@@ -146,6 +148,7 @@ def make_endpoint(
         observer=observer,
         mcs_table=start.mcs_table,
         access=start.access(robot_of(source, sink)),
+        instances=instances_of,
     )
 
 

@@ -67,7 +67,6 @@ class Subscriptions:
         static = [topic for topic in registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
-        self._shared_said: set[str] = set()
         frames = live.endpoint.frames if config.compresses else None
         self.frames = None if frames is None else FrameSender(frames)
         self._worker = None if self.frames is None else FrameWorker(self.frames, live, clock, log)
@@ -282,6 +281,8 @@ class Subscriptions:
             depth=qos.depth,
             lifespan_s=qos.lifespan_s,
             period_s=qos.deadline_s,
+            count=len(offers),
+            keeps=min(sum(max(offer.depth, 1) for offer in offers), 255),
         )
         return self._messages.follow(self._now(topic.topic_id), publishers)
 
@@ -293,18 +294,6 @@ class Subscriptions:
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
             self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
-        shared = all(offer.durability == "transient_local" for offer in offers) and topic.topic_id not in self._static
-        kept = 1 if topic.options.depth == AUTO else max(topic.options.depth, 1)
-        if shared and len(offers) > kept and topic.name not in self._shared_said:
-            self._shared_said.add(topic.name)
-            self._log.warning(
-                "topic %s: %d publishers keep messages for late subscribers, and a robot that joins late gets the "
-                "newest %d of all; set topics.%s.depth to the number of publishers",
-                topic.name,
-                len(offers),
-                kept,
-                topic.name,
-            )
 
     def _take(self, topic_id: int, payload: bytes) -> None:
         """Accept a message of the ROS graph, in a thread of the middleware."""
@@ -327,6 +316,6 @@ class Subscriptions:
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            waited_s = 0.0 if subscription is None else subscription.waited_s
-            self._messages.submit(now_id, whole or payload, self._clock(), waited_s=waited_s)
+            waited_s, publisher = (0.0, None) if subscription is None else (subscription.waited_s, subscription.source)
+            self._messages.submit(now_id, whole or payload, self._clock(), waited_s=waited_s, publisher=publisher)
             self._live.wake()

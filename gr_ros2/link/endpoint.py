@@ -11,7 +11,7 @@ them before any observer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import inf
 from typing import Any, Protocol
@@ -68,6 +68,7 @@ class MessageSide(Protocol):
         dst_id: int | Auto = AUTO,
         *,
         waited_s: float = 0.0,
+        publisher: Hashable = None,
     ) -> None:
         """Take a serialized message.
 
@@ -76,6 +77,8 @@ class MessageSide(Protocol):
         :param lifespan_s: s after which this message is useless, on a topic whose queue has a deadline (version 1)
         :param dst_id: the robot for which it is, auto as its topic says: others carry it there (version 1)
         :param waited_s: s for which it has waited on this computer, and newer ones of its topic have come (version 1)
+        :param publisher: whose message it is: of a latched topic, the newest of each is kept (version 1); None = not
+            known
         :raises ConfigError: for a topic that is not sent
         """
 

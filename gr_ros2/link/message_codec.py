@@ -43,6 +43,10 @@ class MessageCodec(Protocol):
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         """The coded message, its naming byte first; at most one byte longer than the message."""
 
+    def numbered(self, coded: bytes, number: int) -> bytes:
+        """A coded message whose bytes differ from those of others with other numbers, modulo 256, though it says the
+        same. Two bytes longer."""
+
     def decode(self, topic_id: int, coded: bytes) -> bytes:
         """The message.
 

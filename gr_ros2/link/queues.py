@@ -12,10 +12,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice, takewhile
 from math import inf
 from typing import Generic, TypeVar
 
 from gr_ros2.link.fates import Fate
+from gr_ros2.link.instances import ALL, Keys, replaced
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S
 from gr_ros2.settings.config import QueuePolicy, TopicOptions
 from gr_ros2.settings.fields import AUTO
@@ -43,6 +45,8 @@ class Outgoing:
     :param repeat: the message was sent before, and is sent again for robots that join late (transient-local topics)
     :param index: next fragment to send
     :param offset: bytes sent
+    :param keys: the instances that it speaks of; it replaces messages of no others
+    :param released: ``max_rate`` lets it start, together with those that waited beside it
     """
 
     serial: int
@@ -56,6 +60,8 @@ class Outgoing:
     repeat: bool = False
     index: int = 0
     offset: int = 0
+    keys: Keys = ALL
+    released: bool = False
 
     @property
     def started(self) -> bool:
@@ -96,6 +102,8 @@ class PublisherQos:
     :param depth: depth of their history, 0 for unbounded or unknown
     :param lifespan_s: s after which a message is useless, 0 without limit
     :param period_s: their deadline: s within which they promise a message, 0 for no promise
+    :param count: number of publishers
+    :param keeps: how many messages they keep together for late joiners
     """
 
     reliable: bool = True
@@ -103,6 +111,8 @@ class PublisherQos:
     depth: int = 0
     lifespan_s: float = 0.0
     period_s: float = 0.0
+    count: int = 1
+    keeps: int = 1
 
 
 UNKNOWN_QOS = PublisherQos()
@@ -154,9 +164,11 @@ class TopicQueue(deque[M], Generic[M]):
             self.since = message.submitted
         dropped: list[Dropped[M]] = []
         if self.policy == "latest":
-            while self and not self[-1].started:
-                dropped.append(Dropped(self.pop(), Fate.SUPERSEDED, "a newer message came before it could start"))
-        elif depth and len(self) >= depth:
+            for old in replaced([waiting for waiting in self if not waiting.started], message.keys):
+                self.remove(old)
+                message.released |= old.released
+                dropped.append(Dropped(old, Fate.SUPERSEDED, "a newer message came before it could start"))
+        if (self.policy != "latest" or message.keys) and depth and len(self) >= depth:
             for victim in [waiting for waiting in self if not waiting.started][: len(self) - depth + 1]:
                 self.remove(victim)
                 dropped.append(Dropped(victim, Fate.QUEUE_BOUND, f"{depth} messages were waiting"))
@@ -192,10 +204,13 @@ class TopicQueue(deque[M], Generic[M]):
             self.remove(message)
             yield Dropped(message, *self._reason(message, now, packets * interval))
 
-    def started(self, now: float) -> None:
-        """A message was started: compute when the next one may start."""
+    def started(self, message: M, now: float) -> None:
+        """A message is started: compute when the next one may start. Where the newest message of each instance is
+        sent, all that wait may."""
         self.since = now
-        if self._interval:
+        if self._interval and not message.released:
+            for waiting in self if self.policy == "latest" else ():
+                waiting.released = True
             # The delay of one start is not added to the next, unless it was a whole interval.
             self._opens = (self._opens if now - self._opens < self._interval else now) + self._interval
 
@@ -203,11 +218,15 @@ class TopicQueue(deque[M], Generic[M]):
         """The messages that may continue or start."""
         if not self._interval and not self.closed:
             return self
-        return [self[0]] if self and (self[0].started or (now >= self._opens and not self.closed)) else []
+        opened = now >= self._opens and not self.closed
+        if opened and self.policy == "latest":
+            return self
+        let = list(takewhile(lambda one: one.started or (one.released and not self.closed), self))
+        return let or list(islice(self, opened))
 
     def opens(self, now: float) -> float:
         """When the next message may start, if one waits for ``max_rate``; otherwise infinite."""
-        return self._opens if self and now < self._opens and not self[0].started else inf
+        return self._opens if self and now < self._opens and not (self[0].started or self[0].released) else inf
 
     def _expiry(self, message: Outgoing) -> float:
         return message.submitted + min(self.deadline_s, message.lifespan_s) if self.deadline_s else inf

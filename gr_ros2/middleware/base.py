@@ -11,7 +11,7 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -105,12 +105,14 @@ class Subscription(ABC):
 
     :ivar lost: messages that were lost before they reached the callback, as far as the graph reports them
     :ivar waited_s: s for which the message that the callback gets has waited for it at least
+    :ivar source: what tells its publisher apart from others; None = not known
     :ivar calling: for back-ends: held while calling back
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self.waited_s = 0.0
+        self.source: Hashable = None
         self.calling = threading.RLock()
         self._offers: list[Qos] = []
         self._on_offers: OffersCallback | None = None

@@ -198,6 +198,7 @@ class DdsSubscription(Subscription):
             if self._closed:
                 break
             self.waited_s = max(0.0, (newest[sample.source] - sample.stamp) * 1e-9)
+            self.source = sample.source
             self._middleware.deliver(self.topic, self._callback, sample.payload)
         return len(samples)
 

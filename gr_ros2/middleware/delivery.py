@@ -10,7 +10,7 @@ import threading
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 
 from gr_ros2.middleware.base import MessageCallback, Middleware, OffersCallback, Qos, Subscription
@@ -79,7 +79,7 @@ class QueuedSubscription(Subscription):
         self._thread = thread
         self._depth = depth
         self._callback = callback
-        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._waiting: deque[tuple[float, bytes, Hashable]] = deque()
         self._queueing = threading.Lock()
 
     @abstractmethod
@@ -90,15 +90,18 @@ class QueuedSubscription(Subscription):
     def leave(self) -> None:
         """Leave the graph; called once."""
 
-    def push(self, payload: bytes) -> None:
-        """Queue a message, from any thread."""
+    def push(self, payload: bytes, source: Hashable = None) -> None:
+        """Queue a message, from any thread.
+
+        :param source: what tells its publisher apart from others
+        """
         if self.closed:
             return
         with self._queueing:
             full = bool(self._depth) and len(self._waiting) >= self._depth
             if full:
                 self._waiting.popleft()
-            self._waiting.append((time.monotonic(), payload))
+            self._waiting.append((time.monotonic(), payload, source))
         if full:
             text = f"{self.topic}: callbacks do not keep up, depth {self._depth} is full, the oldest are dropped"
             self._participant.count_lost(self, self.topic, text)
@@ -122,7 +125,7 @@ class QueuedSubscription(Subscription):
     def _take(self) -> None:
         with self.calling:
             with self._queueing:
-                came, payload = self._waiting.popleft()
+                came, payload, self.source = self._waiting.popleft()
                 self.waited_s = self._waiting[-1][0] - came if self._waiting else 0.0
             if not self.closed:
                 self._participant.deliver(self.topic, self._callback, payload)

@@ -74,7 +74,7 @@ class _Graph:
             for publisher, matched_at in subscription.matches.items():
                 for serial, payload in publisher.history:
                     if serial < matched_at:
-                        subscription.push(payload)
+                        subscription.push(payload, id(publisher))
                 subscription.matches[publisher] = 0
 
 
@@ -109,7 +109,7 @@ class MemoryPublisher(Publisher):
             self.history.append((self.published, payload))
             self.published += 1
             for subscription in self.matches:
-                subscription.push(payload)
+                subscription.push(payload, id(self))
 
     def matched(self) -> int:
         return len(self.matches)

@@ -342,7 +342,7 @@ class _ZenohSubscription(QueuedSubscription):
         beside = read_attachment(sample.attachment.to_bytes()) if sample.attachment else None
         if beside is not None:
             self._count_missing(*beside)
-        self.push(sample.payload.to_bytes())
+        self.push(sample.payload.to_bytes(), None if beside is None else beside[1])
 
     def _count_missing(self, sequence: int, gid: bytes) -> None:
         newest = self._newest.get(gid)

@@ -246,6 +246,9 @@ class SendOptions:
     :param to: robot for which its messages are, 0..254; other robots do not deliver them; auto = all robots
     :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
     :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
+    :param instance: fields that tell apart the things of which messages speak, so that max_rate and queue latest work
+        for each of them, such as robots[].id; '' = those known of its type (/tf, /diagnostics, JointState, markers),
+        none = they are not told apart
     :param cloud: what leaves of a PointCloud2: exact, or cells of so many m, such as {voxel: 0.1, range: 30}
         (docs/explanation/codecs.md)
     :param camera: what leaves of an Image or CompressedImage: video that fits the air, such as {size: 320x240, fps:
@@ -267,6 +270,7 @@ class SendOptions:
     to: Annotated[Annotated[int, Field(ge=0, le=254)] | Auto, OnlyIn(1), OnlyAt("source")] = AUTO
     codec: Annotated[str, OnlyAt("source")] = AUTO
     quantize: Annotated[str, OnlyAt("source")] = ""
+    instance: Annotated[str, OnlyIn(1), OnlyAt("source")] = ""
     cloud: Annotated[CloudOptions, OnlyAt("source")] = Field(default_factory=CloudOptions)
     camera: Annotated[CameraOptions, OnlyAt("source"), BeforeValidator(_off)] = Field(default_factory=CameraOptions)
     depth_image: Annotated[DepthOptions, OnlyAt("source"), BeforeValidator(_off)] = Field(default_factory=DepthOptions)

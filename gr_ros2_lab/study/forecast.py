@@ -578,6 +578,9 @@ class _Remembering:
             coded = self._coded[topic_id, payload] = self._codec.encode(topic_id, payload)
         return coded
 
+    def numbered(self, coded: bytes, number: int) -> bytes:
+        return self._codec.numbered(coded, number)
+
     def decode(self, topic_id: int, coded: bytes) -> bytes:
         payload = self._decoded.get((topic_id, coded))
         if payload is None:

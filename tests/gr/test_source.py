@@ -246,31 +246,6 @@ def test_a_message_of_which_a_robot_tells_nothing_is_said_once(rig: Rig, caplog:
     assert said[0].startswith("topic odom: robot 7 ")
 
 
-@pytest.mark.parametrize(("depth", "warned"), [("auto", True), (2, True), (3, False)])
-def test_a_latched_topic_of_several_publishers_is_named_once_with_the_remedy(
-    rig: Rig, caplog: pytest.LogCaptureFixture, depth: Any, warned: bool
-) -> None:
-    source = rig.make(version=1, topic_options={"odom": {"depth": depth}, "/tf": {"durability": "volatile"}})
-    for topic, type_name, durability in (
-        *[("/robot_1/odom", "nav_msgs/msg/Odometry", "transient_local")] * 3,
-        *[("/tf", "tf2_msgs/msg/TFMessage", "volatile")] * 3,
-    ):
-        rig.robot.advertise(topic, type_name, Qos("reliable", durability, 1)).publish(b"\0\1\0\0")
-
-    def said() -> list[str]:
-        return [record.getMessage() for record in caplog.records if "late subscribers" in record.getMessage()]
-
-    def came() -> bool:
-        topic = source.stats()["topics"]["/robot_1/odom"]
-        return bool(topic["submitted"] + topic["lost_on_graph"] >= 3)
-
-    wait_for(came, "the messages of all")
-    if warned:
-        wait_for(said, "the warning")
-    assert len(said()) == warned
-    assert all(line.startswith("topic odom: ") and "topics.odom.depth" in line for line in said())
-
-
 def test_a_port_that_nobody_reads_is_said_and_counted(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     source = rig.make()
     rig.top.msg_connect((rig.probe, "credit"), (source, "credit"))

@@ -8,7 +8,7 @@ composed when it is requested, never before; time is an argument and never goes 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from math import inf
 from typing import Any
 from zlib import crc32
@@ -93,6 +93,7 @@ class Sender:
         dst_id: int | Auto = AUTO,  # noqa: ARG002
         *,
         waited_s: float = 0.0,  # noqa: ARG002
+        publisher: Hashable = None,  # noqa: ARG002
     ) -> None:
         """Take a serialized message.
 
@@ -245,7 +246,7 @@ class Sender:
         for message, length in zip(plan.picks, plan.lengths, strict=True):
             if not message.started:
                 message.entry_id = self._take_id(message.topic_id)
-                self._queues[message.topic_id].started(now)
+                self._queues[message.topic_id].started(message, now)
             entry = EntryV0(message.topic_id, message.entry_id, message.index, message.total, message.take(length))
             entries.append(entry)
             record.append(

@@ -27,6 +27,8 @@ _REACHED = 256
 _OVER = 256
 """Messages over other robots that are remembered, because the origin's own packets may bring them too."""
 _NEVER = (-1, -1)
+_MARKS = 64
+"""Messages of a topic with several kept ones that may come between two hellos that name an older one."""
 UNKNOWN_S = 2 * age_of(NO_AGE - 1)
 """s that are taken for an age that is unknown."""
 MAX_AGE_S = 15.0
@@ -38,7 +40,7 @@ class DeliveryRules:
     """See the module.
 
     :param marks: CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as
-        many as its depth
+        many as its depth, or where that is more than 1, ``_MARKS`` more; what a hello has named counts as new again
     :ivar sealed_after: tells the time in s after which a packet was sealed; None where this cannot be proven
     :ivar newest: the newest message that was delivered, by topic
     """
@@ -137,7 +139,11 @@ class DeliveryRules:
     def lacks(self, mark: tuple[int, int], number: int) -> bool:
         """Whether a latched message, named at a packet number, is not here, nor a newer one of its topic."""
         topic_id, value = mark
-        return value not in self.marks.get(topic_id, ()) and self.newest.get(topic_id, (-1, -1))[0] <= number
+        held = self.marks.get(topic_id, ())
+        if value in held:
+            self.marks[topic_id] = (*(other for other in held if other != value), value)
+            return False
+        return self.newest.get(topic_id, (-1, -1))[0] <= number
 
     def is_for_us(self, topic: AnnouncedTopic) -> bool:
         """Whether messages of a topic are for this robot."""
@@ -175,7 +181,8 @@ class DeliveryRules:
             mark, marks = crc32(ready.payload), self.marks.get(ready.topic_id, ())
             if mark in marks:
                 return False
-            self.marks[ready.topic_id] = (*marks, mark)[-max(topic.depth, 1) :]
+            most = topic.depth + _MARKS if topic.depth > 1 else 1
+            self.marks[ready.topic_id] = (*marks, mark)[-most:]
         return True
 
     def limit_s(self, topic: AnnouncedTopic) -> float:

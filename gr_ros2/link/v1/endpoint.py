@@ -20,6 +20,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.access import Access
 from gr_ros2.link.endpoint import LIVE_OPTIONS, HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
+from gr_ros2.link.instances import InstancesOf, no_instances
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.custody import Custody
@@ -61,6 +62,7 @@ class EndpointV1:
     :param save: stores up to which packet a robot was heard; needed if ``keys`` must keep replays out after a restart
     :param observer: called with every SenderEvent, in order
     :param mcs_table: the rates of an adaptive rate, see :mod:`gr_ros2.link.rate`; () for a fixed rate
+    :param instances: tells the instances of a topic that it sends
     :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
     :ivar answers: whether what it receives can change what it sends
     :ivar window: the packets that are worth repairing
@@ -86,6 +88,7 @@ class EndpointV1:
         observer: Callable[[SenderEvent], None] | None = None,
         mcs_table: Sequence[Mcs] = (),
         access: Access | None = None,
+        instances: InstancesOf = no_instances,
     ) -> None:
         self._access = access
         self.settings = settings = settings if access is None else _shared(settings, access)
@@ -106,7 +109,15 @@ class EndpointV1:
             slower=settings.slower,
         )
         self.messages = messages = Outbox(
-            topics, settings, self, window.peers, boot=boot, room=room, codec=codec, observer=observer
+            topics,
+            settings,
+            self,
+            window.peers,
+            boot=boot,
+            room=room,
+            codec=codec,
+            observer=observer,
+            instances=instances,
         )
         self.sent = messages.stats
         self._receiving = ReceivingSide(

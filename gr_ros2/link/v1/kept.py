@@ -9,12 +9,12 @@ many ask, and whoever they are, each message takes a bounded share of the time.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from math import inf
 from zlib import crc32
 
+from gr_ros2.link.instances import ALL, Keys, replaced
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.message import Message
@@ -50,6 +50,8 @@ class _Kept:
     """Time in s from which on hellos name it."""
     until: float = inf
     """Time in s until which it is sent again."""
+    keys: Keys = ALL
+    """The instances that it speaks of."""
     begin: int = 0
     """The packet in which its first fragment left for the first time; 0 if it left whole."""
 
@@ -73,7 +75,7 @@ class KeptMessages:
         self.digest = 0
         self._topics, self._room, self._settings = topics, room, settings
         self._stats, self._admit = stats, admit
-        self._kept: dict[int, deque[_Kept]] = {}
+        self._kept: dict[int, list[_Kept]] = {}
         self._rows: dict[int, _Kept] = {}
         """The rows of the table by topic id."""
         self._answers: dict[int, tuple[float, float]] = {}
@@ -84,11 +86,15 @@ class KeptMessages:
 
     def keep(self, topic: SentTopic, message: Message) -> None:
         """Keep a new message of a topic that keeps some."""
-        kept = self._kept.setdefault(message.topic_id, deque(maxlen=max(topic.kept_depth, 1)))
+        kept = self._kept.setdefault(message.topic_id, [])
         until = message.submitted + min(
             inf if topic.latched else topic.topic.options.keep_s, topic.queue.deadline_s or inf, message.lifespan_s
         )
-        kept.append(_Kept(message.serial, message.payload, message.coded, crc32(message.payload), until=until))
+        for old in replaced(kept, message.keys) if message.keys else ():
+            kept.remove(old)
+        mark = crc32(message.payload)
+        kept.append(_Kept(message.serial, message.payload, message.coded, mark, until=until, keys=message.keys))
+        del kept[: -max(topic.kept_depth, 1)]
 
     def tabulate(self, rows: Sequence[AnnouncedTopic]) -> bool:
         """Keep the rows of the table of topics; returns whether one has changed."""
@@ -157,7 +163,7 @@ class KeptMessages:
                 continue
             again = Message(kept.serial, topic_id, kept.payload, qos, now, topic.weight, kept.until - now)
             again.repeat, again.coded = True, kept.coded
-            again.begin, again.dst_id = kept.begin, topic.dst_id
+            again.begin, again.dst_id, again.keys = kept.begin, topic.dst_id, kept.keys
             self._admit(topic, again)
             self._stats.repeats += 1
         return True
@@ -182,14 +188,13 @@ class KeptMessages:
                 self.ask(topic_id, now)
 
     def marks(self, now: float) -> list[tuple[int, int]]:
-        """What hellos name: (topic id, CRC-32) of the newest message that is kept of each topic.
-
-        A receiver remembers no other of a topic. If hellos named older ones too, it would ask for them for ever.
-        """
+        """What hellos name: (topic id, CRC-32) of the newest message that is kept of each topic, and of those before it
+        that speak of others. A receiver remembers what hellos name."""
         return [
-            (topic_id, messages[-1].mark)
+            (topic_id, kept.mark)
             for topic_id, messages in self._kept.items()
-            if messages[-1].named <= now <= messages[-1].until
+            for kept in messages
+            if (kept.keys or kept is messages[-1]) and kept.named <= now <= kept.until
         ]
 
     def left(self, message: Message, now: float, *, reported: bool) -> None:

@@ -1,9 +1,10 @@
 """How long a message is worth repairing.
 
-The topic decides. With ``latest``, it is until a newer message has left whole. With a lifespan, it is until that has
-passed. Otherwise it is until ``depth`` newer messages have left, or enough newer ones to fill a repair, and not longer
-after the next message than a receiver waits for it. Receivers that report say when they have a message: then a message
-that is delivered in order is repaired until they have it, and any other until ``depth`` newer ones have left.
+The topic decides. With ``latest``, it is until newer messages of all its instances have left whole. With a lifespan, it
+is until that has passed. Otherwise it is until ``depth`` newer messages have left, or enough newer ones to fill a
+repair, and not longer after the next message than a receiver waits for it. Receivers that report say when they have a
+message: then a message that is delivered in order is repaired until they have it, and any other until ``depth`` newer
+ones have left.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 from math import inf
 
+from gr_ros2.link.instances import ALL, Keys, replaced
 from gr_ros2.settings.config import QueuePolicy
 
 WORTH = 0.85
@@ -32,6 +34,7 @@ class Lifetime:
     :param left: whether it has left whole
     :param chained: whether it is of use only to who has followed so far: it is not kept for those out of range
     :param fresh: whether the next message of its topic is its repair on a channel that many share
+    :param keys: the instances that it speaks of
     """
 
     expires: float = inf
@@ -41,6 +44,7 @@ class Lifetime:
     left: bool = False
     fresh: bool = False
     chained: bool = False
+    keys: Keys = ALL
 
     def end(self) -> None:
         """It was replaced by a newer message, or needs no repair."""
@@ -62,7 +66,9 @@ class Lifetimes:
         """
         earlier, most = self._left, MOST_LIFETIMES
         if policy == "latest":
-            most = 1
+            for old in replaced(earlier, lifetime.keys):
+                earlier.remove(old)
+                old.end()
         elif reported:
             most = most if lifetime.in_order else depth or most  # what comes in order is waited for
         elif earlier:

@@ -10,7 +10,7 @@ start lasts, so that no older table of a receiver lets it deliver what is for an
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from math import inf
 from typing import Any, Protocol
 
@@ -19,6 +19,7 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.endpoint import check_live_options
 from gr_ros2.link.events import Accepted, Ended, Missed, Refused
 from gr_ros2.link.fates import Fate
+from gr_ros2.link.instances import InstancesOf, no_instances
 from gr_ros2.link.message_codec import FRAME, MessageCodec
 from gr_ros2.link.queues import OVERLOAD_S, OVERLOADED, Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
@@ -63,6 +64,7 @@ class Outbox:
     :param peers: those that say what they have, so that it is known when a message is over
     :param boot: boot number of this start, for keys
     :param room: bytes of the longest body
+    :param instances: tells the instances of a topic
     :ivar topics: what it sends
     :ivar sent: the same, with what waits
     :ivar asks: how often others have asked for what is kept of a topic, or for a key frame
@@ -81,6 +83,7 @@ class Outbox:
         room: int,
         codec: MessageCodec | None,
         observer: Observer | None,
+        instances: InstancesOf = no_instances,
     ) -> None:
         self.topics = topics
         self.stats = SenderStats()
@@ -91,7 +94,7 @@ class Outbox:
         self._observer = observer
         self._serial = 0
         self.asks: Counter[int] = Counter()
-        self.sent = SentTopics(codec, settings.commands)
+        self.sent = SentTopics(codec, settings.commands, instances)
         self.kept = KeptMessages(self.sent, room, settings, self.stats, self._admit)
         self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)
         self.relayed: SentTopic | None = None
@@ -124,6 +127,7 @@ class Outbox:
 
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
         """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one are told."""
+        self.sent.learn(type_name, definitions)
         if self._codec is None:
             return
         self._codec.learn(type_name, definitions)
@@ -173,6 +177,7 @@ class Outbox:
         dst_id: int | Auto = AUTO,
         *,
         waited_s: float = 0.0,
+        publisher: Hashable = None,
     ) -> None:
         topic = self.sent.get(topic_id)
         if topic is None or topic_id == TABLE_TOPIC:
@@ -186,6 +191,8 @@ class Outbox:
         self.packing.turns.join(topic_id)
         serial = self._new(topic_id)
         codec = None if over else self._codec
+        plain, keys = topic.spoken_of(payload, serial if publisher is None else publisher)
+        payload = plain
         if self._observer is not None:
             expected = None if codec is None else codec.canonical(topic_id, payload)
             self._observer(Accepted(serial, topic_id, payload, now, expected))
@@ -194,12 +201,15 @@ class Outbox:
             return
         if codec is not None:
             payload = codec.encode(topic_id, payload)
+            if topic.kept and topic.kept_depth > 1:
+                payload = codec.numbered(payload, serial)
         if len(payload) > MAX_MESSAGE:
             self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         coded = codec is not None
         message = Message(serial, topic_id, payload, topic.qos, now - waited_s, topic.weight, lifespan_s, coded=coded)
         message.dst_id = topic.dst_id if dst_id == AUTO else dst_id
+        message.keys, message.plain = keys, plain if keys else b""
         if topic.kept:
             self.kept.keep(topic, message)
         self._admit(topic, message)

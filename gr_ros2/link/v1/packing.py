@@ -172,12 +172,12 @@ class Packing:
             topic, back = self._topics[topic_id], message.back(number)
             if not message.index:
                 message.begin, message.place = number - back, -1 if back else place
-                lifetime.expires = message.expires
                 message.began, lifetime.chained = now, topic.coded
+                lifetime.expires, lifetime.keys = message.expires, message.keys
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
                 lifetime.long = self._long(message)
                 lifetime.fresh = not (lifetime.in_order or topic.kept or topic_id > TABLE_TOPIC)
-                topic.queue.started(now)
+                topic.queue.started(message, now)
             if message.submitted < since and not topic.topic.options.max_rate:
                 since = message.submitted
             lifetime.awaited = len(topic.queue) > 1

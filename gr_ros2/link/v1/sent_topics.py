@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
+from typing import Any
 
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import CodecError, ConfigError
 from gr_ros2.link.frames import MARK
+from gr_ros2.link.instances import ALL, InstanceKeys, InstancesOf, Keys, no_instances
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
 from gr_ros2.link.v1.lifetime import Lifetimes
@@ -24,6 +26,10 @@ from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
 LONG_CARRIED = CARRIED_TOPIC + 1
 """The queue of carried messages that take several packets: short ones do not wait for them."""
 
+_STARTS = 2
+"""Messages kept for each of several publishers: one that has started again counts as another, and does not displace a
+third one's."""
+
 
 @dataclass(slots=True, eq=False)
 class SentTopic:
@@ -38,6 +44,7 @@ class SentTopic:
     :param lifetimes: its messages that have left
     :param coded: whether its messages are frames (:mod:`gr_ros2.link.frames`)
     :param output: of frames, the type that comes out, '' = the topic's
+    :param instances: what its messages speak of; None = all of the same
     :ivar dst_id: the robot for which its messages are, 255 for all
     """
 
@@ -53,6 +60,7 @@ class SentTopic:
     lifetimes: Lifetimes = field(default_factory=Lifetimes)
     coded: bool = False
     output: str = ""
+    instances: InstanceKeys | None = None
     dst_id: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -74,13 +82,23 @@ class SentTopic:
 
     @property
     def kept_depth(self) -> int:
-        """How many messages late robots and late subscribers get.
+        """How many messages late robots and late subscribers get at most.
 
         One, unless the topic's options say otherwise: where the graph does not tell the depth of a map's publisher, an
-        earlier map would come out after the newest one.
+        earlier map would come out after the newest one. Of several publishers or instances, the newest of each.
         """
-        depth = self.topic.options.depth
-        return 1 if depth == AUTO else depth
+        depth, publishers = self.topic.options.depth, self.publishers
+        if depth != AUTO:
+            return depth
+        if self.instances is not None:
+            return publishers.keeps
+        return min(_STARTS * publishers.count, 255) if publishers.count > 1 else 1
+
+    @property
+    def shared(self) -> bool:
+        """Whether its newest message says nothing of what others have said before."""
+        by_publisher = self.kept and self.publishers.count > 1
+        return by_publisher if self.instances is None else by_publisher or self.instances.separate
 
     @property
     def in_order(self) -> bool:
@@ -89,7 +107,27 @@ class SentTopic:
             return True
         wanted = self.topic.options.reliability
         reliable = self.publishers.reliable if wanted == AUTO else wanted == "reliable"
-        return reliable and self.queue.policy != "latest"
+        return reliable and (self.queue.policy != "latest" or self.shared)
+
+    def spoken_of(self, payload: bytes, publisher: Hashable) -> tuple[bytes, Keys]:
+        """A new message, merged with those that wait and say more, and the instances that it speaks of.
+
+        :param publisher: whose message it is
+        """
+        if self.instances is None:
+            return payload, frozenset([publisher]) if self.kept and self.publishers.count > 1 else ALL
+        if self.queue.policy != "latest" and not self.kept:
+            return payload, ALL
+        try:
+            keys = frozenset(self.instances.keys(payload))
+            if self.queue.policy == "latest":
+                waiting = [old.plain for old in self.queue if not (old.started or old.repeat or old.keys <= keys)]
+                if waiting:
+                    payload = self.instances.merged(waiting, payload)
+                    keys = frozenset(self.instances.keys(payload))
+        except CodecError:
+            return payload, ALL
+        return payload, keys
 
     def follow(self, publishers: PublisherQos) -> None:
         """Adapt to the QoS of its publishers, where the configuration leaves it open."""
@@ -156,12 +194,18 @@ class SentTopics(dict[int, SentTopic]):
 
     :param codec: codes their messages
     :param commands: types and names of topics whose messages are commands
+    :param instances: tells the instances of a topic
     :ivar deadlines: the queues whose messages may be too late
     """
 
-    def __init__(self, codec: MessageCodec | None, commands: Sequence[str]) -> None:
+    def __init__(
+        self,
+        codec: MessageCodec | None,
+        commands: Sequence[str],
+        instances: InstancesOf = no_instances,
+    ) -> None:
         super().__init__()
-        self._codec, self._commands = codec, commands
+        self._codec, self._commands, self._instances = codec, commands, instances
         self.deadlines: list[TopicQueue[Message]] = []
 
     def add(self, topics: Sequence[Topic]) -> None:
@@ -171,15 +215,22 @@ class SentTopics(dict[int, SentTopic]):
             command = is_command(topic.name, topic.type_name, self._commands)
             queue: TopicQueue[Message] = TopicQueue(*queue_for(options, command=command), options.max_rate)
             qos, hidden = qos_class(options, command=command), not topic.is_topic
-            self[topic.topic_id] = SentTopic(
+            self[topic.topic_id] = made = SentTopic(
                 topic, queue, qos, options.weight, topic.latched, hidden=hidden, command=command
             )
+            made.instances = self._instances(topic, None)
         if TABLE_TOPIC not in self:
             table = Topic(TABLE_TOPIC, "", "")
             queue, qos = TopicQueue[Message]("fifo"), qos_class(table.options)
             rows = PublisherQos(reliable=False)  # each is of use by itself
             self[TABLE_TOPIC] = SentTopic(table, queue, qos, 1.0, latched=False, publishers=rows)
         self.find_deadlines()
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Tell apart the instances of topics whose type was not known before."""
+        for topic in self.named():
+            if topic.topic.type_name == type_name and topic.instances is None:
+                topic.instances = self._instances(topic.topic, definitions)
 
     def relay(self) -> SentTopic:
         """Send messages of other robots too; returns their queue."""
