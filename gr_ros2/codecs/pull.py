@@ -82,10 +82,9 @@ class FramePull:
         rate, waiting = progress.rate * share, progress.waiting
         if self._newest is None or not self.waits(now) or waiting > (rate * self._coding_s if rate < inf else 0):
             return None
-        stuck = now - progress.since > PATIENCE_S
-        if stuck and (progress.heard < progress.since + PATIENCE_S or now - self._keyed < KEY_S):
+        if progress.lacked > PATIENCE_S and (progress.silent or now - self._keyed < KEY_S):
             return None
-        if progress.joined != self._joined or now - progress.behind > PATIENCE_S:
+        if progress.joined != self._joined or progress.behind > PATIENCE_S:
             self._key, self._joined = True, progress.joined
         # Until the message after this one has come, which is a whole number of periods away.
         next_s = max(self._period, self.period_s) or _FIRST_S

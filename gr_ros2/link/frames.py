@@ -22,10 +22,10 @@ class FrameState(NamedTuple):
 
     :param rate: bytes/s that other topics leave free; infinite where the rate of the channel is not known
     :param waiting: bytes that have not left
-    :param since: when the oldest frame began to leave that a robot lacks which reports: of the robot that follows best,
-        s; infinite if it lacks none
+    :param lacked: s for which the robot that follows best has lacked a frame, as far as its reports tell; 0 if none
+        reports
     :param behind: the same, of the robot that follows worst
-    :param heard: when the newest report came, s; -inf for none
+    :param silent: whether some robot reports, and none has for long
     :param age: s from the coming of the newest message that all who report have, until that was known; where nobody
         reports, until it had left
     :param joined: how often a robot that may report has come, or has come back, or has asked for a key frame
@@ -34,9 +34,9 @@ class FrameState(NamedTuple):
 
     rate: float
     waiting: int
-    since: float
+    lacked: float
     behind: float
-    heard: float
+    silent: bool
     age: float
     joined: int
     reports: bool

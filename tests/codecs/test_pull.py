@@ -14,7 +14,7 @@ from gr_ros2.link.frames import FrameState
 
 RATE = 10_000.0
 PERIOD = 0.1
-FREE = FrameState(RATE, 0, inf, inf, -inf, 0.1, 1, reports=True)
+FREE = FrameState(RATE, 0, 0.0, 0.0, False, 0.1, 1, True)
 """All that has left is confirmed."""
 
 
@@ -100,19 +100,22 @@ def test_a_longest_rate_leaves_messages_out() -> None:
     assert taken[-1][1] == pytest.approx(RATE * 0.2, abs=1)
 
 
-def test_none_is_begun_while_all_robots_have_lacked_one_for_long() -> None:
+def test_none_is_begun_while_all_robots_have_lacked_one_for_long_and_are_silent() -> None:
     pull, now = running()
-    assert pull.pull(now + PATIENCE_S + 0.01, FREE._replace(since=now, behind=now)) is None
-    assert pull.pull(now + PATIENCE_S - 0.01, FREE._replace(since=now, behind=now))
+    assert pull.pull(now, FREE._replace(lacked=PATIENCE_S + 0.01, behind=1.0, silent=True)) is None
+    assert pull.pull(now, FREE._replace(lacked=PATIENCE_S - 0.01, behind=0.1, silent=True))
 
 
 def test_when_somebody_is_heard_again_a_key_frame_goes_on() -> None:
     pull, now = running()
-    stuck = FREE._replace(since=now, behind=now, heard=now + 0.1)
+    stuck = FREE._replace(lacked=3.0, behind=3.0, silent=True)
     assert pull.pull(now + 3, stuck) is None
-    request = pull.pull(now + 3, stuck._replace(heard=now + 3))
+    request = pull.pull(now + 3, stuck._replace(silent=False))
     assert request is not None
     assert request.key
+    pull.done()
+    pull.offer(b"next", now + 3.1)
+    assert pull.pull(now + 3.1, stuck._replace(silent=False)) is None
 
 
 def test_a_robot_that_cannot_follow_gets_key_frames_and_holds_nobody_back() -> None:
@@ -121,7 +124,7 @@ def test_a_robot_that_cannot_follow_gets_key_frames_and_holds_nobody_back() -> N
     for number in range(60):
         at = now + number * PERIOD
         pull.offer(b"message", at)
-        request = pull.pull(at, FREE._replace(since=at - 0.1, behind=at - 0.6))
+        request = pull.pull(at, FREE._replace(lacked=0.1, behind=0.6))
         assert request is not None
         keys += [at] * request.key
         pull.done()
@@ -175,9 +178,7 @@ def test_budgets_are_bounded_whatever_happens(events: list[tuple[str, float, int
         if event == "offer":
             pull.offer(b"message", now)
         elif event == "pull":
-            request = pull.pull(
-                now, FrameState(RATE, waiting, now - since, now - since, now, 0.1, joined, reports=since < 5)
-            )
+            request = pull.pull(now, FrameState(RATE, waiting, since, since, since > 7, 0.1, joined, since < 5))
             assert request is None or (not coding and LEAST_BYTES <= (request.budget or 0) <= RATE * 20)
             coding = coding or request is not None
         elif event == "done" and coding:

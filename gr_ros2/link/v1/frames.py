@@ -18,7 +18,7 @@ from gr_ros2.link.pace import Pace
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbour
 from gr_ros2.link.v1.packing import ENTRY
-from gr_ros2.link.v1.peers import Peers
+from gr_ros2.link.v1.peers import Peer, Peers
 from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
 from gr_ros2.wire.v1 import Part
@@ -27,6 +27,8 @@ WINDOW_S = 2.0
 """s over which the rate that other topics leave free is a mean."""
 _LEAST_FREE = 0.1
 """Part of the channel that coded topics may count on; else they would never learn that more is free."""
+SILENT_S, REPORTS = 0.5, 4
+"""A robot is silent when no report has come for so many s, and for so many of its mean times between two."""
 _FEW_S = 0.3
 """s of a window at least, so that the first packets do not stand for a rate."""
 
@@ -91,12 +93,11 @@ class SentFrames:
         """How it stands."""
         queue = self._topics[topic_id].queue
         waiting = sum(message.remaining for message in queue)
-        since, behind = self._lacked(topic_id, now)
-        heard = max((peer.heard for peer in self._peers.all.values()), default=-inf)
-        joined = self._peers.joined + self._outlet.asks[topic_id]
-        return FrameState(
-            self._free(now), waiting, since, behind, heard, self._ages[topic_id], joined, bool(self._peers)
-        )
+        lags = self._lags(topic_id, now)
+        silent = bool(lags) and not any(self._heard(peer, now) for peer in self._reporting)
+        joined, age = self._peers.joined + self._outlet.asks[topic_id], self._ages[topic_id]
+        lacked, behind = min(lags, default=0.0), max(lags, default=0.0)
+        return FrameState(self._free(now), waiting, lacked, behind, silent, age, joined, bool(self._peers))
 
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
         """Send a frame."""
@@ -139,10 +140,19 @@ class SentFrames:
             return capacity
         return max(_LEAST_FREE * capacity, capacity - self._sum / max(now - self._others[0][0], _FEW_S))
 
-    def _lacked(self, topic_id: int, now: float) -> tuple[float, float]:
-        """``since`` and ``behind`` of :class:`FrameState`."""
+    @property
+    def _reporting(self) -> list[Peer]:
+        """The robots that have reported since they came."""
+        return [peer for peer in self._peers.all.values() if not peer.joins]
+
+    def _heard(self, peer: Peer, now: float) -> bool:
+        """Whether a robot has reported lately."""
+        return now - peer.heard <= max(SILENT_S, REPORTS * peer.interval)
+
+    def _lags(self, topic_id: int, now: float) -> list[float]:
+        """For how long each robot has lacked a frame, s. One that was heard lately lacks what it lacked then."""
         sent, records, everybody = self._sent[topic_id], self._packets.records, self._packets.everybody
-        oldest = dict.fromkeys((peer.bit for peer in self._peers.all.values() if not peer.joins), inf)
+        oldest = dict.fromkeys((peer.bit for peer in self._reporting), inf)
         for message in list(sent):
             lacking = 0
             for number in list(message.numbers):
@@ -159,4 +169,6 @@ class SentFrames:
                 for bit in oldest:
                     if lacking & bit:
                         oldest[bit] = min(oldest[bit], message.began)
-        return max(oldest.values(), default=inf), min(oldest.values(), default=inf)
+        return [
+            max(0.0, (peer.heard if self._heard(peer, now) else now) - oldest[peer.bit]) for peer in self._reporting
+        ]
