@@ -179,6 +179,8 @@ class CameraDecoder:
 
     def __init__(self, options: CameraCodec, max_size: int) -> None:
         self._options, self._max_size = options, max_size
+        self.size: tuple[int, int] | None = None
+        """Width and height of the newest picture."""
         self._video = VideoDecoder(min(MAX_PIXELS, max_size) if options.output == IMAGE else MAX_PIXELS)
         self._resize = VideoReformatter()
 
@@ -192,6 +194,7 @@ class CameraDecoder:
         stamp = stamp_of(side)
         if (_even(width), _even(height)) != self._video.size:
             raise DamagedError(f"damaged video: {width} × {height} pixels are not what was coded")
+        self.size = width, height
         header, content = header_of(stamp, frame_id), np.frombuffer(h264, np.uint8)
         if output == VIDEO:
             return self._small(write(VIDEO, timestamp=stamp, frame_id=frame_id, data=content, format="h264"))

@@ -17,7 +17,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 from gr_ros2.codecs.base import MAX_SIZE, Coded
-from gr_ros2.codecs.messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, read
+from gr_ros2.codecs.messages import CAMERA_INFO
 from gr_ros2.codecs.pull import FramePull, Pull
 from gr_ros2.codecs.topic import CODECS, OFF, CodedTopic, TopicDecoder, TopicEncoder
 from gr_ros2.core.errors import BackendMissingError, CodecError
@@ -222,8 +222,8 @@ class FrameReceiver:
     def __init__(self, max_size: int = MAX_SIZE) -> None:
         self._max_size = max_size
         self._decoders: dict[tuple[int, int], tuple[str, str, TopicDecoder]] = {}
-        self._sizes: dict[tuple[int, str], tuple[int, int]] = {}
-        """Width and height of the newest picture in a namespace of a robot."""
+        self._sizes: dict[tuple[int, str], tuple[int, int] | None] = {}
+        """Width and height of the newest picture in a namespace of a robot; None for one that has its own size."""
 
     def announce(self, key: tuple[int, int], told: AnnouncedTopic) -> str:
         """A robot has announced a topic. Returns the type of the messages that come out.
@@ -255,10 +255,9 @@ class FrameReceiver:
         if known is None:
             return payload
         message = known[2].decode(payload)
-        space = (key[0], name.rpartition("/")[0])
-        if known[:2] == (IMAGE, "same"):
-            image = read(IMAGE, message)
-            self._sizes[space] = image.width, image.height
+        # Plug-ins of image_transport publish camera/image/compressed beside camera/camera_info.
+        base = name.removesuffix("/compressed").removesuffix("/compressedDepth")
+        self._sizes[key[0], base.rpartition("/")[0]] = known[2].size
         return message
 
     def scaled(self, src_id: int, name: str, type_name: str, message: bytes) -> bytes:
@@ -269,6 +268,3 @@ class FrameReceiver:
         from gr_ros2.codecs.camera import scaled_camera_info
 
         return scaled_camera_info(message, *size)
-
-
-__all__ = ["CODING_S", "COMPRESSED_IMAGE", "FrameReceiver", "FrameSender", "Job", "coded_topic", "frames_output"]

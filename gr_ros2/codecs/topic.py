@@ -147,6 +147,8 @@ class TopicDecoder:
     def __init__(self, topic: CodedTopic, max_size: int) -> None:
         self._topic, self._max_size = topic, max_size
         self._made: dict[int, Decoder] = {}
+        self.size: tuple[int, int] | None = None
+        """Width and height of the newest message; None for one that is no resized picture."""
 
     def decode(self, data: bytes) -> bytes:
         number = data[0] if data else 0
@@ -154,4 +156,7 @@ class TopicDecoder:
             raise DamagedError(f"damaged frame: no codec {number} for {self._topic.type_name}")
         if number not in self._made:
             self._made[number] = self._topic.codecs[number].decoder(self._max_size)
-        return self._made[number].decode(data[1:])
+        decoder = self._made[number]
+        message = decoder.decode(data[1:])
+        self.size = getattr(decoder, "size", None)
+        return message

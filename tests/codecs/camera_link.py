@@ -34,6 +34,7 @@ class Robot:
     any_length: bool = True
     hears: bool = True
     boot: int = 1
+    name: str = "camera/image"
     seen: list[tuple[float, tuple[int, int], bytes]] = field(default_factory=list)
     types: dict[tuple[int, int], str] = field(default_factory=dict)
     failed: list[tuple[float, CodecError]] = field(default_factory=list)
@@ -90,7 +91,7 @@ class Robot:
             elif isinstance(event, Delivered):
                 key = event.src_id, event.topic_id
                 try:
-                    self.seen.append((now, key, self.receiver.decode(key, "camera/image", event.payload)))
+                    self.seen.append((now, key, self.receiver.decode(key, self.name, event.payload)))
                 except CodecError as error:
                     self.failed.append((now, error))
                     self.end.frames.lost(*key)

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("av", reason="needs PyAV")
 
 from gr_ros2.codecs.frames import FrameReceiver
-from gr_ros2.codecs.messages import IMAGE, VIDEO, read
+from gr_ros2.codecs.messages import CAMERA_INFO, IMAGE, VIDEO, read
 from gr_ros2.link.events import Accepted, Delivered, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import TopicOptions
@@ -238,6 +238,19 @@ def test_the_options_of_a_camera_say_what_comes_out() -> None:
     assert other.robots[1].types[1, CAMERA] == VIDEO
     assert CAMERA not in link(off=True).robots[0].sender
     assert CAMERA not in link(options={"codec": "zstd"}).robots[0].sender
+
+
+@pytest.mark.parametrize("output", ["same", "CompressedImage", "CompressedVideo", "FFMPEGPacket"])
+@pytest.mark.parametrize("name", ["camera/image", "camera/image/compressed"])
+def test_camera_info_has_the_size_of_what_comes_out(output: str, name: str) -> None:
+    air = link(size="160x120", output=output)
+    air.robots[1].name = name
+    air.run(2.0)
+    receiver, info = air.robots[1].receiver, scenes.camera_info(320, 240)
+    shown = read(CAMERA_INFO, receiver.scaled(1, "camera/camera_info", CAMERA_INFO, info))
+    assert (shown.width, shown.height) == (160, 120)
+    assert receiver.scaled(1, "rear/camera_info", CAMERA_INFO, info) == info
+    assert receiver.scaled(2, "camera/camera_info", CAMERA_INFO, info) == info
 
 
 def test_a_longest_rate_of_the_topic_is_heeded() -> None:
