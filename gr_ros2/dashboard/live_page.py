@@ -47,7 +47,7 @@ from gr_ros2.dashboard.tables import (
     tiles_html,
     topics_html,
 )
-from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.dashboard.views import GOOD, Snapshot
 from gr_ros2.observe.colours import AIR_COLOURS, OUTCOME_COLOURS
 from gr_ros2.observe.team import STRIP_S, TeamView
 from gr_ros2.settings.config import ChannelConfig
@@ -71,6 +71,8 @@ class PictureCounter(DataModel):  # type: ignore[misc]
     seen = Int(0)
     empty = String("")
     """Cards that have nothing to show, separated by spaces."""
+    old = String("")
+    """Cards that show what was received some time ago, likewise."""
     said = String("")
     """State and alarms, which a screen reader says when they change."""
 
@@ -105,6 +107,8 @@ class LivePage:
                 "spectrum": "khz db",
                 "air": "t new repair report hello",
                 "snr": "t db",
+                "loss": "t share",
+                "changes": "t",
                 "strip": "left right robot colour",
                 "places": "x y colour",
                 "beliefs": "x y colour",
@@ -157,6 +161,7 @@ class LivePage:
         self._draw_radio(radio)
         self._show_channel(radio)
         self._counter.empty = " ".join(_empty_cards(snapshot, radio))
+        self._counter.old = "constellation spectrum" if snapshot.old else ""
         self._counter.said = ". ".join((state_text(snapshot), *snapshot.alarms))
         self._counter.drawn += 1
 
@@ -177,6 +182,8 @@ class LivePage:
             none = _small(np.full(len(air.t), np.nan))
             self._sources["air"].data = {"t": _small(air.t), **dict.fromkeys(AIR_COLOURS, none), **kinds}
             self._sources["snr"].data = {"t": _small(air.t), "db": _small(air.snr_db)}
+            self._sources["loss"].data = {"t": _small(air.t), "share": _small(air.lost * 100)}
+            self._sources["changes"].data = {"t": _small(air.changes)}
         curves = [topic for topic in snapshot.topics if topic.latency_cdf_s]
         self._sources["latency"].data = {
             "name": [topic.name for topic in curves],
@@ -331,12 +338,14 @@ class LivePage:
         air.legend.label_text_font_size, air.legend.label_text_color = "10px", _SOFT
         snr = _plot("snr", "", "time [s]", "SNR [dB]")
         snr.line("t", "db", source=sources["snr"], color=_SENT, line_width=1.8)
+        loss = _plot("loss", "", "time [s]", "lost [%]", y_range=DataRange1d(start=0, max_interval=100))
+        loss.line("t", "share", source=sources["loss"], color=_RECEIVED, line_width=1.8)
         strip = _plot("strip", "", "time [s]", "robot", x_range=Range1d(-STRIP_S, 0))
         strip.hbar("robot", left="left", right="right", height=0.8, color="colour", source=sources["strip"])
         beliefs = _plot("beliefs", "", "x [m]", "y [m]", match_aspect=True)
         beliefs.multi_line("x", "y", source=sources["beliefs"], color="colour", line_width=3)
         beliefs.scatter("x", "y", source=sources["places"], color="colour", line_color="white", size=13)
-        plots = [map_, error, constellation, spectrum, latency, air, snr, strip, beliefs]
+        plots = [map_, error, constellation, spectrum, latency, air, snr, loss, strip, beliefs]
         series: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
             ("pdr", "pdr", "share", {"y_range": Range1d(0, 1.1)}),
             ("goodput", "goodput", "kB/s", {}),
@@ -348,7 +357,11 @@ class LivePage:
             plot.multi_line("t", values, source=sources["series"], color="colour", line_width=1.8)
             if not options:
                 plot.y_range.start = 0
+            if name == "pdr":
+                plot.hspan(y=GOOD, line_color=_SOFT, line_dash="dotted")
             plots.append(plot)
+        for plot in [plot for plot in plots if plot.name in ("loss", "pdr", "age")]:
+            plot.vspan("t", source=sources["changes"], line_color=_SOFT, line_dash="dashed")
         channel = column(
             *(self._silence, self._noise, self._snr, self._offset, self._loss, self._html["note"]),
             name="channel",
@@ -401,6 +414,7 @@ def _empty_cards(snapshot: Snapshot, radio: RadioView) -> Iterator[str]:
         "air": snapshot.air is not None and bool(snapshot.air.busy),
         **dict.fromkeys(("strip", "beliefs", "team"), snapshot.team is not None),
         "snr": snapshot.air is not None and bool(np.isfinite(snapshot.air.snr_db).any()),
+        "loss": snapshot.air is not None and bool(np.isfinite(snapshot.air.lost).any()),
     }
     if snapshot.phase != "waiting":
         yield from (card for card, filled in has.items() if not filled)

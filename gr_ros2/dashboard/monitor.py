@@ -86,6 +86,7 @@ class RunMonitor:
             tick_s=TICK_S,
             airtime=run.links[0].phy.airtime if run.links and run.links[0].phy.has_airtime else None,
             received_as=run.received_as,
+            senders=run.heard,
         )
         self._run = run
         self.refused = ""
@@ -177,6 +178,8 @@ class RunMonitor:
         self.refused = ""
         try:
             run = self._run
+            if run is not None and self._state is not None:
+                self._state.changed(run.clock())
             for link in () if run is None else run.links:
                 change(link)
             if run is not None and not run.links:

@@ -36,7 +36,7 @@ def packet_views(
             continue
         packet = event.packet
         wire = format_of(packet.version)
-        missing = _missing(packet, newest)
+        missing = missing_before(packet, newest)
         views.append(
             PacketView(
                 t - start,
@@ -61,7 +61,7 @@ def packet_views(
     return tuple(views)
 
 
-def _missing(packet: Packet, newest: dict[int, int]) -> int:
+def missing_before(packet: Packet, newest: dict[int, int]) -> int:
     """Packets of the same source that are missing before this one.
 
     :param newest: newest number that is known of each source; brought up to date

@@ -8,7 +8,7 @@ Counts are exact during the run. When the result is known, every number comes fr
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from math import nan
 from threading import Lock
 from typing import get_args
@@ -16,9 +16,9 @@ from typing import get_args
 import numpy as np
 
 from gr_ros2.core.watch import Watch
-from gr_ros2.dashboard.packets import packet_views
+from gr_ros2.dashboard.packets import missing_before, packet_views
 from gr_ros2.dashboard.topic_names import Key, TopicNames
-from gr_ros2.dashboard.views import AirView, PathView, RobotView, SeriesView, Snapshot, TopicView
+from gr_ros2.dashboard.views import GOOD, SILENT_S, AirView, PathView, RobotView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import RATE_S, AgeMeter, PathComparison, Rate
 from gr_ros2.link.events import (
     Accepted,
@@ -50,15 +50,13 @@ UNDER_WAY = 4096
 """Most messages of a source that wait for their delivery. The oldest is forgotten first and then has no latency."""
 PACKETS_SHOWN = 12
 
-_SILENT_S = 5.0
-"""s without a packet after which a link is down."""
-_GOOD = 0.9
-"""Share of a topic's messages delivered in the last seconds, below which the link is degraded."""
 _ROBOTS = 64
 """Most robots heard that are remembered."""
 _ENOUGH = 3
 """Fewest messages in the last seconds from which a share is taken."""
 
+_CHANGES = 100
+"""Most changes of the channel that are remembered."""
 _PATH_STEP_S = 0.1
 
 
@@ -108,6 +106,7 @@ class DashboardState:
     :param tick_s: s between two calls of :meth:`tick`, for the length of the history
     :param airtime: s that a packet of so many bytes takes; None where packets take no air, or it is not known
     :param received_as: absolute name under which a sender's topic comes out here, '' where it is not known
+    :param senders: source ids of those that the receiver can hear; what others send is left out. None = all
     """
 
     def __init__(
@@ -122,8 +121,10 @@ class DashboardState:
         tick_s: float = 0.5,
         airtime: Callable[[int], float] | None = None,
         received_as: Callable[[int, str], str] = lambda _src_id, _name: "",
+        senders: Collection[int] | None = None,
     ) -> None:
         self._lock = Lock()
+        self._senders = senders
         self._names = TopicNames(registry, topics)
         self._packet_len = packet_len
         self._name = name
@@ -136,6 +137,10 @@ class DashboardState:
         self._received: deque[tuple[float, Received | Rejected]] = deque(maxlen=PACKETS_SHOWN + 1)
         self._packets: Counter[str] = Counter()
         self._packets_sent, self._packets_received = Rate(), Rate()
+        self._understood, self._missed = Rate(), Rate()
+        """Packets received, and as bytes those that their numbers show to be missing."""
+        self._newest: dict[int, int] = {}
+        self._changes: deque[float] = deque(maxlen=_CHANGES)
         self._phase = "waiting"
         self._airtime, self._received_as = airtime, received_as
         self._tick_s, self._silence = tick_s, Watch(2 * tick_s)
@@ -148,12 +153,15 @@ class DashboardState:
         """How many robots have sent the newest message of each robot on, and the last of them."""
         self._result: RunResult | None = None
         for key in topics:
-            self._topic(key)
+            if self._hears(key[0]):
+                self._topic(key)
 
     # -- feeding ------------------------------------------------------------------------------------------------
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         """Take an event of the sender with this source id."""
+        if not self._hears(src_id):
+            return
         with self._lock:
             source = self._sources.setdefault(src_id, _SourceWindow())
             if isinstance(event, SentPacket):
@@ -193,12 +201,22 @@ class DashboardState:
                 self._received.append((now, event))
                 if isinstance(event, Received):
                     self._heard(event.packet.src_id, now, packets=1)
+                    self._understood.add(now)
+                    self._missed.add(now, missing_before(event.packet, self._newest))
                 if isinstance(event, Rejected):
                     self._packets[f"rejected_{event.error.kind}"] += 1
                     self._packets["rejected"] += 1
 
+    def changed(self, now: float) -> None:
+        """Somebody has changed the channel."""
+        with self._lock:
+            if self._start is not None:
+                self._changes.append(now - self._start)
+
     def subscribed(self, src_id: int, topics: Iterable[tuple[str, Topic]]) -> None:
         """Take over what a source in this process subscribes, with absolute names. More may come while it runs."""
+        if not self._hears(src_id):
+            return
         with self._lock:
             for full_name, topic in topics:
                 self._learn((src_id, topic.topic_id), topic.name, topic.type_name, full_name)
@@ -230,6 +248,8 @@ class DashboardState:
         ledger = {} if self._ledger is None else self._ledger()
         with self._lock:
             over = self._phase in ("ended", "failed")
+            here, missing = self._understood.totals(now)[0], self._missed.totals(now)[1]
+            lost_now = missing / (here + missing) if here else None
             start = now if self._start is None else self._start
             elapsed = max(now - start, 0.0)
             keys = sorted(self._topics)
@@ -237,7 +257,8 @@ class DashboardState:
                 for key in keys:
                     self._remember(self._topics[key], now, elapsed, (queued or {}).get(key))
                 spent = (self._spent[kind] / self._tick_s for kind in get_args(AirKind))
-                self._air.append((elapsed, nan if snr_db is None else snr_db, *spent))
+                known = (nan if value is None or not here else value for value in (snr_db, lost_now))
+                self._air.append((elapsed, *known, *spent))
                 self._spent.clear()
             views = tuple(
                 self._view(place, key, now, elapsed=elapsed, queued=queued or {}, ledger=ledger)
@@ -249,8 +270,9 @@ class DashboardState:
             air = {f"air_{kind}": self._packets[f"air_{kind}"] for kind in get_args(AirKind)}
             heard = list(self._received)
             alarms = {} if over or self._start is None else dict(self._alarms(now, elapsed, keys, late_s, told))
-            past = np.array(self._air, dtype=float).reshape(-1, 2 + len(get_args(AirKind)))
-            busy = dict(zip(get_args(AirKind), past[:, 2:].T, strict=True))
+            past = np.array(self._air, dtype=float).reshape(-1, 3 + len(get_args(AirKind)))
+            busy = dict(zip(get_args(AirKind), past[:, 3:].T, strict=True))
+            silent = min((now - last for last, _ in self._robots.values()), default=None)
             return Snapshot(
                 phase=self._phase,
                 name=self._name,
@@ -275,7 +297,15 @@ class DashboardState:
                     RobotView(src_id, now - last, count, *self._ways.get(src_id, ()))
                     for src_id, (last, count) in sorted(self._robots.items())
                 ),
-                air=AirView(past[:, 0], {} if self._airtime is None else busy, past[:, 1]),
+                air=AirView(
+                    past[:, 0],
+                    {} if self._airtime is None else busy,
+                    past[:, 1],
+                    past[:, 2],
+                    tuple(self._changes),
+                ),
+                lost_now=lost_now,
+                silent_s=silent,
                 packets_now=(
                     self._packets_sent.totals(now)[0] / RATE_S,
                     self._packets_received.totals(now)[0] / RATE_S,
@@ -287,19 +317,19 @@ class DashboardState:
         self, now: float, elapsed: float, keys: list[Key], late_s: float, told: Sequence[str]
     ) -> Iterator[tuple[str, list[str]]]:
         """What is wrong now, by the state that it stands for, the worst first."""
+        silent = [now - last for last, _ in self._robots.values()]
+        if self._silence.age(min(silent, default=elapsed), now) > SILENT_S:
+            yield "down", ["no robot has been heard" + (f" for {min(silent):.0f} s" if silent else " yet")]
         if late_s >= LATE_S:
             yield (
                 "late",
                 [f"the computer is up to {late_s:.2f} s late: what this page shows is the computer's, not the link's"],
             )
-        silent = [now - last for last, _ in self._robots.values()]
-        if self._silence.age(min(silent, default=elapsed), now) > _SILENT_S:
-            yield "down", ["no robot has been heard" + (f" for {min(silent):.0f} s" if silent else " yet")]
         poor = [*told]
         for key in keys:
             topic, share = self._topics[key], _pdr_now(self._topics[key], now)
             enough = elapsed > RATE_S and topic.sent_rate.totals(now)[0] >= _ENOUGH
-            if self._ledger is not None and enough and share is not None and share < _GOOD:
+            if self._ledger is not None and enough and share is not None and share < GOOD:
                 poor.append(f"{self._names.full(key)}: {share:.0%} of the messages of the last {RATE_S:.0f} s arrived")
         if poor:
             yield "degraded", poor
@@ -429,6 +459,9 @@ class DashboardState:
         self._robots[src_id] = now, self._robots.get(src_id, (now, 0))[1] + packets
         if len(self._robots) > _ROBOTS:
             del self._robots[min(self._robots, key=lambda one: self._robots[one][0])]
+
+    def _hears(self, src_id: int) -> bool:
+        return self._senders is None or src_id in self._senders
 
     def _delivered(self, event: Delivered, now: float) -> None:
         key = (event.src_id, event.topic_id)

@@ -39,11 +39,13 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
     time = f"{snapshot.elapsed_s:.1f} s" + (f" of {snapshot.duration_s:g} s" if snapshot.duration_s else "")
     sent_now, received_now = snapshot.packets_now
     refused = sum(count for name, count in snapshot.packets.items() if name.startswith("rejected_"))
-    phase = state_text(snapshot)
+    phase, age = state_text(snapshot), "old" if snapshot.old else ""
+    ago = f", {snapshot.silent_s:.0f} s ago" if snapshot.old else ""
     tiles = [
-        _tile("phase", phase, snapshot.name or "no run", css=f"phase {snapshot.phase} {snapshot.state}"),
+        _tile("phase", phase, snapshot.name or "no run", css=f"phase {snapshot.phase} {snapshot.verdict}"),
         _tile("elapsed", time, "time"),
-        _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, f"main {snapshot.state}"),
+        _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, f"main {snapshot.verdict}"),
+        _tile("lost", _share(snapshot.lost_now), "packets lost on the way, last 5 s", snapshot.lost_now, age),
         _tile("sent", f"{snapshot.sent:,}", "messages sent", snapshot.sent),
         _tile("delivered", f"{snapshot.delivered:,}", "delivered", snapshot.delivered),
         _tile(
@@ -57,9 +59,19 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
         ),
         _tile("refused", f"{refused:,}", "packets refused", refused),
         _tile("backlog", "–" if backlog is None else f"{backlog:,}", "packets queued in the PHY", backlog),
-        _tile("snr", "–" if snr_db is None else f"{snr_db:.1f} dB", "SNR received", snr_db),
+        _tile(
+            "snr",
+            "–" if snr_db is None else f"{snr_db:.1f} dB",
+            f"SNR received{ago}",
+            snr_db,
+            age,
+        ),
     ]
     return f'<div class="tiles">{"".join([*tiles, *_repair_tiles(snapshot)])}</div>'
+
+
+def _share(value: Number) -> str:
+    return "–" if value is None else f"{value:.1%}"
 
 
 def state_text(snapshot: Snapshot) -> str:

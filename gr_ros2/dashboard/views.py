@@ -12,6 +12,11 @@ from gr_ros2.dashboard.windows import Floats, Point
 from gr_ros2.observe.latency import Latency
 from gr_ros2.observe.team import TeamView
 
+SILENT_S = 5.0
+"""s without a packet after which a link is down, and what was received is old."""
+GOOD = 0.9
+"""Share of a topic's messages delivered in the last seconds, below which the link is degraded."""
+
 
 @dataclass(frozen=True)
 class TopicView:
@@ -146,12 +151,16 @@ class AirView:
     """The air over time: share of it that packets of each kind took, and the SNR received. Times are s since the start.
 
     :param busy: by kind of packet; {} for a PHY that takes no air
-    :param snr_db: NaN where it is not known
+    :param snr_db: NaN where nothing arrived
+    :param lost: share of the packets that were lost on the way, by their numbers, 0..1; NaN where nothing arrived
+    :param changes: when somebody changed the channel, s since the start
     """
 
     t: Floats
     busy: Mapping[str, Floats]
     snr_db: Floats
+    lost: Floats
+    changes: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -163,6 +172,8 @@ class Snapshot:
     :param packets: sent, received and each refusal by name; if not all carried new messages, also ``air_new``,
         ``air_repair``, ``air_report`` and ``air_hello``: those sent, by what they were for
     :param packets_now: packets/s sent and received in the last seconds
+    :param lost_now: share of the packets of the last seconds that were lost on the way; None where none arrived
+    :param silent_s: s since the newest packet; None before the first
     :param state: of the link now: up, degraded, down, or late where the computer does not keep up; '' before and after
     :param alarms: what is wrong now, a sentence each
     """
@@ -179,6 +190,8 @@ class Snapshot:
     last_packets: tuple[PacketView, ...] = ()
     packets: Mapping[str, int] = field(default_factory=dict)
     packets_now: tuple[float, float] = (0.0, 0.0)
+    lost_now: float | None = None
+    silent_s: float | None = None
     state: str = ""
     alarms: tuple[str, ...] = ()
     heard: tuple[RobotView, ...] = ()
@@ -188,6 +201,18 @@ class Snapshot:
     def in_fate(self, fate: str) -> int:
         """Messages with this fate, over all topics."""
         return sum(topic.ledger.get(fate, 0) for topic in self.topics)
+
+    @property
+    def verdict(self) -> str:
+        """The state of the link now, or after the run what its messages say: up, degraded or down."""
+        if self.phase != "ended" or self.pdr is None:
+            return self.state
+        return "up" if self.pdr >= GOOD else "degraded" if self.pdr > 0 else "down"
+
+    @property
+    def old(self) -> bool:
+        """Whether what was received last is old."""
+        return self.silent_s is not None and self.silent_s > SILENT_S
 
     @property
     def pdr(self) -> float | None:

@@ -101,6 +101,7 @@ class LiveRun:
     :param received_as: absolute name under which a topic of a sender, by its name in a registry, comes out here; ''
         where the names of ``topics`` are shown
     :param alarms: what is wrong with the robots that are heard, one line each
+    :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
     """
 
     name: str
@@ -115,6 +116,7 @@ class LiveRun:
     team: Callable[[], TeamView] | None = None
     received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
     alarms: Callable[[], Sequence[str]] = tuple
+    heard: frozenset[int] | None = None
 
 
 class RunObserver(LinkObserver, Protocol):

@@ -173,6 +173,9 @@ class RunRecords:
             fates=self.recorder.ledger.fates,
             clock=clock,
             team=None if self.team is None else self.team.view,
+            heard=None
+            if len(self._scenario.all_robots) == 2  # which share a recorder
+            else frozenset(src_id for src_id, places in self._hearing.items() if 0 in places),
         )
 
     def check(self) -> None:

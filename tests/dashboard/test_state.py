@@ -298,3 +298,51 @@ def test_a_page_of_a_program_that_was_frozen_accuses_nobody() -> None:
         state.receiver_event(event, 0.0)
     assert [state.tick(now).state for now in (0.5, 1.0, 60.0, 61.0)] == ["up"] * 4
     assert {state.tick(61.0 + 0.5 * n).state for n in range(1, 12)} == {"up", "down"}
+
+
+def test_what_the_receiver_cannot_hear_is_not_judged() -> None:
+    """In a team, the page shows what the first robot receives: its own topics are not among that."""
+    state = DashboardState(REGISTRY, {**NAMES, (9, 0): "/robot_9/at"}, 64, ledger=dict, senders={9})
+    feed = Feed(state, lost=lambda _: True, packet_len=64)
+    for step in range(40):
+        feed.submit(0, at(step, 0), step / 4)
+        feed.fly(step / 4)
+    shown = state.tick(10.0)
+    assert [topic.name for topic in shown.topics] == ["/robot_9/at"]
+    assert shown.packets["sent"] == 0
+    assert not any("arrived" in alarm for alarm in shown.alarms)
+
+
+def test_lost_packets_are_told_apart_from_lost_messages_with_marks_and_gaps() -> None:
+    state = DashboardState(REGISTRY, NAMES, 64)
+    feed = Feed(state, lost=lambda number: number % 4 == 0, packet_len=64)
+    for step in range(80):
+        feed.submit(0, at(step, 0), step / 8)
+        feed.fly(step / 8)
+        if step == 40:
+            state.changed(step / 8)
+        shown = state.tick(step / 8, snr_db=20.0)
+    assert shown.lost_now == pytest.approx(0.25, abs=0.03)
+    assert shown.air is not None
+    assert shown.air.changes == pytest.approx((5.0,), abs=0.2)
+    assert np.nanmax(shown.air.lost) < 0.4
+    for step in range(4 * 12):
+        shown = state.tick(10.0 + step / 4, snr_db=20.0)
+    assert shown.old
+    assert shown.lost_now is None
+    assert np.isnan(shown.air.snr_db[-1]), "a value of a packet long ago is none of now"
+    assert shown.state == "down"
+
+
+def test_a_dead_link_comes_before_a_late_computer_and_after_the_run_its_share_decides() -> None:
+    state = DashboardState(REGISTRY, NAMES, 64)
+    feed = Feed(state, lost=lambda number: number > 3, packet_len=64)
+    for step in range(60):
+        feed.submit(0, at(step, 0), step / 4)
+        feed.fly(step / 4)
+        shown = state.tick(step / 4, late_s=0.06)
+    assert shown.state == "down"
+    assert "no robot has been heard" in shown.alarms[0]
+    assert Snapshot(phase="ended", sent=10, delivered=0).verdict == "down"
+    assert Snapshot(phase="ended", sent=10, delivered=8).verdict == "degraded"
+    assert Snapshot(phase="ended", sent=10, delivered=10).verdict == "up"

@@ -16,7 +16,10 @@ const name = () => everywhere(document, root => {
 
 const show = () => {
     for (const card of document.querySelectorAll("[data-card]"))
+    {
         card.hidden = pulse.empty.split(" ").includes(card.dataset.card);
+        card.classList.toggle("old", pulse.old.split(" ").includes(card.dataset.card));
+    }
     name();
 };
 const say = () => { document.getElementById("said").textContent = pulse.said; };
@@ -29,6 +32,7 @@ const paint = () => {
 };
 
 pulse.connect(pulse.properties.empty.change, show);
+pulse.connect(pulse.properties.old.change, show);
 pulse.connect(pulse.properties.said.change, say);
 pause.connect(pause.properties.active.change, name);
 dark.addEventListener("change", paint);
