@@ -46,6 +46,7 @@ BENCHMARKS = {
     "compression": "bench.compression",
     "codecs": "bench.codecs",
     "cameras": "bench.cameras",
+    "maps": "bench.maps",
     "sweep": "bench.sweep",
     "mac": "bench.mac",
     "cells": "bench.mac",

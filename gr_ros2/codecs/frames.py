@@ -1,4 +1,4 @@
-"""Topics as chains of frames on a link: cameras and depth.
+"""Topics as chains of frames on a link: cameras, depth and maps.
 
 :class:`FrameSender` decides when the newest message of each topic is coded and keeps the encoders, whoever runs them:
 a thread of a link, or a simulation at once. :class:`FrameReceiver` keeps one decoder for each topic of each robot.
@@ -17,8 +17,8 @@ from math import inf
 from typing import Any, NamedTuple
 
 from gr_ros2.codecs.base import MAX_SIZE, Coded
-from gr_ros2.codecs.messages import CAMERA_INFO
-from gr_ros2.codecs.pull import FramePull, Pull
+from gr_ros2.codecs.messages import CAMERA_INFO, GRID
+from gr_ros2.codecs.pull import FramePull, Pull, StatePull
 from gr_ros2.codecs.topic import CODECS, OFF, CodedTopic, TopicDecoder, TopicEncoder
 from gr_ros2.core.errors import BackendMissingError, CodecError
 from gr_ros2.link.fates import Fate
@@ -61,7 +61,8 @@ class _Sent:
     def __init__(self, topic: Topic, coded: CodedTopic) -> None:
         self.name = topic.name
         self.encoder = coded.encoder()
-        self.pull = FramePull(coding_s=CODING_S)
+        self.is_map = topic.type_name == GRID
+        self.pull: FramePull | StatePull = (StatePull if self.is_map else FramePull)(coding_s=CODING_S)
         self.limit(topic)
         self.said: set[str] = set()
         self.frames = self.failed = 0
@@ -103,20 +104,28 @@ class FrameSender:
         self._frames = frames
         self._sent: dict[int, _Sent] = {}
 
-    def add(self, topic: Topic) -> bool:
-        """Send a topic as frames if it is a camera or depth, and its options do not say otherwise. Returns whether it
-        is sent so."""
+    def add(self, topic: Topic, *, latched: bool = False) -> bool:
+        """Send a topic as frames if it is a camera, depth or a latched map, and its options do not say otherwise.
+        Returns whether it is sent so.
+
+        :param latched: whether its one publisher keeps its message for late joiners
+        """
         known = self._sent.get(topic.topic_id)
         if known is not None:
             known.limit(topic)
             return True
-        coded = coded_topic(topic)
+        coded = coded_topic(topic, latched=(latched or topic.latched) and not self._frames.relayed)
         if coded is None:
             return False
         self._sent[topic.topic_id] = _Sent(topic, coded)
         output = topic.options.camera.output
         self._frames.begin(topic.topic_id, "" if output == "same" else output)
         return True
+
+    def forget(self, topic_id: int) -> None:
+        """Send no message of a topic so far to those who come."""
+        if topic_id in self._sent and self._sent[topic_id].is_map:
+            self._sent[topic_id].pull = StatePull(period_s=self._sent[topic_id].pull.period_s, coding_s=CODING_S)
 
     def __contains__(self, topic_id: int) -> bool:
         return topic_id in self._sent
@@ -126,7 +135,7 @@ class FrameSender:
         sent = self._sent[topic_id]
         sent.note(now, came=len(message))
         if sent.pull.offer(message, now):
-            self._frames.refuse(topic_id, Fate.SUPERSEDED, "a newer picture came before the air was free for it")
+            self._frames.refuse(topic_id, Fate.SUPERSEDED, "a newer one came before the air was free for it")
 
     def next(self, now: float) -> Job | None:
         """A message that is to be encoded now. ``done`` has to follow."""
@@ -147,12 +156,14 @@ class FrameSender:
             sent.failed += 1
             self._frames.refuse(job.topic_id, Fate.DAMAGED, str(made))
             return
-        if made.data[0] == 0 and made.said not in sent.said:
+        if made.data[0] == 0 and not sent.is_map and made.said not in sent.said:
             sent.said.add(made.said)
             _log.warning("topic %s: passes exactly, not as pictures: %s", sent.name, made.said)
         sent.frames, sent.what = sent.frames + 1, made.said
         sent.note(now, frame=len(made.data))
         self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=made.before is None)
+        if sent.is_map:
+            sent.encoder.confirmed(made.name)  # frames arrive in order
 
     def stats(self, topic_id: int, now: float) -> dict[str, Any] | None:
         """What is made of a topic: frames so far, messages that could not be coded, and in words what the newest frame
@@ -188,8 +199,13 @@ class TimedCoder:
             self._jobs.append((now + CODING_S, following, following.run()))
 
 
-def coded_topic(topic: Topic) -> CodedTopic | None:
-    """How a topic is coded as frames; None if it is not. What has to be installed for it is said."""
+def coded_topic(topic: Topic, *, latched: bool = False) -> CodedTopic | None:
+    """How a topic is coded as frames; None if it is not. What has to be installed for it is said.
+
+    :param latched: whether one publisher keeps its newest message for late joiners
+    """
+    if topic.type_name == GRID and topic.options.codec == AUTO and latched:
+        return CodedTopic(GRID)
     options, depth = topic.options, topic.options.depth_image
     kept = topic.latched or options.keep_s > 0
     if topic.type_name not in CODECS["camera"].types or options.codec != AUTO or kept:

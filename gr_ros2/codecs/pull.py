@@ -18,6 +18,8 @@ from gr_ros2.link.frames import FrameState
 
 PATIENCE_S = 0.5
 KEY_S = 2.0
+REPEAT_S = 10.0
+"""s between two frames of a map that does not change, where nobody reports."""
 LEAST_BYTES = 120
 """Budget of a frame when nothing is free: a picture that is coarse tells more than none."""
 _LATELY = 0.2
@@ -40,6 +42,56 @@ class Pull(NamedTuple):
     came: float
     budget: int | None
     key: bool
+
+
+class StatePull:
+    """The frames of a topic whose newest message counts, however old it is, such as a map: exactly, and whole for those
+    who ask for it. Where nobody reports every frame is whole, and comes again each ``REPEAT_S``.
+
+    :param period_s, coding_s: see :class:`FramePull`
+    """
+
+    def __init__(self, *, period_s: float = 0.0, coding_s: float = 0.008) -> None:
+        self.period_s, self._coding_s = period_s, coding_s
+        self._newest: bytes | None = None
+        self._came = self._taken = -inf
+        self._new = self._coding = False
+        self._key = True
+        self._asks = 0
+
+    def offer(self, message: bytes, now: float) -> bool:
+        """A message has come. Returns whether it takes the place of one that was not coded."""
+        superseded, self._new = self._new, True
+        self._newest, self._came = message, now
+        return superseded
+
+    def waits(self, now: float) -> bool:
+        """Whether a message may be coded now, if somebody needs it."""
+        return self._newest is not None and not self._coding and now >= self._taken + self.period_s
+
+    def pull(self, now: float, progress: FrameState, share: float = 1.0) -> Pull | None:
+        """The message to be coded now, None if there is none yet. ``done`` has to follow."""
+        rate = progress.rate * share
+        if (
+            self._newest is None
+            or not self.waits(now)
+            or progress.waiting > (rate * self._coding_s if rate < inf else 0)
+        ):
+            return None
+        if progress.asks != self._asks:
+            self._key, self._asks = True, progress.asks
+        alone = not progress.reports
+        if not (self._new or self._key or (alone and now >= self._taken + REPEAT_S)):
+            return None
+        request = Pull(self._newest, self._came, None, self._key or alone)
+        self._new = self._key = False
+        self._coding, self._taken = True, now
+        return request
+
+    def done(self, *, key: bool = False) -> None:
+        """The message was coded, or could not be; see :class:`FramePull`."""
+        self._coding = False
+        self._key = self._key or key
 
 
 class FramePull:

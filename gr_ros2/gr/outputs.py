@@ -45,6 +45,7 @@ class Output:
     :param published: number of messages
     :param delivered_at: time of the newest one, s
     :param way: how many robots have sent it on, and the last of them
+    :param kept: the newest message of a latched topic that comes as frames
     """
 
     topic: Topic
@@ -56,6 +57,7 @@ class Output:
     delivered_at: float | None = None
     latency: LatencyWindow | None = None
     way: tuple[int, int | None] = (0, None)
+    kept: bytes = b""
 
 
 class Outputs:
@@ -238,6 +240,8 @@ class Outputs:
             output = self._outputs.get(key) or self._output(key)
             topic = output.topic
             shown = self._shown(event, topic)
+            if shown == output.kept:
+                return event._replace(shown=shown)  # a key frame for another robot
             payload = self._prefix.apply(topic.type_name, event.src_id, shown)
             publisher = output.publisher or self._advertise(key, output)
             publisher.publish(payload)
@@ -246,6 +250,8 @@ class Outputs:
             self._failures.note(Fate.PUBLISH_FAILED.value, f"ros2_sink: a message of {named} was not published", error)
             with self._lock:
                 return self._end.unpublished(event)
+        if topic.latched and shown is not event.payload:
+            output.kept = shown
         with self._lock:
             output.published += 1
             output.delivered_at, output.way = self._clock(), (event.hops, event.over)

@@ -9,6 +9,7 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -271,6 +272,8 @@ class Subscriptions:
             self.take_losses()
             self._subscriptions = subscriptions
             self._messages.forget_kept(self._now(topic.topic_id))
+            if self.frames is not None:
+                self.frames.forget(self._now(topic.topic_id))
 
     def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
         """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
@@ -290,6 +293,9 @@ class Subscriptions:
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
         with self._live.lock:
             changed = self._adapt(topic, offers)
+            if len(offers) == 1 and offers[0].durability == "transient_local" and self.frames is not None:
+                now = self._now(topic.topic_id)
+                self.frames.add(replace(topic, topic_id=now), latched=topic.options.durability != "volatile")
             policy, deadline_s = self._messages.queue(self._now(topic.topic_id))
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""

@@ -30,6 +30,7 @@ class FrameState(NamedTuple):
         reports, until it had left
     :param joined: how often a robot that may report has come, or has come back, or has asked for a key frame
     :param reports: whether any robot reports
+    :param asks: how often a robot has asked for the topic, within what is answered
     """
 
     rate: float
@@ -40,10 +41,16 @@ class FrameState(NamedTuple):
     age: float
     joined: int
     reports: bool
+    asks: int = 0
 
 
 class FrameSide(Protocol):
-    """The coded topics of one sender."""
+    """The coded topics of one sender.
+
+    :ivar relayed: whether what it sends is to be sent on: then latched topics are not coded, since chains are not
+    """
+
+    relayed: bool
 
     def begin(self, topic_id: int, output: str = "") -> None:
         """Send frames of a topic from now on, in the class bulk unless its options say otherwise.

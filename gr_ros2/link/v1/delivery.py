@@ -12,6 +12,7 @@ from math import inf
 from zlib import crc32
 
 from gr_ros2.link.fates import Fate
+from gr_ros2.link.frames import MARK
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.relay.gain import EXPIRES_S
@@ -179,7 +180,7 @@ class DeliveryRules:
             self._came.pop(ready.topic_id, None)
         if topic.latched:
             mark, marks = crc32(ready.payload), self.marks.get(ready.topic_id, ())
-            if mark in marks:
+            if mark in marks and not topic.codec.startswith(MARK):  # a frame may be needed again
                 return False
             most = topic.depth + _MARKS if topic.depth > 1 else 1
             self.marks[ready.topic_id] = (*marks, mark)[-most:]

@@ -174,6 +174,7 @@ class EndpointV1:
             turn_s=settings.turn_s,
             fixed=settings.fixed,
             neighbours=neighbours.all,
+            relayed=settings.relay,
         )
 
     def submitted(self, topic_id: int, now: float) -> None:

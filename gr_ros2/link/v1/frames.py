@@ -59,6 +59,7 @@ class SentFrames:
     :param turn_s: tells s from one packet to the next, 0 = not known
     :param neighbours: the robots that are heard
     :param fixed: whether every packet is as long as the longest
+    :param relayed: see :class:`gr_ros2.link.frames.FrameSide`
     """
 
     def __init__(
@@ -73,7 +74,9 @@ class SentFrames:
         turn_s: Callable[[], float],
         fixed: bool,
         neighbours: Mapping[int, Neighbour],
+        relayed: bool,
     ) -> None:
+        self.relayed = relayed
         self._topics, self._outlet, self._packets, self._peers, self._pace = topics, outlet, packets, peers, pace
         self._room, self._turn_s, self._fixed, self._neighbours = room, turn_s, fixed, neighbours
         self._sent: dict[int, deque[Message]] = {}
@@ -95,9 +98,10 @@ class SentFrames:
         waiting = sum(message.remaining for message in queue)
         lags = self._lags(topic_id, now)
         silent = bool(lags) and not any(self._heard(peer, now) for peer in self._reporting)
-        joined, age = self._peers.joined + self._outlet.asks[topic_id], self._ages[topic_id]
+        asks, age = self._outlet.asks[topic_id], self._ages[topic_id]
+        joined = self._peers.joined + asks
         lacked, behind = min(lags, default=0.0), max(lags, default=0.0)
-        return FrameState(self._free(now), waiting, lacked, behind, silent, age, joined, bool(self._peers))
+        return FrameState(self._free(now), waiting, lacked, behind, silent, age, joined, bool(self._peers), asks)
 
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
         """Send a frame."""

@@ -149,6 +149,8 @@ class KeptMessages:
         topic = self._topics.get(topic_id)
         if topic is None:
             return False
+        if topic.coded:
+            return True  # whoever codes it makes a key frame
         if topic_id == TABLE_TOPIC and not fills:
             for message in topic.queue:
                 message.qos = self._table_qos
@@ -204,7 +206,7 @@ class KeptMessages:
         """
         if not (of := self._of(message.topic_id)):
             return
-        if message.repeat:
+        if message.repeat or message.key:
             self._took[message.topic_id] = now - message.submitted
         for kept in of:
             if kept.payload is message.payload:

@@ -273,6 +273,8 @@ class Outbox:
             return None
         message = Message(serial, topic_id, payload, topic.qos, came, topic.weight, coded=True, key=key)
         message.dst_id = topic.dst_id
+        if topic.kept:
+            self.kept.keep(topic, message)
         topic.queue.append(message)
         return message
 

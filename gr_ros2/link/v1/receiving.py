@@ -314,8 +314,9 @@ class ReceivingSide:
                 self.relaying.newest(self._sender.src_id, entry)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
             for topic_id in dict.fromkeys(entry.topic_ids):
-                self._messages.asks[topic_id] += 1
-                if not self._messages.kept.asked(topic_id, self._now):
+                if self._messages.kept.asked(topic_id, self._now):
+                    self._messages.asks[topic_id] += 1
+                else:
                     self.stats.dropped["asked_too_often"] += 1
 
     def _reported(self, sender: int, report: Report) -> None:

@@ -1,0 +1,86 @@
+"""Maps over the engine of a link: what has changed for those who follow, all of it for those who come."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.codecs.messages import GRID
+from gr_ros2.link.events import SentPacket
+from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.registry import Registry, Topic
+from tests.codecs import scenes
+from tests.codecs.camera_link import Air, Robot
+
+MAP = Topic(0, "map", GRID, TopicOptions(durability="transient_local"))
+MAPS = list(scenes.exploring(12))
+
+
+def distinct(robot: Robot) -> list[bytes]:
+    """The maps that come out at a robot: one that is the same as before does not."""
+    seen = [message for _, message in robot.of(1, 0)]
+    return [message for before, message in zip([b"", *seen], seen, strict=False) if message != before]
+
+
+def sent_bytes(robot: Robot) -> int:
+    """Bytes of maps that have left so far."""
+    return sum(len(event.data) for event in robot.events if isinstance(event, SentPacket) and event.kind == "new")
+
+
+def link(loss: float = 0.0, kbit_s: float = 128.0, **values: bool) -> Air:
+    mapper = Robot(1, Registry([MAP]), kbit_s, **values)
+    air = Air(mapper, Robot(2, None, kbit_s, **values), loss=loss)
+    air.feed(mapper, 0, 1, lambda number: MAPS[min(number, len(MAPS) - 1)])
+    return air
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_each_map_comes_out_exactly_and_costs_what_has_changed(loss: float) -> None:
+    air = link(loss)
+    air.run(11.9)
+    _, follower = air.robots
+    assert distinct(follower) == MAPS
+    assert not follower.failed
+    assert len(follower.of(1, 0)) == len(MAPS)
+
+
+def test_a_late_robot_gets_the_whole_map_by_asking_although_it_does_not_change() -> None:
+    air = link()
+    mapper, follower = air.robots
+    late = Robot(3, None, 128.0)
+    late.on = False
+    air.robots.append(late)
+    air.run(14.0)
+    mapper.on = True
+    air._feeds.clear()  # the mapper has nothing new to say
+    air.run(16.0)
+    before = sent_bytes(mapper)
+    late.on = True
+    late.start()
+    air.run(24.0)
+    assert distinct(late) == [MAPS[-1]]
+    assert distinct(follower) == MAPS
+    cost = sent_bytes(mapper) - before
+    air.run(34.0)
+    assert sent_bytes(mapper) - before - cost < cost / 2, "the map is not sent again and again"
+
+
+def test_a_robot_that_was_out_of_range_goes_on_from_the_map_that_it_has() -> None:
+    air = link()
+    _, follower = air.robots
+    whole = air.lost
+    air.run(4.5)
+    air.lost = lambda _, receiver: receiver is follower
+    air.run(7.5)
+    air.lost = whole
+    air.run(20.0)
+    assert distinct(follower)[-1] == MAPS[-1]
+
+
+def test_where_nobody_reports_every_map_is_whole_and_comes_again() -> None:
+    air = link(hears=False)
+    air.run(12.9)
+    late = Robot(3, None, 128.0, hears=False)
+    air.robots.append(late)
+    air._feeds.clear()
+    air.run(30.0)
+    assert distinct(late) == [MAPS[-1]]
