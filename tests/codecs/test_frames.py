@@ -25,6 +25,7 @@ FPS = 15
 ZERO = {"header": scenes.header(), "height": 0, "width": 0, "encoding": "rgb8", "is_bigendian": 0, "step": 0} | {
     "data": np.zeros(0, np.uint8)
 }
+RNG = np.random.default_rng(1)
 _PICTURES: dict[int, bytes] = {}
 
 
@@ -336,3 +337,15 @@ def test_without_its_package_pictures_pass_as_they_are_and_a_line_says_what_to_i
     assert len(air.robots[1].of(1)) > 2
     assert [record.message for record in caplog.records if "gr-ros2[video]" in record.message][1:] == []
     assert "pip install 'gr-ros2[video]'" in caplog.text
+
+
+def test_a_picture_that_passes_exactly_is_repaired_however_long_it_takes() -> None:
+    """And the next one does not end its repair."""
+    air = link(loss=0.3, kbit_s=256)
+    odd = [scenes.image(RNG.integers(0, 9, (90, 120, 6), np.uint8), "rgb16", number) for number in range(16)]
+    air._feeds[0] = air.robots[0], CAMERA, 2, lambda n: odd[min(n, 15)], 0
+    air.run(16.0)
+    shown = [message for _, message in air.robots[1].of(1)]
+    sent = [event for event in air.robots[0].events if isinstance(event, Accepted) and event.topic_id == CAMERA]
+    assert len(shown) >= len(sent) - 1 >= 4
+    assert set(shown) <= set(odd)

@@ -106,7 +106,7 @@ class SentFrames:
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
         """Send a frame."""
         for before in self._sent[topic_id] if key else ():
-            if before.lifetime.left and now - before.began > LONG_S:
+            if now - before.left_at > LONG_S:
                 before.lifetime.end()
         message = self._outlet.submit_frame(self._topics[topic_id], frame, came, now, key=key)
         if message is not None:
@@ -172,7 +172,7 @@ class SentFrames:
             elif lacking:
                 for bit in oldest:
                     if lacking & bit:
-                        oldest[bit] = min(oldest[bit], message.began)
+                        oldest[bit] = min(oldest[bit], message.left_at)
         return [
             max(0.0, (peer.heard if self._heard(peer, now) else now) - oldest[peer.bit]) for peer in self._reporting
         ]

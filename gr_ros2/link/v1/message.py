@@ -18,7 +18,7 @@ class Message(Outgoing):
 
     :param dst_id: the robot for which it is, 255 for all
     :param numbers: the packets that carry a frame of a coded topic, as far as somebody lacks them
-    :param began: when its first fragment left, s
+    :param left_at: when its last fragment left, s
     :param key: it needs no earlier message of its topic, and these are of no more use when it has left
     :param plain: the message before it was coded, where later ones may be merged with it
     :param carried: its topic and key at the robot that made it, while it is carried over others
@@ -32,7 +32,7 @@ class Message(Outgoing):
     plain: bytes = b""
     carried: tuple[int, Key] | None = None
     numbers: list[int] = field(default_factory=list)
-    began: float = inf
+    left_at: float = inf
     key: bool = False
 
     def back(self, number: int) -> int:

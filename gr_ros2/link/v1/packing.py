@@ -172,7 +172,7 @@ class Packing:
             topic, back = self._topics[topic_id], message.back(number)
             if not message.index:
                 message.begin, message.place = number - back, -1 if back else place
-                message.began, lifetime.chained = now, topic.coded
+                lifetime.chained = topic.coded
                 lifetime.expires, lifetime.keys = message.expires, message.keys
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
                 lifetime.long = self._long(message)
@@ -196,7 +196,7 @@ class Packing:
                 qos = message.qos
             stats.payload_bytes += taken
             if last:
-                lifetime.left = True
+                lifetime.left, message.left_at = True, now
                 topic.queue.popleft()
                 if not (topic.queue and topic.queue[0].repeat):  # what is repeated together is worth the same
                     topic.newest = max(topic.newest, message.submitted)
