@@ -75,9 +75,10 @@ def ping(live: LiveEnd, robot: int, now: float, *, anew: bool = False) -> dict[s
         questions = live.endpoint.questions
         questions.wall_s = time.time() - now  # the clock of the wall may have been set
         told = questions.put(robot, now, anew=anew)
-        here = next((peer.snr_db for peer in live.endpoint.peers(now) if peer.robot == robot), None)
+        snrs = {peer.robot: peer.snr_db for peer in live.endpoint.peers(now)}
         live.work.notify()
-    return {**told, "robot": robot, "snr_here_db": questions.snr_db() if here is None else here}
+    only = questions.snr_db() if list(snrs) == [robot] else None  # where no other robot's packet may be the newest
+    return {**told, "robot": robot, "snr_here_db": only if snrs.get(robot) is None else snrs[robot]}
 
 
 def differences(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:

@@ -6,7 +6,7 @@ Invariant: a line is returned only if it has changed. A look changes nothing on 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -98,6 +98,10 @@ class Waiting:
     def __init__(self, source: RosSource) -> None:
         self._source = source
         self._last = ALL_THERE
+        self._looked = False
+        self._missing: set[str] = set()
+        self._left: set[str] = set()
+        """Topics that had a publisher, which has left."""
 
     def look(self) -> str | None:
         """One line for the user; None if the last line is still true. At first, every topic is assumed to have a
@@ -106,8 +110,10 @@ class Waiting:
         :raises MiddlewareError: when the graph cannot be asked
         """
         missing = self._source.found.unmatched()
+        self._left = (self._left | (set(missing) - self._missing if self._looked else set())) & set(missing)
+        self._missing, self._looked = set(missing), True
         types = {name: topic.type_name for name, topic in self._source.subscriptions.subscribed.items()}
-        line = waiting_line(missing, types, self._others()) if missing else self._sent()
+        line = waiting_line(missing, types, self._others(), left=self._left) if missing else self._sent()
         if line == self._last:
             return None
         self._last = line
@@ -128,12 +134,15 @@ class Waiting:
         return f"{ALL_THERE}: {_listed(topics)}{offered}"
 
 
-def waiting_line(missing: Sequence[str], types: dict[str, str], found: Sequence[TopicInfo]) -> str:
+def waiting_line(
+    missing: Sequence[str], types: dict[str, str], found: Sequence[TopicInfo], *, left: Collection[str] = ()
+) -> str:
     """The topics that a link waits for, and the topics that are published instead. Similar topics come first.
 
     :param missing: topics without a publisher, at least one
     :param types: type of every topic of the link, by name
     :param found: topics on the graph
+    :param left: those that had a publisher, which has left
     """
     published = [info for info in found if info.publishers and info.topic not in INFRASTRUCTURE]
     wrong = [info for info in published if types.get(info.topic, info.type_name) != info.type_name]
@@ -143,7 +152,11 @@ def waiting_line(missing: Sequence[str], types: dict[str, str], found: Sequence[
     def meant(info: TopicInfo) -> tuple[bool, bool, str]:
         return info.topic.rpartition("/")[2] not in last_names, info.type_name not in wanted_types, info.topic
 
-    line = f"no publisher on {_listed(missing)} yet"
+    never, gone = [name for name in missing if name not in left], [name for name in missing if name in left]
+    parts = [
+        f"no publisher on {_listed(names)} {when}" for names, when in ((never, "yet"), (gone, "any more")) if names
+    ]
+    line = "; ".join(parts)
     if wrong:
         line += "".join(f"; {info.topic} has another type, {info.type_name}" for info in wrong)
     if others:

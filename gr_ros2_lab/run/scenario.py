@@ -43,6 +43,7 @@ from gr_ros2.wire import BROADCAST
 from gr_ros2_lab.run.builtin import SCENARIO_DIR, builtin_scenarios
 from gr_ros2_lab.run.robot_settings import RobotSettings, ScenarioRobot, settings_of_all, sources_of
 from gr_ros2_lab.sim.sim_settings import SimSettings
+from gr_ros2_lab.sim.tasks import task_class
 
 SHARED = tuple(item.name for item in fields(RobotConfig) if item.name != "robot")
 """Settings of robots that may stand above them."""
@@ -378,6 +379,8 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
     values = read_settings(path, overrides)
     values.update((key, value) for key, value in settings.items() if value is not None)
     scenario = scenario_from(values, str(name_or_path))
+    if scenario.task:
+        task_class(scenario.task)
     if _contradicted(overrides):
         return scenario_from({**values, "description": _described(scenario, overrides)}, str(name_or_path))
     return scenario

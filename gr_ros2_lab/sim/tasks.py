@@ -175,8 +175,8 @@ def towards(own: State, x: float, y: float, most: float) -> Command:
     return min(wanted, most) * max(0.0, math.cos(off)), max(-MAX_TURN, min(MAX_TURN, 2 * off))
 
 
-def make_task(name: str, robots: int, seed: int) -> Task:
-    """A task by its name, or ``module:Class``.
+def task_class(name: str) -> type[Task]:
+    """The class of a task, by its name or as ``module:Class``.
 
     :raises ConfigError: where there is none of that name; says what went wrong
     """
@@ -190,7 +190,15 @@ def make_task(name: str, robots: int, seed: int) -> Task:
     if not (isinstance(kind, type) and issubclass(kind, Task)):
         known = ", ".join(BUILT_IN)
         raise ConfigError(f"task = {name!r}: is no task; known are {known}, and module:Class, a subclass of Task")
-    return kind(robots, random.Random(f"task {seed}"))
+    return kind
+
+
+def make_task(name: str, robots: int, seed: int) -> Task:
+    """A task by its name, or ``module:Class``.
+
+    :raises ConfigError: where there is none of that name; says what went wrong
+    """
+    return task_class(name)(robots, random.Random(f"task {seed}"))
 
 
 class TaskRobots:

@@ -58,6 +58,10 @@ def test_a_line_is_told_when_it_changes() -> None:
             assert waiting.look() is None
             robot.advertise("/odom", ODOM, QOS)
             assert waiting.look() == "no publisher on /robot_1/odom yet; seen on the graph: /odom"
+            with_publisher = robot.advertise("/robot_1/odom", ODOM, QOS)
+            assert waiting.look() == ALL_THERE
+            with_publisher.close()
+            assert waiting.look() == "no publisher on /robot_1/odom any more; seen on the graph: /odom"
             assert source.stats()["unmatched"] == ["/robot_1/odom"]
             robot.advertise("/robot_1/odom", ODOM, QOS)
             assert waiting.look() == ALL_THERE
