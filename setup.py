@@ -157,6 +157,7 @@ setup(
     extras_require={
         "audio": ["sounddevice>=0.5,<0.6"],
         "dashboard": ["bokeh>=3.8,<4", "jinja2>=3.1,<4"],
+        "foxglove": ["foxglove-sdk>=0.30,<1"],
         "lab": LABORATORY,
         "sweep": [*LABORATORY, "distributed>=2024.8"],
         # Each release has wheels for some versions of Python only.

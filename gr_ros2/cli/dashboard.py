@@ -22,10 +22,12 @@ from gr_ros2.core.errors import BackendMissingError, ConfigError, RunError
 from gr_ros2.settings.config import STRICT, build
 
 if TYPE_CHECKING:
+    from gr_ros2.dashboard.foxglove import FoxgloveServer
     from gr_ros2.dashboard.server import Dashboard
     from gr_ros2.observe.observers import LateObservers
 
 ADDRESS, PORT = "127.0.0.1", 5006
+LOCAL = (ADDRESS, "localhost", "::1")
 _ASK_S = 0.5
 _ANSWER_S, _ANSWER_BYTES = 2.0, 4096
 _log = logging.getLogger(__name__)
@@ -37,6 +39,41 @@ dashboard_option = click.option(
     metavar="[ADDRESS:]PORT",
     help=f"Show it live on a web page, at {ADDRESS}:{PORT} unless told otherwise (write --dashboard=PORT).",
 )
+
+FOXGLOVE_PORT = 8765
+foxglove_option = click.option(
+    "--foxglove",
+    is_flag=False,
+    flag_value=str(FOXGLOVE_PORT),
+    metavar="[ADDRESS:]PORT",
+    help=f"Serve its messages to Foxglove, at {ADDRESS}:{FOXGLOVE_PORT} unless told otherwise.",
+)
+
+
+@contextmanager
+def foxglove_server(where: str | None, console: Console) -> Iterator[list[FoxgloveServer]]:
+    """The observer that serves a link to Foxglove.
+
+    :param where: value of ``--foxglove``; None for none
+    :raises ConfigError: when nothing can be served there
+    :raises BackendMissingError: when the SDK is not installed
+    """
+    if where is None:
+        yield []
+        return
+    from gr_ros2.dashboard.foxglove import FoxgloveServer
+
+    address, port = parse_place(where, "foxglove")
+    with FoxgloveServer(address, port) as server:
+        console.print(f"Foxglove: ws://{address}:{server.port}", soft_wrap=True)
+        if address not in LOCAL:
+            _log.warning(
+                "ws://%s:%d: everybody on the network can see all messages; leave the address out to serve this "
+                "machine only",
+                address,
+                server.port,
+            )
+        yield [server]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -154,14 +191,14 @@ def _find(address: str, port: int, pid: int | None) -> str | None:
     return str(request(chosen, {"address": address, "port": port})["url"])
 
 
-def parse_place(text: str) -> tuple[str, int]:
+def parse_place(text: str, what: str = "dashboard") -> tuple[str, int]:
     """Split `5006`, `192.168.1.5:5006` or `[::1]:5006` into address and port.
 
     :raises ConfigError: for anything else
     """
     address, _, port = text.strip().rpartition(":")
     if not port.isascii() or not port.isdigit() or int(port) > 65535 or (":" in address and address[0] != "["):
-        raise ConfigError(f"dashboard = {text!r}: write [ADDRESS:]PORT, such as {PORT} or 0.0.0.0:{PORT}")
+        raise ConfigError(f"{what} = {text!r}: write [ADDRESS:]PORT, such as {PORT} or 0.0.0.0:{PORT}")
     return address.strip("[]") or ADDRESS, int(port)
 
 

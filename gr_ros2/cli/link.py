@@ -18,7 +18,7 @@ from rich.live import Live
 
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.dashboard import audience, dashboard_option
+from gr_ros2.cli.dashboard import audience, dashboard_option, foxglove_option, foxglove_server
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import BackendName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
@@ -75,6 +75,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 )
 @set_option(LinkConfig)
 @dashboard_option
+@foxglove_option
 @pcap_option
 def link(
     *,
@@ -92,6 +93,7 @@ def link(
     against: Path | None,
     overrides: tuple[str, ...],
     dashboard: str | None,
+    foxglove: str | None,
     pcap: Path | None,
     **flags: Any,
 ) -> int:
@@ -138,7 +140,8 @@ def link(
     with ExitStack() as stack:
         clients = stack.enter_context(audience(dashboard, console, settings.name, answers=answers))
         captures = stack.enter_context(capture(pcap))
-        run_observers = RunObservers([clients, *captures], threaded=True)
+        viewers = stack.enter_context(foxglove_server(foxglove, console))
+        run_observers = RunObservers([clients, *captures, *viewers], threaded=True)
         stack.callback(run_observers.run_ended, None)
         running = RobotLink(settings, observer=run_observers, instrumented=True)
         stack.callback(running.stop)

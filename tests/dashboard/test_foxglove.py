@@ -1,0 +1,183 @@
+"""What a client of Foxglove's protocol sees of a link."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+
+from tornado.httpclient import HTTPRequest
+from tornado.websocket import websocket_connect
+
+from gr_ros2.codecs.messages import GRID
+from gr_ros2.core.errors import BackendMissingError, ConfigError
+from gr_ros2.dashboard.foxglove import BACKLOG, FoxgloveServer
+from gr_ros2.link.events import Accepted, Announced, Delivered
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.settings.registry import Topic
+from gr_ros2.wire.table import AnnouncedTopic
+from tests.codecs import scenes
+from tests.codecs.test_instances import TF, transforms
+from tests.domains import domain
+from tests.waiting import PATIENCE_S, wait_for
+
+QOS = Qos("reliable", "volatile", 0)
+ROWS = (AnnouncedTopic(0, "tf", TF), AnnouncedTopic(1, "map", GRID, latched=True))
+
+
+def _run() -> Any:
+    """A link that sends /tf as robot 1."""
+    sent = SimpleNamespace(frames=None, named=lambda: [("/robot_1/tf", Topic(0, "tf", TF))])
+    return SimpleNamespace(
+        sources={1: SimpleNamespace(subscriptions=sent)}, received_as=lambda src, name: f"/rx_robot_{src}/{name}"
+    )
+
+
+@pytest.fixture
+def server() -> Any:
+    with FoxgloveServer("127.0.0.1", 0) as made:
+        made.run_started(_run())
+        made.receiver_event(Announced(2, ROWS), 0.0)
+        yield made
+
+
+class Client:
+    """A client that subscribes to every topic."""
+
+    def __init__(self, port: int) -> None:
+        self.channels: dict[int, Any] = {}
+        self.seen: list[tuple[str, bytes]] = []
+        self._port = port
+
+    def watch(self, until: Callable[[], bool], work: Callable[[], None] = lambda: None) -> None:
+        """Take part until something is so; ``work`` is done at each look."""
+        asyncio.run(asyncio.wait_for(self._run(until, work), PATIENCE_S))
+
+    async def _run(self, until: Callable[[], bool], work: Callable[[], None]) -> None:
+        request = HTTPRequest(f"ws://127.0.0.1:{self._port}")
+        connection = await websocket_connect(request, subprotocols=["foxglove.sdk.v1"])
+        waiting = asyncio.ensure_future(_read(connection))
+        while not until():
+            work()
+            done, _ = await asyncio.wait([waiting], timeout=0.02)
+            if done:
+                await self._take(connection, waiting.result())
+                waiting = asyncio.ensure_future(_read(connection))
+        waiting.cancel()
+        connection.close()
+
+    async def _take(self, connection: Any, message: str | bytes | None) -> None:
+        assert message is not None, "the server has closed the connection"
+        if isinstance(message, bytes):
+            if message[0] == 1:
+                (number,) = struct.unpack_from("<I", message, 1)
+                self.seen.append((self.channels[number]["topic"], message[13:]))
+            return
+        said = json.loads(message)
+        for channel in said.get("channels", ()) if said["op"] == "advertise" else ():
+            self.channels[channel["id"]] = channel
+            asked = {"id": channel["id"], "channelId": channel["id"]}
+            await connection.write_message(json.dumps({"op": "subscribe", "subscriptions": [asked]}))
+
+
+async def _read(connection: Any) -> Any:
+    return await connection.read_message()
+
+
+def test_what_is_sent_and_what_comes_out_is_seen_as_it_is_with_its_definition(server: FoxgloveServer) -> None:
+    client = Client(server.port)
+    sent, came = transforms("odom"), transforms("arm")
+
+    def work() -> None:
+        server.sender_event(1, Accepted(0, 0, sent, 0.0))
+        server.receiver_event(Delivered(2, 0, came, 0), 0.0)
+
+    client.watch(lambda: {("/robot_1/tf", sent), ("/rx_robot_2/tf", came)} <= set(client.seen), work)
+    channel = next(iter(client.channels.values()))
+    assert (channel["encoding"], channel["schemaName"], channel["schemaEncoding"]) == ("cdr", TF, "ros2msg")
+    assert "geometry_msgs/TransformStamped[] transforms" in channel["schema"].replace("/msg/", "/")
+    assert "MSG: geometry_msgs/" in channel["schema"]
+
+
+def test_who_comes_late_sees_the_map(server: FoxgloveServer) -> None:
+    (message,) = scenes.exploring(1, 100)
+    server.receiver_event(Delivered(2, 1, b"a frame", 0, shown=message), 0.0)
+    client = Client(server.port)
+    client.watch(lambda: bool(client.seen))
+    assert client.seen == [("/rx_robot_2/map", message)]
+
+
+def test_a_client_that_reads_nothing_slows_nobody_and_loses_messages_of_its_own(server: FoxgloveServer) -> None:
+    """It opens a connection, subscribes and never reads again, while more comes than any buffer of its holds."""
+    big = transforms("x" * 100_000)
+    server.receiver_event(Delivered(2, 0, big, 0), 0.0)
+    with socket.create_connection(("127.0.0.1", server.port)) as slow:
+        slow.sendall(
+            b"GET / HTTP/1.1\r\nHost: h\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
+        )
+        wait_for(lambda: b"101" in slow.recv(4096), "the server")
+        number = next(iter(server._channels.values()))[1].id()
+        asked = json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": number}]}).encode()
+        slow.sendall(bytes((0x81, 0x80 | len(asked))) + bytes(4) + asked)
+        channel = server._channels["/rx_robot_2/tf"][1]
+        wait_for(channel.has_sinks, "the subscription")
+        for _ in range(4 * BACKLOG):
+            server.receiver_event(Delivered(2, 0, big, 0), 0.0)
+        client, last = Client(server.port), transforms("last")
+        client.watch(
+            lambda: ("/rx_robot_2/tf", last) in client.seen,
+            lambda: server.receiver_event(Delivered(2, 0, last, 0), 0.0),
+        )
+    assert client.seen[-1] == ("/rx_robot_2/tf", last)
+
+
+def test_a_live_link_is_seen_by_both_names(tmp_path: Path) -> None:
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    pytest.importorskip("zmq", reason="needs pyzmq")
+    from gr_ros2.cli.link import _live
+    from gr_ros2.observe.observers import RunObservers
+    from tests.radio.test_instances import robot
+
+    said = transforms("odom")
+    with (
+        FoxgloveServer("127.0.0.1", 0) as server,
+        MemoryMiddleware(domain_id=domain(1)) as near,
+        MemoryMiddleware(domain_id=domain(2)) as far,
+    ):
+        observers = RunObservers([server], threaded=True)
+        with robot(1, tmp_path, 2), robot(2, tmp_path, 1, observer=observers) as two:
+            observers.run_started(_live(two.link))
+            publishers = [near.advertise("/robot_1/tf", TF, QOS), far.advertise("/robot_2/tf", TF, QOS)]
+            client = Client(server.port)
+
+            def work() -> None:
+                for publisher in publishers:
+                    publisher.publish(said)
+
+            wanted = {("/rx_robot_1/tf", said), ("/robot_2/tf", said)}
+            client.watch(lambda: wanted <= set(client.seen), work)
+        observers.run_ended(None)
+        assert observers.incomplete() == []
+
+
+def test_without_the_sdk_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(BackendMissingError, match=r"--foxglove needs foxglove-sdk: pip install 'gr-ros2\[foxglove\]'"):
+        FoxgloveServer("127.0.0.1", 0)
+
+
+def test_a_port_that_is_taken_is_named(server: FoxgloveServer) -> None:
+    with pytest.raises(ConfigError, match=rf"foxglove = 127\.0\.0\.1:{server.port}: cannot be served there"):
+        FoxgloveServer("127.0.0.1", server.port)
