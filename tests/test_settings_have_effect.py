@@ -324,6 +324,7 @@ effects(
     clock_rate=drives(clock_rate=5.0),
     map_rate=drives(map_rate=3.0),
     rtcm_rate=drives(rtcm_rate=3.0),
+    camera_rate=drives(camera_rate=3.0),
     beams=drives(beams=90),
     scan_range=drives(scan_range=3.0),
     map_cells=drives(map_cells=50),

@@ -19,7 +19,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.sim.driver import Driver
 from gr_ros2_lab.sim.motion import RADIUS, TICK, State, places_and_velocities
 from gr_ros2_lab.sim.roadmap import Roadmap
-from gr_ros2_lab.sim.sensors import ALL_TYPES, TYPES, Sensors
+from gr_ros2_lab.sim.sensors import ALL_TYPES, CAMERA, TYPES, Sensors
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from gr_ros2_lab.sim.world import Floats, World
 
@@ -90,8 +90,10 @@ class Fleet:
         return f"/robot_{robot_id}"
 
     def topics(self) -> dict[str, str]:
-        """Topic name without namespace -> type, in the order of the paper's table 4; corrections come last."""
-        return dict(ALL_TYPES if self.settings.rtcm_rate else TYPES)
+        """Topic name without namespace -> type, in the order of the paper's table 4, then what is optional."""
+        return {
+            name: kind for name, kind in ALL_TYPES.items() if name in TYPES or getattr(self.settings, f"{name}_rate")
+        }
 
     def rates(self) -> dict[str, float]:
         """Topic name without namespace -> Hz; 0 = once."""
@@ -140,7 +142,7 @@ class Fleet:
             if topic == "cmd_vel":  # the command of this period is the motion at its end
                 tick = int(t / TICK)
                 state = self._log[robot_id - 1][tick].after(TICK)
-            others = [self.state(i, t) for i in self.robot_ids if i != robot_id] if topic == "scan" else ()
+            others = [self.state(i, t) for i in self.robot_ids if i != robot_id] if topic in ("scan", CAMERA) else ()
             payload = sensors[robot_id].read(topic, t, state, others)
             yield SimMessage(t, robot_id, name, ALL_TYPES[topic], payload)
 

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from gr_ros2_lab.sim.camera import HEIGHT, WIDTH, picture
 from gr_ros2_lab.sim.motion import MAX_TURN, RADIUS, State
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from gr_ros2_lab.sim.world import Floats, World
@@ -30,8 +31,9 @@ TYPES: Final = {
 }
 """The paper's table 4."""
 RTCM: Final = "rtcm"
-ALL_TYPES: Final = {**TYPES, RTCM: "rtcm_msgs/msg/Message"}
-"""And the corrections of a base station, in the type that GNSS drivers use for them."""
+CAMERA: Final = "camera"
+ALL_TYPES: Final = {**TYPES, RTCM: "rtcm_msgs/msg/Message", CAMERA: "sensor_msgs/msg/Image"}
+"""And the corrections of a base station, in the type that GNSS drivers use for them, and a camera."""
 GRAVITY: Final = 9.80665
 _SCAN_MIN: Final = 0.05
 _STORE: Final = get_typestore(Stores.ROS2_HUMBLE)
@@ -175,6 +177,18 @@ class Sensors:
         every compression, so they are random here."""
         frames = b"".join(_rtcm_frame(number, self._rng[RTCM].bytes(_MSM4_LEN - 2)) for number in _MSM4)
         return _TYPE[ALL_TYPES[RTCM]](header=self._header(t, "gnss"), message=np.frombuffer(frames, np.uint8))
+
+    def _camera(self, t: float, state: State, others: Sequence[State]) -> Any:
+        view = picture(self._world, state, others, self._rng[CAMERA])
+        return _TYPE[ALL_TYPES[CAMERA]](
+            header=self._header(t, "camera"),
+            height=HEIGHT,
+            width=WIDTH,
+            encoding="rgb8",
+            is_bigendian=0,
+            step=3 * WIDTH,
+            data=view.ravel(),
+        )
 
 
 _MSM4: Final = (1074, 1084, 1094, 1124)

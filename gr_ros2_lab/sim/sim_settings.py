@@ -32,6 +32,7 @@ class SimSettings:
     :param clock_rate: Hz
     :param map_rate: maps, Hz; 0 = once at the start
     :param rtcm_rate: RTK corrections of a base station, Hz; 0 = there are none
+    :param camera_rate: pictures of 320 × 240, Hz; 0 = there is no camera
     :param beams: of a laser scan, over the full turn
     :param scan_range: farthest range the scanner measures, m; beyond it a beam reads +inf (REP 117)
     :param map_cells: cells along each side of the map
@@ -58,6 +59,7 @@ class SimSettings:
     clock_rate: Rate = 10.0
     map_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
     rtcm_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    camera_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
     beams: Annotated[int, Field(ge=1, le=10_000)] = 360
     scan_range: Annotated[float, Field(ge=1, le=1000)] = 12.0
     map_cells: Annotated[int, Field(ge=10, le=2000)] = 100

@@ -139,7 +139,7 @@ def test_override_values_are_yaml() -> None:
         ("packet_len.x=4", "packet_len has no settings below it"),
         ("source=bag:", "the path of the bag is missing"),
         ("source=dds", "write sim or bag:PATH"),
-        ("registry=nope", "registry = 'nope': no such file; built in are odom, rtk, search, table4"),
+        ("registry=nope", "registry = 'nope': no such file; built in are cameras, odom, rtk, search, table4"),
         ("duration_s=0", "the simulator has no end"),
         ("channel.taps=[", "the value is no YAML"),
         ("packet_len", "write key=value"),
