@@ -21,7 +21,7 @@ import numpy as np
 from bench.rows import Row
 from gr_ros2.codecs import video
 from gr_ros2.codecs.messages import IMAGE, read
-from gr_ros2.settings.config import TopicOptions, vars_of
+from gr_ros2.settings.config import SendOptions, vars_of
 from tests.codecs import scenes
 from tests.codecs.camera_link import CAMERA, ODOMETRY, PACKET_LEN, SCAN, Air, Robot, registry
 
@@ -63,7 +63,7 @@ def _grey(pixels: Any) -> Any:
 class Scheme:
     """How the camera's pictures are sent; this one is the topic as a link sends it, on pull."""
 
-    options: TopicOptions = TopicOptions()
+    options: SendOptions = SendOptions()
 
     def __init__(self, kbit_s: float) -> None:
         self.kbit_s = kbit_s
@@ -83,7 +83,7 @@ class Scheme:
 class Jpeg(Scheme):
     """JPEG of quality 50, the newest kept, repaired."""
 
-    options = TopicOptions(queue="fifo", queue_depth=1, qos="bulk", codec="none", reliability="reliable")
+    options = SendOptions(queue="fifo", queue_depth=1, qos="bulk", codec="none", reliability="reliable")
 
     def message(self, number: int) -> bytes:
         pixels = read(IMAGE, _pictures()[number * TRUTH]).data.reshape(HEIGHT, -1)
@@ -98,7 +98,7 @@ class Jpeg(Scheme):
 class Fixed(Scheme):
     """H.264 at .8 of the rate that is free without loss, a key frame each second, a queue of 10, repaired in order."""
 
-    options = TopicOptions(queue="fifo", queue_depth=10, qos="bulk", codec="none", reliability="reliable")
+    options = SendOptions(queue="fifo", queue_depth=10, qos="bulk", codec="none", reliability="reliable")
 
     def __init__(self, kbit_s: float) -> None:
         super().__init__(kbit_s)

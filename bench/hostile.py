@@ -26,7 +26,7 @@ from gr_ros2.link.events import Delivered, Rejected
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import v1
 
@@ -72,8 +72,8 @@ def attack(kind: Kind, count: int, seed: int = 1) -> Outcome:
     """Feed so many bad packets to a receiver, a real sender's packets among them."""
     rng = random.Random(seed)
     keys = Keys((bytes(range(32)),), "encrypt") if kind == "damaged, sealed" else Keys()
-    topics = Registry([Topic(n, f"t{n}", "std_msgs/msg/String", TopicOptions()) for n in range(3)])
-    sender = EndpointV1(topics, Settings(_SENDER, PACKET_LEN, fixed=False), boot=_BOOT, keys=keys)
+    topics = Registry([Topic(n, f"t{n}", "std_msgs/msg/String", SendOptions()) for n in range(3)])
+    sender = EndpointV1(topics, Settings(_SENDER, PACKET_LEN, any_length=True), boot=_BOOT, keys=keys)
     settings = Settings(_RECEIVER, PACKET_LEN, max_source_bytes=SOURCE_BYTES, max_sources=SOURCES)
     receiver = EndpointV1(None, settings, boot=_BOOT, keys=keys)
     sender.pace.use_credit()

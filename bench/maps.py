@@ -14,7 +14,7 @@ from bench.rows import Row
 from gr_ros2.codecs import CodedTopic
 from gr_ros2.codecs.messages import GRID
 from gr_ros2.link.events import SentPacket
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.codecs import scenes
 from tests.codecs.camera_link import Air, Robot
@@ -39,7 +39,7 @@ def _maps() -> list[bytes]:
 def simulate(loss: float, **options: str) -> Judged:
     """One run."""
     maps = _maps()
-    topic = Topic(0, "map", GRID, TopicOptions(durability="transient_local", **options))
+    topic = Topic(0, "map", GRID, SendOptions(durability="transient_local", **options))
     mapper, follower = Robot(1, Registry([topic]), KBIT_S), Robot(2, None, KBIT_S)
     air = Air(mapper, follower, loss=loss)
 

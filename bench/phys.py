@@ -21,16 +21,19 @@ from bench.port import _OUT, AS_IT_IS, PACKET_LEN, _Graph, _Poster, _Taker, _wai
 from bench.rows import Row
 from bench.runs import DRIVE
 from gr_ros2.core.errors import BackendMissingError
-from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.link.v0.sender import Sender
+from gr_ros2.gr import RosLink
+from gr_ros2.gr.factory import Start
 from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, modulated
 from gr_ros2.phy.threads import shorten_switch_interval
 from gr_ros2.phy.window import WINDOW
-from gr_ros2.settings.config import ChannelConfig, SourceConfig
+from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 
 SNR_DB = 20.0
 LEAST = 0.5
@@ -55,7 +58,7 @@ def drive() -> list[Row]:
 def drive_packets() -> list[bytes]:
     """What the sending engine makes of the recording: every message, uncompressed."""
     registry = Registry.from_rows(DRIVE.topics)
-    sender = Sender(registry, SourceConfig(packet_len=PACKET_LEN, robot_id=1, queue_depth=0))
+    sender = Sender(registry, *paper_from(packet_len=PACKET_LEN, robot=1, queue_depth=0))
     ids = {f"/robot_1/{topic.name}": topic.topic_id for topic in registry}
     packets = []
     for message in read_bag(DRIVE.path, list(ids)):
@@ -167,8 +170,16 @@ def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
     """The same from a message at the source to the message at the sink."""
     registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
     robot, base = _Graph(1), _Graph(2)
-    source = RosSource(registry, middleware=robot, robot_id=1, packet_len=phy.packet_len, backpressure=True, **AS_IT_IS)
-    sink = RosSink(registry, middleware=base, packet_len=phy.packet_len)
+    common: dict[str, Any] = {"packet_len": phy.packet_len, "graph": {"namespace": ""}}
+    sends = RosLink(
+        RobotConfig(robot=1, direction="send", **common, **AS_IT_IS),
+        registry=registry,
+        middleware=robot,
+        backpressure=True,
+        start=Start(),
+    )
+    takes = RosLink(RobotConfig(robot=2, direction="receive", **common), middleware=base, start=Start())
+    source, sink = sends.source, takes.sink
     message = b"\0\1\0\0" + bytes(phy.packet_len - _HEADERS - 4)
     with LoopbackLink(phy, source, sink, throttled=False):
         phy.prefer_latency()
@@ -180,8 +191,8 @@ def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
         rate = many / (time.perf_counter() - begin)
         feeder.join()
         checked_count(phy.name, sink.stats()["packets"], few + many, 1)
-    source.close()
-    sink.close()
+    sends.close()
+    takes.close()
     return rate, single
 
 

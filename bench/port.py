@@ -16,11 +16,13 @@ import pmt
 from gnuradio import gr
 
 from bench.rows import Row
-from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr import RosLink
+from gr_ros2.gr.factory import Start
 from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.base import MessageCallback
 from gr_ros2.phy.threads import shorten_switch_interval
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 
 PACKET_LEN, REPEATS = 64, 5
 PACKETS = 45_000
@@ -141,15 +143,23 @@ def bare_rate() -> float:
 
 
 def blocks_rate(size: int, each: int) -> float:
-    """Packets/s through RosSource and RosSink.
+    """Packets/s through two ROS Links, one way.
 
     :param size: bytes of a message
     :param each: packets that a message of this size leaves in
     """
     registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
     robot, base = _Graph(1), _Graph(2)
-    source = RosSource(registry, middleware=robot, robot_id=1, packet_len=PACKET_LEN, backpressure=True, **AS_IT_IS)
-    sink = RosSink(registry, middleware=base, packet_len=PACKET_LEN)
+    common: dict[str, Any] = {"packet_len": PACKET_LEN, "graph": {"namespace": ""}}
+    sends = RosLink(
+        RobotConfig(robot=1, direction="send", **common, **AS_IT_IS),
+        registry=registry,
+        middleware=robot,
+        backpressure=True,
+        start=Start(),
+    )
+    takes = RosLink(RobotConfig(robot=2, direction="receive", **common), middleware=base, start=Start())
+    source, sink = sends.source, takes.sink
     graph = gr.top_block()
     graph.msg_connect(source, "pdus", sink, "pdus")
     messages = PACKETS // each
@@ -166,8 +176,8 @@ def blocks_rate(size: int, each: int) -> float:
     finally:
         graph.stop()
         graph.wait()
-        source.close()
-        sink.close()
+        sends.close()
+        takes.close()
     return packets / elapsed
 
 

@@ -14,7 +14,7 @@ from statistics import mean
 from bench.mac import MANY_SEEDS, Graph, Measured, at_random, joined, line, measured, within
 from bench.rows import Row
 from bench.swarm import SwarmConfig, fully_meshed
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import registry
 from tests.link.v1.test_relaying import Line, robot
 
@@ -62,7 +62,7 @@ def relay() -> list[Row]:
 def carried() -> list[Row]:
     """How long a map for one robot takes over hops, with a goal every 5 s beside it, and whether both are whole."""
     last = 1 + MAP_HOPS
-    topics = registry(odom=TopicOptions(queue="latest"), goal=TopicOptions(to=last), map=TopicOptions(to=last))
+    topics = registry(odom=SendOptions(queue="latest"), goal=SendOptions(to=last), map=SendOptions(to=last))
     line = Line(
         robot(1, topics=topics, packet_len=220),
         *(robot(src_id, packet_len=220) for src_id in range(2, last + 1)),

@@ -21,7 +21,7 @@ from gr_ros2.link.events import Delivered, SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 
 RATE = 75.0
@@ -99,7 +99,7 @@ def run(
     seed: int = 1,
     once: bool = False,
     tail: float = 3.0,
-    options: TopicOptions | None = None,
+    options: SendOptions | None = None,
     delay: int = 0,
     outage: float = 0.0,
 ) -> Outcome:
@@ -112,7 +112,7 @@ def run(
     :param delay: slots that reports take beside their own
     :param outage: s at the end of each ``OUTAGE_EVERY_S``, in which nothing arrives in either direction
     """
-    registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options or TopicOptions())])
+    registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options or SendOptions())])
     events: list[SenderEvent] = []
     common = {"packet_len": packet_len}
     sender = EndpointV1(

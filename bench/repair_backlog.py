@@ -17,7 +17,7 @@ from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 
 CASES = {"1 MB, then 1 B": (1_000_000, 1), "five of 200 kB": (200_000,) * 5}
@@ -50,7 +50,7 @@ class Beside:
 @lru_cache
 def run(sizes: tuple[int, ...], loss: float, *, odometry: bool = True, reports: bool = True, seed: int = 1) -> Beside:
     """One robot that sends to one that reports, or that only listens."""
-    options = TopicOptions(queue="fifo", reliability="reliable")
+    options = SendOptions(queue="fifo", reliability="reliable")
     names = Registry([Topic(n, name, "std_msgs/msg/String", options) for n, name in enumerate(("odom", "long"))])
     sender = EndpointV1(names, Settings(1, packet_len=PACKET_LEN, hears=reports), boot=1000)
     receiver = EndpointV1(None, Settings(2, packet_len=PACKET_LEN, hears=reports), boot=2000)

@@ -115,7 +115,7 @@ class Load:
 def load(name: str, seconds: float) -> Load:
     """A scenario's traffic and its radio."""
     scenario = load_scenario(name, duration_s=seconds)
-    registry = scenario.load_registry().with_options(scenario.first.topic_options)
+    registry = scenario.load_registry().with_options(scenario.first.options)
     codec = message_codec(registry)
     messages = [replace(one, payload=codec.encode(one.topic_id, one.payload)) for one in offered(scenario, registry)]
     return Load(scenario, registry, tuple(messages), make_phy(scenario, registry).airtime())

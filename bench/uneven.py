@@ -16,15 +16,15 @@ from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 
 _STEPS = 12
 """Looks at an end per airtime."""
 _TOPICS = Registry(
     [
-        Topic(0, "odom", "nav_msgs/msg/Odometry", TopicOptions(queue="latest", reliability="best_effort")),
-        Topic(1, "cmd", "std_msgs/msg/String", TopicOptions(queue="fifo", reliability="reliable")),
+        Topic(0, "odom", "nav_msgs/msg/Odometry", SendOptions(queue="latest", reliability="best_effort")),
+        Topic(1, "cmd", "std_msgs/msg/String", SendOptions(queue="fifo", reliability="reliable")),
     ]
 )
 

@@ -20,7 +20,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.gf256 import combine
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
 from gr_ros2.mac import Slots
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import ENCRYPTS, About, Ask, Control, Heard, Hello, Newest, Ping, Report
@@ -245,12 +245,14 @@ def insider(data: bytes) -> None:
     mode, relay = script.pick(_MODES), script.byte() % 4 > 0
     topics = Registry(
         [
-            Topic(0, "state", "std_msgs/msg/String", TopicOptions(queue="latest")),
-            Topic(1, "map", "std_msgs/msg/String", TopicOptions(durability="transient_local")),
-            Topic(2, "goal", "std_msgs/msg/String", TopicOptions(to=1)),
+            Topic(0, "state", "std_msgs/msg/String", SendOptions(queue="latest")),
+            Topic(1, "map", "std_msgs/msg/String", SendOptions(durability="transient_local")),
+            Topic(2, "goal", "std_msgs/msg/String", SendOptions(to=1)),
         ]
     )
-    settings = Settings(_OWN, packet_len=PACKET_LEN, fixed=False, max_sources=3, max_source_bytes=16_384, relay=relay)
+    settings = Settings(
+        _OWN, packet_len=PACKET_LEN, any_length=True, max_sources=3, max_source_bytes=16_384, relay=relay
+    )
     access = Slots(_OWN, _SLOT_S, random.Random(1)) if relay or script.byte() & 1 else None
     keys = Keys((_KEY,) if mode != "none" else (), mode)
     end = EndpointV1(topics, settings, boot=_BOOT, keys=keys, access=access, save=lambda *_: None)

@@ -8,9 +8,9 @@ from functools import partial
 
 from fuzz.loop import main, within
 from gr_ros2.link import AirPacket, Delivered, Lost, ReceiverEvent, Rejected
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.sender import Sender
-from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import with_crc, without_crc
 
@@ -21,7 +21,8 @@ BASE, PER_BYTE = 500, 20
 _STEP = 1 + _BODY_LEN
 _WAITS_S = (0.0, 0.0, 0.001, 0.03, 0.6, 2.0, 70.0, 1e6)
 _REGISTRY = Registry.from_rows({"a": "std_msgs/String", "map": "std_msgs/String", "c": "std_msgs/String"})
-_CONFIG = SinkConfig(version=0, packet_len=PACKET_LEN, max_sources=3, max_source_bytes=4096, max_bytes=8192, robot_id=9)
+_CONFIG = paper_from(packet_len=PACKET_LEN, max_sources=3, max_source_bytes=4096, robot=9)
+_MAX_BYTES = 8192
 
 
 def receiver(data: bytes) -> None:
@@ -30,7 +31,7 @@ def receiver(data: bytes) -> None:
 
 
 def _hear(data: bytes) -> None:
-    engine = Receiver(_REGISTRY, _CONFIG)
+    engine = Receiver(_REGISTRY, *_CONFIG, max_bytes=_MAX_BYTES)
     events: list[ReceiverEvent] = []
     now = 0.0
     given = 0
@@ -39,10 +40,10 @@ def _hear(data: bytes) -> None:
         packet = with_crc(body) if intact else body + b"\0\0"
         events += engine.receive(AirPacket(packet), now)
         given += 1
-        assert engine.held_bytes <= _CONFIG.max_bytes
+        assert engine.held_bytes <= _MAX_BYTES
         timeout = engine.next_timeout()
         assert (timeout is None) == (engine.held_bytes == 0)
-    events += engine.handle_timeout(now + 2 * _CONFIG.reassembly_timeout_s)
+    events += engine.handle_timeout(now + 2 * _CONFIG[1].reassembly_timeout_s)
     stats = engine.stats
     assert engine.held_bytes == 0
     assert engine.next_timeout() is None
@@ -64,7 +65,7 @@ def corpus() -> list[bytes]:
     rng = random.Random(2)
     scripts = []
     for robot_id in (1, 2, 9):
-        sender = Sender(_REGISTRY, SourceConfig(robot_id=robot_id, packet_len=PACKET_LEN), rng=random.Random(robot_id))
+        sender = Sender(_REGISTRY, *paper_from(robot=robot_id, packet_len=PACKET_LEN), rng=random.Random(robot_id))
         for number in range(30):
             sender.submit(number % 3, rng.randbytes(rng.choice((4, 30, 100))), 0.0)
         packets = []

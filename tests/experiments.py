@@ -23,9 +23,9 @@ import numpy as np
 from click.testing import CliRunner
 from gnuradio import blocks, gr
 
-from gr_ros2.gr import RosSink
-from gr_ros2.gr.factory import EndpointSetup, make_endpoint
-from gr_ros2.gr.starts import start_of
+from gr_ros2.gr import RosLink
+from gr_ros2.gr.factory import Start, make_endpoint, start_of
+from gr_ros2.link.air import Air
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy import PHY
@@ -35,8 +35,9 @@ from gr_ros2.phy.threads import run_flowgraph
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.settings.config import ChannelConfig, SourceConfig, build
+from gr_ros2.settings.config import ChannelConfig, build
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig, robot_from
 from gr_ros2_lab.cli.run import run
 from gr_ros2_lab.race.contenders import CONTENDERS
 from gr_ros2_lab.race.measure import Identity, RaceSender
@@ -125,16 +126,18 @@ def reached(*settings: str) -> list[Any]:
 
 
 def published(**settings: Any) -> tuple[Any, ...]:
-    """Topics, QoS and a message that a sink publishes."""
+    """Topics, QoS and a message that a robot publishes."""
     rows = Registry.from_rows({"odom": "nav_msgs/Odometry"})
-    end = make_endpoint(rows, SourceConfig(robot_id=1, packet_len=1500), None)
+    end = make_endpoint(RobotConfig(robot=1, packet_len=1500), rows, air=Air(hears=False), start=Start())
     (message,) = (m.payload for m in Fleet(SimSettings(odom_rate=1.0)).messages(0.9, 0.0, ["/robot_1/odom"]))
     end.messages.submit(0, message, 0.0)
     packets = []
     while (packet := end.next_packet(0.0)) is not None:
         packets.append(packet.data)
     graph, other = (MemoryMiddleware(domain_id=domain) for domain in (GRAPH, GRAPH + 1))
-    sink = RosSink(**{"middleware": "memory", "domain_id": GRAPH, "packet_len": 1500, **settings})
+    values = {"robot": 2, "direction": "receive", "graph_domain_id": GRAPH, "packet_len": 1500, **settings}
+    link = RosLink(robot_from(graph_middleware="memory", **values), start=Start())
+    sink = link.sink
     probe, top, came = Probe(), gr.top_block(), list[bytes]()
     top.msg_connect((probe, "pdus"), (sink, "pdus"))
     top.start()
@@ -152,7 +155,7 @@ def published(**settings: Any) -> tuple[Any, ...]:
     finally:
         top.stop()
         top.wait()
-        for one in (sink, graph, other):
+        for one in (link, graph, other):
             one.close()
 
 
@@ -171,7 +174,7 @@ def kept(**settings: Any) -> list[str]:
     """Files that the start of a robot leaves, ``{}`` in a setting for the folder."""
     with TemporaryDirectory() as folder, mock.patch.dict("os.environ", {"XDG_STATE_HOME": folder}):
         own = {name: value.format(folder) for name, value in settings.items()}
-        start_of(SourceConfig(robot_id=1, **own), 1, EndpointSetup()).close()
+        start_of(RobotConfig(robot=1, **own)).close()
         return sorted(path.name for path in Path(folder).rglob("*.json"))
 
 

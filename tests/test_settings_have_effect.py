@@ -26,23 +26,27 @@ from click.testing import CliRunner
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.factory import make_endpoint
-from gr_ros2.link.endpoint import LIVE_OPTIONS
+from gr_ros2.gr.factory import Start, make_endpoint
+from gr_ros2.link.air import Air as RadioFacts
+from gr_ros2.link.endpoint import LIVE_OPTIONS, Endpoint, OpenEndpoint
+from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
+from gr_ros2.paper.endpoint import EndpointV0
+from gr_ros2.paper.factory import make_paper_endpoint
+from gr_ros2.paper.settings import PaperConfig, check, check_rows
 from gr_ros2.phy.wifi_frames import DataFrames
 from gr_ros2.settings.config import (
     CameraOptions,
     CloudOptions,
     DepthOptions,
     DiagnosticsConfig,
-    SinkConfig,
-    SourceConfig,
-    TopicOptions,
+    SendOptions,
     build,
 )
 from gr_ros2.settings.fields import AUTO, Setting, settings_of
 from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.robot import PublishOptions, RobotConfig, robot_from
 from gr_ros2_lab.cli.medium import medium
 from gr_ros2_lab.race.contenders import chosen
 from gr_ros2_lab.run.scenario import load_scenario
@@ -133,10 +137,10 @@ def sealed() -> Outcomes:
     return close
 
 
-def withheld(**sink: Any) -> list[bytes]:
+def withheld(**settings: Any) -> list[bytes]:
     """Messages that are taken of sealed packets which somebody held back for 5 s."""
-    take = end_settings(None, SinkConfig(robot_id=2, key="fleet.key", **sink), hears=True)
-    one = Robot(1, registry(cmd_vel=TopicOptions(queue="deadline", deadline_s=1.0)), mode="encrypt")
+    take = end_settings(robot_from(robot=2, key="fleet.key", **settings), RadioFacts())
+    one = Robot(1, registry(cmd_vel=SendOptions(queue="deadline", deadline_s=1.0)), mode="encrypt")
     two = Robot(2, registry(), mode="encrypt", max_age_s=take.max_age_s, max_ages=take.max_ages)
     air = Air(one, two)
     air.run(2.0)
@@ -214,7 +218,7 @@ effects(
     deadline_s=run(OPTION + "scan.deadline_s=0.2"),
     weight=run(OPTION + "odom.weight=1"),
     max_rate=run(OPTION + "odom.max_rate=5"),
-    max_age_s=lambda: (withheld(), withheld(topic_options={"cmd_vel": TopicOptions(max_age_s=2.0)})),
+    max_age_s=run(OPTION + "odom.max_age_s=2", "key=fleet.key"),
     codec=run(OPTION + "odom.codec=zstd"),
     to=run(OPTION + "odom.to=3"),
     keep_s=Elsewhere("link/v1/test_latest_state.py::test_keep_s_says_how_long_a_robot_out_of_range_can_still_get_it"),
@@ -248,67 +252,6 @@ effects(
     voxel=Elsewhere("codecs/test_whole.py::test_cells_come_out_as_they_were_said_to"),
     range=Elsewhere("codecs/test_whole.py::test_range_and_keep_say_what_of_a_cloud_leaves"),
     keep=Elsewhere("codecs/test_whole.py::test_range_and_keep_say_what_of_a_cloud_leaves"),
-)
-effects("Columns of a registry", publish_as=differs(published, topic_options={"odom": {"publish_as": "/here"}}))
-effects(
-    "ROS Source",
-    packet_len=run("packet_len=300"),
-    registry=run("registry=odom.csv", "topics=[odom]"),
-    version=run("paper={}", "topics=auto"),
-    key=run("key=fleet.key"),
-    seal=run("seal=authenticate", "key=fleet.key"),
-    state=differs(kept, state="{}/mine.json"),
-    robot_id=run("robots.0.robot=7"),
-    middleware=Elsewhere("core/test_backends.py::test_choosing_what_is_not_installed_names_what_to_install"),
-    domain_id=Elsewhere("gr/test_source.py::test_a_loop_is_refused_whichever_comes_first"),
-    commands=run("commands=[]", OPTION + "cmd_vel={qos: auto}"),
-    topic_options=run(OPTION + "odom.max_rate=5"),
-    debug=Elsewhere("gr/test_source.py::test_debug_lines"),
-    queue_depth=run("queue_depth=2", OPTION + "odom={queue: fifo}"),
-    topics=run("topics=[odom, scan]"),
-    services=Elsewhere("radio/test_found_services.py::test_services_can_be_left_to_the_robot"),
-    namespace=run("robots.0.graph.namespace=/robot_2"),
-    dst_id=run("paper.dst_id=9", *PAPER),
-    min_fragment=run("paper.min_fragment=150", *PAPER),
-    greedy=run("paper.greedy=true", *PAPER),
-    flush_timeout_s=run("paper.flush_timeout_s=0.2", *PAPER),
-    subscriber_depth=Elsewhere(
-        "gr/test_source.py::test_what_the_graph_loses_before_it_reaches_the_source_is_a_row_that_adds_up"
-    ),
-    hop=run("paper.hop=3", *PAPER),
-    packet_rate=run("packet_rate=10"),
-    backpressure=Elsewhere("gr/test_source.py::test_backpressure_holds_the_publisher_back_and_close_lets_it_go"),
-    entry_ids=run("paper.entry_ids=random", *PAPER),
-    repeat_s=run("repeat_s=0.5"),
-    compression=run("compression=false"),
-    repair=run("repair='off'", scenario="paper-ofdm-paced"),
-    beacon_s=run("beacon_s=0.05", LOSSY, REPORTING),
-    expected_loss=run("expected_loss=0.6", LOSSY, "repair=thrifty", scenario="paper-ofdm-paced"),
-)
-effects(
-    "ROS Sink",
-    packet_len=run("packet_len=300"),
-    registry=run("registry=odom.csv", "topics=[odom]"),
-    version=run("paper={}", "topics=auto"),
-    key=run("key=fleet.key"),
-    seal=run("seal=authenticate", "key=fleet.key"),
-    state=differs(kept, state="{}/mine.json"),
-    robot_id=run("robots.1.robot=8", *PAPER, "paper.dst_id=8"),
-    middleware=Elsewhere("core/test_backends.py::test_choosing_what_is_not_installed_names_what_to_install"),
-    domain_id=differs(published, domain_id=GRAPH + 1),
-    topic_options=differs(published, topic_options={"odom": {"publish_as": "/here"}}),
-    debug=Elsewhere("gr/test_readable.py::test_lines_appear_on_standard_output_where_nothing_else_takes_them"),
-    namespace_format=differs(published, namespace_format="/from_{robot}"),
-    publisher_depth=differs(published, publisher_depth=3),
-    reassembly_timeout_s=run("paper.reassembly_timeout_s=0.05", *PAPER, LOSSY),
-    max_age_s=lambda: (withheld(), withheld(max_age_s=2.0)),
-    hold_s=run("hold_s=0.1", LOSSY, OPTION + "scan={queue: fifo}", "phy.sample_rate=400000"),
-    max_sources=Elsewhere("link/v0/test_receiver.py::test_sources_beyond_the_bound_wait_until_one_has_gone_silent"),
-    max_source_bytes=Elsewhere("link/v1/test_endpoint.py::test_a_long_message_is_given_up_when_its_memory_is_needed"),
-    max_bytes=Elsewhere("link/v0/test_receiver.py::test_forged_packets_never_raise_and_memory_stays_bounded"),
-    use_sim_time=Elsewhere("gr/test_sink.py::test_latency_by_simulated_clock"),
-    frame_prefix=differs(published, frame_prefix="robot_{robot}/"),
-    merge_tf=Elsewhere("gr/test_frame_ids.py::test_two_robots_on_one_graph_of_a_real_dds"),
 )
 effects(
     "Simulator",
@@ -439,41 +382,58 @@ effects(
     tx_power_dbm=lambda: (reached(), reached("robots=[{tx_power_dbm: 10}, {}]")),
     noise_figure_db=lambda: (reached(), reached("robots=[{noise_figure_db: 3}, {}]")),
 )
-OF_SOURCE = (
-    *("packet_len", "registry", "key", "seal", "state", "commands", "services", "packet_rate", "queue_depth"),
-    *("compression", "repair", "repeat_s", "beacon_s", "expected_loss", "debug", "topics"),
-)
 effects(
     "Robot",
-    **{name: EFFECTS["ROS Source", name] for name in OF_SOURCE},
-    **{name: EFFECTS["ROS Sink", name] for name in ("hold_s", "max_age_s", "max_sources", "max_source_bytes")},
     robot=run("robots.0.robot=7"),
     direction=run("robots.1.direction=receive", LOSSY, REPORTING),
+    topics=run("topics=[odom, scan]"),
     publish=Elsewhere("radio/test_robot_link.py::test_parts_that_do_not_fit_are_refused_and_nothing_stays_open"),
     graph=run("robots.0.graph.namespace=/robot_2"),
+    registry=run("registry=odom.csv", "topics=[odom]"),
+    services=Elsewhere("radio/test_found_services.py::test_services_can_be_left_to_the_robot"),
+    commands=run("commands=[]", OPTION + "cmd_vel={qos: auto}"),
+    packet_len=run("packet_len=300"),
+    key=run("key=fleet.key"),
+    seal=run("seal=authenticate", "key=fleet.key"),
+    state=differs(kept, state="{}/mine.json"),
+    packet_rate=run("packet_rate=10"),
+    queue_depth=run("queue_depth=2", OPTION + "odom={queue: fifo}"),
+    compression=run("compression=false"),
+    repair=run("repair='off'", scenario="paper-ofdm-paced"),
+    expected_loss=run("expected_loss=0.6", LOSSY, "repair=thrifty", scenario="paper-ofdm-paced"),
+    repeat_s=run("repeat_s=0.5"),
+    beacon_s=run("beacon_s=0.05", LOSSY, REPORTING),
+    hold_s=run("hold_s=0.1", LOSSY, OPTION + "scan={queue: fifo}", "phy.sample_rate=400000"),
+    max_age_s=lambda: (withheld(), withheld(max_age_s=2.0)),
+    max_sources=Elsewhere("paper/test_receiver.py::test_sources_beyond_the_bound_wait_until_one_has_gone_silent"),
+    max_source_bytes=Elsewhere("link/v1/test_endpoint.py::test_a_long_message_is_given_up_when_its_memory_is_needed"),
+    debug=Elsewhere("gr/test_source.py::test_debug_lines"),
 )
 effects(
     "Graph",
-    middleware=EFFECTS["ROS Source", "middleware"],
-    domain_id=Elsewhere("lab/run/test_domains.py::test_a_domain_that_is_named_stays"),
+    middleware=Elsewhere("core/test_backends.py::test_choosing_what_is_not_installed_names_what_to_install"),
+    domain_id=differs(published, graph_domain_id=GRAPH + 1),
     localhost_only=Elsewhere("middleware/test_dds.py::test_a_domain_is_on_loopback_or_not_for_the_whole_process"),
     namespace=run("robots.0.graph.namespace=/robot_2"),
     depth=Elsewhere("radio/test_config.py::test_the_depths_of_a_graph_are_those_of_its_blocks"),
-    use_sim_time=EFFECTS["ROS Sink", "use_sim_time"],
+    use_sim_time=Elsewhere("gr/test_sink.py::test_latency_by_simulated_clock"),
 )
-OF_PUBLISH = {"as": "namespace_format", "depth": "publisher_depth", "topics": "topic_options"}
 effects(
     "Publish",
-    **{name: EFFECTS["ROS Sink", OF_PUBLISH.get(name, name)] for name in (*OF_PUBLISH, "frame_prefix", "merge_tf")},
+    depth=differs(published, publish_depth=3),
+    frame_prefix=differs(published, publish_frame_prefix="robot_{robot}/"),
+    merge_tf=Elsewhere("gr/test_frame_ids.py::test_two_robots_on_one_graph_of_a_real_dds"),
+    topics=differs(published, publish_topics={"odom": {"as": "/here"}}),
+    **{"as": differs(published, publish_as="/from_{robot}")},
 )
 effects(
     "Topics that come out",
-    depth=differs(published, topic_options={"odom": {"depth": 3}}),
-    reliability=differs(published, topic_options={"odom": {"reliability": "best_effort"}}),
-    durability=differs(published, topic_options={"odom": {"durability": "transient_local"}}),
+    depth=differs(published, publish_topics={"odom": {"depth": 3}}),
+    reliability=differs(published, publish_topics={"odom": {"reliability": "best_effort"}}),
+    durability=differs(published, publish_topics={"odom": {"durability": "transient_local"}}),
     deadline_s=Elsewhere("radio/test_calls.py::test_calls_that_the_server_leaves_open_end_by_name"),
-    max_age_s=lambda: (withheld(), withheld(topic_options={"cmd_vel": TopicOptions(max_age_s=2.0)})),
-    **{"as": differs(published, topic_options={"odom": {"publish_as": "/here"}})},
+    max_age_s=lambda: (withheld(), withheld(publish_topics={"cmd_vel": {"max_age_s": 2.0}})),
+    **{"as": differs(published, publish_topics={"odom": {"as": "/here"}})},
 )
 effects(
     "Link",
@@ -742,7 +702,7 @@ def of_kind(*kinds: type[Any]) -> list[Row]:
 def test_a_test_elsewhere_shows_the_effect_of_the_setting(row: Row) -> None:
     file, _, name = str(EFFECTS[row]).partition("::")
     assert name in (sources := sources_in(file)), f"{file} has no {name}"
-    assert re.search(rf"\b(set_)?{row[1]}\b", sources[name]), f"{name} does not name {row[1]}"
+    assert re.search(rf"\b(set_|graph_|publish_)?{row[1]}\b", sources[name]), f"{name} does not name {row[1]}"
 
 
 @functools.cache
@@ -798,59 +758,62 @@ def other(setting: Setting) -> Any:
     return 0.5 if setting.default == AUTO or setting.below is not None else setting.default + 1
 
 
-OF_ONE_VERSION = [
-    (cls, setting)
-    for cls in (SourceConfig, SinkConfig, TopicOptions)
-    for setting in settings_of(cls)
-    if setting.version is not None
+OF_LINKS = [
+    *("key", "seal", "state", "services", "commands", "beacon_s", "repair", "expected_loss", "hold_s", "max_age_s"),
+    *(f"topics.odom.{name}" for name in ("queue", "deadline_s", "weight", "max_rate", "max_age_s", "keep_s", "to")),
+    *("topics.odom.instance", "topics.odom.camera", "topics.odom.depth_image"),
+    *("publish.topics.odom.deadline_s", "publish.topics.odom.max_age_s", "compression"),
 ]
+"""Settings of a robot that the paper's blocks do not have."""
 
 
-@pytest.mark.parametrize(("cls", "setting"), OF_ONE_VERSION, ids=lambda one: getattr(one, "name", ""))
-def test_a_version_refuses_what_only_the_other_one_has(cls: type[Any], setting: Setting) -> None:
-    assert setting.version is not None
-    version, value = 1 - setting.version, {setting.name: other(setting)}
-    said = f"{setting.name} = {other(setting)!r}: version {version} has no such setting; leave it out"
-    if cls is TopicOptions:
-        with pytest.raises(ConfigError, match=re.escape(f"topic_options.odom.{said}")):
-            build(SourceConfig, {"version": version, "topic_options": {"odom": value}})
-        row = Topic(0, "odom", "nav_msgs/msg/Odometry", build(TopicOptions, value))
-        with pytest.raises(ConfigError, match=re.escape(f"registry: topic odom: {said}")):
-            make_endpoint(Registry([row]), SourceConfig(version=version, robot_id=1), None)
-    else:
-        with pytest.raises(ConfigError, match=re.escape(said)):
-            build(cls, {"version": version, **value})
-    build(cls, {setting.name: setting.default})
+@pytest.mark.parametrize("name", OF_LINKS)
+def test_the_papers_blocks_refuse_what_only_links_have(name: str) -> None:
+    (*parts, last), cls = name.split("."), RobotConfig
+    cls = {"topics": SendOptions, "publish": PublishOptions}.get(parts[0] if parts else "", RobotConfig)
+    value = other(next(setting for setting in settings_of(cls) if setting.name == last))
+    beside = {"key": "fleet.key"} if last in ("seal", "max_age_s") else {}
+    values: Any = {last: value}
+    for part in reversed(parts):
+        values = {part: values}
+    robot = build(RobotConfig, {"robot": 1, **beside, **values})
+    with pytest.raises(ValueError, match=r"the paper's blocks have (no such setting|a setting of their own)"):
+        check(robot, PaperConfig())
+    if parts[:1] == ["topics"]:
+        row = Topic(0, "odom", "nav_msgs/msg/Odometry", robot.topics["odom"])
+        with pytest.raises(ConfigError, match=f"registry: topic odom: {last} = .*the paper's blocks have no such"):
+            check_rows(Registry([row]))
 
 
-@pytest.mark.parametrize("version", [0, 1])
-def test_a_running_link_refuses_what_cannot_change(version: int) -> None:
+def test_a_running_link_refuses_what_cannot_change() -> None:
     rows = Registry.from_rows({"odom": "nav_msgs/Odometry"})
-    end = make_endpoint(rows, SourceConfig(version=version, robot_id=1), None)
-    for setting in settings_of(SourceConfig):
-        if setting.name == "dst_id" and version:
-            with pytest.raises(ConfigError, match="dst_id = 7: another destination needs a restart of the link"):
-                end.reconfigure(dst_id=7)
-        elif setting.name not in end.live_settings:
+    end = link_end(rows)
+    for setting in settings_of(RobotConfig):
+        if setting.name not in end.live_settings:
             said = f"{setting.name} cannot change while running; these can: {', '.join(end.live_settings)}"
             with pytest.raises(ConfigError, match=re.escape(said)):
-                end.reconfigure(**{setting.name: other(setting)})
-    for option in settings_of(TopicOptions):
+                end.reconfigure(**{setting.name: None})
+    for option in settings_of(SendOptions):
         if option.name not in end.live_options:
             changed = replace(rows[0].options, **{option.name: other(option)})
-            with pytest.raises(
-                ConfigError, match=f"topic odom: ({option.name} cannot|with version 0, its options) change"
-            ):
+            with pytest.raises(ConfigError, match=f"topic odom: {option.name} cannot change"):
                 end.messages.change(0, changed)
+
+
+def link_end(rows: Registry, **settings: Any) -> OpenEndpoint:
+    return make_endpoint(RobotConfig(robot=1, **settings), rows, air=RadioFacts(hears=False), start=Start())
 
 
 def says(version: int, **changes: Any) -> list[Any]:
     """What an end sends for 3 s, of which a setting changes in the first: packets with their times, and queues."""
-    options = TopicOptions(durability="transient_local", queue="fifo" if version else AUTO)
+    options = SendOptions(durability="transient_local", queue="fifo" if version else AUTO)
     rows = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options)])
-    end = make_endpoint(
-        rows, SourceConfig(version=version, robot_id=1, packet_rate=20.0, repeat_s=1.0), None, rng=random.Random(1)
-    )
+    end: Endpoint
+    if version:
+        end = link_end(rows, packet_rate=20.0, repeat_s=1.0)
+    else:
+        robot = RobotConfig(robot=1, packet_rate=20.0, repeat_s=1.0)
+        end = make_paper_endpoint(robot, PaperConfig(), rows, rng=random.Random(1))
     sent: list[Any] = []
     for step in range(300):
         now = step * 0.01
@@ -868,12 +831,9 @@ LIVE = {"packet_rate": 50.0, "dst_id": 7, "repeat_s": 0.3, "queue_depth": 3}
 
 @pytest.mark.parametrize("version", [0, 1])
 def test_what_can_change_while_a_link_runs_has_its_effect_then(version: int) -> None:
-    end = make_endpoint(
-        Registry.from_rows({"odom": "nav_msgs/Odometry"}), SourceConfig(version=version, robot_id=1), None
-    )
     same = says(version)
     assert says(version) == same
-    for name in end.live_settings:
+    for name in (EndpointV0, EndpointV1)[version].live_settings:
         assert says(version, **{name: LIVE[name]}) != same, name
     assert len(says(version, repeat_s=0.0)) < len(same), "0 is off"
 
@@ -893,10 +853,9 @@ CHANGED: dict[str, tuple[dict[str, Any], Any]] = {
 
 def optioned(base: Mapping[str, Any], **changed: Any) -> list[bytes]:
     """What an end sends of two topics that want more than there is, of which the options of one change."""
-    options = TopicOptions(**{"queue": "fifo", **base})
+    options = SendOptions(**{"queue": "fifo", **base})
     rows = Registry([Topic(n, name, "a_msgs/msg/B", options) for n, name in enumerate(("goal", "scan"))])
-    config = SourceConfig(robot_id=1, packet_rate=20.0, repeat_s=0.5, compression=False)
-    end = make_endpoint(rows, config, None)
+    end = link_end(rows, packet_rate=20.0, repeat_s=0.5, compression=False)
     sent, topic_id = [], 0
     for step in range(300):
         now = step * 0.01
@@ -944,7 +903,7 @@ def test_a_recording_takes_the_settings_of_the_simulator() -> None:
 
 def test_a_seal_needs_a_key_and_a_shared_setting_is_refused_once() -> None:
     with pytest.raises(ConfigError, match="seal = 'authenticate': nothing is sealed without a key; set key"):
-        build(SourceConfig, {"seal": "authenticate"})
+        build(RobotConfig, {"robot": 1, "seal": "authenticate"})
     with pytest.raises(ConfigError) as error:
         load_scenario("paper-direct", ["key=fleet.key"])
-    assert str(error.value).count("version 0 has no such setting") == 1
+    assert str(error.value).count("the paper's blocks have no such setting") == 1

@@ -11,9 +11,10 @@ from binascii import unhexlify
 from collections.abc import Iterable, Iterator
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.settings.config import MIN_PACKET_LEN, SourceConfig
+from gr_ros2.settings.config import MIN_PACKET_LEN
+from gr_ros2.settings.robot import RobotConfig
 
-DEFAULT_PACKET_LEN = SourceConfig().packet_len
+DEFAULT_PACKET_LEN = RobotConfig.packet_len
 
 _ETHERNET, _RAW_IP, _LINUX_SLL = 1, 101, 113
 _IP_OFFSET = {_ETHERNET: 14, _RAW_IP: 0, _LINUX_SLL: 16}

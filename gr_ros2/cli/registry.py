@@ -24,7 +24,7 @@ from gr_ros2.middleware.adapt import settle
 from gr_ros2.middleware.bag_files import bag_contents
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.observe.positions import humble_types
-from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, TopicOptions
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import MAX_TOPICS, Registry, Topic
 from gr_ros2.settings.service_rows import OF_ACTION, ServiceRow, parts, rows_of
@@ -247,6 +247,6 @@ def _write(text: str, left_out: Mapping[str, str], out: Path | None) -> None:
 
 
 def _options(topic: Topic) -> str:
-    default = TopicOptions()
-    changed = {item.name: getattr(topic.options, item.name) for item in fields(TopicOptions)}
+    default = SendOptions()
+    changed = {item.name: getattr(topic.options, item.name) for item in fields(SendOptions)}
     return ", ".join(f"{key}={value}" for key, value in changed.items() if value != getattr(default, key))

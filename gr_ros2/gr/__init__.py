@@ -11,17 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gr_ros2.gr.ros_link import RosLink
-    from gr_ros2.gr.sink import RosSink
-    from gr_ros2.gr.source import RosSource
     from gr_ros2.phy.airtime import AirtimeGate
 
-__all__ = ["AirtimeGate", "RosLink", "RosSink", "RosSource"]
+__all__ = ["AirtimeGate", "RosLink"]
 
 _BLOCKS = {
     "AirtimeGate": "gr_ros2.phy.airtime",
     "RosLink": "gr_ros2.gr.ros_link",
-    "RosSink": "gr_ros2.gr.sink",
-    "RosSource": "gr_ros2.gr.source",
 }
 
 

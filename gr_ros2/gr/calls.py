@@ -20,11 +20,13 @@ from typing import Any
 
 from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, OutgoingFrame, Request, Service
 from gr_ros2.core.errors import ConfigError, GrRos2Error, MiddlewareError
+from gr_ros2.gr.found_topics import FoundTopics
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.loops import LOOP_GUARD
-from gr_ros2.gr.sink import RosSink
-from gr_ros2.gr.source import RosSource
+from gr_ros2.gr.receiving import ReceivingBlock
+from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.link import Delivered, ReceiverEvent
+from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.link.events import Gone, Met
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceClient, ServiceGraph, ServiceServer
@@ -53,10 +55,13 @@ class LiveCalls:
 
     :param end: the endpoint, whose registry has a topic for requests and replies behind those of the source
     :param source, sink: the blocks whose graphs are joined
+    :param found: what is looked for on the graph
     :raises ConfigError: for a service on a graph that carries topics only
     """
 
-    def __init__(self, end: LiveEnd, source: RosSource, sink: RosSink) -> None:
+    def __init__(
+        self, end: LiveEnd[OpenEndpoint], source: SendingBlock, sink: ReceivingBlock, found: FoundTopics
+    ) -> None:
         self._end, self._messages = end.endpoint, end.endpoint.messages
         self._lock, self._work = end.lock, end.work
         self._engine = Calls(source.src_id, self._end.boot)
@@ -75,7 +80,7 @@ class LiveCalls:
         self._clients: dict[int, ServiceClient] = {}
         for name, topic in source.subscriptions.services.items():
             self._offer(name, topic)
-        source.found.offer_with(self._offer_found)
+        found.offer_with(self._offer_found)
         sink.share(self)
 
     def takes(self, event: ReceiverEvent) -> bool:
@@ -211,7 +216,7 @@ class LiveCalls:
         """Make a server of ours for a service of another robot."""
         name = self._name(src_id, topic)
         try:
-            LOOP_GUARD.add_output(self._sink, self._sink.graph, (src_id, topic.topic_id), name)
+            LOOP_GUARD.add_output(self._sink, self._sink.middleware, (src_id, topic.topic_id), name)
             graph = _with_services(self._sink.middleware, name)
             taker = partial(self._request, src_id, topic)
             # ros2 param and ros2 lifecycle look for the node before they call its services.
@@ -227,7 +232,7 @@ class LiveCalls:
             self._send(self._engine.call(service, client, payload, deadline_s=_deadline(topic), now=now), now)
 
     def _name(self, src_id: int, topic: Topic) -> str:
-        return topic.republished(self._sink.config.namespace_format, src_id)
+        return topic.republished(self._sink.config.publish.as_, src_id)
 
     # ---- frames
 

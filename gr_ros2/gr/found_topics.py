@@ -1,4 +1,4 @@
-"""What a ROS Source finds on its ROS graph: topics and services that no registry names, and types of what it sends.
+"""What a robot finds on its ROS graph: topics and services that no registry names, and types of what it sends.
 
 Invariant: what cannot be sent or offered is said once.
 """
@@ -9,19 +9,19 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 
 from gr_ros2.core.errors import ConfigError, GrRos2Error
-from gr_ros2.gr.subscriptions import Subscriptions
+from gr_ros2.gr.subscriptions import OpenSubscriptions
 from gr_ros2.gr.topic_search import TopicSearch
 from gr_ros2.middleware import Middleware, TopicInfo
 from gr_ros2.middleware.services import OTHER_RMW, ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.settings.config import SourceConfig
-from gr_ros2.settings.registry import MAX_TOPICS, NewTopic, Topic, options_of
+from gr_ros2.settings.registry import DEFAULT_OPTIONS, MAX_TOPICS, NewTopic, Topic, options_of
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.settings.service_rows import ServiceRow, is_service, parts, rows_of
 from gr_ros2.settings.topic_choice import TopicChoice
 
 
 class FoundTopics:
-    """The search of one source.
+    """The search of one robot.
 
     :param subscriptions: takes what is found
     :ivar choice: the topics and services that are looked for
@@ -31,9 +31,9 @@ class FoundTopics:
     """
 
     def __init__(
-        self, config: SourceConfig, middleware: Middleware, subscriptions: Subscriptions, log: logging.Logger
+        self, config: RobotConfig, middleware: Middleware, subscriptions: OpenSubscriptions, log: logging.Logger
     ) -> None:
-        self.choice = TopicChoice(() if subscriptions.registry else config.topics, config.namespace)
+        self.choice = TopicChoice(() if subscriptions.registry else config.words, config.namespace)
         self.offered: set[str] = set()
         self.left_out: set[str] = set()
         self.not_offered: set[str] = set()
@@ -54,7 +54,7 @@ class FoundTopics:
         """Look periodically."""
         if self.choice:
             self._searches.append(TopicSearch(self._middleware, self._found, services=self._offer is not None))
-        if self._config.version and self._config.compresses and isinstance(self._middleware, ServiceGraph):
+        if self._config.compression and isinstance(self._middleware, ServiceGraph):
             subscriptions = self._subscriptions
             self._searches.append(TypeSearch(self._middleware, subscriptions.types, subscriptions.learn))
 
@@ -128,7 +128,7 @@ class FoundTopics:
         for name, type_name in parts(row.name, row.kind).items():
             if not self.choice.leaves_out(name):
                 part = row_name + name.removeprefix(row.name)
-                rows[name] = part, type_name, options_of(part, self._subscriptions.options)
+                rows[name] = part, type_name, options_of(part, self._subscriptions.options, DEFAULT_OPTIONS)
         if not any(is_service(type_name) for _, type_name, _ in rows.values()):
             raise ConfigError("topics leaves out all its services")
         services = self._subscriptions.add_services(rows)

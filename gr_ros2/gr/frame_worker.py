@@ -14,6 +14,7 @@ from collections.abc import Callable
 from gr_ros2.codecs.frames import FrameSender, Job
 from gr_ros2.core.errors import CodecError
 from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.link.endpoint import Endpoint
 
 _PATIENCE_S = 1.0
 """s that closing waits for a picture that is being encoded."""
@@ -26,7 +27,9 @@ class FrameWorker:
     :param clock: s, monotonic
     """
 
-    def __init__(self, sender: FrameSender, live: LiveEnd, clock: Callable[[], float], log: logging.Logger) -> None:
+    def __init__(
+        self, sender: FrameSender, live: LiveEnd[Endpoint], clock: Callable[[], float], log: logging.Logger
+    ) -> None:
         self._sender, self._live, self._clock, self._log = sender, live, clock, log
         self._work = threading.Condition(live.lock)
         self._jobs: deque[Job] = deque()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.registry import Registry, Topic, options_of
+from gr_ros2.settings.robot import PublishConfig, PublishOptions
 
 Key = tuple[int, int]
 """Source id and topic id."""
@@ -13,8 +13,8 @@ Key = tuple[int, int]
 class HeardTopics:
     """The topics of all robots that are heard, by source id and topic id."""
 
-    def __init__(self, registry: Registry, config: SinkConfig) -> None:
-        self._registry, self._config = registry, config
+    def __init__(self, registry: Registry, publish: PublishConfig) -> None:
+        self._registry, self._publish = registry, publish
         self._announced: dict[Key, Topic] = {}
 
     def announce(self, key: Key, topic: Topic) -> None:
@@ -23,12 +23,12 @@ class HeardTopics:
 
     def name_of(self, src_id: int, name: str) -> str:
         """Absolute name under which a sender's topic comes out, by its name in a registry."""
-        options = options_of(name, self._config.topic_options)
-        return Topic(0, name, "", options).republished(self._config.namespace_format, src_id)
+        named = options_of(name, self._publish.topics, PublishOptions()).as_
+        return Topic(0, name, "", publish_as=named).republished(self._publish.as_, src_id)
 
     def name(self, key: Key) -> str:
         """Absolute name under which a topic comes out."""
-        return self.topic(key).republished(self._config.namespace_format, key[0])
+        return self.topic(key).republished(self._publish.as_, key[0])
 
     def topic(self, key: Key) -> Topic:
         """The topic that a sender's topic id means, from its announcement or from the registry.

@@ -5,15 +5,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from math import inf
+from typing import Generic, TypeVar
 
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import SenderEvent
 
+_E_co = TypeVar("_E_co", bound=Endpoint, covariant=True)
 SHORTEST_WAIT_S = 2e-4
 """s for which the sending thread sleeps at least."""
 
 
-class LiveEnd:
+class LiveEnd(Generic[_E_co]):
     """An endpoint that the blocks of one flowgraph share, and the one lock that protects it.
 
     :param make: makes the endpoint, given its observer
@@ -23,7 +25,7 @@ class LiveEnd:
     :ivar observer: called with each event of the sending half, while the lock is held
     """
 
-    def __init__(self, make: Callable[[Callable[[SenderEvent], None]], Endpoint]) -> None:
+    def __init__(self, make: Callable[[Callable[[SenderEvent], None]], _E_co]) -> None:
         self.lock = threading.Lock()
         self.work = threading.Condition(self.lock)
         self.sleeps_until = self.looked = -inf

@@ -13,39 +13,13 @@ from collections.abc import Iterable
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.middleware import Middleware, join_graph, meet
-from gr_ros2.settings.config import SinkConfig
-from gr_ros2.settings.fields import Auto
+from gr_ros2.middleware import Middleware, meet
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import PublishConfig
 from gr_ros2.wire import BROADCAST
 
 
-class Graph:
-    """A block's participant on a ROS graph. The caller passes it in open, or this class opens it by name and closes it.
-
-    :param middleware: an open Middleware; for anything else, ``name`` is opened
-    :raises GrRos2Error: see :func:`gr_ros2.middleware.join_graph`
-    """
-
-    def __init__(self, middleware: str | Middleware | None, name: str, domain_id: int | Auto, node_name: str) -> None:
-        if isinstance(middleware, Middleware):
-            self.middleware = middleware
-            self.owned = False
-        else:
-            self.middleware = join_graph(name, domain_id=domain_id, node_name=node_name)
-            self.owned = True
-
-    def same_as(self, other: Graph) -> bool:
-        """Whether messages published on one of the two graphs reach the other."""
-        return meet(self.middleware, other.middleware)
-
-    def close(self) -> None:
-        """Leave the graph, if this object has joined it."""
-        if self.owned:
-            self.middleware.close()
-
-
-def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry) -> None:
+def check_loop(subscribed: Iterable[str], publish: PublishConfig, registry: Registry) -> None:
     """Refuse a sink that publishes a topic to which a source on the same graph subscribes.
 
     :param subscribed: absolute names of the topics to which the source subscribes, and of the services that it offers
@@ -53,19 +27,19 @@ def check_loop(subscribed: Iterable[str], config: SinkConfig, registry: Registry
     :raises ConfigError: for a loop; the message names the topic
     """
     names = set(subscribed)
-    for merged in config.merged_topics:
+    for merged in publish.merged_topics:
         if merged in names:
             raise ConfigError(
-                f"loop: the sink publishes {merged} (merge_tf), which a source on the same graph subscribes; "
-                "change merge_tf or domain_id"
+                f"loop: the sink publishes {merged} (publish.merge_tf), which a source on the same graph "
+                "subscribes; change that or graph.domain_id"
             )
     for topic in registry:
         for src_id in range(BROADCAST + 1):
-            name = topic.republished(config.namespace_format, src_id)
+            name = topic.republished(publish.as_, src_id)
             if name in names:
                 raise ConfigError(
                     f"loop: the sink publishes {name} (sender {src_id}), which a source on the same graph "
-                    "subscribes; change namespace_format, publish_as or domain_id"
+                    "subscribes; change publish.as, its publish_as or graph.domain_id"
                 )
 
 
@@ -74,31 +48,33 @@ class LoopGuard:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._sources: weakref.WeakKeyDictionary[Any, tuple[Graph, frozenset[str]]] = weakref.WeakKeyDictionary()
-        self._sinks: weakref.WeakKeyDictionary[Any, tuple[Graph, SinkConfig, Registry]] = weakref.WeakKeyDictionary()
-        self._outputs: weakref.WeakKeyDictionary[Any, tuple[Graph, dict[tuple[int, int], str]]] = (
+        self._sources: weakref.WeakKeyDictionary[Any, tuple[Middleware, frozenset[str]]] = weakref.WeakKeyDictionary()
+        self._sinks: weakref.WeakKeyDictionary[Any, tuple[Middleware, PublishConfig, Registry]] = (
+            weakref.WeakKeyDictionary()
+        )
+        self._outputs: weakref.WeakKeyDictionary[Any, tuple[Middleware, dict[tuple[int, int], str]]] = (
             weakref.WeakKeyDictionary()
         )
         """Topics that senders have announced, under the names that sinks give them, by sender and topic id."""
 
-    def add_source(self, block: Any, graph: Graph, subscribed: Iterable[str]) -> None:
+    def add_source(self, block: Any, graph: Middleware, subscribed: Iterable[str]) -> None:
         """:raises ConfigError: for a loop with an existing sink"""
         names = frozenset(subscribed)
         with self._lock:
-            for other, config, registry in self._sinks.values():
-                if graph.same_as(other):
-                    check_loop(names, config, registry)
+            for other, publish, registry in self._sinks.values():
+                if meet(graph, other):
+                    check_loop(names, publish, registry)
             self._sources[block] = (graph, names)
 
-    def add_sink(self, block: Any, graph: Graph, config: SinkConfig, registry: Registry) -> None:
+    def add_sink(self, block: Any, graph: Middleware, publish: PublishConfig, registry: Registry) -> None:
         """:raises ConfigError: for a loop with an existing source"""
         with self._lock:
             for other, names in self._sources.values():
-                if graph.same_as(other):
-                    check_loop(names, config, registry)
-            self._sinks[block] = (graph, config, registry)
+                if meet(graph, other):
+                    check_loop(names, publish, registry)
+            self._sinks[block] = (graph, publish, registry)
 
-    def add_output(self, block: Any, graph: Graph, key: tuple[int, int], name: str) -> None:
+    def add_output(self, block: Any, graph: Middleware, key: tuple[int, int], name: str) -> None:
         """Note a topic that a sink is about to publish because a sender has announced it.
 
         :param key: sender and topic id, which have only one name at a time
@@ -106,25 +82,25 @@ class LoopGuard:
         """
         with self._lock:
             for other, names in self._sources.values():
-                if name in names and graph.same_as(other):
+                if name in names and meet(graph, other):
                     raise ConfigError(
                         f"loop: the sink would publish {name}, which a source on the same graph subscribes; change "
-                        "namespace_format, publish_as or domain_id"
+                        "publish.as, its publish_as or graph.domain_id"
                     )
             self._outputs.setdefault(block, (graph, {}))[1][key] = name
 
-    def returns(self, graph: Graph, name: str) -> bool:
+    def returns(self, graph: Middleware, name: str) -> bool:
         """Whether a topic of a graph has come by radio: a sink publishes it, or one of another process may do so."""
         with self._lock:
-            sinks = [(config, registry) for other, config, registry in self._sinks.values() if graph.same_as(other)]
-            if any(name in names.values() for other, names in self._outputs.values() if graph.same_as(other)):
+            sinks = [(publish, registry) for other, publish, registry in self._sinks.values() if meet(graph, other)]
+            if any(name in names.values() for other, names in self._outputs.values() if meet(graph, other)):
                 return True
-        formats = {config.namespace_format for config, _ in sinks} | {SinkConfig().namespace_format}
+        formats = {publish.as_ for publish, _ in sinks} | {PublishConfig().as_}
         if any(_made_by(form, name) for form in formats):
             return True
         try:
-            for config, registry in sinks:
-                check_loop((name,), config, registry)
+            for publish, registry in sinks:
+                check_loop((name,), publish, registry)
         except ConfigError:
             return True
         return False

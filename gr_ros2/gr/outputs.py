@@ -1,4 +1,4 @@
-"""The topics of other robots as a ROS Sink publishes them.
+"""The topics of other robots as a robot publishes them.
 
 Invariants: messages are published in the order in which they become complete. A message counts as delivered only after
 it was published. Publishers are kept when a robot has gone: late subscribers still get its map, and a robot that comes
@@ -22,16 +22,17 @@ from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
 from gr_ros2.gr.heard_topics import HeardTopics, Key
 from gr_ros2.gr.latency import Latencies, LatencyWindow
 from gr_ros2.gr.live_end import LiveEnd
-from gr_ros2.gr.loops import LOOP_GUARD, Graph
+from gr_ros2.gr.loops import LOOP_GUARD
 from gr_ros2.link import Delivered, ReceiverEvent
+from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import Announced
 from gr_ros2.link.fates import Fate
-from gr_ros2.middleware import Publisher, Qos
+from gr_ros2.middleware import Middleware, Publisher, Qos
 from gr_ros2.middleware.type_definitions import known
 from gr_ros2.middleware.type_descriptions import Described
-from gr_ros2.settings.config import SinkConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry, Topic, announced
+from gr_ros2.settings.robot import RobotConfig
 
 
 @dataclass(slots=True, eq=False)
@@ -77,30 +78,30 @@ class Outputs:
         self,
         owner: Any,
         registry: Registry,
-        config: SinkConfig,
-        graph: Graph,
-        live: LiveEnd,
+        config: RobotConfig,
+        graph: Middleware,
+        live: LiveEnd[Endpoint],
         *,
         tell: Callable[[ReceiverEvent], None],
         clock: Callable[[], float],
         failures: Failures,
         log: logging.Logger,
     ) -> None:
-        self.heard = HeardTopics(registry, config)
+        self.heard = HeardTopics(registry, config.publish)
         self.opening: set[Output] = set()
         self.running = False
         self.due = threading.Condition(live.lock)
-        self._owner, self._config, self._graph, self._end = owner, config, graph, live.endpoint
+        self._owner, self._settings, self._graph, self._end = owner, config.publish, graph, live.endpoint
         self._lock = live.lock
         self._tell, self._clock, self._failures, self._log = tell, clock, failures, log
         self._outputs: dict[Key, Output] = {}
         self.frames = FrameReceiver()
-        self._prefix = FramePrefix(config.frame_prefix, failures.counters)
+        self._prefix = FramePrefix(config.publish.frame_prefix, failures.counters)
         self._transforms: MergedTransforms | None = None
-        if config.merge_tf:
-            self._transforms = MergedTransforms(config.merged_topics, graph.middleware, failures.counters)
+        if config.publish.merge_tf:
+            self._transforms = MergedTransforms(config.publish.merged_topics, graph, failures.counters)
         try:
-            self._latencies = Latencies(graph.middleware, sim_time=config.use_sim_time)
+            self._latencies = Latencies(graph, sim_time=config.graph.use_sim_time)
         except GrRos2Error:
             if self._transforms is not None:
                 self._transforms.close()
@@ -133,10 +134,10 @@ class Outputs:
         for told in event.topics:
             key = (event.src_id, told.topic_id)
             try:
-                topic = announced(told, self._config.topic_options)
+                topic = announced(told, self._settings.topics)
                 if (output := self.frames.announce(key, told)) != told.type_name:
                     topic = replace(topic, type_name=output)
-                name = topic.republished(self._config.namespace_format, event.src_id)
+                name = topic.republished(self._settings.as_, event.src_id)
                 if topic.is_topic:
                     LOOP_GUARD.add_output(self._owner, self._graph, key, name)
                 if fault := topic_fault(name):
@@ -310,7 +311,7 @@ class Outputs:
         topic = output.topic
         depth = topic.options.depth
         if depth == AUTO:
-            depth = 1 if topic.latched else self._config.publisher_depth
+            depth = 1 if topic.latched else self._settings.depth
         asked = topic.options.reliability
         qos = Qos(None if asked == AUTO else asked, "transient_local" if topic.latched else "volatile", depth)
         name = self.heard.name(key)
@@ -323,9 +324,9 @@ class Outputs:
                     return before
                 before.close()
         output.name = name
-        publisher = output.publisher = self._graph.middleware.advertise(name, topic.type_name, qos)
-        if self.running and self._graph.middleware.settling_s and not topic.latched:
-            output.early = EarlyMessages(publisher, self._graph.middleware.settling_s, self._clock())
+        publisher = output.publisher = self._graph.advertise(name, topic.type_name, qos)
+        if self.running and self._graph.settling_s and not topic.latched:
+            output.early = EarlyMessages(publisher, self._graph.settling_s, self._clock())
             with self._lock:
                 self.opening.add(output)
                 self.due.notify_all()

@@ -1,9 +1,9 @@
-"""ROS Link: both directions of one robot in one block; ROS topics in and out, packets in and out.
+"""ROS Link: one robot's end of a link in one block; ROS topics in and out, packets in and out.
 
 Services cross the link too.
 
-Invariant: the block contains a RosSource and a RosSink that share one endpoint. So received packets can change what is
-sent.
+Invariant: the block that sends and the one that receives share one endpoint, so that received packets can change what
+is sent. A robot that receives its own packets has an endpoint for each instead.
 """
 
 from __future__ import annotations
@@ -11,67 +11,137 @@ from __future__ import annotations
 import secrets
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.block_settings import read_registry
+from gr_ros2.core.errors import ConfigError, GrRos2Error
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.factory import EndpointSetup
-from gr_ros2.gr.robot_blocks import RobotBlocks
-from gr_ros2.gr.starts import start_of
+from gr_ros2.gr.factory import Start, make_endpoint, start_of
+from gr_ros2.gr.found_topics import FoundTopics
+from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.receiving import ReceivingBlock
+from gr_ros2.gr.sending import SendingBlock
+from gr_ros2.gr.subscriptions import OpenSubscriptions
+from gr_ros2.link.air import Air
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
+from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.mac import GUARD_S, access_of
 from gr_ros2.middleware import Middleware, join
-from gr_ros2.settings.config import airtime_from, build, replaced
-from gr_ros2.settings.registry import MAX_TOPICS
-from gr_ros2.settings.robot import RobotConfig, halves
+from gr_ros2.settings.config import airtime_from, replaced
+from gr_ros2.settings.registry import MAX_TOPICS, Registry, check_outputs
+from gr_ros2.settings.robot import RobotConfig, robot_from
 
-_HEARD = EndpointSetup(reports=True)
-"""Of a robot whose others hear it, on a channel of its own."""
+
+class LinkSendingBlock(SendingBlock):
+    """Sends topics that need not be known when it is made.
+
+    :ivar found: what it looks for
+    """
+
+    _subscribes = OpenSubscriptions
+    subscriptions: OpenSubscriptions
+    _end: OpenEndpoint
+
+    def __init__(self, config: RobotConfig, registry: Registry, *arguments: Any, **options: Any) -> None:
+        super().__init__(config, registry, *arguments, **options)
+        self.found = FoundTopics(config, self.middleware, self.subscriptions, self._log)
+
+    def unmatched(self) -> list[str]:
+        return self.found.unmatched()
+
+    def start(self) -> bool:
+        super().start()
+        self.found.start()
+        return True
+
+    def stop(self) -> bool:
+        self.found.stop()
+        return super().stop()
+
+    def close(self) -> None:
+        if hasattr(self, "found"):
+            self.found.stop()
+        super().close()
+
+    @property
+    def live_options(self) -> Sequence[str]:
+        """Options of a topic that may change while it runs."""
+        return self._end.live_options
+
+    def set_topics(self, topics: Any) -> None:
+        """Use other options of single topics, of which ``live_options`` may change. A message is for the robot that
+        ``to`` named when the ROS graph handed it over."""
+        with self._lock:
+            config = replaced(self.config, topics=topics)
+            self.subscriptions.change(config.options)
+            self.config = config
+            self.live.wake()
+            self._room.notify_all()
 
 
 class RosLink(gr.hier_block2):  # type: ignore[misc]
     """One robot's end of a link.
 
-    Message ports: `pdus` in and out, `credit` in, as in :class:`RosSource` and :class:`RosSink`.
+    Message ports: `pdus` in and out, `credit` in, as in :class:`SendingBlock` and :class:`ReceivingBlock`.
 
     :param config: settings of the robot
-    :param setup: what is known of the radio; the start of the robot is counted here
+    :param air: what is known of the radio
+    :param start: of the robot; None: it is counted here
+    :param loops_back: whether it receives its own packets
     :param middleware: an open Middleware for both directions; None: opened as the settings say
-    :param observer, clock, seed: see :class:`RosSource`
+    :param observer, clock, backpressure: see :class:`SendingBlock`
+    :param registry: the topics that the robots know beforehand; None: as the settings say
     :raises ConfigError: for settings that contradict each other
+    :ivar end: its endpoint; of a robot that receives its own packets, the one that receives
+    :ivar calls: the services that cross the link; None where it goes one way, or topics leave no room for calls
     """
 
     def __init__(
         self,
         config: RobotConfig,
         *,
-        setup: EndpointSetup = _HEARD,
+        air: Air | None = None,
+        start: Start | None = None,
+        loops_back: bool = False,
         middleware: Middleware | None = None,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
-        seed: int | None = None,
+        backpressure: bool = False,
+        registry: Registry | None = None,
     ) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
         self.config = config
-        source, sink = halves(config)
-        topics = read_registry(config.registry if config.sends else "", needed=False)
-        start = self._start = start_of(source, config.robot_id, setup)
-        calls = config.direction == "both" and (len(topics) < MAX_TOPICS or bool(topics.services))
-        common: dict[str, Any] = {"observer": observer, "clock": clock, "seed": seed, "calls": calls}
-        blocks = RobotBlocks(topics, source, sink, start=start, **common)
+        known = registry if registry is not None else read_registry(config.registry)
+        topics = known if config.sends else Registry.empty()
+        calls = config.direction == "both" and not loops_back and (len(topics) < MAX_TOPICS or bool(topics.services))
+        air = air or Air(hears=config.direction == "both")
+        self._start = start or start_of(config)
+        heard = topics if registry is None else known
+        check_outputs(heard, config.publish)
+
+        make = partial(make_endpoint, config, topics, air=air, start=self._start)
+
+        common: dict[str, Any] = {"observer": observer, "clock": clock}
+        sending = self.end = LiveEnd(lambda events: make(observer=events, calls=calls))
+        if loops_back:
+            self.end = LiveEnd(lambda events: make(observer=events, loops_back=True))
         self._graph = middleware or join(config.graph, f"gr_ros2_link_{config.robot_id}")
         self._leave = weakref.finalize(self, self._graph.close if middleware is None else lambda: None)
-        self.end, self.source, self.sink = blocks.end, blocks.source(self._graph), blocks.sink(self._graph)
+        published = heard.with_options(config.publish.topics, announced=True)
         self.calls: LiveCalls | None = None
-        """The services that cross the link; None where topics leave no room for calls."""
-        if calls:
-            self.calls = LiveCalls(self.end, self.source, self.sink)
+        try:
+            self.source = LinkSendingBlock(config, topics, sending, self._graph, backpressure=backpressure, **common)
+            self.sink = ReceivingBlock(config, published, self.end, self._graph, **common)
+            if calls:
+                self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
+        except GrRos2Error:
+            self.close()
+            raise
         for port in ("pdus", "credit"):
             self.message_port_register_hier_in(port)
         self.message_port_register_hier_out("pdus")
@@ -82,20 +152,25 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
             self.msg_connect(self.source, "pdus", self, "pdus")
 
     def set_topics(self, topics: Any) -> None:
-        """Use other options of single topics, of which ``to``, ``queue`` and others may change; see
-        :meth:`RosSource.set_topic_options`."""
-        config = replaced(self.config, topics=topics)
-        self.source.set_topic_options(halves(config)[0].topic_options)
-        self.config = config
+        """See :meth:`LinkSendingBlock.set_topics`."""
+        self.source.set_topics(topics)
+        self.config = self.source.config
 
     def close(self) -> None:
         """Leave the ROS graph, and let another process use the state file. Idempotent."""
-        if self.calls is not None:
-            self.calls.close()
-        self.source.close()
-        self.sink.close()
+        for part in (self.calls, getattr(self, "source", None), getattr(self, "sink", None)):
+            if part is not None:
+                part.close()
         self._leave()
         self._start.close()
+
+
+def read_registry(path: str) -> Registry:
+    """The registry in a file, or an empty one without a file.
+
+    :raises RegistryError: for a wrong file; the message names file, line and problem
+    """
+    return Registry.from_csv(path) if path else Registry.empty()
 
 
 def make_link(
@@ -111,31 +186,26 @@ def make_link(
     """Make a link from settings in one list, as GRC does.
 
     :param half_duplex: whether sending and receiving share the airtime
-    :param any_length: see :class:`RosSource`
+    :param any_length: whether the PHY carries shorter packets in less time (:attr:`gr_ros2.phy.Phy.any_length`)
     :param airtime_limit: how much the radio may send, as its block says: what the robot says about itself becomes rarer
     :param medium: see :class:`gr_ros2.settings.config.AirConfig`
     :param airtime_s: of the longest packet, s; needed unless ``medium`` is exclusive
     :param slot_guard_s: silence between the packets of two robots, s: the timing error of the radio
-    :param values: fields of RobotConfig; those of its ``graph`` and ``publish`` as ``graph_domain_id``, ``publish_as``
+    :param values: see :func:`gr_ros2.settings.robot.robot_from`
     :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
-    parts: dict[str, dict[str, Any]] = {"graph": {}, "publish": {}}
-    for name in list(values):
-        part, _, setting = name.partition("_")
-        if part in parts and setting:
-            parts[part][setting] = values.pop(name)
-    config = build(RobotConfig, {**parts, **values})
+    config = robot_from(**values)
     limits = airtime_from(airtime_limit)
     limits.check_seal(encrypts=bool(config.key) and config.seal == "encrypt")
     shares = medium != "exclusive"
     if shares and not airtime_s > 0:
         raise ConfigError(f"medium = {medium!r}: needs airtime_s above 0: that of the longest packet")
-    setup = EndpointSetup(
-        reports=config.direction == "both",
+    air = Air(
+        hears=config.direction == "both",
         half_duplex=half_duplex or shares,
         any_length=any_length,
         access=access_of(medium, airtime_s, secrets.randbits(32), guard_s=slot_guard_s, lead_s=LEAD_S),
         airtime_share=sustained(limits.rule),
         airtime_s=airtime_s,
     )
-    return RosLink(config, setup=setup)
+    return RosLink(config, air=air)

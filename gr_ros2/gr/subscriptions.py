@@ -1,4 +1,4 @@
-"""What a ROS Source takes from its ROS graph: the topics, with the QoS of their publishers.
+"""What a robot takes from its ROS graph: the topics, with the QoS of their publishers.
 
 Invariants: a callback of the middleware blocks only with ``backpressure``. Each type of a topic has its own topic id.
 """
@@ -18,24 +18,27 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.frame_worker import FrameWorker
 from gr_ros2.gr.live_end import LiveEnd
-from gr_ros2.gr.loops import LOOP_GUARD, Graph
-from gr_ros2.link.endpoint import check_live_options
+from gr_ros2.gr.loops import LOOP_GUARD
+from gr_ros2.link.endpoint import Endpoint, OpenMessages, check_live_options
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.queues import PublisherQos
-from gr_ros2.middleware import Qos, Subscription, TopicInfo
+from gr_ros2.middleware import Middleware, Qos, Subscription, TopicInfo
 from gr_ros2.middleware.adapt import agreed
 from gr_ros2.middleware.type_descriptions import Described
-from gr_ros2.settings.config import SourceConfig, TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import NewTopic, Registry, Topic, normalize_type, options_of
+from gr_ros2.settings.registry import DEFAULT_OPTIONS, NewTopic, Registry, Topic, normalize_type, options_of
+from gr_ros2.settings.robot import RobotConfig
 
 
 class Subscriptions:
-    """The topics that a source sends, and the services that it offers.
+    """The topics that a robot sends, and the services that it offers.
 
     :param registry: what it sends and offers, from which ``config.topics`` chooses, with its own options
+    :param graph: the robot's participant on its ROS graph
     :param live: endpoint that takes the messages
     :param clock: s, monotonic
+    :param backpressure: holds the middleware back while a queue is full
     :param counters: counts ``held_back_at_close``, and what static transforms count
     :ivar registry: all topics so far
     :ivar frames: the topics that are sent as frames; None in a version, or with a setting, without them
@@ -49,31 +52,32 @@ class Subscriptions:
     def __init__(
         self,
         registry: Registry,
-        config: SourceConfig,
-        graph: Graph,
-        live: LiveEnd,
+        config: RobotConfig,
+        graph: Middleware,
+        live: LiveEnd[Endpoint],
         *,
         clock: Callable[[], float],
         counters: Counter[str],
         log: logging.Logger,
+        backpressure: bool = False,
     ) -> None:
         self._given = registry
-        self.options: Mapping[str, TopicOptions] = config.topic_options
+        self.options: Mapping[str, SendOptions] = config.options
         self.registry = registry = registry.with_options(self.options)
         self.room = threading.Condition(live.lock)
-        self._config, self._graph, self._live = config, graph, live
+        self._config, self._graph, self._live, self._backpressure = config, graph, live, backpressure
         self._messages = live.endpoint.messages
         self._clock, self._counters, self._log = clock, counters, log
         self._closed = False
         static = [topic for topic in registry if topic.latched and topic.type_name == TF_TYPE]
         self._static = {topic.topic_id: StaticTransforms(counters) for topic in static}
         self._subscriptions: dict[int, Subscription] = {}
-        frames = live.endpoint.frames if config.compresses else None
+        frames = live.endpoint.frames if config.compression else None
         self.frames = None if frames is None else FrameSender(frames)
         self._worker = None if self.frames is None else FrameWorker(self.frames, live, clock, log)
         self._moved: dict[int, int] = {}
         """Topic ids under which messages leave now, by those that were subscribed, where ``to`` has changed."""
-        chosen = registry.chosen(config.topics) if registry else []
+        chosen = registry.chosen(config.words) if registry else []
         self.subscribed = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_topic}
         self.services = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_service}
 
@@ -87,8 +91,6 @@ class Subscriptions:
             self._code(topic)
         for name, topic in self.subscribed.items():
             self._subscribe(name, topic)
-        if self._graph.owned:
-            self._graph.middleware.start()
 
     def close(self) -> None:
         """Take no further messages. Idempotent."""
@@ -151,6 +153,88 @@ class Subscriptions:
         names = {topic.name: name for name, topic in self.subscribed.items()}
         return [(names[topic.name], topic) for topic in self.registry if topic.is_topic and topic.name in names]
 
+    def _now(self, topic_id: int) -> int:
+        """The topic id under which messages of a subscription leave now."""
+        return self._moved.get(topic_id, topic_id)
+
+    def _code(self, topic: Topic) -> None:
+        """Send a topic as frames if it is one of pictures."""
+        if self.frames is not None and topic.is_topic:
+            self.frames.add(topic)
+
+    def _guard_loops(self) -> None:
+        LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
+
+    def _subscribe(self, name: str, topic: Topic) -> None:
+        options = topic.options
+        depth = self._config.graph.depth if options.depth == AUTO else options.depth
+        if topic.topic_id in self._static and depth:
+            depth = max(depth, STATIC_DEPTH)
+        reliability = None if options.reliability == AUTO else options.reliability
+        durability = None if options.durability == AUTO else options.durability
+        qos = Qos(reliability, durability, depth)
+        callback = partial(self._take, topic.topic_id)
+        subscription = self._graph.subscribe(name, topic.type_name, qos, callback)
+        self._subscriptions = {**self._subscriptions, topic.topic_id: subscription}
+        subscription.follow(partial(self._follow, topic))
+
+    def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
+        """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
+        qos = agreed(offers)
+        publishers = PublisherQos(
+            reliable=qos.reliability != "best_effort",
+            latched=all(offer.durability == "transient_local" for offer in offers),
+            depth=qos.depth,
+            lifespan_s=qos.lifespan_s,
+            period_s=qos.deadline_s,
+            count=len(offers),
+            keeps=min(sum(max(offer.depth, 1) for offer in offers), 255),
+        )
+        return self._messages.follow(self._now(topic.topic_id), publishers)
+
+    def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
+        """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
+        with self._live.lock:
+            changed = self._adapt(topic, offers)
+            if len(offers) == 1 and offers[0].durability == "transient_local" and self.frames is not None:
+                now = self._now(topic.topic_id)
+                self.frames.add(replace(topic, topic_id=now), latched=topic.options.durability != "volatile")
+            policy, deadline_s = self._messages.queue(self._now(topic.topic_id))
+        if changed:
+            limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
+            self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
+
+    def _take(self, topic_id: int, payload: bytes) -> None:
+        """Accept a message of the ROS graph, in a thread of the middleware."""
+        with self._live.lock:
+            now_id = self._now(topic_id)
+            frames = self.frames if self.frames is not None and now_id in self.frames else None
+            while self._backpressure and frames is None and not self._closed and not self._messages.room(now_id):
+                self.room.wait()
+                now_id = self._now(topic_id)
+            if self._closed:
+                self._counters["held_back_at_close"] += 1
+                return
+            subscription = self._subscriptions.get(topic_id)
+            if subscription is not None and subscription.lost:
+                self._messages.missed(topic_id, subscription.lost)
+            if frames is not None:
+                frames.offer(now_id, payload, self._clock())
+                self._live.look()
+                return
+            # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
+            static = self._static.get(topic_id)
+            whole = None if static is None else static.union(payload)
+            waited_s, publisher = (0.0, None) if subscription is None else (subscription.waited_s, subscription.source)
+            self._messages.submit(now_id, whole or payload, self._clock(), waited_s=waited_s, publisher=publisher)
+            self._live.wake()
+
+
+class OpenSubscriptions(Subscriptions):
+    """Those of a robot that announces its topics, so that these may change while it runs."""
+
+    _messages: OpenMessages
+
     def types(self) -> list[tuple[str, str]]:
         """Name on the ROS graph and type of each topic."""
         return [(name, topic.type_name) for name, topic in self.subscribed.items()]
@@ -161,7 +245,7 @@ class Subscriptions:
             self._messages.learn(described.type_name, described.types)
             self._live.work.notify()
 
-    def change(self, options: Mapping[str, TopicOptions]) -> None:
+    def change(self, options: Mapping[str, SendOptions]) -> None:
         """Use other options of single topics from now on, all or none. Called with the lock held.
 
         :raises ConfigError: for an option that cannot change, or one robot more than the table has rows for
@@ -170,8 +254,8 @@ class Subscriptions:
         changed = {}
         for topic in (*self.subscribed.values(), *self.services.values()):
             given = topic.topic_id < len(after)
-            old = before[topic.topic_id].options if given else options_of(topic.name, self.options)
-            new = after[topic.topic_id].options if given else options_of(topic.name, options)
+            old = before[topic.topic_id].options if given else options_of(topic.name, self.options, DEFAULT_OPTIONS)
+            new = after[topic.topic_id].options if given else options_of(topic.name, options, DEFAULT_OPTIONS)
             if new != old:
                 if topic.is_service:
                     raise ConfigError(f"{topic.name}: the options of a service change with a restart only")
@@ -206,7 +290,7 @@ class Subscriptions:
 
         :raises ConfigError: for a topic that cannot be sent, such as one more than a link carries
         """
-        options, type_name = options_of(row_name, self.options), normalize_type(info.type_name)
+        options, type_name = options_of(row_name, self.options, DEFAULT_OPTIONS), normalize_type(info.type_name)
         with self._live.lock:
             before = self.subscribed.get(info.topic)
             known = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
@@ -233,36 +317,11 @@ class Subscriptions:
         """Whether a topic or service of the ROS graph has come by radio."""
         return any(LOOP_GUARD.returns(self._graph, name) for name in names)
 
-    def _now(self, topic_id: int) -> int:
-        """The topic id under which messages of a subscription leave now."""
-        return self._moved.get(topic_id, topic_id)
-
-    def _change(self, topic_id: int, options: TopicOptions) -> None:
+    def _change(self, topic_id: int, options: SendOptions) -> None:
         self.registry, after = self._messages.change(self._now(topic_id), options)
         self._moved[topic_id] = after.topic_id
         if self.frames is not None and topic_id in self.frames:
             self._code(after)
-
-    def _code(self, topic: Topic) -> None:
-        """Send a topic as frames if it is one of pictures."""
-        if self.frames is not None and topic.is_topic:
-            self.frames.add(topic)
-
-    def _guard_loops(self) -> None:
-        LOOP_GUARD.add_source(self, self._graph, [*self.subscribed, *self.services])
-
-    def _subscribe(self, name: str, topic: Topic) -> None:
-        options = topic.options
-        depth = self._config.subscriber_depth if options.depth == AUTO else options.depth
-        if topic.topic_id in self._static and depth:
-            depth = max(depth, STATIC_DEPTH)
-        reliability = None if options.reliability == AUTO else options.reliability
-        durability = None if options.durability == AUTO else options.durability
-        qos = Qos(reliability, durability, depth)
-        callback = partial(self._take, topic.topic_id)
-        subscription = self._graph.middleware.subscribe(name, topic.type_name, qos, callback)
-        self._subscriptions = {**self._subscriptions, topic.topic_id: subscription}
-        subscription.follow(partial(self._follow, topic))
 
     def _unsubscribe(self, topic: Topic) -> None:
         """Take no further messages of a topic id, and keep none for robots that join late."""
@@ -274,54 +333,3 @@ class Subscriptions:
             self._messages.forget_kept(self._now(topic.topic_id))
             if self.frames is not None:
                 self.frames.forget(self._now(topic.topic_id))
-
-    def _adapt(self, topic: Topic, offers: Sequence[Qos]) -> bool:
-        """Tell the endpoint the QoS of a topic's publishers; return whether its queue changed. The lock is held."""
-        qos = agreed(offers)
-        publishers = PublisherQos(
-            reliable=qos.reliability != "best_effort",
-            latched=all(offer.durability == "transient_local" for offer in offers),
-            depth=qos.depth,
-            lifespan_s=qos.lifespan_s,
-            period_s=qos.deadline_s,
-            count=len(offers),
-            keeps=min(sum(max(offer.depth, 1) for offer in offers), 255),
-        )
-        return self._messages.follow(self._now(topic.topic_id), publishers)
-
-    def _follow(self, topic: Topic, offers: Sequence[Qos]) -> None:
-        """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
-        with self._live.lock:
-            changed = self._adapt(topic, offers)
-            if len(offers) == 1 and offers[0].durability == "transient_local" and self.frames is not None:
-                now = self._now(topic.topic_id)
-                self.frames.add(replace(topic, topic_id=now), latched=topic.options.durability != "volatile")
-            policy, deadline_s = self._messages.queue(self._now(topic.topic_id))
-        if changed:
-            limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
-            self._log.info("topic %s: queue %s%s, as its publishers' QoS has it", topic.name, policy, limit)
-
-    def _take(self, topic_id: int, payload: bytes) -> None:
-        """Accept a message of the ROS graph, in a thread of the middleware."""
-        with self._live.lock:
-            now_id = self._now(topic_id)
-            frames = self.frames if self.frames is not None and now_id in self.frames else None
-            while self._config.backpressure and frames is None and not self._closed and not self._messages.room(now_id):
-                self.room.wait()
-                now_id = self._now(topic_id)
-            if self._closed:
-                self._counters["held_back_at_close"] += 1
-                return
-            subscription = self._subscriptions.get(topic_id)
-            if subscription is not None and subscription.lost:
-                self._messages.missed(topic_id, subscription.lost)
-            if frames is not None:
-                frames.offer(now_id, payload, self._clock())
-                self._live.look()
-                return
-            # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
-            static = self._static.get(topic_id)
-            whole = None if static is None else static.union(payload)
-            waited_s, publisher = (0.0, None) if subscription is None else (subscription.waited_s, subscription.source)
-            self._messages.submit(now_id, whole or payload, self._clock(), waited_s=waited_s, publisher=publisher)
-            self._live.wake()

@@ -23,7 +23,7 @@ from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.stats import ReceiverStats, SenderStats
-from gr_ros2.settings.config import QueuePolicy, TopicOptions
+from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
@@ -44,12 +44,12 @@ LIVE_OPTIONS = ("to", "qos", "queue", "queue_depth", "deadline_s", "weight", "ma
 and of its codec, or of a sink."""
 
 
-def check_live_options(topic: str, before: TopicOptions, after: TopicOptions) -> None:
+def check_live_options(topic: str, before: SendOptions, after: SendOptions) -> None:
     """Refuse to change other options of a topic than ``LIVE_OPTIONS``.
 
     :raises ConfigError: naming topic and option, and those that can change
     """
-    for option in fields(TopicOptions):
+    for option in fields(SendOptions):
         if option.name not in LIVE_OPTIONS and getattr(before, option.name) != getattr(after, option.name):
             raise ConfigError(
                 f"topic {topic}: {option.name} cannot change while running; these can: {', '.join(LIVE_OPTIONS)}"
@@ -88,40 +88,6 @@ class MessageSide(Protocol):
         :param total: since the start; the increase is reported to the observer
         """
 
-    def add(self, topics: Sequence[NewTopic]) -> Registry:
-        """Send further topics from now on, all or none. Services among them are announced when they are offered.
-
-        A name may come again with another type: both stay, and the messages of each keep their type.
-
-        :return: everything that is sent; the new topics are the last ones
-        :raises ConfigError: too many topics, a wrong option, or a version in which both ends need the same registry
-        """
-
-    def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:
-        """Give a topic other options from now on, in ``LIVE_OPTIONS``.
-
-        With another robot in ``to``, its messages leave under another topic id, which is the same again for the same
-        robot. What was submitted before stays with the robot for which it was, and is sent on and repaired.
-
-        :return: everything that is sent, and the topic as which its messages are to be submitted from now on
-        :raises ConfigError: too many topics, another option, or a version that has no such options
-        """
-
-    def offer(self, topic_id: int, *, offered: bool) -> None:
-        """Start or stop announcing a service to the other robots. At the start, services are not announced.
-
-        :raises ConfigError: a version without services
-        """
-
-    def forget_kept(self, topic_id: int) -> None:
-        """Send no message of a topic so far to robots that join late, because its publisher has changed its type."""
-
-    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
-        """Code messages of a type by its definition, which was not known before, or another one.
-
-        :param definitions: of the type and of those that it is made of, as the codec takes them
-        """
-
     def follow(self, topic_id: int, publishers: PublisherQos) -> bool:
         """Adapt a topic to the QoS of its publishers, where the configuration leaves it open.
 
@@ -139,6 +105,41 @@ class MessageSide(Protocol):
 
     def queued(self) -> dict[int, int]:
         """Messages that wait or are partly sent, per topic id."""
+
+
+class OpenMessages(MessageSide, Protocol):
+    """The messages of an end that announces its topics, so that these may change while it runs."""
+
+    def add(self, topics: Sequence[NewTopic]) -> Registry:
+        """Send further topics from now on, all or none. Services among them are announced when they are offered.
+
+        A name may come again with another type: both stay, and the messages of each keep their type.
+
+        :return: everything that is sent; the new topics are the last ones
+        :raises ConfigError: too many topics, or a wrong option
+        """
+
+    def change(self, topic_id: int, options: SendOptions) -> tuple[Registry, Topic]:
+        """Give a topic other options from now on, in ``LIVE_OPTIONS``.
+
+        With another robot in ``to``, its messages leave under another topic id, which is the same again for the same
+        robot. What was submitted before stays with the robot for which it was, and is sent on and repaired.
+
+        :return: everything that is sent, and the topic as which its messages are to be submitted from now on
+        :raises ConfigError: too many topics, or another option
+        """
+
+    def offer(self, topic_id: int, *, offered: bool) -> None:
+        """Start or stop announcing a service to the other robots. At the start, services are not announced."""
+
+    def forget_kept(self, topic_id: int) -> None:
+        """Send no message of a topic so far to robots that join late, because its publisher has changed its type."""
+
+    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
+        """Code messages of a type by its definition, which was not known before, or another one.
+
+        :param definitions: of the type and of those that it is made of, as the codec takes them
+        """
 
 
 class PacketSide(Protocol):
@@ -255,23 +256,12 @@ class Endpoint(PacketSide, Protocol):
         """Settings of its sending half that may change at run time."""
 
     @property
-    def live_options(self) -> Sequence[str]:
-        """Options of a topic that may change at run time."""
-
-    @property
     def messages(self) -> MessageSide:
-        """Its message side.
-
-        :raises ConfigError: it sends nothing
-        """
+        """Its message side."""
 
     @property
     def frames(self) -> FrameSide | None:
         """Its coded topics; None in a version without them."""
-
-    @property
-    def boot(self) -> int:
-        """Number of this start of the robot; 0 in a version that does not count them."""
 
     @property
     def sent(self) -> SenderStats:
@@ -301,15 +291,28 @@ class Endpoint(PacketSide, Protocol):
     def knows(self, src_id: int) -> bool:
         """Whether the state of a sender is held at present."""
 
+    def peers(self, now: float) -> list[HeardRobot]:
+        """The robots that are known, if the version tells."""
+
+
+class OpenEndpoint(Endpoint, Protocol):
+    """An end that announces its topics, asks other robots and may carry services."""
+
+    @property
+    def live_options(self) -> Sequence[str]:
+        """Options of a topic that may change at run time."""
+
+    @property
+    def messages(self) -> OpenMessages:
+        """Its message side."""
+
+    @property
+    def boot(self) -> int:
+        """Number of this start of the robot."""
+
     def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:
         """The topics of a robot by topic id, as far as it has announced them."""
 
     @property
     def questions(self) -> Questions:
-        """Its questions to other robots.
-
-        :raises ConfigError: a version without them
-        """
-
-    def peers(self, now: float) -> list[HeardRobot]:
-        """The robots that are known, if the version tells."""
+        """Its questions to other robots."""

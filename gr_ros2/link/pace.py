@@ -23,7 +23,7 @@ good: what was dropped measured nothing better."""
 class Pace:
     """The pace of one sending half.
 
-    :param packet_rate: see :class:`gr_ros2.settings.config.SourceConfig`
+    :param packet_rate: see :class:`gr_ros2.settings.robot.RobotConfig`
     """
 
     def __init__(self, packet_rate: float | Auto) -> None:

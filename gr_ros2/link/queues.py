@@ -19,7 +19,7 @@ from typing import Generic, TypeVar
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.instances import ALL, Keys, replaced
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S
-from gr_ros2.settings.config import QueuePolicy, TopicOptions
+from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.wire import QOS_DEFAULT, QOS_LATENCY, QOS_NAMES
 
@@ -122,7 +122,7 @@ UNKNOWN_QOS = PublisherQos()
 class TopicQueue(deque[M], Generic[M]):
     """The messages of one topic, in the order in which they are sent.
 
-    :param policy: see ``TopicOptions.queue``
+    :param policy: see ``SendOptions.queue``
     :param deadline_s: s a message may take from submission to the far end, 0 no limit
     :param max_rate: messages/s that may start, 0 unlimited
     """
@@ -240,7 +240,7 @@ class TopicQueue(deque[M], Generic[M]):
         return Fate.CANNOT_COMPLETE, f"{needs * 1e3:.0f} ms on the air end after {limit}"
 
 
-def qos_class(options: TopicOptions, *, command: bool = False) -> int:
+def qos_class(options: SendOptions, *, command: bool = False) -> int:
     """The QoS class of a topic's messages.
 
     :param command: whether it is one of commands, which go first unless the options say otherwise
@@ -251,7 +251,7 @@ def qos_class(options: TopicOptions, *, command: bool = False) -> int:
 
 
 def queue_for(
-    options: TopicOptions, publishers: PublisherQos = UNKNOWN_QOS, *, command: bool = False
+    options: SendOptions, publishers: PublisherQos = UNKNOWN_QOS, *, command: bool = False
 ) -> tuple[QueuePolicy, float]:
     """The policy of a topic's queue and its deadline in s (0 = none): the configured ones, otherwise from its
     publishers' QoS.

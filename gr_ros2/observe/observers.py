@@ -25,7 +25,7 @@ from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.settings.registry import Registry
 
 if TYPE_CHECKING:  # they need GNU Radio, and a run in simulated time by packets does not
-    from gr_ros2.gr import RosSource
+    from gr_ros2.gr.sending import SendingBlock
     from gr_ros2.phy.path import LinkCounts
     from gr_ros2.phy.tap import Samples
 
@@ -109,7 +109,7 @@ class LiveRun:
     packet_len: int
     registry: Registry
     topics: Mapping[tuple[int, int], str]
-    sources: Mapping[int, RosSource]
+    sources: Mapping[int, SendingBlock]
     links: Sequence[LiveLink]
     fates: Callable[[], Mapping[tuple[int, int], Mapping[str, int]]] | None
     clock: Callable[[], float] = time.monotonic

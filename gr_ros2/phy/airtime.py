@@ -23,7 +23,7 @@ from gr_ros2.phy.threads import WaitingBlock
 
 
 class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
-    """Message ports `pdus` in, `pdus` out, `credit` out (see :class:`gr_ros2.gr.source.RosSource`).
+    """Message ports `pdus` in, `pdus` out, `credit` out (see :class:`gr_ros2.gr.sending.SendingBlock`).
 
     :param airtime: s that one packet occupies, gap included; 0 lets packets pass at once
     :param airtime_of: the airtime for a packet's bytes and MCS, at most ``airtime``; None = all packets have the same

@@ -20,8 +20,8 @@ from gr_ros2.radio.permission import check_band
 from gr_ros2.settings.config import STRICT, AirConfig, ChannelConfig, DiagnosticsConfig, Text, build
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import read_settings
-from gr_ros2.settings.registry import Registry, check_outputs
-from gr_ros2.settings.robot import RobotConfig, halves
+from gr_ros2.settings.robot import RobotConfig
+from gr_ros2.wire import FORMATS
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, use_attribute_docstrings=True))
@@ -60,7 +60,8 @@ class LinkConfig(AirConfig, RobotConfig):
         if self.airtime.rule is not None and self.packet_rate == 0:
             raise ValueError("packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out")
         self.airtime.check_seal(encrypts=bool(self.key) and self.seal == "encrypt")
-        halves(self)  # says what does not go together
+        if self.packet_len < (least := FORMATS[1].min_packet_len):
+            raise ValueError(f"packet_len = {self.packet_len}: a link needs at least {least}")
         check_band(self.airtime, self.front_end, 0.0 if self.phy.sample_rate == AUTO else self.phy.sample_rate)
         return self
 
@@ -73,19 +74,6 @@ class LinkConfig(AirConfig, RobotConfig):
     def front_end_options(self) -> dict[str, Any]:
         """The settings of the front end."""
         return {key: value for key, value in self.front_end.items() if key != "name"}
-
-    def load_registry(self) -> Registry:
-        """Load the registry.
-
-        :raises RegistryError: for a wrong file; the message names file, line and problem
-        :raises ConfigError: when the sink could not publish its topics, see
-            :func:`gr_ros2.settings.registry.check_outputs`
-        """
-        if not self.registry:
-            return Registry.empty()
-        registry = Registry.from_csv(self.registry)
-        check_outputs(registry, halves(self)[1])
-        return registry
 
 
 def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:

@@ -18,6 +18,7 @@ from typing import Any
 from gr_ros2 import __version__
 from gr_ros2.gr.health import LOCKED
 from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.phy import Phy, configured
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.settings.fields import AUTO
@@ -51,21 +52,23 @@ def about(config: LinkConfig, phy: Phy) -> dict[str, Any]:
     return {"packet_len": config.packet_len, "phy": digest, "key": key, "text": text}
 
 
-def introduce(live: LiveEnd, told: Mapping[str, Any], snr_db: Callable[[], float | None], now: float) -> None:
+def introduce(
+    live: LiveEnd[OpenEndpoint], told: Mapping[str, Any], snr_db: Callable[[], float | None], now: float
+) -> None:
     """From now on, tell those who ask what this end is, what time it has, and how well it receives."""
     questions = live.endpoint.questions
     questions.introduce(**told)
     questions.snr_db, questions.wall_s = snr_db, time.time() - now
 
 
-def peers(live: LiveEnd, now: float) -> list[dict[str, Any]]:
+def peers(live: LiveEnd[OpenEndpoint], now: float) -> list[dict[str, Any]]:
     """The robots that were heard; the one heard last comes first."""
     with live.lock:
         found = live.endpoint.peers(now)
     return [{**asdict(peer), "start": f"{peer.start:016x}"} for peer in sorted(found, key=lambda peer: peer.heard_s)]
 
 
-def ping(live: LiveEnd, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
+def ping(live: LiveEnd[OpenEndpoint], robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
     """Ask a robot, and say what has come of all questions to it so far.
 
     :param anew: forget the earlier ones

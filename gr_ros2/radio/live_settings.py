@@ -11,7 +11,8 @@ from functools import partial
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError, shortened
-from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.receiving import ReceivingBlock
+from gr_ros2.gr.ros_link import LinkSendingBlock
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import options_of
 
@@ -25,10 +26,10 @@ class LiveSettings:
     :param sink: the block that receives
     """
 
-    def __init__(self, source: RosSource, sink: RosSink) -> None:
+    def __init__(self, source: LinkSendingBlock, sink: ReceivingBlock) -> None:
         self._source = source
         self._setters: dict[str, Callable[[Any], None]] = {
-            name: getattr(source, f"set_{name}") for name in source.live_settings if name != "topic_options"
+            name: getattr(source, f"set_{name}") for name in source.live_settings
         }
         self._setters |= {name: partial(self._set_both, name) for name in sink.live_settings}
         self._sink = sink
@@ -52,11 +53,11 @@ class LiveSettings:
             self._setters[name](value)
             return shortened(f"{name} = {value}")
         topic, option = place
-        given = self._source.config.topic_options
+        given = self._source.config.topics
         known = next((other for other in given if other.lstrip("/") == topic.lstrip("/")), topic)
-        before = options_of(topic, given)
+        before = options_of(topic, self._source.config.options, SendOptions())
         changed = {**{each.name: getattr(before, each.name) for each in fields(SendOptions)}, option: value}
-        self._source.set_topic_options({**given, known: changed})
+        self._source.set_topics({**given, known: changed})
         sent = {topic.name.lstrip("/") for topic in self._source.subscriptions.subscribed.values()}
         return shortened(f"{name} = {value}") + ("" if topic.lstrip("/") in sent else f"; no topic {topic} is sent now")
 

@@ -34,7 +34,7 @@ _LEAST_WAIT_S = 0.001
 
 
 class Radio(PacketPath, HierBlock):
-    """Message ports `pdus` in, `pdus` out and `credit` out (see :class:`gr_ros2.gr.source.RosSource`).
+    """Message ports `pdus` in, `pdus` out and `credit` out (see :class:`gr_ros2.gr.sending.SendingBlock`).
 
     :param phy: converts packets to samples and back
     :param front_end: carries the samples; ``close`` closes it too

@@ -109,7 +109,8 @@ class RobotLink(Flowgraph):
             stack=self._stack,
         )
         self.node_name, graph = self._ros.node_name, self._ros.graph
-        self.source, self.sink, self.end, self.calls = self._ros.source, self._ros.sink, self._ros.end, self._ros.calls
+        link = self._ros.link
+        self.source, self.sink, self.end, self.calls = link.source, link.sink, link.end, link.calls
         self._connect_radio()
         self.source.use_credit()
         told = about(config, self.phy)
@@ -148,14 +149,14 @@ class RobotLink(Flowgraph):
 
     def _connect_radio(self) -> None:
         """Connect the radio with the blocks of ROS."""
-        sends, receives = self._ros.blocks
+        link = self._ros.link
         if self.sends:  # without credit, nothing leaves
-            self.msg_connect(sends, "pdus", self.radio, "pdus")
-            self.msg_connect(self.radio, "credit", sends, "credit")
+            self.msg_connect(link, "pdus", self.radio, "pdus")
+            self.msg_connect(self.radio, "credit", link, "credit")
             if self._ros.shares:
                 self.front_end.follow(self._at_rest)
         if self.config.receives:
-            self.msg_connect(self.radio, "pdus", receives, "pdus")
+            self.msg_connect(self.radio, "pdus", link, "pdus")
 
     def _lose(self, error: RadioError) -> None:
         """The device has vanished: close it, and wait for it. The rest of the link keeps its state."""

@@ -14,7 +14,7 @@ from gr_ros2.core.names import INFRASTRUCTURE
 from gr_ros2.middleware import TopicInfo
 
 if TYPE_CHECKING:
-    from gr_ros2.gr import RosSource
+    from gr_ros2.gr.ros_link import LinkSendingBlock
 
 _FIRST_S, _EVERY_S = 3.0, 10.0
 """s after which the graph has told most of what is on it, and s from one look at it to the next."""
@@ -95,7 +95,7 @@ class Waiting:
     :param source: source of an open link
     """
 
-    def __init__(self, source: RosSource) -> None:
+    def __init__(self, source: LinkSendingBlock) -> None:
         self._source = source
         self._last = ALL_THERE
         self._looked = False

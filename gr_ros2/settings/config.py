@@ -7,7 +7,6 @@ value and what is allowed.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -20,7 +19,6 @@ from pydantic import (
     Field,
     TypeAdapter,
     ValidationError,
-    field_validator,
     model_validator,
 )
 from pydantic.dataclasses import dataclass
@@ -32,18 +30,14 @@ from gr_ros2.core.names import (
     checked_namespace,
     checked_namespace_form,
     checked_topic_form,
-    topic_fault,
 )
 from gr_ros2.settings.airtime import Airtime, AirtimeConfig
-from gr_ros2.settings.commands import COMMAND_TYPES, checked_commands
 from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
-from gr_ros2.settings.fields import AUTO, Auto, OnlyAt, OnlyIn
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.problems import explain
-from gr_ros2.settings.topic_choice import checked_words, words_of
 from gr_ros2.settings.yaml_bounds import read_bounded
 from gr_ros2.settings.yaml_text import parse_yaml
-from gr_ros2.state.keys import checked_key_file
-from gr_ros2.wire import BROADCAST, FORMATS, Format, format_of
+from gr_ros2.wire import BROADCAST, FORMATS
 
 NOBODY = -1
 """Id of an end that belongs to no robot."""
@@ -74,7 +68,6 @@ FrameForm = Annotated[str, AfterValidator(checked_frame_form)]
 QosClass = Literal["default", "latency", "bulk"]
 Medium = Literal["exclusive", "slots", "aloha"]
 QueuePolicy = Literal["latest", "fifo", "deadline"]
-WireVersion = Literal[0, 1]
 Repairs = Literal["idle", "thrifty", "off"]
 Kernels = Literal["auto", "numpy"]
 
@@ -107,28 +100,6 @@ class Traffic:
     def bag_path(self) -> Path | None:
         """The recording to play, None when the simulator is the source."""
         return None if self.source == "sim" else Path(self.source.removeprefix("bag:").strip()).expanduser()
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Agreed:
-    """What all ends of a link have to agree on.
-
-    :param packet_len: bytes on the wire, 14..4095 (40 or more with version 1), the same at every end of a link
-    :param registry: CSV path or, in a YAML file, the name of a built-in one such as `table4`; the same at every end
-    :param version: of the wire format, 0 the paper's, 1 with repair, announcements and seals; the same at every end
-    :param key: file of the fleet's keys (gr-ros2 key new); '' sends packets that anybody can read and forge; with one,
-        sealed packets alone are taken
-    :param seal: with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption
-    :param state: file that counts this robot's starts and says what was heard before a restart; '' keeps it in the
-        user's state folder
-    """
-
-    packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
-    registry: Annotated[Text, Field(title="Registry CSV")]
-    version: Annotated[WireVersion, Field(title="Version of the wire format")] = 1
-    key: Annotated[str, OnlyIn(1), Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
-    seal: Annotated[Literal["encrypt", "authenticate"], OnlyIn(1)] = "encrypt"
-    state: Annotated[str, OnlyIn(1), Field(title="State file")] = ""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -228,7 +199,7 @@ class SendOptions:
     :param qos: class of its packets, the two QoS bits of the header; auto = latency for ``commands``, else default
     :param reliability: auto adapts the subscription to the publishers found
     :param durability: auto adapts likewise; the sink publishes volatile unless this says transient_local
-    :param depth: QoS depth of subscription and publisher, auto takes ``subscriber_depth``/``publisher_depth``; of a
+    :param depth: QoS depth of subscription and publisher, auto takes that of ``graph`` or ``publish``; of a
         transient-local topic also how many messages late robots and late subscribers get, auto 1
     :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
         ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
@@ -256,24 +227,24 @@ class SendOptions:
     :param depth_image: the same of depth images, such as {mode: 10}
     """
 
-    qos: Annotated[QosClass | Auto, OnlyAt("source")] = AUTO
+    qos: QosClass | Auto = AUTO
     reliability: Literal["reliable", "best_effort"] | Auto = AUTO
     durability: Literal["volatile", "transient_local"] | Auto = AUTO
     depth: Count | Auto = AUTO
-    queue_depth: Annotated[Count | Auto, OnlyAt("source"), Field(title="Queue depth (messages per topic)")] = AUTO
-    queue: Annotated[QueuePolicy | Auto, OnlyIn(1), OnlyAt("source")] = AUTO
-    deadline_s: Annotated[Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto, OnlyIn(1)] = AUTO
-    weight: Annotated[float, OnlyIn(1), OnlyAt("source"), Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
-    max_rate: Annotated[float, OnlyIn(1), OnlyAt("source"), Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
-    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
-    keep_s: Annotated[Seconds, OnlyIn(1), OnlyAt("source")] = 0.0
-    to: Annotated[Annotated[int, Field(ge=0, le=254)] | Auto, OnlyIn(1), OnlyAt("source")] = AUTO
-    codec: Annotated[str, OnlyAt("source")] = AUTO
-    quantize: Annotated[str, OnlyAt("source")] = ""
-    instance: Annotated[str, OnlyIn(1), OnlyAt("source")] = ""
-    cloud: Annotated[CloudOptions, OnlyAt("source")] = Field(default_factory=CloudOptions)
-    camera: Annotated[CameraOptions, OnlyAt("source"), BeforeValidator(_off)] = Field(default_factory=CameraOptions)
-    depth_image: Annotated[DepthOptions, OnlyAt("source"), BeforeValidator(_off)] = Field(default_factory=DepthOptions)
+    queue_depth: Annotated[Count | Auto, Field(title="Queue depth (messages per topic)")] = AUTO
+    queue: QueuePolicy | Auto = AUTO
+    deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
+    weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
+    max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
+    max_age_s: Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")] = AUTO
+    keep_s: Seconds = 0.0
+    to: RobotId | Auto = AUTO
+    codec: str = AUTO
+    quantize: str = ""
+    instance: str = ""
+    cloud: CloudOptions = Field(default_factory=CloudOptions)
+    camera: Annotated[CameraOptions, BeforeValidator(_off)] = Field(default_factory=CameraOptions)
+    depth_image: Annotated[DepthOptions, BeforeValidator(_off)] = Field(default_factory=DepthOptions)
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("queue_depth",),
@@ -289,229 +260,6 @@ class SendOptions:
         if self.queue == "deadline" and self.deadline_s in (0, AUTO):
             raise ValueError("queue = 'deadline': deadline_s is missing; set it above 0")
         return self
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class TopicOptions(SendOptions):
-    """Options of one topic: named columns of a registry.
-
-    :param publish_as: its name where it comes out, ``{robot}`` allowed; auto takes that of the receiver
-    """
-
-    publish_as: Annotated[TopicForm, OnlyAt("sink")] = AUTO
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class EndConfig(Agreed):
-    """What both ends of a link have.
-
-    :param registry: CSV path, the same on both ends; '' where a Registry object is handed over
-    :param robot_id: the robot's own id on the wire, 0..254. auto: a source takes the last run of digits of its
-        namespace; a sink takes that of the source beside it, and hears everything where there is none, or where the
-        front end loops back. A sink that has one drops and counts its own packets and those for others
-    :param middleware: where the ROS graph is reached, a name of ``gr_ros2.middleware.MIDDLEWARE``
-    :param domain_id: ROS domain, 0..232; auto takes ROS_DOMAIN_ID
-    :param topic_options: per topic name, over the registry's columns, such as {'odom': {'depth': 100}}
-    :param debug: readable log of headers, topic ids and entries
-    """
-
-    registry: Annotated[str, Field(title="Registry CSV")] = ""
-    robot_id: Annotated[RobotId | Auto, Field(title="Robot ID")] = AUTO
-    middleware: str = DEFAULT_MIDDLEWARE
-    domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
-    topic_options: dict[str, TopicOptions] = Field(default_factory=dict)
-    debug: Annotated[bool, Field(title="Debug log")] = False
-    end: ClassVar[Any] = ""
-    """``source`` or ``sink``."""
-    conditions: ClassVar[tuple[ActsWhere, ...]] = (
-        ActsWhere(
-            ("seal", "topic_options.*.max_age_s"),
-            lambda end: bool(end.key),
-            "nothing is sealed without a key; set key, or leave it out",
-        ),
-    )
-
-    @model_validator(mode="after")
-    def _has_effect(self) -> EndConfig:
-        for name, options in self.topic_options.items():
-            if fault := topic_fault(f"/{re.sub('[*?]', 'x', name).removeprefix('/')}"):
-                raise ValueError(f"topic_options has topic {name!r}: {fault}")
-            refuse_without_effect(options, self.version, f"topic_options.{name}.", self.end)
-        refuse_without_effect(self, self.version)
-        return self
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class SourceConfig(EndConfig):
-    """ROS Source (the paper, section 4.3; docs/reference/parameters.md).
-
-    :param topics: which topics are sent: names, in which * and ? stand for others; auto = every topic of the namespace;
-        -NAME leaves out. Of the registry, where there is one ([] = all); otherwise, with version 1, of the ROS graph,
-        which says type and QoS ([] = none)
-    :param services: whether these names choose services and actions of the ROS graph too, which other robots may then
-        call; this needs both directions of a link
-    :param commands: types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before
-        others, unless the topic's options say otherwise
-    :param namespace: namespace of the robot on the ROS graph; a registry row ``/x`` is absolute
-    :param dst_id: destination id, 255 broadcast; while a link runs it can change with version 0 only
-    :param min_fragment: k_min, lower bound on an entry's payload, bytes
-    :param greedy: several entries of one topic in a packet, back to back
-    :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
-    :param subscriber_depth: QoS depth of the subscriptions, 0 unbounded
-    :param hop: initial hop count (TTL) 0..15
-    :param packet_rate: packets/s at most. auto = as the PHY grants credits, each packet composed just before; a number
-        is a limit beside that; 0 = every packet at once, whatever the PHY grants, as the paper has it
-    :param queue_depth: messages waiting per topic, the oldest dropped and counted; 0 unbounded
-    :param backpressure: hold the middleware back instead of dropping when a queue is full (bags)
-    :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only: on a lossy link it
-        joins fragments of different messages)
-    :param repeat_s: s between repeats of a transient-local topic such as /map, 0 off; with
-        version 1 only while no robot reports, and up to 32 times as long while none is heard that could be
-    :param beacon_s: s without hearing any robot after which nothing is sent but one hello every so many s, until one is
-        heard; 0 = never; needs both directions
-    :param compression: code every message, which a receiver sees by itself; auto = with version 1, which the paper's
-        version 0 leaves off
-    :param repair: what idle air is spent on: idle = all of it on what may have been lost, thrifty = as
-        much as losses are known or expected, off; auto = thrifty where receivers report, idle where none does
-    :param expected_loss: share of packets lost, 0..1, as long as no report tells (thrifty)
-    """
-
-    topics: Annotated[
-        tuple[str, ...],
-        BeforeValidator(lambda given: words_of(given) if isinstance(given, str) else given),
-        AfterValidator(checked_words),
-    ] = ()
-    services: Annotated[bool, OnlyIn(1), Field(title="Services and actions too")] = True
-    commands: Annotated[tuple[str, ...], OnlyIn(1), AfterValidator(checked_commands)] = COMMAND_TYPES
-    namespace: Namespace = ""
-    dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
-    min_fragment: Annotated[int, OnlyIn(0), Field(ge=1, le=65535, title="Smallest fragment (bytes)")] = 16
-    greedy: Annotated[bool, OnlyIn(0)] = False
-    flush_timeout_s: Annotated[Seconds, OnlyIn(0)] = 0.0
-    subscriber_depth: Annotated[Count, Field(title="Subscriber depth (messages)")] = 10
-    hop: Annotated[int, OnlyIn(0), Field(ge=0, le=15, title="Hop limit (hops)")] = 1
-    packet_rate: Annotated[
-        Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Packet rate (packets/s)")
-    ] = AUTO
-    queue_depth: Annotated[Count, Field(title="Queue depth (messages per topic)")] = 100
-    backpressure: bool = False
-    entry_ids: Annotated[Literal["sequential", "random"], OnlyIn(0), Field(title="Entry IDs")] = "sequential"
-    beacon_s: Annotated[Seconds, OnlyIn(1), Field(title="Time until only beacons are sent (s)")] = 0.0
-    repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
-    compression: bool | Auto = AUTO
-    repair: Annotated[Repairs | Auto, OnlyIn(1)] = AUTO
-    expected_loss: Annotated[float, OnlyIn(1), Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
-    end: ClassVar[Any] = "source"
-    conditions: ClassVar[Any] = (
-        ActsWhere(
-            tuple(f"topic_options.*.{option}" for option in CODING),
-            lambda source: source.compresses,
-            "no message is coded without compression; set compression: true, or leave it out",
-        ),
-        ActsWhere(
-            ("expected_loss",),
-            lambda source: source.repair != "off",
-            "nothing is repaired; set repair to thrifty, or leave it out",
-        ),
-    )
-
-    @field_validator("repair", mode="before")
-    @classmethod
-    def _off_is_a_word(cls, value: object) -> object:
-        """YAML 1.1 reads an unquoted ``off`` as false."""
-        return "off" if value is False else value
-
-    @model_validator(mode="after")
-    def _fits(self) -> SourceConfig:
-        least = self.wire_format.min_packet_len
-        if self.packet_len < least:
-            raise ValueError(f"packet_len = {self.packet_len}: version {self.version} needs at least {least}")
-        most = self.wire_format.single_entry_payload(self.packet_len)
-        if self.min_fragment > most:
-            raise ValueError(
-                f"min_fragment = {self.min_fragment} does not fit packet_len = {self.packet_len}; at most {most}"
-            )
-        return self
-
-    @property
-    def wire_format(self) -> Format:
-        """The wire format of the version in which packets are written."""
-        return format_of(self.version)
-
-    @property
-    def compresses(self) -> bool:
-        """Whether messages are coded: as ``compression`` says, or as the version has it."""
-        return self.version != 0 if self.compression == AUTO else self.compression
-
-    def src_id(self) -> int:
-        """The source id on the wire: ``robot_id``, or the last run of digits of the namespace (section 4.3).
-
-        :raises ConfigError: when ``auto`` finds no digits or a number of 255 or more
-        """
-        if self.robot_id != AUTO:
-            return self.robot_id
-        runs = re.findall(r"[0-9]+", self.namespace)
-        if not runs:
-            raise ConfigError(f"robot_id = auto: namespace {self.namespace!r} has no digits; set robot_id to 0..254")
-        if int(runs[-1]) >= BROADCAST:
-            raise ConfigError(
-                f"robot_id = auto: {int(runs[-1])} from namespace {self.namespace!r} is not below 255; "
-                "set robot_id to 0..254"
-            )
-        return int(runs[-1])
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class SinkConfig(EndConfig):
-    """ROS Sink (the paper, section 4.4).
-
-    :param namespace_format: topics come out as this + '/' + row name; ``{robot}`` is the sender
-    :param publisher_depth: QoS depth of the publishers, 0 unbounded
-    :param reassembly_timeout_s: s an incomplete message is kept
-    :param hold_s: s that a message of a reliable topic waits for an earlier one where the sender gets no reports; where
-        it does, until that one is repaired or given up by its sender
-    :param max_age_s: s for which a sealed message may have been withheld on its way (with a key), or it is not taken;
-        auto: 15 for calls and topics with a deadline or lifespan, any time for others; 0 = any time
-    :param max_sources: senders served at a time; packets of further ones are counted and dropped
-    :param max_source_bytes: memory per sender, in version 1 a quarter for incomplete messages; the oldest goes first
-    :param max_bytes: fragments held in all
-    :param use_sim_time: take latency from stamps on the graph's /clock instead of wall time
-    :param frame_prefix: before every frame name of a message, ``{robot}`` is the sender; '' leaves messages as sent
-    :param merge_tf: topic on which the transforms of all senders come out too, and their static ones, latched, on this
-        + ``_static``; needs ``frame_prefix``; '' off
-    """
-
-    namespace_format: NamespaceForm = "/rx_robot_{robot}"
-    publisher_depth: Annotated[Count, Field(title="Publisher depth (messages)")] = 10
-    reassembly_timeout_s: Annotated[float, OnlyIn(0), Field(gt=0, allow_inf_nan=False)] = 1.0
-    hold_s: Annotated[Seconds, OnlyIn(1), Field(title="Wait for repair (s)")] = 1.0
-    max_age_s: Annotated[Seconds | Auto, OnlyIn(1), Field(title="Oldest sealed message (s)")] = AUTO
-    max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
-    max_source_bytes: Annotated[Bytes, Field(title="Memory per sender (bytes)")] = 72_000_000
-    max_bytes: Annotated[Bytes, OnlyIn(0), Field(title="Memory in all (bytes)")] = 64_000_000
-    use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
-    frame_prefix: FrameForm = ""
-    merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
-    end: ClassVar[Any] = "sink"
-    conditions: ClassVar[Any] = (
-        ActsWhere(
-            ("max_age_s",), lambda sink: bool(sink.key), "only sealed messages have an age; set key, or leave it out"
-        ),
-    )
-
-    @model_validator(mode="after")
-    def _frames_stay_apart(self) -> SinkConfig:
-        if self.merge_tf and not self.frame_prefix:
-            raise ValueError(
-                f"merge_tf = {self.merge_tf!r}: frames of several robots would be mixed up; set frame_prefix, "
-                "for instance to 'robot_{robot}/'"
-            )
-        return self
-
-    @property
-    def merged_topics(self) -> tuple[str, ...]:
-        """The topics of ``merge_tf``: moving and static transforms; () where it is off."""
-        return (self.merge_tf, f"{self.merge_tf}_static") if self.merge_tf else ()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -615,31 +363,6 @@ class PathConfig(ChannelConfig):
     def between(self, sender: int, receiver: int) -> bool:
         """Whether it lies between two robots, by their numbers."""
         return self.from_ in (None, sender) and self.to in (None, receiver)
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class PaperConfig:
-    """What the paper's blocks have, ROS Source and ROS Sink, which speak version 0.
-
-    :param dst_id: destination id, 255 broadcast
-    :param min_fragment: k_min, lower bound on an entry's payload, bytes
-    :param greedy: several entries of one topic in a packet, back to back
-    :param flush_timeout_s: s a partly filled packet waits for further messages; 0 = it is sent at once
-    :param hop: initial hop count (TTL) 0..15
-    :param entry_ids: sequential per topic, or random as the paper has it (compatibility trials only: on a lossy link it
-        joins fragments of different messages)
-    :param compression: code every message, which the paper leaves off
-    :param reassembly_timeout_s: s an incomplete message is kept
-    """
-
-    dst_id: Annotated[int, Field(ge=0, le=BROADCAST, title="Destination ID")] = BROADCAST
-    min_fragment: Annotated[int, Field(ge=1, le=65535, title="Smallest fragment (bytes)")] = 16
-    greedy: bool = False
-    flush_timeout_s: Seconds = 0.0
-    hop: Annotated[int, Field(ge=0, le=15, title="Hop limit (hops)")] = 1
-    entry_ids: Annotated[Literal["sequential", "random"], Field(title="Entry IDs")] = "sequential"
-    compression: bool = False
-    reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -899,13 +622,3 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected keys and values, found {type(values).__name__}")
     return values
-
-
-def robot_of(source: SourceConfig | None, sink: SinkConfig | None) -> int:
-    """Id of the robot that an end belongs to; ``NOBODY`` for an end that only receives and has none.
-
-    :raises ConfigError: when the source names no robot
-    """
-    if source is not None:
-        return source.src_id()
-    return NOBODY if sink is None or sink.robot_id == AUTO else sink.robot_id

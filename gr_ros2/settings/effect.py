@@ -1,11 +1,11 @@
-"""Refuses settings that have no effect where they are given: of another version, of the other end, or beside others.
+"""Refuses settings that have no effect where they are given.
 
 Invariant: a default is never refused, and neither is a value that equals it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,31 +26,28 @@ class ActsWhere:
     otherwise: str
 
 
-def refuse_without_effect(config: Any, version: int | None = None, where: str = "", end: str = "") -> None:
-    """Refuse settings that have no effect. At their defaults they are taken.
+def refuse_without_effect(config: Any) -> None:
+    """Refuse settings that have no effect beside others. At their defaults they are taken.
 
     :param config: an object of a settings class
-    :param version: of the wire format that runs; None: whatever version
-    :param where: what the names of the settings begin with in the error
-    :param end: ``source`` or ``sink``: the end of the link at which they are given; '': at both, as in a registry
     :raises ValueError: naming setting, value and remedy
     """
-    for setting in () if version is None else settings_of(type(config)):
-        value = getattr(config, setting.attribute)
-        if value == setting.default:
-            continue
-        if setting.version not in (None, version):
-            raise ValueError(f"{where}{setting.name} = {value!r}: version {version} has no such setting; leave it out")
-        if end and setting.end not in (None, end):
-            raise ValueError(
-                f"{where}{setting.name} = {value!r}: acts at the {setting.end} alone; give it to ros_{setting.end}, or "
-                "leave it out"
-            )
     for condition in conditions_of(type(config)):
         if not condition.holds(config):
-            for name in condition.settings:
-                for given, value in _given(config, name):
-                    raise ValueError(f"{where}{given} = {value!r}: {condition.otherwise}")
+            refuse_given(config, condition.settings, condition.otherwise)
+
+
+def refuse_given(config: Any, settings: Iterable[str], why: str, where: str = "") -> None:
+    """Refuse some settings of an object unless they are at their defaults.
+
+    :param settings: dotted names, see :class:`ActsWhere`
+    :param why: why, and the remedy
+    :param where: what the names begin with in the error
+    :raises ValueError: naming setting, value and remedy
+    """
+    for name in settings:
+        for given, value in _given(config, name):
+            raise ValueError(f"{where}{given} = {value!r}: {why}")
 
 
 def conditions_of(cls: type[Any]) -> list[ActsWhere]:

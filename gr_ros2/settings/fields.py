@@ -20,20 +20,6 @@ AUTO: Final = "auto"
 """The value of a setting that is derived from others or chosen by a device; the setting's meaning says how."""
 
 
-@dataclass(frozen=True)
-class OnlyIn:
-    """Marks a setting that only one version of the wire format has, as in ``Annotated[bool, OnlyIn(0)]``."""
-
-    version: int
-
-
-@dataclass(frozen=True)
-class OnlyAt:
-    """Marks an option of a topic that only one end of a link has, as in ``Annotated[str, OnlyAt("sink")]``."""
-
-    end: Literal["source", "sink"]
-
-
 REQUIRED: Final = object()
 """Stands for the default of a setting that has none."""
 
@@ -57,8 +43,6 @@ class Setting:
     :param most: largest allowed number; None if there is no such limit
     :param above: numbers must be above this; None if there is no such limit
     :param below: numbers must be below this; None if there is no such limit
-    :param version: the only version of the wire format that has it; None if all have
-    :param end: the only end of a link that has it; None if both have
     """
 
     name: str
@@ -73,20 +57,11 @@ class Setting:
     most: float | None = None
     above: float | None = None
     below: float | None = None
-    version: int | None = None
-    end: str | None = None
-
-    @property
-    def only(self) -> str:
-        """Where it exists, '' if everywhere: ``version 1, source``."""
-        version = "" if self.version is None else f"version {self.version}"
-        return ", ".join(filter(None, (version, self.end)))
 
     @property
     def explained(self) -> str:
-        """Its meaning in plain text, and where it exists if not everywhere."""
-        meaning = self.meaning.replace("``", "")
-        return f"{meaning} ({self.only} only)" if self.only else meaning
+        """Its meaning in plain text."""
+        return self.meaning.replace("``", "")
 
     @property
     def derives(self) -> bool:
@@ -146,8 +121,6 @@ def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> S
         next((bound.le for bound in bounds if isinstance(bound, Le)), None),  # type: ignore[arg-type]
         next((bound.gt for bound in bounds if isinstance(bound, Gt)), None),  # type: ignore[arg-type]
         next((bound.lt for bound in bounds if isinstance(bound, Lt)), None),  # type: ignore[arg-type]
-        next((mark.version for mark in marks if isinstance(mark, OnlyIn)), None),
-        next((mark.end for mark in marks if isinstance(mark, OnlyAt)), None),
     )
 
 

@@ -18,16 +18,18 @@ from pathlib import Path
 from typing import TypeVar, overload
 
 from gr_ros2.core.errors import ConfigError, RegistryError
-from gr_ros2.core.names import filled, topic_fault
-from gr_ros2.settings.config import SinkConfig, TopicOptions, build
+from gr_ros2.core.names import checked_topic_form, filled, topic_fault
+from gr_ros2.settings.config import SendOptions, build
 from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.robot import PublishConfig, PublishOptions
 from gr_ros2.settings.service_rows import OF_ACTION, STATUS, is_of_node, is_service, parts
 from gr_ros2.settings.topic_choice import TopicChoice, is_wild
 from gr_ros2.wire import FORMATS, AnnouncedTopic
 
 MAX_TOPICS = max(version.max_topics for version in FORMATS.values())
-DEFAULT_OPTIONS = TopicOptions()
+DEFAULT_OPTIONS = SendOptions()
 _O = TypeVar("_O")
+_D = TypeVar("_D")
 
 CALLS_TYPE = "gr_ros2/calls/Frame"
 """Type of the row in which requests and replies are sent (see :mod:`gr_ros2.calls`); no topic has this type."""
@@ -66,12 +68,14 @@ class Topic:
     :param topic_id: its number on the wire
     :param name: as registered, relative to the robot's namespace or absolute with leading slash
     :param type_name: ``package/msg/Type``; ``package/srv/Type`` in the row of a service
+    :param publish_as: its name where it comes out, ``{robot}`` allowed; auto takes that of the receiver
     """
 
     topic_id: int
     name: str
     type_name: str
-    options: TopicOptions = DEFAULT_OPTIONS
+    options: SendOptions = DEFAULT_OPTIONS
+    publish_as: str = AUTO
 
     def on_graph(self, namespace: str) -> str:
         """Absolute topic name of this row at a source in a namespace."""
@@ -82,8 +86,8 @@ class Topic:
 
     def republished(self, namespace_format: str, src_id: int) -> str:
         """Absolute topic name of this row at a sink, for one sender."""
-        if self.options.publish_as != AUTO:
-            name = filled(self.options.publish_as, src_id)
+        if self.publish_as != AUTO:
+            name = filled(self.publish_as, src_id)
         else:
             name = f"{filled(namespace_format, src_id).rstrip('/')}/{self.name.lstrip('/')}"
         return name if name.startswith("/") else f"/{name}"
@@ -116,7 +120,7 @@ class Topic:
         return self.type_name != CALLS_TYPE and not self.is_service
 
 
-NewTopic = tuple[str, str, TopicOptions]
+NewTopic = tuple[str, str, SendOptions]
 """Name, type and options of a row that has no number yet."""
 
 
@@ -163,7 +167,8 @@ class Registry(Sequence[Topic]):
         """Read the paper's form: rows ``name,type``.
 
         A header row ``topic,type`` (or ``name,type``), blank lines and ``#`` comments are allowed; with a header,
-        further columns are options of that topic (see :class:`gr_ros2.settings.config.TopicOptions`), empty = default.
+        further columns are options of that topic (see :class:`gr_ros2.settings.config.SendOptions`) and
+        ``publish_as``, empty = default.
 
         :raises RegistryError: file, line, what is wrong
         """
@@ -243,35 +248,29 @@ class Registry(Sequence[Topic]):
 
         return [topic for topic in self if is_chosen(topic)]
 
-    def with_options(self, options: Mapping[str, TopicOptions], *, announced: bool = False) -> Registry:
+    def with_options(
+        self, options: Mapping[str, SendOptions] | Mapping[str, PublishOptions], *, announced: bool = False
+    ) -> Registry:
         """The same rows, with configured options instead of the registry's own. Only settings that differ from the
         default replace the registry's.
 
         :param announced: whether options may also be of topics that other robots announce; those change nothing here
         :raises ConfigError: for a topic that is not registered, unless the registry is empty
         """
-        if not self:
+        if not self or not options:
             return self
-        topics = list(self._topics)
         for name in options:
             if not (announced or is_wild(name) or name == AUTO):
                 self.named(name)
-        for topic in self:
-            override = options_of(topic.name, options)
-            changed = {f.name: getattr(override, f.name) for f in fields(TopicOptions)}
-            changed = {key: value for key, value in changed.items() if value != getattr(DEFAULT_OPTIONS, key)}
-            if not changed:
-                continue
-            merged = build(TopicOptions, {**asdict(topic.options), **changed}, f"topic {topic.name}")
-            topics[topic.topic_id] = Topic(topic.topic_id, topic.name, topic.type_name, merged)
-        return Registry(topics)
+        given: Mapping[str, SendOptions | PublishOptions] = {**options}
+        return Registry([_with(topic, options_of(topic.name, given, DEFAULT_OPTIONS)) for topic in self])
 
     def with_calls(self) -> Registry:
         """The same rows, and one more in which requests and replies are sent.
 
         :raises RegistryError: when there is no room for one more
         """
-        options = TopicOptions(queue="deadline", deadline_s=_CALLS_LAST_S, queue_depth=_CALLS_WAITING)
+        options = SendOptions(queue="deadline", deadline_s=_CALLS_LAST_S, queue_depth=_CALLS_WAITING)
         return Registry([*self._topics, Topic(len(self), "_calls", CALLS_TYPE, options)])
 
     @property
@@ -286,7 +285,7 @@ class Registry(Sequence[Topic]):
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def announced(told: AnnouncedTopic, options: Mapping[str, TopicOptions]) -> Topic:
+def announced(told: AnnouncedTopic, options: Mapping[str, PublishOptions]) -> Topic:
     """A topic as its sender has announced it.
 
     :param options: configured options by topic name, which replace the announced ones
@@ -294,15 +293,27 @@ def announced(told: AnnouncedTopic, options: Mapping[str, TopicOptions]) -> Topi
     """
     if fault := topic_fault(told.name if told.name.startswith("/") else f"/{told.name}"):
         raise ConfigError(f"malformed topic name {told.name!r}: {fault}")
-    known = options_of(told.name, options)
-    from_publishers = {"durability": "transient_local" if told.latched else "volatile", "depth": told.depth or AUTO}
-    chosen = {name: value for name, value in from_publishers.items() if getattr(known, name) == AUTO}
-    merged = build(TopicOptions, {**asdict(known), **chosen})
     special = told.type_name == CALLS_TYPE or is_service(told.type_name)
-    return Topic(told.topic_id, told.name, told.type_name if special else normalize_type(told.type_name), merged)
+    offered = build(
+        SendOptions, {"durability": "transient_local" if told.latched else "volatile", "depth": told.depth or AUTO}
+    )
+    topic = Topic(told.topic_id, told.name, told.type_name if special else normalize_type(told.type_name), offered)
+    return _with(topic, options_of(told.name, options, PublishOptions()))
 
 
-def options_of(name: str, options: Mapping[str, _O], default: _O = DEFAULT_OPTIONS) -> _O:  # type: ignore[assignment]
+def _with(topic: Topic, configured: SendOptions | PublishOptions) -> Topic:
+    """A topic with other options where these are set."""
+    default = type(configured)()
+    changed = {f.name: getattr(configured, f.name) for f in fields(configured)}
+    changed = {name: value for name, value in changed.items() if value != getattr(default, name)}
+    publish_as = changed.pop("as_", topic.publish_as)
+    options = topic.options
+    if changed:
+        options = build(SendOptions, {**asdict(options), **changed}, f"topic {topic.name}")
+    return Topic(topic.topic_id, topic.name, topic.type_name, options, publish_as)
+
+
+def options_of(name: str, options: Mapping[str, _O], default: _D) -> _O | _D:
     """The configured options of a topic, with or without leading slash: its own, or else those of the first word that
     stands for it too."""
     plain = {other.lstrip("/"): value for other, value in options.items()}
@@ -311,16 +322,17 @@ def options_of(name: str, options: Mapping[str, _O], default: _O = DEFAULT_OPTIO
     return plain[name] if name in plain else plain.get(next(words, ""), default)
 
 
-def check_outputs(registry: Registry, sink: SinkConfig) -> None:
-    """Refuse settings with which a sink could not publish what it receives.
+def check_outputs(registry: Registry, publish: PublishConfig, *, announced: bool = True) -> None:
+    """Refuse settings with which a robot could not publish what it receives.
 
+    :param announced: see :meth:`Registry.with_options`
     :raises ConfigError: if a topic would be published under a name that ROS does not allow, or two topics of different
-        types under one name; with version 0 also if ``topic_options`` has a topic that is not registered
+        types under one name
     """
-    types = dict.fromkeys(sink.merged_topics, _TF_TYPE)
-    for topic in registry.with_options(sink.topic_options, announced=sink.version != 0):
-        name = topic.republished(sink.namespace_format, _LONGEST_ID)
-        remedy = "change its publish_as, or namespace_format"
+    types = dict.fromkeys(publish.merged_topics, _TF_TYPE)
+    for topic in registry.with_options(publish.topics, announced=announced):
+        name = topic.republished(publish.as_, _LONGEST_ID)
+        remedy = "change its publish_as, or publish.as"
         if fault := topic_fault(name):
             raise ConfigError(f"topic {topic.name!r} would come out as {name!r}: {fault}; {remedy}")
         if types.setdefault(name, topic.type_name) != topic.type_name:
@@ -365,7 +377,7 @@ def _topics(rows: Sequence[tuple[int, list[str]]], path: str | Path) -> Iterator
 
 
 def _check_columns(columns: Sequence[str], path: str | Path, line: int) -> None:
-    known = [field.name for field in fields(TopicOptions)]
+    known = [*(field.name for field in fields(SendOptions)), "publish_as"]
     for column in columns[2:]:
         if column not in known:
             raise RegistryError(f"unknown column {column!r}; known are {', '.join(known)}", path, line)
@@ -385,9 +397,14 @@ def _parts(name: str, kind: str, options: Mapping[str, str]) -> Iterator[tuple[s
 def _topic(topic_id: int, name: str, kind: str, options: Mapping[str, str]) -> Topic:
     if fault := topic_fault(name if name.startswith("/") else f"/{name}"):
         raise ConfigError(f"malformed topic name {name!r}: {fault}")
+    options = dict(options)
+    publish_as = options.pop("publish_as", AUTO)
     try:
         type_name = kind if is_service(kind) else normalize_type(kind)
-        topic_options = build(TopicOptions, options)
+        topic_options = build(SendOptions, options)
+        checked_topic_form(publish_as)
     except ConfigError as error:
         raise ConfigError(f"topic {name!r}: {error}") from error
-    return Topic(topic_id, name, type_name, topic_options)
+    except ValueError as error:
+        raise ConfigError(f"topic {name!r}: publish_as = {publish_as!r}: {error}") from error
+    return Topic(topic_id, name, type_name, topic_options, publish_as)

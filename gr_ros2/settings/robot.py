@@ -18,8 +18,6 @@ from gr_ros2.settings.commands import COMMAND_TYPES, checked_commands
 from gr_ros2.settings.config import (
     CODING,
     DEFAULT_MIDDLEWARE,
-    MAX_PACKET_LEN,
-    MIN_PACKET_LEN,
     STRICT,
     Bytes,
     Count,
@@ -28,16 +26,12 @@ from gr_ros2.settings.config import (
     MergedTopic,
     Namespace,
     NamespaceForm,
-    PaperConfig,
+    PacketLen,
     Repairs,
     Seconds,
     SendOptions,
-    SinkConfig,
-    SourceConfig,
     TopicForm,
-    TopicOptions,
     build,
-    vars_of,
 )
 from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
 from gr_ros2.settings.fields import AUTO, Auto
@@ -119,6 +113,11 @@ class PublishConfig:
     )
     """single topics of others, such as {odom: {depth: 100}}; * and ? stand for others"""
 
+    @property
+    def merged_topics(self) -> tuple[str, ...]:
+        """The topics of ``merge_tf``: moving and static transforms; () where it is off."""
+        return (self.merge_tf, f"{self.merge_tf}_static") if self.merge_tf else ()
+
 
 @dataclass(frozen=True, kw_only=True, config=_DESCRIBED)
 class RobotConfig:
@@ -145,7 +144,7 @@ class RobotConfig:
     commands: Annotated[tuple[str, ...], AfterValidator(checked_commands)] = COMMAND_TYPES
     """types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before others, unless
     the topic's options say otherwise"""
-    packet_len: Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN, title="Packet length (bytes)")] = 220
+    packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
     """bytes of the longest packet, 40..4095 (14 or more of the paper's blocks), the same at all robots"""
     key: Annotated[str, Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
     """file of the fleet's keys (gr-ros2 key new); '' sends packets that anybody can read and forge; with one, sealed
@@ -253,6 +252,17 @@ class RobotConfig:
         return bool(self.topics) and self.direction != "receive"
 
     @property
+    def words(self) -> tuple[str, ...]:
+        """The words that choose what it sends, of its registry or of its graph; () = nothing."""
+        return tuple(self.topics) if self.sends else ()
+
+    @property
+    def options(self) -> dict[str, SendOptions]:
+        """What is set for some of the topics that it sends, by these words."""
+        chosen = self.topics.items() if self.sends else ()
+        return {word: options for word, options in chosen if options != SendOptions()}
+
+    @property
     def receives(self) -> bool:
         """Whether messages of others come out."""
         return self.direction != "send"
@@ -275,54 +285,17 @@ def number_of(robot: int | str) -> int:
     return int(runs[-1])
 
 
-def halves(robot: RobotConfig, paper: PaperConfig | None = None) -> tuple[SourceConfig, SinkConfig]:
-    """The settings of a robot as its two blocks have them.
+def robot_from(**given: Any) -> RobotConfig:
+    """A robot from settings in one list, as GRC has them: those of ``graph`` and ``publish`` may stand beside the
+    others as ``graph_domain_id``, ``publish_as``.
 
-    :param paper: those of the paper's blocks; None: it speaks version 1
-    :raises ConfigError: for a setting that the paper's blocks do not have
+    :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
-    if paper is not None and not robot.compression:
-        raise ConfigError("compression = False: the paper's blocks have a setting of their own; set paper.compression")
-    common: dict[str, Any] = {name: getattr(robot, name) for name in ("packet_len", "key", "seal", "state", "debug")}
-    common |= {"robot_id": robot.robot_id, "middleware": robot.graph.middleware, "domain_id": robot.graph.domain_id}
-    registry = robot.registry if robot.sends else ""
-    words = tuple(robot.topics) if robot.sends else ()
-    sent = {
-        word: TopicOptions(**vars_of(options)) for word, options in robot.topics.items() if options != SendOptions()
-    }
-    taken = {
-        name: TopicOptions(
-            publish_as=options.as_, **{key: value for key, value in vars_of(options).items() if key != "as_"}
-        )
-        for name, options in robot.publish.topics.items()
-    }
-    common["version"] = 1 if paper is None else 0
-    of_paper = {} if paper is None else vars_of(paper)
-    timeout = {"reassembly_timeout_s": of_paper.pop("reassembly_timeout_s")} if of_paper else {}
-    both = (
-        *("services", "commands", "packet_rate", "queue_depth", "compression"),
-        *("repair", "expected_loss", "repeat_s", "beacon_s"),
-    )
-    source = {
-        **common,
-        "registry": registry,
-        "topics": () if registry and words == (AUTO,) else words,
-        "topic_options": sent if robot.sends else {},
-        "namespace": robot.namespace,
-        "subscriber_depth": robot.graph.depth,
-        **{name: getattr(robot, name) for name in both},
-        **of_paper,
-    }
-    sink = {
-        **common,
-        "registry": robot.registry,
-        "topic_options": taken,
-        "namespace_format": robot.publish.as_,
-        "publisher_depth": robot.publish.depth,
-        "frame_prefix": robot.publish.frame_prefix,
-        "merge_tf": robot.publish.merge_tf,
-        "use_sim_time": robot.graph.use_sim_time,
-        **{name: getattr(robot, name) for name in ("hold_s", "max_age_s", "max_sources", "max_source_bytes")},
-        **timeout,
-    }
-    return build(SourceConfig, source), build(SinkConfig, sink)
+    values: dict[str, Any] = {"graph": {}, "publish": {}}
+    for name, value in given.items():
+        part, _, setting = name.partition("_")
+        if part in ("graph", "publish") and setting:
+            values[part] = {**values[part], setting: value}
+        else:
+            values[name] = value
+    return build(RobotConfig, values)

@@ -45,7 +45,7 @@ class Contender:
     :param stack: what carries the messages
     :param reliable: whether data that is lost on the air is sent again
     :param summary: description in one line
-    :param settings: ``version`` and ``compression`` of both ends and further settings of the ``source`` (`gr-ros2`);
+    :param settings: settings of both robots, and what the ``paper``'s blocks have beside them (`gr-ros2`);
         ``transport`` (multicast, udp or tcp) and ``congestion`` control of Zenoh; what waits in the ``queue`` of a
         topic of a team
     :param races: between two robots, or among those of a team
@@ -57,21 +57,26 @@ class Contender:
     settings: dict[str, Any] = field(default_factory=dict)
     races: tuple[Races, ...] = ("two", "team")
 
+    @property
+    def compresses(self) -> bool:
+        """Of gr-ros2, whether messages are coded."""
+        return bool(self.settings.get("paper", {"compression": True}).get("compression"))
+
 
 CONTENDERS = {
-    "gr-ros2": Contender("gr-ros2", True, "version 1, compressed", {"version": 1, "compression": True, "source": {}}),
+    "gr-ros2": Contender("gr-ros2", True, "version 1, compressed"),
     "gr-ros2-v0": Contender(
         "gr-ros2",
         False,
         "version 0, compressed",
-        {"version": 0, "compression": True, "source": {"queue_depth": 8}},
+        {"queue_depth": 8, "paper": {"compression": True}},
         ("two",),
     ),
     "gr-ros2-plain": Contender(
         "gr-ros2",
         False,
         "version 0, as it is, a packet per message",
-        {"version": 0, "compression": False, "source": {"queue_depth": 1}},
+        {"queue_depth": 1, "paper": {}},
         ("two",),
     ),
     "gr-ros2-latest": Contender(

@@ -18,18 +18,22 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.core.closing import Closing
-from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.factory import EndpointSetup
-from gr_ros2.gr.robot_blocks import RobotBlocks
+from gr_ros2.gr import RosLink
+from gr_ros2.gr.factory import Start
+from gr_ros2.gr.receiving import ReceivingBlock
+from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.link import ReceiverEvent, SenderEvent
+from gr_ros2.link.air import Air
 from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import Middleware, join_graph
+from gr_ros2.paper import RosSink, RosSource
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.pdus import PDUS, packets_of, pdu_of
 from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
-from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig, SinkConfig, SourceConfig
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import robot_from
 from gr_ros2_lab.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2_lab.race.namespaces import inside
 from gr_ros2_lab.race.race_settings import PHY_NAME
@@ -123,44 +127,57 @@ class RaceRosLink(Closing):
         self._registry = Registry.from_rows([topic])
         self._logs = (LinkLog(), LinkLog())
         with ExitStack() as stack:
-            ends: list[tuple[RosSource, RosSink]] = []
+            ends: list[tuple[SendingBlock | None, ReceivingBlock | None]] = []
             for direction, (namespace, domain_id) in enumerate(zip(namespaces, DOMAINS, strict=True)):
                 loopback_up(namespace)
                 graph = stack.enter_context(inside(namespace, lambda domain=domain_id: _graph(domain)))  # type: ignore[misc]
-                ends.append(self._end(direction, graph))
-                for block in ends[-1]:
-                    stack.callback(block.close)
-            (self._source, _), (_, self._sink) = ends
+                ends.append(self._end(direction, graph, stack))
+            source, sink = ends[0][0], ends[1][1]
+            assert source is not None and sink is not None, "one sends, the other receives"
+            self._source, self._sink = source, sink
             self._sink.outputs.announce(SOURCE_ID, [0])
             self._links: list[LoopbackLink] = []
-            for direction, (source, _) in enumerate(ends):
-                phy, sink = radio.with_frames_of(packet_len), ends[1 - direction][1]
-                self._links.append(LoopbackLink(phy, source, sink, channel=radio.channel(direction)))
-                stack.callback(self._links[-1].stop)
+            for direction, (sends, _) in enumerate(ends):
+                phy, hears = radio.with_frames_of(packet_len), ends[1 - direction][1]
+                if sends is not None and hears is not None:
+                    self._links.append(LoopbackLink(phy, sends, hears, channel=radio.channel(direction)))
+                    stack.callback(self._links[-1].stop)
             for link in reversed(self._links):  # the receiving end listens when the sending end begins
                 link.start()
             self._stack = stack.pop_all()
 
-    def _end(self, direction: int, graph: Middleware) -> tuple[RosSource, RosSink]:
-        """The blocks of one robot, which share one endpoint. Its packets take a direction each."""
-        common: dict[str, Any] = {
-            "version": self._settings["version"],
-            "robot_id": SOURCE_ID + direction,
-            "packet_len": self._packet_len,
-        }
-        compression = self._settings["compression"]
-        source = SourceConfig(subscriber_depth=DEPTH, compression=compression, **common, **self._settings["source"])
-        sink = SinkConfig(publisher_depth=DEPTH, **common)
+    def _end(
+        self, direction: int, graph: Middleware, stack: ExitStack
+    ) -> tuple[SendingBlock | None, ReceivingBlock | None]:
+        """The blocks of one robot. Its packets take a direction each."""
         phy = self._radio.with_frames_of(self._packet_len)
-        start = EndpointSetup(1, reports=True, any_length=phy.any_length)
-        log = _FrameLog(phy, self._logs[direction])
-        blocks = RobotBlocks(self._registry, source, sink, start=start, observer=log, seed=self._radio.seed)
-        return blocks.source(graph), blocks.sink(graph)
+        common: dict[str, Any] = {"middleware": graph, "observer": _FrameLog(phy, self._logs[direction])}
+        values: dict[str, Any] = {
+            "robot": SOURCE_ID + direction,
+            "packet_len": self._packet_len,
+            "graph_namespace": "",
+            "graph_depth": DEPTH,
+            "publish_depth": DEPTH,
+            **self._settings,
+        }
+        paper = values.pop("paper", None)
+        if paper is None:
+            air, start = Air(any_length=phy.any_length), Start()
+            link = RosLink(robot_from(**values), air=air, start=start, registry=self._registry, **common)
+            stack.callback(link.close)
+            return link.source, link.sink
+        block: RosSource | RosSink
+        if direction:
+            block = RosSink(self._registry, **common, **values, **paper)
+        else:
+            block = RosSource(self._registry, seed=self._radio.seed, **common, **values, **paper)
+        stack.callback(block.close)
+        return (None, block) if isinstance(block, RosSink) else (block, None)
 
     @property
     def output_topic(self) -> str:
         """The topic on which the receiving end publishes the messages."""
-        return self._sink.registry[0].republished(self._sink.config.namespace_format, SOURCE_ID)
+        return self._sink.registry[0].republished(self._sink.config.publish.as_, SOURCE_ID)
 
     def matched(self) -> bool:
         """Whether both blocks have found the programs at their ends: each side of a match is told of it by itself."""

@@ -105,7 +105,7 @@ def _run_cell(settings: RaceSettings, sender: RaceSender, condition: Condition, 
         paths = (spaces[0].path, spaces[1].path)
         topic = output = RaceTopic(recording.topic, recording.type_name)
         if contender.stack == "gr-ros2":
-            packet_len = settings.packet_len if contender.settings["compression"] else recording.single_packet_len
+            packet_len = settings.packet_len if contender.compresses else recording.single_packet_len
             arguments = (radio, paths, (topic.name, topic.type_name), packet_len, contender)
             air = stack.enter_context(Worker("radio", "", RaceRosLink, *arguments))
             output = RaceTopic(air.call("output_topic"), topic.type_name)

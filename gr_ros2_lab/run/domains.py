@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 from gr_ros2.middleware.free_domains import FREE, ReservedDomain
-from gr_ros2.settings.config import replaced
 from gr_ros2.settings.fields import AUTO
 from gr_ros2_lab.run.robot_settings import RobotSettings
 from gr_ros2_lab.run.scenario import Scenario
@@ -34,9 +33,4 @@ def _on_own_domain(robot: RobotSettings, free: Iterator[int], stack: ExitStack) 
     if graph.domain_id != AUTO:
         return robot
     domain_id = stack.enter_context(ReservedDomain(free)).number
-    return replace(
-        robot,
-        config=replace(robot.config, graph=replace(graph, domain_id=domain_id)),
-        source=robot.source and replaced(robot.source, domain_id=domain_id),
-        sink=robot.sink and replaced(robot.sink, domain_id=domain_id),
-    )
+    return replace(robot, config=replace(robot.config, graph=replace(graph, domain_id=domain_id)))

@@ -13,19 +13,20 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from gr_ros2.gr import RosSink, RosSource
+from gr_ros2.gr.receiving import ReceivingBlock
+from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.middleware import Middleware, join
 from gr_ros2.observe.observers import LiveLink
 from gr_ros2.phy import Phy
-from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.run.load import source_names
 from gr_ros2_lab.run.outcome import by_sender
 from gr_ros2_lab.run.own_channels import OwnChannels
 from gr_ros2_lab.run.recorders import RunRecords
-from gr_ros2_lab.run.robot_settings import RobotSettings, sources_of
+from gr_ros2_lab.run.robot_settings import RobotSettings, senders_of
 from gr_ros2_lab.run.robots import hearer_of
 from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.run.shared_channel import SharedChannel
@@ -43,7 +44,7 @@ class LiveMedium(Protocol):
     channels: int
 
     @property
-    def blocks(self) -> Sequence[tuple[RosSource | None, RosSink | None]]: ...
+    def blocks(self) -> Sequence[tuple[SendingBlock | None, ReceivingBlock | None]]: ...
     @property
     def links(self) -> Sequence[LiveLink]: ...
     @property
@@ -88,8 +89,8 @@ class LiveRobot:
     settings: RobotSettings
     topics: Mapping[str, int]
     heard: Mapping[str, str]
-    source: RosSource | None
-    sink: RosSink | None
+    source: SendingBlock | None
+    sink: ReceivingBlock | None
 
     @property
     def graph(self) -> Middleware:
@@ -124,19 +125,19 @@ class LiveRobots:
         kind: Callable[..., LiveMedium] = SharedChannel if scenario.duplex == "half" else OwnChannels
         self._scenario = scenario
         self.medium = kind(scenario, robots, registry, phy, around, records=records, stack=stack)
-        sources = sources_of(robots)
+        senders = senders_of(robots)
         self.robots = [
-            _robot(registry, settings, sources, blocks)
+            _robot(registry, settings, senders, blocks)
             for settings, blocks in zip(robots, self.medium.blocks, strict=True)
         ]
-        self.offering = self.robots[: len(sources)]
+        self.offering = self.robots[: len(senders)]
         """Those that offer messages."""
         self.recorded = [one for number, one in enumerate(self.robots) if one.heard and not records.place(number)]
         """Those of which the bag has what comes out: what counts in the tables of the first receiver."""
-        self._hearers = [hearer_of(around, number) for number in range(len(sources))]
+        self._hearers = [hearer_of(around, number) for number in range(len(senders))]
 
     @property
-    def sources(self) -> dict[int, RosSource]:
+    def sources(self) -> dict[int, SendingBlock]:
         """The blocks that send messages, by source id."""
         return {robot.settings.robot_id: robot.source for robot in self.offering if robot.source is not None}
 
@@ -145,7 +146,7 @@ class LiveRobots:
         """Where other programs can join in: what is there, and the ROS domain."""
         return tuple(
             (f"the graph of {robot.settings.namespace}", robot.source.middleware.domain_id)
-            if robot.settings.source is not None and robot.source is not None
+            if robot.settings.config.sends and robot.source is not None
             else ("the graph on which messages come out", robot.graph.domain_id)
             for robot in self.robots
         )
@@ -176,17 +177,17 @@ class LiveRobots:
 def _robot(
     registry: Registry,
     settings: RobotSettings,
-    sources: Sequence[SourceConfig],
-    blocks: tuple[RosSource | None, RosSink | None],
+    senders: Sequence[RobotConfig],
+    blocks: tuple[SendingBlock | None, ReceivingBlock | None],
 ) -> LiveRobot:
     """A robot, whose sink knows the topics of the others from the start."""
     source, sink = blocks
     heard: dict[str, str] = {}
-    for other in sources:
-        if sink is not None and sink.registry and other is not settings.source:
-            src_id, ids = other.src_id(), source_names(other, registry).values()
+    for other in senders:
+        if sink is not None and sink.registry and other is not settings.config:
+            src_id, ids = other.robot_id, source_names(other, registry).values()
             sink.outputs.announce(src_id, ids)
             topics = [sink.registry[topic_id] for topic_id in ids]
-            heard |= {topic.republished(sink.config.namespace_format, src_id): topic.type_name for topic in topics}
-    offered = {} if settings.source is None else source_names(settings.source, registry)
+            heard |= {topic.republished(sink.config.publish.as_, src_id): topic.type_name for topic in topics}
+    offered = source_names(settings.config, registry) if settings.config.sends else {}
     return LiveRobot(settings, offered, heard, source, sink)

@@ -12,11 +12,11 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.names import first
 from gr_ros2.middleware.bag_files import BagContents, bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy, configured
-from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire import Format
-from gr_ros2_lab.run.robot_settings import sources_of
+from gr_ros2_lab.run.robot_settings import senders_of
 from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.sim.fleet import Fleet
 
@@ -33,7 +33,7 @@ def make_phy(scenario: Scenario, registry: Registry) -> Phy:
     rate = 0.0 if chosen == AUTO else chosen
     if not rate and PHY.load(scenario.phy.name).has_samples:
         at_1_hz = configured(scenario.phy, scenario.packet_len, 1.0)
-        most = max(offered_packets(scenario, source, registry) for source in sources_of(scenario.all_robots))
+        most = max(offered_packets(scenario, robot, registry) for robot in senders_of(scenario.all_robots))
         rate = scenario.phy.headroom * most * at_1_hz.airtime_samples()
     phy = configured(scenario.phy, scenario.packet_len, rate)
     check_channels(scenario, phy)
@@ -49,34 +49,34 @@ def check_channels(scenario: Scenario, phy: Phy) -> None:
         phy.check_channel(channel)
 
 
-def offered_packets(scenario: Scenario, source: SourceConfig, registry: Registry) -> float:
-    """Packets/s that a robot's source needs if no packet carries more than one message.
+def offered_packets(scenario: Scenario, robot: RobotConfig, registry: Registry) -> float:
+    """Packets/s that a robot needs if no packet carries more than one message.
 
     A recording counts with one message per second at least: at the average load of one with a message per hour, a
     packet would take the better part of an hour, and the last ones would never arrive.
 
-    :raises ConfigError: when the source offers nothing on the registered topics
+    :raises ConfigError: when it offers nothing on the registered topics
     """
-    load = _sim_load if scenario.bag_path is None else _bag_load
-    packets, seconds = load(scenario, source, registry)
+    by_sim = scenario.bag_path is None
+    packets, seconds = _sim_load(scenario, robot, registry) if by_sim else _bag_load(scenario, registry)
     if packets == 0:
         raise ConfigError(f"{scenario.source}: nothing on the registered topics; set phy.sample_rate, or other topics")
     return packets / seconds
 
 
-def source_names(source: SourceConfig, registry: Registry) -> dict[str, int]:
-    """Topic ids of the topics that a source subscribes, by their absolute names."""
-    return {topic.on_graph(source.namespace): topic.topic_id for topic in registry.chosen(source.topics)}
+def source_names(robot: RobotConfig, registry: Registry) -> dict[str, int]:
+    """Topic ids of the topics that a robot sends, by their absolute names."""
+    return {topic.on_graph(robot.namespace): topic.topic_id for topic in registry.chosen(robot.words)}
 
 
-def published_names(scenario: Scenario, source: SourceConfig, registry: Registry) -> dict[str, str]:
-    """Name of every topic of a source where it comes out, by its name there. Of several sinks the first one says it."""
-    others = (robot.sink for robot in scenario.all_robots if robot.source is not source)
-    sink = next(sink for sink in others if sink is not None)
-    topics = registry.with_options(sink.topic_options)
-    names = source_names(source, registry)
+def published_names(scenario: Scenario, robot: RobotConfig, registry: Registry) -> dict[str, str]:
+    """Name of every topic of a robot where it comes out, by its name there. Of several that receive the first says
+    it."""
+    publish = next(other.config.publish for other in scenario.all_robots if other.takes and other.config is not robot)
+    topics = registry.with_options(publish.topics, announced=True)
     return {
-        name: topics[topic_id].republished(sink.namespace_format, source.src_id()) for name, topic_id in names.items()
+        name: topics[topic_id].republished(publish.as_, robot.robot_id)
+        for name, topic_id in source_names(robot, registry).items()
     }
 
 
@@ -105,8 +105,8 @@ def recording(scenario: Scenario) -> BagContents:
     return BagContents(Path(), {}, {}, ()) if scenario.bag_path is None else bag_contents(scenario.bag_path)
 
 
-def _sim_load(scenario: Scenario, source: SourceConfig, registry: Registry) -> tuple[float, float]:
-    names = source_names(source, registry)
+def _sim_load(scenario: Scenario, robot: RobotConfig, registry: Registry) -> tuple[float, float]:
+    names = source_names(robot, registry)
     duration = min(_SAMPLE_S, scenario.duration_s)
     sizes = {
         message.topic: len(message.payload)
@@ -117,17 +117,17 @@ def _sim_load(scenario: Scenario, source: SourceConfig, registry: Registry) -> t
     packets = 0.0
     for topic, size in sizes.items():
         rate = rates.get(topic.rsplit("/", 1)[-1], 0.0)
-        alone = _packets_alone(size, scenario.packet_len, source.wire_format)
+        alone = _packets_alone(size, scenario.packet_len, scenario.wire_format)
         packets += alone * (rate or 1 / scenario.duration_s)
     return packets, 1.0
 
 
-def _bag_load(scenario: Scenario, source: SourceConfig, registry: Registry) -> tuple[float, float]:
+def _bag_load(scenario: Scenario, registry: Registry) -> tuple[float, float]:
     assert scenario.bag_path is not None
     packets, messages = 0, 0
     begin = last = None
     for message in read_bag(scenario.bag_path, recorded_names(scenario, registry)):
-        packets += _packets_alone(len(message.payload), scenario.packet_len, source.wire_format)
+        packets += _packets_alone(len(message.payload), scenario.packet_len, scenario.wire_format)
         messages += 1
         begin = message.stamp_ns if begin is None else begin
         last = message.stamp_ns

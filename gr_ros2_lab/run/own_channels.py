@@ -6,20 +6,24 @@ receiver for each channel that it hears. A robot that sends nothing but reports 
 
 from __future__ import annotations
 
+import random
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr import RosSink, RosSource
-from gr_ros2.gr.factory import EndpointSetup
-from gr_ros2.gr.robot_blocks import RobotBlocks
+from gr_ros2.gr import RosLink
+from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.receiving import ReceivingBlock
+from gr_ros2.gr.sending import SendingBlock
+from gr_ros2.link.air import Air
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.middleware import Middleware, join
 from gr_ros2.middleware.bag import BagMiddleware
+from gr_ros2.paper.factory import make_paper_endpoint
 from gr_ros2.phy import Phy
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.loopback import SimulatedLink
@@ -28,8 +32,8 @@ from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.record.lateness import modem_lateness
 from gr_ros2_lab.run.load import recorded_names
 from gr_ros2_lab.run.recorders import RunRecords
-from gr_ros2_lab.run.robot_settings import RobotSettings, sources_of
-from gr_ros2_lab.run.robots import start_of_run
+from gr_ros2_lab.run.robot_settings import RobotSettings, senders_of
+from gr_ros2_lab.run.robots import air_of_run, start_of_run
 from gr_ros2_lab.run.scenario import Scenario
 
 _QUIET_S = 0.3
@@ -52,14 +56,13 @@ class OwnChannels:
     ) -> None:
         self._scenario, self._registry, self._records, self._stack = scenario, registry, records, stack
         self._hearing = Counter(receiver for number in range(around.robots) for receiver in around.reached(number))
-        start = start_of_run(scenario, phy)
+        air = air_of_run(scenario, phy)
         self.blocks = [
-            self._blocks(number, robot, start, sends=bool(around.reached(number)))
-            for number, robot in enumerate(robots)
+            self._blocks(number, robot, air, sends=bool(around.reached(number))) for number, robot in enumerate(robots)
         ]
         self._flowgraph = Flowgraph("gr_ros2_channels", scenario.name)
         self.links = [self._link(number, phy, around) for number in range(around.robots) if around.reached(number)]
-        self._offering = [source.src_id() for source in sources_of(robots)]
+        self._offering = [robot.robot_id for robot in senders_of(robots)]
         stack.callback(self.stop)
         self.clock: Callable[[], float] = time.monotonic
         self.channels = len(self._offering)
@@ -108,36 +111,45 @@ class OwnChannels:
         return {}
 
     def _blocks(
-        self, number: int, robot: RobotSettings, start: EndpointSetup, *, sends: bool
-    ) -> tuple[RosSource | None, RosSink | None]:
+        self, number: int, robot: RobotSettings, air: Air, *, sends: bool
+    ) -> tuple[SendingBlock | None, ReceivingBlock | None]:
         """The blocks of a robot, which share one endpoint."""
-        scenario, source, sink = self._scenario, robot.source, robot.sink
+        scenario, config, registry = self._scenario, robot.config, self._registry
         hears = bool(self._hearing[number])
-        if source is not None and not sends:
+        if config.sends and not sends:
             raise ConfigError(
-                f"gains_db: nobody hears {source.namespace}, whose channel in real time would have no receiver; set "
+                f"gains_db: nobody hears {config.namespace}, whose channel in real time would have no receiver; set "
                 "duplex: half, or time to packets or samples"
             )
-        if source is None and not hears:
+        if not config.sends and not hears:
             raise ConfigError(
-                f"gains_db: {robot.config.namespace} hears nobody; set a higher gain, or time to packets or samples"
+                f"gains_db: {config.namespace} hears nobody; set a higher gain, or time to packets or samples"
             )
-        if source is not None and scenario.bag_path is not None and not scenario.bag_speed:
-            # A bag that is read as fast as the link takes it: the reader waits, so that nothing is dropped.
-            source = replace(source, backpressure=True)
-        observer = self._records.of(number)
-        blocks = RobotBlocks(self._registry, source, sink, start=start, observer=observer, seed=scenario.seed)
+        # A bag that is read as fast as the link takes it: the reader waits, so that nothing is dropped.
+        waits = config.sends and scenario.bag_path is not None and not scenario.bag_speed
+        common: dict[str, Any] = {"observer": self._records.of(number)}
         graph = self._graph(robot)
-        sending, receiving = blocks.source(graph) if sends else None, blocks.sink(graph) if hears else None
-        for block in (sending, receiving):
+        if scenario.paper is None:
+            start = start_of_run(scenario)
+            link = RosLink(
+                config, air=air, start=start, middleware=graph, backpressure=waits, registry=registry, **common
+            )
+            self._stack.callback(link.close)
+            return link.source if sends else None, link.sink if hears else None
+        make = partial(make_paper_endpoint, config, scenario.paper, registry, rng=random.Random(scenario.seed))
+        end = LiveEnd(lambda events: make(observer=events))
+        heard = registry.with_options(config.publish.topics)
+        source = SendingBlock(config, registry, end, graph, backpressure=waits, **common) if config.sends else None
+        sink = ReceivingBlock(config, heard, end, graph, **common) if robot.takes and hears else None
+        for block in (source, sink):
             if block is not None:
                 self._stack.callback(block.close)
-        return sending, receiving
+        return source, sink
 
     def _graph(self, robot: RobotSettings) -> Middleware:
         """The participant of a robot."""
         graph: Middleware
-        if robot.source is not None and (path := self._scenario.bag_path) is not None:
+        if robot.config.sends and (path := self._scenario.bag_path) is not None:
             recorded_names(self._scenario, self._registry)  # raises if the recording has nothing for this link
             graph = BagMiddleware(path=path, speed=self._scenario.bag_speed)
         else:

@@ -17,8 +17,8 @@ from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.observe.observers import LiveLink, LiveRun, RunObservers
 from gr_ros2.observe.positions import position_reader
 from gr_ros2.phy import Phy
-from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.record.recorder import Recorder
 from gr_ros2_lab.record.result import LatenessResult, ReceiverResult, Result
@@ -26,28 +26,28 @@ from gr_ros2_lab.record.team import TeamRecord
 from gr_ros2_lab.record.trace import Trace
 from gr_ros2_lab.run.load import published_names, source_names
 from gr_ros2_lab.run.outcome import Outcome, phy_numbers
-from gr_ros2_lab.run.robot_settings import sources_of
+from gr_ros2_lab.run.robot_settings import senders_of
 from gr_ros2_lab.run.scenario import Scenario, dump
 from gr_ros2_lab.run.task_run import TaskRun
 
 if TYPE_CHECKING:
-    from gr_ros2.gr import RosSource
+    from gr_ros2.gr.sending import SendingBlock
 
 
 def make_recorder(
     registry: Registry,
-    sources: Sequence[SourceConfig],
+    senders: Sequence[RobotConfig],
     on_delivery: Callable[[Delivered, float, float | None], None] | None = None,
 ) -> Recorder:
     """The recorder of a run.
 
-    :param sources: of the robots whose messages it counts
+    :param senders: the robots whose messages it counts
     :param on_delivery: see :class:`gr_ros2_lab.record.recorder.Recorder`
     """
     return Recorder(
         registry,
-        {source.src_id(): source.namespace for source in sources},
-        {source.src_id(): source_names(source, registry).values() for source in sources},
+        {robot.robot_id: robot.namespace for robot in senders},
+        {robot.robot_id: source_names(robot, registry).values() for robot in senders},
         on_delivery=on_delivery,
     )
 
@@ -56,14 +56,14 @@ def make_team(registry: Registry, scenario: Scenario, phy: Phy) -> TeamRecord | 
     """What follows the robots of a scenario that share a channel; None where they do not."""
     if scenario.duplex != "half":
         return None
-    sources = sources_of(scenario.all_robots)
+    senders = senders_of(scenario.all_robots)
     readers = {
-        (source.src_id(), topic_id): reader
-        for source in sources
-        for topic_id in source_names(source, registry).values()
+        (robot.robot_id, topic_id): reader
+        for robot in senders
+        for topic_id in source_names(robot, registry).values()
         if (reader := position_reader(registry[topic_id].type_name)) is not None
     }
-    return TeamRecord([source.src_id() for source in sources], phy.airtime, readers)
+    return TeamRecord([robot.robot_id for robot in senders], phy.airtime, readers)
 
 
 def receivers_of(scenario: Scenario, around: Surroundings) -> dict[int, list[int]]:
@@ -71,14 +71,14 @@ def receivers_of(scenario: Scenario, around: Surroundings) -> dict[int, list[int
     that of the result. Two robots share one. Each of several that receive counts what it can hear, or messages of all
     where they are relayed."""
     robots = scenario.all_robots
-    senders = [number for number, robot in enumerate(robots) if robot.source is not None]
+    senders = [number for number, robot in enumerate(robots) if robot.config.sends]
     if len(robots) == 2:
         return {1: senders}
     relays, reached = scenario.relay != "off", {one: set(around.reached(one)) for one in senders}
     return {
         number: [one for one in senders if one != number and (relays or number in reached[one])]
         for number, robot in enumerate(robots)
-        if robot.sink is not None
+        if robot.takes
     }
 
 
@@ -103,19 +103,19 @@ class RunRecords:
     ) -> None:
         self._scenario, self._registry, self._phy = scenario, registry, phy
         self._config = dump(scenario)
-        self._sources = sources = sources_of(scenario.all_robots)
+        self._senders = senders = senders_of(scenario.all_robots)
         self.run_observers = run_observers
         receivers = receivers_of(scenario, around)
         self._places = {number: place for place, number in enumerate(receivers)}
-        heard = [[sources[number] for number in senders] for senders in receivers.values()]
+        heard = [[senders[number] for number in numbers] for numbers in receivers.values()]
         self.recorder = make_recorder(registry, heard[0], on_delivery)
         self._recorders = [self.recorder, *(make_recorder(registry, others) for others in heard[1:])]
         self._guards = [Guard("Recorder", needed=True) for _ in self._recorders]
-        self._hearing: dict[int, list[int]] = {source.src_id(): [] for source in sources}
+        self._hearing: dict[int, list[int]] = {robot.robot_id: [] for robot in senders}
         """Which recorders get what a robot sends; all that of one that offers nothing."""
         for place, others in enumerate(heard):
-            for source in others:
-                self._hearing[source.src_id()].append(place)
+            for robot in others:
+                self._hearing[robot.robot_id].append(place)
         self.team = make_team(registry, scenario, phy)
         self._task, self._acting = task, Guard(f"task {scenario.task}", needed=True)
 
@@ -151,7 +151,7 @@ class RunRecords:
     def live_run(
         self,
         clock: Callable[[], float] = time.monotonic,
-        sources: Mapping[int, RosSource] | None = None,
+        sources: Mapping[int, SendingBlock] | None = None,
         links: Sequence[LiveLink] = (),
     ) -> LiveRun:
         """The run as its observers see it.
@@ -164,9 +164,9 @@ class RunRecords:
             packet_len=self._scenario.packet_len,
             registry=self._registry,
             topics={
-                (source.src_id(), topic_id): name
-                for source in self._sources
-                for name, topic_id in source_names(source, self._registry).items()
+                (robot.robot_id, topic_id): name
+                for robot in self._senders
+                for name, topic_id in source_names(robot, self._registry).items()
             },
             sources=sources or {},
             links=links,
@@ -211,8 +211,8 @@ class RunRecords:
         topics = self.recorder.finish(played, end, drained)
         names = {
             name: other
-            for source in self._sources
-            for name, other in published_names(self._scenario, source, self._registry).items()
+            for robot in self._senders
+            for name, other in published_names(self._scenario, robot, self._registry).items()
         }
         trace = self.recorder.trace(begin, end, names)
         numbers = partial(phy_numbers, self._phy, channels)

@@ -74,7 +74,7 @@ def replay(
         replace(scenario, time=scenario.time if scenario.simulated else "samples"), contents, topics
     )
     names = source_names(scenario.first, registry)
-    src_id = scenario.first.src_id()
+    src_id = scenario.first.robot_id
     with _bag_at(target, bag_origin_ns(scenario, names)) as bag:
         bag.copy_source(src_id, {topic_id: recorded[name] for name, topic_id in names.items()})
         outcome = run_simulated(scenario, None, registry=registry, bag=bag)
@@ -116,7 +116,7 @@ def _made_for(
         if name not in recorded:
             raise ConfigError(f"topics = {name!r}: {source} has {', '.join(first(recorded)) or 'no topics'}")
     rows = {name: recorded[name].info.type_name for name in topics or contents.some()}
-    most = scenario.first.wire_format.max_topics
+    most = scenario.wire_format.max_topics
     if len(rows) > most:
         raise ConfigError(
             f"{source}: has {len(rows)} topics, and a link carries {most}; choose with --topics from "

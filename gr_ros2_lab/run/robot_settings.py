@@ -1,7 +1,6 @@
 """The robots that a scenario consists of: their settings, and what lies between them.
 
-Invariants: robots that offer messages come first; a robot has a receiving half if another one offers messages, and a
-path to whoever it may concern.
+Invariants: robots that offer messages come first; a robot has a path to whoever it may concern.
 """
 
 from __future__ import annotations
@@ -16,14 +15,11 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.settings.config import (
     STRICT,
     ChannelConfig,
-    PaperConfig,
     PathConfig,
     ScenarioChannel,
-    SinkConfig,
-    SourceConfig,
     Transceiver,
 )
-from gr_ros2.settings.robot import RobotConfig, halves
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire import BROADCAST
 from gr_ros2_lab.medium.base import Path
 
@@ -43,16 +39,14 @@ class RobotSettings:
     """One robot of a run.
 
     :param config: its settings
-    :param source: settings of its sending half; None: it offers nothing, and sends nothing but reports
-    :param sink: settings of its receiving half; None: it has none
+    :param takes: whether messages of others come out at it
     :param paths: what lies between it and those that may hear it. Levels may follow from gains or positions instead
     :param levels: power that it transmits, dBm, and noise figure of its receiver, dB
     :param start_s: in simulated time, when it begins to send, s
     """
 
     config: RobotConfig
-    source: SourceConfig | None
-    sink: SinkConfig | None
+    takes: bool
     paths: tuple[Path, ...]
     levels: tuple[float, float]
     start_s: float = 0.0
@@ -65,12 +59,12 @@ class RobotSettings:
     @property
     def namespace(self) -> str:
         """Of what it sends on its ROS graph; '' where it offers nothing."""
-        return "" if self.source is None else self.source.namespace
+        return self.config.namespace if self.config.sends else ""
 
 
-def sources_of(robots: Iterable[RobotSettings]) -> list[SourceConfig]:
-    """The sending halves of those that offer messages."""
-    return [robot.source for robot in robots if robot.source is not None]
+def senders_of(robots: Iterable[RobotSettings]) -> list[RobotConfig]:
+    """Those that offer messages."""
+    return [robot.config for robot in robots if robot.config.sends]
 
 
 def settings_of_all(
@@ -78,7 +72,6 @@ def settings_of_all(
     channel: ScenarioChannel,
     differing: Sequence[PathConfig],
     *,
-    paper: PaperConfig | None,
     shared: bool,
     leveled: bool,
     seed: int,
@@ -87,7 +80,6 @@ def settings_of_all(
 
     :param channel: between all of them
     :param differing: the paths that have another one; of several that fit, the last counts
-    :param paper: settings of the paper's blocks; None: they speak version 1
     :param shared: whether they use one channel, rather than one each
     :param leveled: whether the level of each path follows from gains
     """
@@ -95,7 +87,6 @@ def settings_of_all(
     offering = [number for number, robot in enumerate(robots) if robot.sends]
     made = []
     for number, robot in enumerate(robots):
-        source, sink = halves(robot, paper)
         hearers = [other for other, one in enumerate(robots) if other != number and one.receives]
         if not robot.sends and not shared:  # its reports concern those that send
             hearers = [other for other in hearers if other in offering]
@@ -105,8 +96,7 @@ def settings_of_all(
         made.append(
             RobotSettings(
                 robot,
-                source if robot.sends else None,
-                sink if robot.receives and set(offering) - {number} else None,
+                robot.receives and bool(set(offering) - {number}),
                 tuple(paths),
                 channel.levels(robot),
                 starts.uniform(0.0, STARTED_S) if shared or len(offering) > 2 else 0.0,

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.factory import EndpointSetup, keys_of_run
+from gr_ros2.gr.factory import Start, keys_of_run
+from gr_ros2.link.air import Air
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.mac import access_of
 from gr_ros2.phy import Phy
@@ -25,12 +26,15 @@ from gr_ros2_lab.sim.recorded_motion import RecordedMotion
 from gr_ros2_lab.sim.world import World
 
 
-def start_of_run(scenario: Scenario, phy: Phy) -> EndpointSetup:
+def start_of_run(scenario: Scenario) -> Start:
     """The start of every robot of a run."""
-    return EndpointSetup(
-        scenario.seed + 1,
-        keys=keys_of_run(scenario.first),
-        reports=scenario.reports,
+    return Start(scenario.seed + 1, keys_of_run(scenario.first))
+
+
+def air_of_run(scenario: Scenario, phy: Phy) -> Air:
+    """What the endpoints of all robots of a run know of their radios."""
+    return Air(
+        hears=scenario.reports,
         half_duplex=scenario.duplex == "half",
         any_length=phy.any_length,
         mcs_table=phy.mcs_table,
@@ -79,7 +83,7 @@ def _motion(scenario: Scenario, task: TaskRun | None) -> tuple[Motion, World | N
     if scenario.task:
         task = task or TaskRun(scenario, scenario.load_registry())
         return task.at, task.world
-    named = [None if robot.source is None else robot.source.namespace for robot in scenario.all_robots]
+    named = [robot.namespace if robot.config.sends else None for robot in scenario.all_robots]
     if scenario.bag_path is not None:
         topics = source_names(scenario.first, scenario.load_registry())
         recorded = RecordedMotion(scenario.bag_path, named, speed=scenario.bag_speed or 1.0, topics=topics)

@@ -222,7 +222,7 @@ class _Run:
         graphs = {
             stack.enter_context(join(robot.settings.config.graph, "gr_ros2_listener")): robot.heard
             for robot in self.live.recorded
-            if robot.settings.sink is not None
+            if robot.settings.takes
         }
         listener = DeliveryRecorder(graphs, out / DELIVERED_BAG, recording(self.scenario).texts)
         stack.callback(listener.close)

@@ -20,17 +20,16 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.core.backends import BackendTable
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
+from gr_ros2.paper.settings import PaperConfig, check, check_rows
 from gr_ros2.phy import PHY
 from gr_ros2.settings.config import (
     LEVELS,
     STRICT,
     AirConfig,
     Decibels,
-    PaperConfig,
     PathConfig,
     ScenarioChannel,
     Seconds,
-    SourceConfig,
     Traffic,
     build,
 )
@@ -39,9 +38,9 @@ from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.files import read_settings
 from gr_ros2.settings.registry import Registry, check_outputs
 from gr_ros2.settings.robot import RobotConfig
-from gr_ros2.wire import BROADCAST
+from gr_ros2.wire import BROADCAST, FORMATS, Format
 from gr_ros2_lab.run.builtin import SCENARIO_DIR, builtin_scenarios
-from gr_ros2_lab.run.robot_settings import RobotSettings, ScenarioRobot, settings_of_all, sources_of
+from gr_ros2_lab.run.robot_settings import RobotSettings, ScenarioRobot, settings_of_all
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from gr_ros2_lab.sim.tasks import task_class
 
@@ -148,6 +147,11 @@ class Scenario(Experiment, Traffic, AirConfig):
             raise ValueError("packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out")
         self.airtime.check_seal(encrypts=bool(self.key) and self.robots[0].seal == "encrypt")
         self._check_robots()
+        if self.paper is not None:
+            for robot in self.robots:
+                check(robot, self.paper)
+        elif self.packet_len < (least := self.wire_format.min_packet_len):
+            raise ValueError(f"packet_len = {self.packet_len}: robots need at least {least}")
         self._check_positions()
         self.all_robots  # noqa: B018 - says what does not go together
         return self
@@ -229,16 +233,25 @@ class Scenario(Experiment, Traffic, AirConfig):
             self.robots,
             self.channel,
             self.paths,
-            paper=self.paper,
             shared=self.duplex == "half",
             leveled=self.gains_db is not None,
             seed=self.seed,
         )
 
     @property
-    def first(self) -> SourceConfig:
-        """The sending half of the first robot."""
-        return sources_of(self.all_robots)[0]
+    def first(self) -> RobotConfig:
+        """The first robot, which sends."""
+        return self.robots[0]
+
+    @property
+    def wire_format(self) -> Format:
+        """The wire format in which its robots write packets."""
+        return FORMATS[1 if self.paper is None else 0]
+
+    @property
+    def compresses(self) -> bool:
+        """Whether messages are coded."""
+        return self.first.compression if self.paper is None else self.paper.compression
 
     @property
     def packet_len(self) -> int:
@@ -258,7 +271,7 @@ class Scenario(Experiment, Traffic, AirConfig):
     @property
     def reports(self) -> bool:
         """Whether a robot that sends messages may hear from a robot that receives them."""
-        return any(robot.sink is not None and robot.paths for robot in self.all_robots)
+        return any(robot.takes and robot.paths for robot in self.all_robots)
 
     @property
     def simulated(self) -> bool:
@@ -276,8 +289,10 @@ class Scenario(Experiment, Traffic, AirConfig):
             raise ConfigError("registry is missing; a scenario names the topics of its robots, as table4 does")
         registry = Registry.from_csv(self.registry)
         for robot in self.all_robots:
-            if robot.sink is not None:
-                check_outputs(registry, robot.sink)
+            if robot.takes:
+                check_outputs(registry, robot.config.publish, announced=self.paper is None)
+        if self.paper is not None:
+            check_rows(registry)
         return registry
 
 

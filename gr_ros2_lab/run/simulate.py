@@ -32,16 +32,17 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.observe.result import TopicResult
+from gr_ros2.paper.factory import make_paper_endpoint
 from gr_ros2.phy import Phy
-from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium import FixedPaths, Medium, Reception, Transmission, make_medium
 from gr_ros2_lab.medium.packets import PacketMedium
 from gr_ros2_lab.record.recorder import Recorder
 from gr_ros2_lab.run.load import make_phy, recorded_names, source_names
 from gr_ros2_lab.run.recorders import make_recorder
-from gr_ros2_lab.run.robot_settings import sources_of
-from gr_ros2_lab.run.robots import hearer_of, start_of_run, surroundings
+from gr_ros2_lab.run.robot_settings import senders_of
+from gr_ros2_lab.run.robots import air_of_run, hearer_of, start_of_run, surroundings
 from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.run.task_run import TaskRun
 from gr_ros2_lab.sim.fleet import Fleet, SimMessage
@@ -138,7 +139,7 @@ def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
 
 def offered_by(scenario: Scenario, registry: Registry) -> list[Iterator[Offered]]:
     """What each robot that sends gives to the link. The robots of a simulator drive only once."""
-    names = [source_names(source, registry) for source in sources_of(scenario.all_robots)]
+    names = [source_names(robot, registry) for robot in senders_of(scenario.all_robots)]
     if len(names) == 1:
         return [offered(scenario, registry)]
     sent = list(_simulated(scenario.sim, scenario.duration_s, frozenset().union(*names)))
@@ -192,10 +193,10 @@ def simulate(
     if phy.mcs_table:
         raise ConfigError("rate = 'adaptive': a forecast has one rate; set phy.options.rate to fixed")
     run = Simulation(scenario, registry, phy, messages=messages, codec=codec, ideal=True)
-    sources = sources_of(scenario.all_robots)
-    ids = [source.src_id() for source in sources]
+    senders = senders_of(scenario.all_robots)
+    ids = [robot.robot_id for robot in senders]
     listeners = {src_id: hearer_of(run.around, number) for number, src_id in enumerate(ids)}
-    recorder = make_recorder(registry, sources)
+    recorder = make_recorder(registry, senders)
     for timed_event in run.events():
         _, robot, event = timed_event
         if not isinstance(event, _OfSender) or listeners.get(event.src_id, robot.number) == robot.number:
@@ -304,12 +305,17 @@ def _robots(
     busy: bool = False,
 ) -> list[Robot]:
     """The robots of a run, those that send first; see :class:`Simulation` and :class:`Robot`."""
-    start, coming = start_of_run(scenario, phy), iter(messages)
+    start, air, coming = start_of_run(scenario), air_of_run(scenario, phy), iter(messages)
     robots: list[Robot] = []
     for number, settings in enumerate(scenario.all_robots):
         events: list[SenderEvent] = []
-        halves, rng = (settings.source, settings.sink), random.Random(scenario.seed)
-        endpoint = make_endpoint(registry, *halves, start=start, codec=codec, rng=rng, observer=events.append)
+        config, rng = settings.config, random.Random(scenario.seed)
+        endpoint: Endpoint
+        common: dict[str, Any] = {"codec": codec, "observer": events.append}
+        if scenario.paper is None:
+            endpoint = make_endpoint(config, registry, air=air, start=start, **common)
+        else:
+            endpoint = make_paper_endpoint(config, scenario.paper, registry, rng=rng, **common)
         robot = Robot(
             scenario,
             number,
@@ -317,21 +323,21 @@ def _robots(
             events=events,
             src_id=settings.robot_id,
             airtime=phy.airtime,
-            messages=iter(()) if settings.source is None else next(coming),
+            messages=iter(()) if not config.sends else next(coming),
             start_s=settings.start_s,
             busy=busy,
-            frames=frames_of(endpoint, settings.source, registry),
+            frames=frames_of(endpoint, config, registry),
         )
         robots.append(robot)
     return robots
 
 
-def frames_of(endpoint: Endpoint, source: SourceConfig | None, registry: Registry) -> FrameSender | None:
+def frames_of(endpoint: Endpoint, robot: RobotConfig, registry: Registry) -> FrameSender | None:
     """The topics of a robot that are sent as frames; None where none is."""
-    if endpoint.frames is None or source is None or not source.compresses:
+    if endpoint.frames is None or not robot.sends or not robot.compression:
         return None
     sender = FrameSender(endpoint.frames)
-    sent = [sender.add(topic) for topic in registry.with_options(source.topic_options) if topic.is_topic]
+    sent = [sender.add(topic) for topic in registry.with_options(robot.options) if topic.is_topic]
     return sender if any(sent) else None
 
 

@@ -22,7 +22,7 @@ from gr_ros2_lab.run.delivered import DeliveredBag, bag_origin_ns
 from gr_ros2_lab.run.load import make_phy, published_names, recording, source_names
 from gr_ros2_lab.run.outcome import DELIVERED_BAG, Outcome, Progress, by_sender
 from gr_ros2_lab.run.recorders import RunRecords
-from gr_ros2_lab.run.robot_settings import sources_of
+from gr_ros2_lab.run.robot_settings import senders_of
 from gr_ros2_lab.run.robots import hearer_of
 from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.run.simulate import Simulation, pass_on
@@ -56,19 +56,19 @@ def run_simulated(
     """
     began = time.monotonic()
     registry = registry or scenario.load_registry()
-    sources = sources_of(scenario.all_robots)
+    senders = senders_of(scenario.all_robots)
     phy = make_phy(scenario, registry)
     with ExitStack() as stack:
         if bag is None and out is not None:
-            origin_ns = bag_origin_ns(scenario, source_names(sources[0], registry))
+            origin_ns = bag_origin_ns(scenario, source_names(senders[0], registry))
             contents = recording(scenario)
             for line in contents.differences:
                 _log.warning(line)
             bag = stack.enter_context(DeliveredBag(out / DELIVERED_BAG, origin_ns, definitions=contents.texts))
-            for source in sources:
-                names = published_names(scenario, source, registry)
-                ids = source_names(source, registry)
-                bag.add_source(source.src_id(), registry, {ids[name]: other for name, other in names.items()})
+            for sender in senders:
+                names = published_names(scenario, sender, registry)
+                ids = source_names(sender, registry)
+                bag.add_source(sender.robot_id, registry, {ids[name]: other for name, other in names.items()})
         task = TaskRun(scenario, registry) if scenario.task else None
         run = Simulation(scenario, registry, phy, task=task)
         run_observers = run_observers or RunObservers(threaded=False)
@@ -96,13 +96,13 @@ def run_simulated(
                 reported = time.monotonic()
                 progress(on_progress, Progress(clock.now, scenario.duration_s, *records.recorder.progress()))
         records.check()
-    counted = [_counters(run, number, source_names(source, registry)) for number, source in enumerate(sources)]
+    counted = [_counters(run, number, source_names(robot, registry)) for number, robot in enumerate(senders)]
     return records.outcome(
         begin=0.0,
         end=run.duration_s,
         played=run.duration_s,
         drained=run.empty,
-        channels=1 if run.medium.shared else len(sources),
+        channels=1 if run.medium.shared else len(senders),
         began=began,
         incomplete=tuple(run_observers.incomplete()),
         counters={**by_sender(counted), "listener": {} if bag is None else dict(bag.written)},

@@ -22,7 +22,7 @@ from gr_ros2.middleware import Middleware, Qos
 from gr_ros2.middleware.base import Subscription
 from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.run.load import source_names
-from gr_ros2_lab.run.robot_settings import sources_of
+from gr_ros2_lab.run.robot_settings import senders_of
 from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.sim.sensors import TYPES, read_command
 from gr_ros2_lab.sim.tasks import TaskRobots, make_task
@@ -53,22 +53,22 @@ class TaskRun:
     """
 
     def __init__(self, scenario: Scenario, registry: Registry) -> None:
-        sources = sources_of(scenario.all_robots)
+        senders = senders_of(scenario.all_robots)
         self.settings, self._duration_s = scenario.sim, scenario.duration_s
-        self.robot_ids = tuple(source.src_id() for source in sources)
+        self.robot_ids = tuple(robot.robot_id for robot in senders)
         self.commands: Counter[str] = Counter()
-        self._namespaces = [source.namespace for source in sources]
+        self._namespaces = [robot.namespace for robot in senders]
         self._topics: list[tuple[str, int]] = []
-        for source in sources:
-            names = source_names(source, registry)
-            if list(names) != [f"{source.namespace}/odom"]:
+        for robot in senders:
+            names = source_names(robot, registry)
+            if list(names) != [f"{robot.namespace}/odom"]:
                 raise ConfigError(
                     f"task = {scenario.task!r}: its robots send their odometry alone, and {scenario.registry} has "
                     f"{', '.join(names) or 'nothing'}; set registry to odom.csv"
                 )
             self._topics += names.items()
-        task = make_task(scenario.task, len(sources), scenario.seed)
-        self._commanded = [] if scenario.controller == "task" else [*{*range(len(sources))} - {*task.scripted}]
+        task = make_task(scenario.task, len(senders), scenario.seed)
+        self._commanded = [] if scenario.controller == "task" else [*{*range(len(senders))} - {*task.scripted}]
         self._robots = TaskRobots(task, scenario.sim, self._commanded)
         self._subscriptions: dict[str, Subscription] = {}
         self._clock: Callable[[], float] = lambda: 0.0

@@ -13,8 +13,9 @@ from pathlib import Path
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.queues import queue_for
-from gr_ros2.settings.config import CloudOptions, SourceConfig
+from gr_ros2.settings.config import CloudOptions
 from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.report.page import Run, read_runs
 from gr_ros2_lab.report.table import Grid, milliseconds, number
@@ -42,9 +43,9 @@ def variants(scenario: Scenario) -> list[Variant]:
 
     :raises ConfigError: for a scenario in which all of these parts are off
     """
-    source, robot = scenario.first, scenario.robots[0]
+    robot, of_link = scenario.first, scenario.paper is None
     found = [Variant(WHOLE)]
-    if source.compresses:
+    if scenario.compresses:
         details = []
         for name, options in robot.topics.items():
             details += [f"topics.{name}.codec=auto"] * (options.codec != AUTO)
@@ -52,17 +53,17 @@ def variants(scenario: Scenario) -> list[Variant]:
             details += [f"topics.{name}.cloud={{}}"] * (options.cloud != CloudOptions())
         where = "" if scenario.paper is None else "paper."
         found.append(Variant("no-compression", (f"{where}compression=false", *details)))
-    if source.packet_rate != 0:
+    if robot.packet_rate != 0:
         found.append(Variant("no-pull", ("packet_rate=0",)))
-    if source.version and source.repair != "off":
-        expected = SourceConfig.expected_loss
-        details = [f"expected_loss={expected}"] * (source.expected_loss != expected)
+    if of_link and robot.repair != "off":
+        expected = RobotConfig.expected_loss
+        details = [f"expected_loss={expected}"] * (robot.expected_loss != expected)
         found.append(Variant("no-repair", ("repair='off'", *details)))
     silent = [number for number, one in enumerate(scenario.robots) if not one.sends and one.direction == "both"]
     if silent:
         found.append(Variant("no-reports", tuple(f"robots.{number}.direction=receive" for number in silent)))
-    registry = scenario.load_registry().with_options(source.topic_options)
-    latest = [topic.name for topic in registry if source.version and queue_for(topic.options)[0] == "latest"]
+    registry = scenario.load_registry().with_options(robot.options)
+    latest = [topic.name for topic in registry if of_link and queue_for(topic.options)[0] == "latest"]
     if latest:
         found.append(Variant("no-latest", tuple(f"topics.{name}.queue=fifo" for name in latest)))
     if len(found) == 1:

@@ -38,7 +38,7 @@ from gr_ros2_lab.medium.loss_table import LossCurve
 from gr_ros2_lab.medium.positions import Positions
 from gr_ros2_lab.report.explain import air_line
 from gr_ros2_lab.run.load import make_phy, source_names
-from gr_ros2_lab.run.robot_settings import sources_of
+from gr_ros2_lab.run.robot_settings import senders_of
 from gr_ros2_lab.run.robots import surroundings
 from gr_ros2_lab.run.scenario import Scenario, changed
 from gr_ros2_lab.run.simulate import Simulated, coupled, offered_by, simulate
@@ -254,9 +254,9 @@ class Planner:
             raise ConfigError(f"source = {scenario.source!r}: has nothing on the registered topics; set other topics")
         self._rows: dict[str, str] = {}
         self._weights: dict[str, float] = {}
-        for source in sources_of(self.scenario.all_robots):
-            options = self.registry.with_options(source.topic_options)
-            for name, topic_id in source_names(source, self.registry).items():
+        for robot in senders_of(self.scenario.all_robots):
+            options = self.registry.with_options(robot.options)
+            for name, topic_id in source_names(robot, self.registry).items():
                 self._rows[name], self._weights[name] = self.registry[topic_id].name, options[topic_id].options.weight
         self._remembering: _Remembering | None = None
         self._now: Forecast | None = None
@@ -336,19 +336,18 @@ class Planner:
         """The first seconds as they are, and with each change; the settings that make it."""
         base = replace(self.scenario, duration_s=min(self.scenario.duration_s or TRIAL_S, TRIAL_S))
         yield "", base
-        if not base.first.compresses:
+        if not base.compresses:
             yield "compression=true", _sending(base, lambda own: replace(own, compression=True))
         if base.first.packet_rate == 0:
             yield "packet_rate=auto", _sending(base, lambda own: replace(own, packet_rate=AUTO))
-        if base.duplex == "half" and len(sources_of(base.all_robots)) > 1 and base.medium == "exclusive":
+        if base.duplex == "half" and len(senders_of(base.all_robots)) > 1 and base.medium == "exclusive":
             yield "medium=slots", replace(base, medium="slots")
         for packet_len in self._packet_lens():
             yield f"packet_len={packet_len}", _with_packet_len(base, packet_len)
 
     def _packet_lens(self) -> list[int]:
         """Packet lengths such that the messages of one of the topics fit into one packet, or into a few equal parts."""
-        source = self.scenario.first
-        wire = source.wire_format
+        wire = self.scenario.wire_format
         sizes: dict[int, list[int]] = {}
         for message in chain(*self._messages):
             sizes.setdefault(message.topic_id, []).append(self._size(message.topic_id, message.payload))
@@ -358,7 +357,7 @@ class Planner:
             most = sorted(values)[int(0.99 * (len(values) - 1))]
             lens |= {wire.packed_len([-(-most // parts)]) for parts in _PARTS}
         lens.discard(self.scenario.packet_len)
-        usable = range(max(wire.packed_len([source.min_fragment]), wire.min_packet_len), wire.max_packet_len + 1)
+        usable = range(wire.min_packet_len, wire.max_packet_len + 1)
         return sorted(
             packet_len for packet_len in lens if packet_len in usable and largest <= wire.largest_message(packet_len)
         )
@@ -433,7 +432,7 @@ class Planner:
                 scenario = _sending(scenario, partial(_limited, row=row, rate_hz=rate_hz))
             else:
                 scenario = _sending(scenario, partial(_without, row=row))
-                left = [self.registry.chosen(source.topics) for source in sources_of(scenario.all_robots)]
+                left = [self.registry.chosen(robot.words) for robot in senders_of(scenario.all_robots)]
                 if not all(left):
                     return
                 settings.append(f"topics.-{row}=")
@@ -454,25 +453,25 @@ class Planner:
 
     def _size(self, topic_id: int, payload: bytes) -> int:
         """Bytes of a message on the air, without headers."""
-        codec = self._codec(self.scenario.first.compresses)
+        codec = self._codec(self.scenario.compresses)
         return len(payload) if codec is None else len(codec.encode(topic_id, payload))
 
     def _forecast(self, scenario: Scenario) -> Forecast:
-        sources = sources_of(scenario.all_robots)
+        robots = senders_of(scenario.all_robots)
         phy = configured(scenario.phy, scenario.packet_len, self.phy.sample_rate)
         airtime = phy.airtime()
-        codec = self._codec(scenario.first.compresses)
+        codec = self._codec(scenario.compresses)
         rule = scenario.airtime.rule
         shared = scenario.duplex == "half"
-        allowed = 1.0 if rule is None else min(1.0, (len(sources) if shared else 1) * sustained(rule))
+        allowed = 1.0 if rule is None else min(1.0, (len(robots) if shared else 1) * sustained(rule))
         duration = scenario.duration_s or self._messages[0][-1].t
         topic_ids: dict[tuple[int, str], int] = {}
         rates_hz: dict[tuple[int, int], float] = {}
         payloads: dict[tuple[int, int], list[bytes]] = {}
         messages = []
-        for source, own in zip(sources, self._messages, strict=True):
-            src_id, options = source.src_id(), self.registry.with_options(source.topic_options)
-            for name, topic_id in source_names(source, self.registry).items():
+        for robot, own in zip(robots, self._messages, strict=True):
+            src_id, options = robot.robot_id, self.registry.with_options(robot.options)
+            for name, topic_id in source_names(robot, self.registry).items():
                 topic_ids[src_id, name] = topic_id
                 rates_hz[src_id, topic_id] = options[topic_id].options.max_rate or np.inf
                 payloads[src_id, topic_id] = []
@@ -484,7 +483,7 @@ class Planner:
         senders: dict[str, Counter[str]] = {}
         begun, ended = np.inf, 0.0
 
-        wire = scenario.first.wire_format
+        wire = scenario.wire_format
 
         def share(sent: SentPacket) -> None:
             nonlocal padded, sent_bytes, begun, ended
@@ -533,7 +532,7 @@ class Planner:
         delivered = sum(topic.result.delivered for topic in topics)
         spent = [float(kinds.total()) for kinds in senders.values()]
         span = max(ended - begun, airtime)
-        sending = {str(source.src_id()) for source in sources}
+        sending = {str(robot.robot_id) for robot in robots}
         return Forecast(
             packet_len=scenario.packet_len,
             airtime_s=airtime,

@@ -266,7 +266,7 @@ def test_sealed_packets_with_and_without_the_key(
 def test_announced_topics_have_names_and_packets_as_long_as_needed_are_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    one = Robot(1, registry(), fixed=False)
+    one = Robot(1, registry(), any_length=True)
     now, packets = 0.0, []
     for number in range(40):
         one.end.messages.submit(number % 3, bytes(10 * number), now)

@@ -63,7 +63,7 @@ def goes_on(robot: Robot) -> None:
         ({SET: [["packet_len", 7]]}, "packet_len cannot change while the link runs"),
         ({SET: [["queue_depth", 10**30]]}, "queue_depth = 10+: must be less"),
         ({SET: [["topic\nx\x1b[1m", 7]]}, r"topic x\\x1b\[1m cannot change"),
-        ({SET: [["topics.a\nb.to", 7]]}, r"topic 'a\\nb': '\\n' may not stand in a ROS name"),
+        ({SET: [["topics.a\nb.to", 7]]}, r"topics: 'a\\nb' '\\n' may not stand in a ROS name"),
         ({"p\nong": 7}, "p ong: no question here"),
         ({"pong": 7}, "pong: no question here; known are ping, set, status"),
         ({"address": "127.0.0.1", "port": 70000}, "dashboard: port = 70000: .* 65535"),

@@ -13,7 +13,7 @@ from gr_ros2.cli.main import run
 from gr_ros2.cli.registry import registry_csv, unfit
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import Qos, TopicInfo
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.settings.service_rows import rows_of
 from tests.domains import domain
@@ -212,7 +212,7 @@ def test_from_a_bag(storage: StoragePlugin, tmp_path: Path, capsys: pytest.Captu
     bare = next(path for path in bag.iterdir() if path.suffix in (".mcap", ".db3"))
     assert run(["registry", "from-bag", str(bare), "--topics", "robot_1/tf_static", "--out", str(out)]) == 0
     assert capsys.readouterr().out == f"{out}: 1 topics, digest {Registry.from_csv(out).digest}\n"
-    assert Registry.from_csv(out)[0].options == TopicOptions(
+    assert Registry.from_csv(out)[0].options == SendOptions(
         reliability="reliable", durability="transient_local", depth=1
     )
 

@@ -16,7 +16,7 @@ from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Announced, Delivered
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 
 CAMERA, ODOMETRY, SCAN = range(3)
@@ -50,7 +50,7 @@ class Robot:
         settings = Settings(
             self.number,
             packet_len=PACKET_LEN,
-            fixed=not self.any_length,
+            any_length=self.any_length,
             hears=self.hears,
             turn_s=lambda: PACKET_LEN * 8e-3 / self.kbit_s,
         )
@@ -153,11 +153,11 @@ class Air:
 def registry(**camera: Any) -> Registry:
     """A camera with such options, odometry, a scan."""
     options = camera.pop("options", {})
-    camera_options = TopicOptions(**({"camera": camera} if camera else {}), **options)
+    camera_options = SendOptions(**({"camera": camera} if camera else {}), **options)
     return Registry(
         [
             Topic(CAMERA, "camera/image", (options and options.get("type", IMAGE)) or IMAGE, camera_options),
-            Topic(ODOMETRY, "odom", "std_msgs/msg/String", TopicOptions(queue="latest", codec="none")),
-            Topic(SCAN, "scan", "std_msgs/msg/String", TopicOptions(queue="latest", codec="none")),
+            Topic(ODOMETRY, "odom", "std_msgs/msg/String", SendOptions(queue="latest", codec="none")),
+            Topic(SCAN, "scan", "std_msgs/msg/String", SendOptions(queue="latest", codec="none")),
         ]
     )

@@ -16,7 +16,7 @@ from gr_ros2.codecs.frames import FrameReceiver
 from gr_ros2.codecs.messages import CAMERA_INFO, IMAGE, VIDEO, read
 from gr_ros2.link.events import Accepted, Delivered, Refused
 from gr_ros2.link.fates import Fate
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.codecs import scenes
 from tests.codecs.camera_link import CAMERA, ODOMETRY, Air, Robot, registry
@@ -295,7 +295,7 @@ def test_what_is_said_of_a_topic() -> None:
 
 
 def test_two_cameras_share_what_is_free_by_weight() -> None:
-    rows = [Topic(0, "camera/image", IMAGE), Topic(1, "rear/image", IMAGE, TopicOptions(weight=3.0))]
+    rows = [Topic(0, "camera/image", IMAGE), Topic(1, "rear/image", IMAGE, SendOptions(weight=3.0))]
     sender, receiver = Robot(1, Registry(rows), 256), Robot(2, None, 256)
     air = Air(sender, receiver)
     for topic_id in (0, 1):

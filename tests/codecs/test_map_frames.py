@@ -6,12 +6,12 @@ import pytest
 
 from gr_ros2.codecs.messages import GRID
 from gr_ros2.link.events import SentPacket
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.codecs import scenes
 from tests.codecs.camera_link import Air, Robot
 
-MAP = Topic(0, "map", GRID, TopicOptions(durability="transient_local"))
+MAP = Topic(0, "map", GRID, SendOptions(durability="transient_local"))
 MAPS = list(scenes.exploring(12))
 
 

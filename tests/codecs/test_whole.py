@@ -11,13 +11,13 @@ from gr_ros2.codecs.messages import CLOUD, read
 from gr_ros2.compression.link_codec import WHOLE
 from gr_ros2.core.errors import CodecError, ConfigError
 from gr_ros2.gr.factory import message_codec
-from gr_ros2.settings.config import TopicOptions, build
+from gr_ros2.settings.config import SendOptions, build
 from gr_ros2.settings.registry import Topic
 from tests.codecs.scenes import cloud, street
 
 
 def codec_of(**options: object) -> object:
-    return message_codec([Topic(0, "points", CLOUD, build(TopicOptions, options))])
+    return message_codec([Topic(0, "points", CLOUD, build(SendOptions, options))])
 
 
 def test_an_exact_cloud_is_much_shorter_than_by_zstd_and_comes_out_to_the_byte() -> None:
@@ -79,4 +79,4 @@ def test_any_bytes_are_a_message_or_a_codec_error(body: bytes) -> None:
 
 def test_an_option_without_effect_is_refused() -> None:
     with pytest.raises(ConfigError, match="an exact cloud has every point"):
-        build(TopicOptions, {"cloud": {"range": 30.0}})
+        build(SendOptions, {"cloud": {"range": 30.0}})

@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from gr_ros2.compression import Dictionary, LinkCodec
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic, normalize_type
 from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
@@ -123,7 +123,7 @@ class Writer:
 
 def codec_for(type_name: str, *dictionaries: Dictionary, max_size: int = 1 << 20, **options: Any) -> LinkCodec:
     """The codec of a link with one topic."""
-    topic = Topic(0, "topic", normalize_type(type_name), TopicOptions(**options))
+    topic = Topic(0, "topic", normalize_type(type_name), SendOptions(**options))
     return LinkCodec(Registry([topic]), dictionaries, max_size=max_size)
 
 

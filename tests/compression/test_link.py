@@ -6,8 +6,8 @@ import pytest
 
 from gr_ros2.compression import LinkCodec
 from gr_ros2.link import AirPacket, Delivered, Lost, Received, ReceiverEvent
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.settings.config import SinkConfig
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 from tests.compression.support import simulated
@@ -17,7 +17,7 @@ PACKET_LEN = 220
 
 
 def received(coded: bytes, *, codec: LinkCodec | None, compressed: bool = True) -> list[ReceiverEvent]:
-    receiver = Receiver(REGISTRY, SinkConfig(packet_len=PACKET_LEN), codec=codec)
+    receiver = Receiver(REGISTRY, *paper_from(robot=0, packet_len=PACKET_LEN), codec=codec)
     pieces = [coded[at : at + 100] for at in range(0, len(coded), 100)]
     events: list[ReceiverEvent] = []
     for n, piece in enumerate(pieces):

@@ -21,7 +21,7 @@ from gr_ros2.compression.schema import tree_of
 from gr_ros2.compression.train import learn
 from gr_ros2.core.errors import CodecError
 from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.compression import second_decoder as second
 from tests.compression.support import STORE, Writer
@@ -110,7 +110,7 @@ def test_a_dictionary_of_a_user(tmp_path: Path) -> None:
     made.save(tmp_path / "mine.json")
     own = json.loads((tmp_path / "mine.json").read_text())
     for mode in ("fields", "zstd"):
-        sender = LinkCodec([Topic(0, "odom", type_name, TopicOptions(codec=mode))], [made])
+        sender = LinkCodec([Topic(0, "odom", type_name, SendOptions(codec=mode))], [made])
         for payload in payloads[:50]:
             coded = sender.encode(0, payload)
             assert coded[0] >> 4 == 15

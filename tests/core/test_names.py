@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.names import MAX_TOPIC_LEN, check_node, check_topic, filled, topic_fault
+from gr_ros2.gr.ros_link import make_link
 from gr_ros2.radio.config import link_from
-from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.settings.config import build
 from gr_ros2.settings.registry import Registry, check_outputs
+from gr_ros2.settings.robot import GraphConfig, PublishConfig, PublishOptions
 from gr_ros2_lab.run.scenario import load_scenario, scenario_from
 
 NAMES = st.text(st.sampled_from("aZ_09/-~ {}é\n"), max_size=12)
@@ -53,14 +55,14 @@ def test_the_longest_topic_passes() -> None:
 
 @pytest.mark.parametrize("namespace", ["", "/", "robot_1", "/robot_1", "/robot_1/", "/fleet/robot_1"])
 def test_a_namespace_may_be_written_as_people_do(namespace: str) -> None:
-    assert SourceConfig(namespace=namespace).namespace == namespace
+    assert GraphConfig(namespace=namespace).namespace == namespace
     assert check_node("n", namespace) == ("n", "/" + namespace.strip("/"))
 
 
 @pytest.mark.parametrize("namespace", ["/robot-1", "/robot 1", "//robot_1", "/robot_1//", "/1", "~", "/{robot}"])
 def test_a_namespace_that_ros_refuses(namespace: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(f"namespace = {namespace!r}: ")):
-        build(SourceConfig, {"namespace": namespace})
+        build(GraphConfig, {"namespace": namespace})
     with pytest.raises(ConfigError, match=re.escape(f"namespace {namespace!r}: ")):
         check_node("n", namespace)
 
@@ -71,21 +73,21 @@ def test_a_node_name_that_ros_refuses(name: str) -> None:
         check_node(name, "/")
 
 
-@pytest.mark.parametrize("key", ["namespace_format", "frame_prefix"])
+@pytest.mark.parametrize("key", ["as", "frame_prefix"])
 @pytest.mark.parametrize(
     "form", ["{robot.__class__}", "{robot!r}", "{robot:99}", "{robot}{", "{{robot}}", "{who}", "{}", "{0}"]
 )
 def test_a_form_has_one_field(key: str, form: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(f"{key} = '/x{form}'" if key[0] == "n" else f"{key} = 'x{form}'")):
-        build(SinkConfig, {key: f"/x{form}" if key[0] == "n" else f"x{form}"})
-    with pytest.raises(ConfigError, match="publish_as"):
-        build(TopicOptions, {"publish_as": f"/x{form}"})
+    with pytest.raises(ConfigError, match=re.escape(f"{key} = '/x{form}'" if key == "as" else f"{key} = 'x{form}'")):
+        build(PublishConfig, {key: f"/x{form}" if key == "as" else f"x{form}"})
+    with pytest.raises(ConfigError, match="as = "):
+        build(PublishOptions, {"as": f"/x{form}"})
 
 
 @given(st.sampled_from(["/rx_robot_{robot}", "rx_{robot}_{robot}/", "/", "", "/all"]), st.integers(0, 255))
 def test_a_form_that_passes_gives_every_sender_a_name_ros_takes(form: str, src_id: int) -> None:
-    sink = build(SinkConfig, {"namespace_format": form})
-    name = REGISTRY[0].republished(sink.namespace_format, src_id)
+    publish = build(PublishConfig, {"as": form})
+    name = REGISTRY[0].republished(publish.as_, src_id)
     assert check_topic(name) == name
     assert filled(form, src_id) == form.format(robot=src_id)
 
@@ -93,10 +95,10 @@ def test_a_form_that_passes_gives_every_sender_a_name_ros_takes(form: str, src_i
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
-        ("namespace_format", "/rx-{robot}", "'-' may not stand"),
-        ("namespace_format", "/a b/{robot}", "' ' may not stand"),
-        ("namespace_format", "/{robot}", "part '255' must not begin with a digit (for sender 255)"),
-        ("namespace_format", "/rx//{robot}", "two / in a row"),
+        ("as", "/rx-{robot}", "'-' may not stand"),
+        ("as", "/a b/{robot}", "' ' may not stand"),
+        ("as", "/{robot}", "part '255' must not begin with a digit (for sender 255)"),
+        ("as", "/rx//{robot}", "two / in a row"),
         ("frame_prefix", "/robot_{robot}/", "must not begin with /"),
         ("frame_prefix", "robot\0", "cannot be printed"),
         ("merge_tf", "tf", "must begin with /"),
@@ -106,13 +108,13 @@ def test_a_form_that_passes_gives_every_sender_a_name_ros_takes(form: str, src_i
 )
 def test_a_sink_refuses_names_that_ros_does(key: str, value: str, says: str) -> None:
     with pytest.raises(ConfigError, match=f"{re.escape(f'{key} = {value!r}: ')}.*{re.escape(says)}"):
-        build(SinkConfig, {"frame_prefix": "robot_{robot}/", key: value})
+        build(PublishConfig, {"frame_prefix": "robot_{robot}/", key: value})
 
 
 @pytest.mark.parametrize("value", ["/robot-1/odom", "/a b/odom", "/odom/", "/", "/1/odom", "{robot}"])
 def test_a_topic_cannot_come_out_under_a_name_that_ros_refuses(value: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(f"topic_options.odom.publish_as = {value!r}: ")):
-        build(SinkConfig, {"topic_options": {"odom": {"publish_as": value}}})
+    with pytest.raises(ConfigError, match=re.escape(f"topics.odom.as = {value!r}: ")):
+        build(PublishConfig, {"topics": {"odom": {"as": value}}})
 
 
 def test_a_link_and_a_scenario_refuse_them_when_they_are_read() -> None:
@@ -130,20 +132,18 @@ def test_a_link_and_a_scenario_refuse_them_when_they_are_read() -> None:
         load_scenario("demo", ["publish.as=/rx-{robot}"])
 
 
-def test_names_of_a_registry_and_a_sink_together() -> None:
-    check_outputs(REGISTRY, SinkConfig(frame_prefix="r{robot}/", merge_tf="/tf"))
+def test_names_of_a_registry_and_of_what_comes_out_together() -> None:
+    check_outputs(REGISTRY, PublishConfig(frame_prefix="r{robot}/", merge_tf="/tf"))
     long = Registry.from_rows({"a" * 240: "nav_msgs/Odometry"})
-    with pytest.raises(ConfigError, match="ROS allows 247; change its publish_as, or namespace_format"):
-        check_outputs(long, SinkConfig())
-    shared: dict[str, Any] = {"odom": TopicOptions(publish_as="/x"), "tf": TopicOptions(publish_as="/x")}
+    with pytest.raises(ConfigError, match=r"ROS allows 247; change its publish_as, or publish\.as"):
+        check_outputs(long, PublishConfig())
+    shared: dict[str, Any] = {"odom": {"as": "/x"}, "tf": {"as": "/x"}}
     with pytest.raises(ConfigError, match="'tf' would come out as '/x' of type tf2_msgs/msg/TFMessage, where nav_msgs"):
-        check_outputs(REGISTRY, SinkConfig(topic_options=shared))
+        check_outputs(REGISTRY, build(PublishConfig, {"topics": shared}))
     with pytest.raises(ConfigError, match="'odom' would come out as '/tf' of type nav_msgs/msg/Odometry"):
         check_outputs(
             REGISTRY,
-            SinkConfig(
-                frame_prefix="r{robot}/", merge_tf="/tf", topic_options={"odom": TopicOptions(publish_as="/tf")}
-            ),
+            build(PublishConfig, {"frame_prefix": "r{robot}/", "merge_tf": "/tf", "topics": {"odom": {"as": "/tf"}}}),
         )
 
 
@@ -153,6 +153,5 @@ def test_a_scenario_refuses_them_with_its_registry(tmp_path: Path) -> None:
     scenario = load_scenario("demo", registry=str(registry))
     with pytest.raises(ConfigError, match="ROS allows 247"):
         scenario.load_registry()
-    values = {"registry": str(registry), "phy": {"name": "direct"}, "robot": 1}
     with pytest.raises(ConfigError, match="ROS allows 247"):
-        link_from(values).load_registry()
+        make_link(registry=str(registry), robot=1, graph_middleware="memory", state=str(tmp_path / "state"))

@@ -8,10 +8,10 @@ from typing import Any, Protocol
 
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.sender import Sender
 from gr_ros2.observe.positions import humble_types
-from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.settings.registry import Registry
 from tests.packets import data_of
 
@@ -44,14 +44,14 @@ class Feed:
         self.packets = 0
         self._lost = lost
         self.sender = Sender(
-            REGISTRY, SourceConfig(robot_id=SRC, **settings), rng=random.Random(1), observer=self._sender_event
+            REGISTRY, *paper_from(robot=SRC, **settings), rng=random.Random(1), observer=self._sender_event
         )
         self.forget()
 
     def forget(self) -> None:
         """The receiver starts anew."""
-        config = self.sender.config
-        self.receiver = Receiver(REGISTRY, SinkConfig(packet_len=config.packet_len, version=config.version))
+        config = self.sender.robot
+        self.receiver = Receiver(REGISTRY, *paper_from(robot=0, packet_len=config.packet_len))
 
     def submit(self, topic_id: int, payload: bytes, now: float) -> None:
         self.sender.submit(topic_id, payload, now)

@@ -13,7 +13,7 @@ import pytest
 from gr_ros2.dashboard.state import LATENCIES, PACKETS_SHOWN, UNDER_WAY, DashboardState
 from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.link.events import Accepted, Announced, Delivered, SentPacket
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Topic
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2_lab.record.recorder import Recorder
@@ -150,8 +150,8 @@ def test_now_means_the_last_seconds() -> None:
 def test_a_repeat_counts_only_where_it_delivers_the_message_it_repeats(with_ledger: bool) -> None:
     recorder = Recorder(REGISTRY, {SRC: "/robot_4"})
     state = make(recorder if with_ledger else None)
-    latched = {"raw": TopicOptions(durability="transient_local")}
-    feed = Feed(recorder, state, lost=lambda number: number == 1, packet_len=64, topic_options=latched, repeat_s=2.0)
+    latched = {"raw": SendOptions(durability="transient_local")}
+    feed = Feed(recorder, state, lost=lambda number: number == 1, packet_len=64, topics=latched, repeat_s=2.0)
     feed.submit(1, b"the map", 10.0)
     feed.fly(10.0)
     feed.fly(12.5)
@@ -168,7 +168,7 @@ def test_a_repeat_counts_only_where_it_delivers_the_message_it_repeats(with_ledg
 
 def test_packets_field_by_field() -> None:
     state = make()
-    feed = Feed(state, lost=lambda number: number in (3, 4), packet_len=64, version=0, hop=5)
+    feed = Feed(state, lost=lambda number: number in (3, 4), packet_len=64, hop=5)
     feed.submit(1, bytes(300), 10.0)
     feed.fly(10.0)
     feed.hear(b"no packet", 11.0)
@@ -199,7 +199,7 @@ def test_topics_get_the_names_that_their_robot_announces() -> None:
 
 def test_topics_found_while_the_source_runs_have_their_names_on_the_graph() -> None:
     state = make()
-    found = Topic(5, "found", "nav_msgs/msg/Odometry", TopicOptions())
+    found = Topic(5, "found", "nav_msgs/msg/Odometry", SendOptions())
     state.subscribed(SRC, [("/robot_4/found", found)])
     state.sender_event(SRC, Accepted(0, 5, at(1, 2), 1.0))
     assert [topic.name for topic in state.tick(1.0).topics if topic.topic_id == 5] == ["/robot_4/found"]

@@ -16,12 +16,12 @@ from functools import partial
 
 from gnuradio import gr
 
-from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
+from tests.gr.ends import link
 from tests.middleware.support import STRING, message
 from tests.waiting import wait_for
 
@@ -63,12 +63,28 @@ def growth() -> int:
 
     with ExitStack() as stack:
         robot, listener = (stack.enter_context(MemoryMiddleware(domain_id=domain)) for domain in (sending, receiving))
-        source = RosSource(
-            registry, middleware=robot, robot_id=1, packet_len=64, subscriber_depth=0, queue_depth=0, repeat_s=0.0
+        common = {"registry": registry, "packet_len": 64}
+        sends = link(
+            middleware=robot,
+            robot=1,
+            direction="send",
+            graph_namespace="",
+            graph_depth=0,
+            queue_depth=0,
+            repeat_s=0.0,
+            **common,
         )
-        stack.callback(source.close)
-        sink = RosSink(registry, middleware=listener, packet_len=64, publisher_depth=0, max_source_bytes=WINDOW_BYTES)
-        stack.callback(sink.close)
+        takes = link(
+            middleware=listener,
+            robot=2,
+            direction="receive",
+            publish_depth=0,
+            max_source_bytes=WINDOW_BYTES,
+            **common,
+        )
+        stack.callback(sends.close)
+        stack.callback(takes.close)
+        source, sink = sends.source, takes.sink
         for which, name in enumerate("ab"):
             listener.subscribe(f"/rx_robot_1/{name}", STRING, Qos(depth=0), partial(hear, which))
         publishers = [robot.advertise(f"/{name}", STRING, Qos(depth=0)) for name in "ab"]

@@ -12,13 +12,14 @@ import pytest
 from gnuradio import gr
 
 from gr_ros2.cli import main as command
-from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
+from gr_ros2.paper import RosSink, RosSource
 from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.run.runner import run_scenario
 from tests.domains import free_domains
 from tests.e2e.support import check_books, on_free_domains, scenario, set_options
+from tests.gr.ends import link
 from tests.gr.probe import Probe, pdu
 from tests.middleware.support import RELIABLE, STRING, message, same
 from tests.waiting import wait_for
@@ -59,7 +60,7 @@ def files(folder: Path) -> dict[str, str]:
         ),
         (
             "run paper-direct --set registry={f}/seventeen.csv",
-            "topic 17, 't16': version 0 carries 16 topics; leave some out, or set version: 1",
+            "topic 17, 't16': the paper's packets carry 16 topics; leave some out, or take a ROS Link",
         ),
         ("run paper-direct --set registry={f}/type.csv", "type.csv:1: topic 'odom': malformed type 'Odometry'"),
         ("run paper-direct --set registry={f}/nowhere.csv", "nowhere.csv': no such file"),
@@ -163,18 +164,17 @@ def test_garbage_from_the_phy_is_counted_and_nothing_else_is_lost(version: int) 
             for domain, name in ((sending, "robot"), (sending, "source"), (receiving, "sink"), (receiving, "listener"))
         ]
         heard: list[bytes] = []
-        source = RosSource(
-            registry,
-            middleware=graphs[1],
-            robot_id=1,
-            version=version,
-            packet_len=PACKET_LEN,
-            queue_depth=0,
-            subscriber_depth=0,
-        )
-        stack.callback(source.close)
-        sink = RosSink(registry, middleware=graphs[2], version=version, packet_len=PACKET_LEN, publisher_depth=1000)
-        stack.callback(sink.close)
+        common = {"packet_len": PACKET_LEN, "registry": registry}
+        sends = {"middleware": graphs[1], "robot": 1, "graph_namespace": "", "queue_depth": 0, "graph_depth": 0}
+        takes = {"middleware": graphs[2], "publish_depth": 1000}
+        if version:
+            ends = [link(direction="send", **sends, **common)]
+            ends.append(link(direction="receive", robot=2, **takes, **common))
+            source, sink = ends[0].source, ends[1].sink
+        else:
+            source, sink = ends = [RosSource(**sends, **common), RosSink(**takes, **common)]
+        for end in ends:
+            stack.callback(end.close)
         sink.outputs.announce(1, [0])
         broken, tap = Probe(), Probe()
         flowgraph = gr.top_block()
@@ -217,7 +217,7 @@ def test_a_port_that_nobody_reads_is_said_and_counted(caplog: pytest.LogCaptureF
     with ExitStack() as stack:
         robot = stack.enter_context(DdsMiddleware(domain_id=domain, node_name="robot", localhost_only=True))
         graph = stack.enter_context(DdsMiddleware(domain_id=domain, node_name="source", localhost_only=True))
-        source = RosSource(Registry.from_rows({"chatter": STRING}), middleware=graph, robot_id=1)
+        source = RosSource(Registry.from_rows({"chatter": STRING}), middleware=graph, robot=1, graph_namespace="")
         stack.callback(source.close)
         publisher = robot.advertise("/chatter", STRING, Qos("reliable", "transient_local", 100))
         flowgraph = gr.top_block()

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from gnuradio import gr
 
-from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.record.result import read_result
 from tests.domains import free_domains
 from tests.e2e.support import COMMAND, check_books, delivered_bag, set_options
+from tests.gr.ends import link
 from tests.middleware.support import LATCHED, Peer, message, same
 from tests.waiting import wait_for
 
@@ -105,12 +105,13 @@ def test_a_late_joiner_on_the_receiving_graph_gets_the_map() -> None:
         here = stack.enter_context(DdsMiddleware(domain_id=receiving, node_name="sink", localhost_only=True))
         robot.advertise("/robot_1/map", GRID, LATCHED).publish(map_)
         # The source comes after the map was published, and the subscriber after it crossed the link.
-        source = RosSource(registry, middleware=there, namespace="/robot_1")
-        stack.callback(source.close)
-        sink = RosSink(registry, middleware=here)
-        stack.callback(sink.close)
+        sends = link(registry=registry, middleware=there, robot="/robot_1", direction="send")
+        stack.callback(sends.close)
+        takes = link(middleware=here, robot=2, direction="receive")
+        stack.callback(takes.close)
+        sink = takes.sink
         graph = gr.top_block()
-        graph.msg_connect(source, "pdus", sink, "pdus")
+        graph.msg_connect(sends.source, "pdus", sink, "pdus")
         graph.start()
         stack.callback(graph.wait)
         stack.callback(graph.stop)

@@ -12,13 +12,13 @@ import threading
 import pytest
 from gnuradio import gr
 
-from gr_ros2.gr import RosSource
-from gr_ros2.link.v0.sender import Sender
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.paper import RosSource
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.ofdm import OfdmPhy
-from gr_ros2.settings.config import SourceConfig
 from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
 from tests.gr.probe import Probe
@@ -48,9 +48,9 @@ def submissions(seed: int) -> list[tuple[int, bytes, float]]:
 
 
 def engine_packets(seed: int) -> list[bytes]:
-    config = SourceConfig(robot_id=1, version=0, packet_len=64, packet_rate=400.0, queue_depth=0)
+    config = paper_from(robot=1, packet_len=64, packet_rate=400.0, queue_depth=0)
     registry = Registry.from_rows({"a": STRING, "b": STRING, "c": STRING})
-    sender = Sender(registry, config, rng=random.Random(seed))
+    sender = Sender(registry, *config, rng=random.Random(seed))
     packets: list[bytes] = []
     for topic_id, payload, at in submissions(5):
         while (due := sender.next_timeout()) is not None and due <= at:
@@ -68,10 +68,10 @@ def block_packets(seed: int) -> list[bytes]:
         source = RosSource(
             registry,
             middleware=graph,
-            robot_id=1,
-            version=0,
+            robot=1,
+            graph_namespace="",
             packet_len=64,
-            subscriber_depth=0,
+            graph_depth=0,
             queue_depth=0,
             seed=seed,
         )
@@ -102,7 +102,7 @@ def test_equal_seeds_give_equal_packets() -> None:
 
 def test_engine_and_block_agree_on_the_order_of_packets() -> None:
     registry = Registry.from_rows({"a": STRING, "b": STRING, "c": STRING})
-    sender = Sender(registry, SourceConfig(robot_id=1, version=0, packet_len=64, queue_depth=0), rng=random.Random(7))
+    sender = Sender(registry, *paper_from(robot=1, packet_len=64, queue_depth=0), rng=random.Random(7))
     for topic_id, payload, _ in submissions(5):
         sender.submit(topic_id, payload, 0.0)
     expected = []

@@ -14,8 +14,8 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.gr import RosLink
-from gr_ros2.gr.factory import EndpointSetup
 from gr_ros2.link import AirPacket
+from gr_ros2.link.air import Air
 from gr_ros2.link.events import ReceiverEvent
 from gr_ros2.mac import Slots
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -54,15 +54,13 @@ class LinkedRobot:
         )
         self.link = RosLink(
             config,
-            setup=EndpointSetup(
-                reports=True,
+            air=Air(
                 half_duplex=True,
                 relay=True,
                 access=lambda robot: Slots(robot, SLOT_S, random.Random(robot), period_s=0.1),
             ),
             middleware=own,
             clock=lambda: line.now,
-            seed=src_id,
         )
         stack.callback(self.link.close)
         self.link.source.use_credit()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,12 +13,12 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gnuradio import gr
 
 from gr_ros2.cli.link import status_line
-from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.early import MESSAGES
 from gr_ros2.middleware import Middleware, Publisher, Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
 from tests.domains import free_domains
+from tests.gr.ends import link
 from tests.middleware.support import STRING, Peer
 from tests.waiting import wait_for
 
@@ -29,18 +28,16 @@ INT32 = "std_msgs/msg/Int32"
 class Pair:
     """A source that finds its topics, a sink that receives its packets, and a participant on the graph of each."""
 
-    def __init__(
-        self, folder: Path, make: Callable[..., Middleware], *, sinks: Callable[..., Middleware] | None = None
-    ) -> None:
+    def __init__(self, make: Callable[..., Middleware], *, sinks: Callable[..., Middleware] | None = None) -> None:
         domains = free_domains()
         self.near, self.far = (make(domain_id=domain) for domain in domains)
-        common: dict[str, Any] = {"version": 1, "middleware": self.near.name}
         self.graph = None if sinks is None else sinks(domain_id=domains[1])
-        source: dict[str, Any] = {"robot_id": 1, "domain_id": domains[0], "queue_depth": 0, "subscriber_depth": 0}
-        source |= {"state": str(folder / "state"), "topics": ["auto"]}
-        self.source = RosSource(**source, **common)
-        graph = {} if self.graph is None else {"middleware": self.graph}
-        self.sink = RosSink(robot_id=2, domain_id=domains[1], publisher_depth=0, **{**common, **graph})
+        source: dict[str, Any] = {"robot": 1, "graph_domain_id": domains[0], "queue_depth": 0, "graph_depth": 0}
+        source |= {"graph_namespace": "", "direction": "send", "graph_middleware": self.near.name}
+        sink: dict[str, Any] = {"robot": 2, "graph_domain_id": domains[1], "publish_depth": 0, "direction": "receive"}
+        sink |= {"graph_middleware": self.near.name, "middleware": self.graph}
+        self.ends = link(**source), link(**sink)
+        self.source, self.sink = self.ends[0].source, self.ends[1].sink
         self.top = gr.top_block()
         self.top.msg_connect((self.source, "pdus"), (self.sink, "pdus"))
 
@@ -51,7 +48,7 @@ class Pair:
     def __exit__(self, *_: object) -> None:
         self.top.stop()
         self.top.wait()
-        for end in (self.source, self.sink, self.near, self.far):
+        for end in (*self.ends, self.near, self.far):
             end.close()
         if self.graph is not None:
             self.graph.close()
@@ -71,10 +68,8 @@ def text(number: int) -> bytes:
 
 
 @pytest.mark.parametrize("make", [MemoryMiddleware, DdsMiddleware])
-def test_a_publisher_that_comes_back_with_another_type_is_carried_again(
-    make: Callable[..., Middleware], tmp_path: Path
-) -> None:
-    with Pair(tmp_path, make) as pair:
+def test_a_publisher_that_comes_back_with_another_type_is_carried_again(make: Callable[..., Middleware]) -> None:
+    with Pair(make) as pair:
         heard: dict[str, list[bytes]] = {STRING: [], INT32: []}
         for type_name, payloads in heard.items():
             pair.far.subscribe("/rx_robot_1/count", type_name, Qos("reliable", "volatile", 0), payloads.append)
@@ -114,10 +109,10 @@ with DdsMiddleware(domain_id=int(sys.argv[1])) as graph:
 
 
 @pytest.mark.slow
-def test_the_first_message_of_a_topic_reaches_best_effort_subscribers(tmp_path: Path) -> None:
+def test_the_first_message_of_a_topic_reaches_best_effort_subscribers() -> None:
     topics = [f"topic_{number}" for number in range(30)]
     wanted = {f"/rx_robot_1/{name}" for name in topics}
-    with Pair(tmp_path, DdsMiddleware) as pair:
+    with Pair(DdsMiddleware) as pair:
         listener = Peer([sys.executable, "-c", SUBSCRIBERS, str(pair.far.domain_id), INT32, *sorted(wanted)])
         try:
             wait_for(lambda: wanted <= {info.topic for info in pair.far.discover()}, "the subscribers")
@@ -147,8 +142,8 @@ class Slow(MemoryMiddleware):
         return publisher
 
 
-def test_what_waits_for_subscribers_leaves_in_order_and_never_grows(tmp_path: Path) -> None:
-    with Pair(tmp_path, MemoryMiddleware, sinks=Slow) as pair:
+def test_what_waits_for_subscribers_leaves_in_order_and_never_grows() -> None:
+    with Pair(MemoryMiddleware, sinks=Slow) as pair:
         heard: list[bytes] = []
         pair.far.subscribe("/rx_robot_1/count", INT32, Qos("reliable", "volatile", 0), heard.append)
         publisher = pair.near.advertise("/count", INT32, Qos("reliable", "volatile", 0))

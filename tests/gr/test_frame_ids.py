@@ -21,21 +21,25 @@ from tests.packets import data_of
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.gr.frame_ids import MAX_STATIC, TF_TYPE, FramePrefix, MergedTransforms, StaticTransforms, prefixed_frame
 from gr_ros2.link.events import Accepted
-from gr_ros2.link.v0.sender import Sender
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.middleware.type_definitions import typestore
-from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.paper import RosSink, RosSource
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
+from gr_ros2.settings.config import SendOptions, build
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import PublishConfig, robot_from
 from tests.domains import free_domains
+from tests.gr.ends import link
 from tests.gr.probe import Hears
 from tests.waiting import wait_for
 
 STORE = typestore()
+ROOT = {"robot": 1, "graph_namespace": "", "direction": "send"}
 PREFIX = "robot_{robot}/"
 FRAMES = st.one_of(st.just(""), st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12))
 ORDERS = st.booleans()
@@ -226,11 +230,11 @@ def test_static_transforms_are_bounded() -> None:
 
 
 def test_settings() -> None:
-    assert build(SinkConfig, {"frame_prefix": PREFIX, "merge_tf": "/tf"}).merged_topics == ("/tf", "/tf_static")
-    with pytest.raises(ConfigError, match="set frame_prefix"):
-        build(SinkConfig, {"merge_tf": "/tf"})
+    assert PublishConfig(frame_prefix=PREFIX, merge_tf="/tf").merged_topics == ("/tf", "/tf_static")
+    with pytest.raises(ConfigError, match=r"set publish\.frame_prefix"):
+        robot_from(robot=1, publish_merge_tf="/tf")
     with pytest.raises(ConfigError, match=r"frame_prefix = '\{who\}': only"):
-        build(SinkConfig, {"frame_prefix": "{who}"})
+        build(PublishConfig, {"frame_prefix": "{who}"})
 
 
 def test_one_broadcaster_is_left_as_it_is() -> None:
@@ -245,7 +249,7 @@ def test_a_source_repeats_the_static_transforms_of_all_its_broadcasters() -> Non
     events: list[Any] = []
     rows = Registry.from_rows({"/tf_static": TF_TYPE})
     with MemoryMiddleware(domain_id=64) as graph, MemoryMiddleware(domain_id=64) as robot:
-        source = RosSource(rows, robot_id=1, middleware=graph, observer=Hears(events.append))
+        source = link(**ROOT, registry=rows, middleware=graph, observer=Hears(events.append))
         for child in ("imu", "laser"):
             robot.advertise("/tf_static", TF_TYPE, Qos("reliable", "transient_local", 1)).publish(transforms(child))
         wait_for(lambda: len(events) >= 2)
@@ -258,11 +262,11 @@ def test_no_broadcaster_is_lost_to_a_small_depth(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     (domain,) = free_domains(1)
     events: list[Any] = []
-    rows = Registry.from_rows({"/tf_static": TF_TYPE}).with_options({"/tf_static": TopicOptions(depth=1)})
+    rows = Registry.from_rows({"/tf_static": TF_TYPE}).with_options({"/tf_static": SendOptions(depth=1)})
     with DdsMiddleware(domain_id=domain) as robot:
         for child in ("imu", "laser", "camera"):
             robot.advertise("/tf_static", TF_TYPE, Qos("reliable", "transient_local", 1)).publish(transforms(child))
-        source = RosSource(rows, robot_id=1, middleware="dds", domain_id=domain, observer=Hears(events.append))
+        source = link(**ROOT, registry=rows, graph_domain_id=domain, observer=Hears(events.append))
         try:
 
             def told() -> list[set[str]]:
@@ -279,14 +283,14 @@ REGISTRY = Registry.from_rows({"odom": "nav_msgs/Odometry", "tf": TF_TYPE, "tf_s
 def test_merged_transforms_may_not_come_back() -> None:
     rows = Registry.from_rows({"/tf": TF_TYPE})
     with MemoryMiddleware(domain_id=64) as graph:
-        source = RosSource(rows, robot_id=1, middleware=graph)
+        source = RosSource(rows, robot=1, graph_namespace="", middleware=graph)
         with pytest.raises(ConfigError, match="merge_tf"):
-            RosSink(rows, middleware=graph, frame_prefix=PREFIX, merge_tf="/tf")
+            RosSink(rows, middleware=graph, publish_frame_prefix=PREFIX, publish_merge_tf="/tf")
         source.close()
 
 
 def packets(src_id: int, *messages: tuple[int, bytes]) -> list[bytes]:
-    sender = Sender(REGISTRY, SourceConfig(version=0, robot_id=src_id, repeat_s=0), rng=random.Random(1))
+    sender = Sender(REGISTRY, *paper_from(robot=src_id, repeat_s=0), rng=random.Random(1))
     made = []
     for topic_id, payload in messages:
         sender.submit(topic_id, payload, 0.0)
@@ -300,7 +304,7 @@ def test_two_robots_on_one_graph_of_a_real_dds(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     (domain,) = free_domains(1)
     odometry = encode("nav_msgs/msg/Odometry", message("nav_msgs/msg/Odometry", "odom", 1))
-    sink = RosSink(REGISTRY, version=0, domain_id=domain, frame_prefix=PREFIX, merge_tf="/tf")
+    sink = RosSink(REGISTRY, graph_domain_id=domain, publish_frame_prefix=PREFIX, publish_merge_tf="/tf")
     sink.outputs.announce(1, [0])
     try:
         with DdsMiddleware(domain_id=domain) as listener:

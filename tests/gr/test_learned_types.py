@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,11 +13,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gnuradio import gr
 
-from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.link.events import Announced
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
+from tests.gr.ends import link
 from tests.gr.probe import Hears
 from tests.middleware.describing import CUSTOM, message
 from tests.middleware.support import Peer
@@ -36,23 +35,21 @@ def node(domain: int, topic: str, role: str, how: str) -> Peer:
 class Link:
     """A source on one graph and a sink on another, connected without losses."""
 
-    def __init__(self, domains: list[int], folder: Path, stack: ExitStack) -> None:
+    def __init__(self, domains: list[int], stack: ExitStack) -> None:
         graphs = [stack.enter_context(DdsMiddleware(domain_id=domain, localhost_only=True)) for domain in domains]
-        state = str(folder / "state")
-        self.source = RosSource(
-            REGISTRY, middleware=graphs[0], version=1, namespace="/robot_1", robot_id=1, state=state
-        )
+        sends = link(registry=REGISTRY, middleware=graphs[0], robot="/robot_1", direction="send")
         self.told: list[Any] = []
-        self.sink = RosSink(
-            "",
+        takes = link(
             middleware=graphs[1],
-            version=1,
-            frame_prefix="robot_{robot}/",
+            robot=2,
+            direction="receive",
+            publish_frame_prefix="robot_{robot}/",
             observer=Hears(self.told.append),
         )
+        self.source, self.sink = sends.source, takes.sink
         top = gr.top_block()
         top.msg_connect((self.source, "pdus"), (self.sink, "pdus"))
-        for block in (self.source, self.sink):
+        for block in (sends, takes):
             stack.callback(block.close)
         stack.callback(lambda: (top.stop(), top.wait()))
         top.start()
@@ -70,11 +67,11 @@ def stack() -> Iterator[ExitStack]:
 
 
 @pytest.mark.parametrize("how", ["right", "silent"])
-def test_a_custom_type_is_coded_and_prefixed_by_what_its_nodes_say(how: str, tmp_path: Path, stack: ExitStack) -> None:
+def test_a_custom_type_is_coded_and_prefixed_by_what_its_nodes_say(how: str, stack: ExitStack) -> None:
     domains = free_domains(2)
     publisher = stack.enter_context(closing(node(domains[0], SENT, "pub", how)))
     subscriber = stack.enter_context(closing(node(domains[1], RECEIVED, "sub", how)))
-    link = Link(domains, tmp_path, stack)
+    link = Link(domains, stack)
     wait_for(lambda: publisher.ready and subscriber.ready and link.source.matched, "the link to find the publisher")
     count = iter(range(100_000))
 

@@ -21,13 +21,13 @@ import pmt
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError, MiddlewareError
-from gr_ros2.gr import RosSink
 from gr_ros2.gr.latency import LatencySummary, LatencyWindow
 from gr_ros2.link import Delivered, Lost, Received
-from gr_ros2.link.v0.sender import Sender
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
-from gr_ros2.settings.config import SourceConfig
+from gr_ros2.paper import RosSink
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.settings.registry import Registry
 from tests.gr.probe import Hears, Probe
 from tests.waiting import PATIENCE_S, wait_for
@@ -41,7 +41,7 @@ PACKET_LEN = 64
 
 def packets(*messages: tuple[int, bytes], src_id: int = 1) -> list[bytes]:
     """What a sender makes of messages given as (topic id, payload)."""
-    sender = Sender(REGISTRY, SourceConfig(robot_id=src_id, packet_len=PACKET_LEN, repeat_s=0), rng=random.Random(1))
+    sender = Sender(REGISTRY, *paper_from(robot=src_id, packet_len=PACKET_LEN, repeat_s=0), rng=random.Random(1))
     for topic_id, payload in messages:
         sender.submit(topic_id, payload, 0.0)
     made = []
@@ -66,7 +66,7 @@ class Rig:
         self.sink: RosSink | None = None
 
     def make(self, **settings: Any) -> RosSink:
-        values = {"version": 0, "middleware": "memory", "domain_id": DOMAIN, "packet_len": PACKET_LEN, **settings}
+        values = {"graph_middleware": "memory", "graph_domain_id": DOMAIN, "packet_len": PACKET_LEN, **settings}
         self.sink = RosSink(REGISTRY, **values)
         return self.sink
 
@@ -91,7 +91,7 @@ def rig() -> Iterator[Rig]:
 
 
 def test_messages_come_out_unaltered_and_in_order(rig: Rig) -> None:
-    sink = rig.make(publisher_depth=0)
+    sink = rig.make(publish_depth=0)
     rig.start()
     sent = [stamped(number) + bytes([number]) * 600 for number in range(1, 40)]
     for data in packets(*((0, payload) for payload in sent)):
@@ -102,7 +102,7 @@ def test_messages_come_out_unaltered_and_in_order(rig: Rig) -> None:
 
 
 def test_each_sender_has_its_topics(rig: Rig) -> None:
-    sink = rig.make(namespace_format="/from_{robot}/x")
+    sink = rig.make(publish_as="/from_{robot}/x")
     rig.start("/from_7/x/cmd_vel", "geometry_msgs/Twist")
     for data in packets((2, b"\0\1\0\0" + bytes(48)), src_id=7) + packets((0, stamped(1)), src_id=8):
         rig.probe.post(data)
@@ -244,11 +244,11 @@ def test_what_was_not_published_is_not_delivered_whatever_the_reason(rig: Rig, e
 @pytest.mark.parametrize(
     ("settings", "key"),
     [
-        ({"namespace_format": "/rx-{robot}"}, "namespace_format = '/rx-{robot}'"),
-        ({"namespace_format": "/{robot.__class__}"}, "namespace_format = '/{robot.__class__}'"),
-        ({"topic_options": {"odom": {"publish_as": "/robot-1/odom"}}}, "topic_options.odom.publish_as"),
+        ({"publish_as": "/rx-{robot}"}, "publish.as = '/rx-{robot}'"),
+        ({"publish_as": "/{robot.__class__}"}, "publish.as = '/{robot.__class__}'"),
+        ({"publish_topics": {"odom": {"as": "/robot-1/odom"}}}, "publish.topics.odom.as"),
         (
-            {"topic_options": {"odom": {"publish_as": "/x"}, "map": {"publish_as": "/x"}}},
+            {"publish_topics": {"odom": {"as": "/x"}, "map": {"as": "/x"}}},
             "'map' would come out as '/x'",
         ),
     ],
@@ -257,7 +257,7 @@ def test_names_that_ros_refuses_are_refused_before_the_graph_is_joined(
     rig: Rig, settings: dict[str, Any], key: str
 ) -> None:
     with pytest.raises(ConfigError, match=re.escape(key)):
-        rig.make(middleware="no such", **settings)
+        rig.make(**{**settings, "graph_middleware": "no such"})
 
 
 def test_what_fails_after_publication_takes_no_delivery_back(rig: Rig) -> None:
@@ -277,11 +277,10 @@ def test_what_fails_after_publication_takes_no_delivery_back(rig: Rig) -> None:
     with NoMerging(domain_id=DOMAIN) as middleware:
         rig.sink = RosSink(
             rows,
-            version=0,
             middleware=middleware,
             packet_len=PACKET_LEN,
-            frame_prefix="r{robot}/",
-            merge_tf="/tf",
+            publish_frame_prefix="r{robot}/",
+            publish_merge_tf="/tf",
             observer=Hears(events.append),
         )
         rig.start("/rx_robot_1/tf", "tf2_msgs/TFMessage")
@@ -384,7 +383,7 @@ def test_latency_by_wall_clock(rig: Rig) -> None:
 
 
 def test_latency_by_simulated_clock(rig: Rig) -> None:
-    sink = rig.make(use_sim_time=True)
+    sink = rig.make(graph_use_sim_time=True)
     rig.start()
     clock = rig.listener.advertise("/clock", "rosgraph_msgs/Clock", Qos())
     clock.publish(b"\0\1\0\0" + struct.pack("<iI", 100, 500_000_000))

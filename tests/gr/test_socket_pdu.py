@@ -12,10 +12,11 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gnuradio import gr, network
 
-from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.paper import RosSink, RosSource
 from gr_ros2.settings.registry import Registry
+from tests.gr.ends import link
 from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows({"text": "std_msgs/String"})
@@ -53,11 +54,15 @@ def blocks() -> Iterator[list[Any]]:
 @pytest.mark.parametrize("version", [0, 1])
 def test_all_packets_come_through_a_socket(blocks: list[Any], kind: str, mtu: int, rate: float, version: int) -> None:
     here, there = (MemoryMiddleware(domain_id=domain_id) for domain_id in (171, 172))
-    shared = {"version": version, "packet_len": PACKET_LEN, "middleware": "memory"}
-    sink = RosSink(REGISTRY, domain_id=172, **shared)
-    source = RosSource(
-        REGISTRY, domain_id=171, namespace="/robot_1", packet_rate=rate, queue_depth=0, subscriber_depth=0, **shared
-    )
+    shared = {"packet_len": PACKET_LEN, "graph_middleware": "memory"}
+    sends = {"graph_domain_id": 171, "robot": "/robot_1", "packet_rate": rate, "queue_depth": 0, "graph_depth": 0}
+    if version:
+        takes = link(direction="receive", robot=2, graph_domain_id=172, **shared)
+        gives = link(direction="send", registry=REGISTRY, **sends, **shared)
+        sink, source = takes.sink, gives.source
+        blocks += [takes, gives]
+    else:
+        sink, source = RosSink(REGISTRY, graph_domain_id=172, **shared), RosSource(REGISTRY, **sends, **shared)
     receiver, sender = gr.top_block(), gr.top_block()
     blocks += [here, there, sink, source, receiver, sender]
     port = free_port(kind)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,11 +12,12 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr import RosSource
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.paper import RosSource
 from gr_ros2.radio.waiting import Waiting
 from tests.domains import free_domains
+from tests.gr.ends import link
 from tests.gr.probe import Probe
 from tests.middleware.support import CUSTOM, STRING, message
 from tests.waiting import wait_for
@@ -28,8 +28,9 @@ ODOM = "nav_msgs/msg/Odometry"
 class Running:
     """A source in a flowgraph, and what it emits."""
 
-    def __init__(self, folder: Path, **settings: Any) -> None:
-        self.source = RosSource(**{"version": 1, "namespace": "/robot_1", "state": str(folder / "state"), **settings})
+    def __init__(self, **settings: Any) -> None:
+        self.link = link(**{"robot": "/robot_1", "direction": "send", **settings})
+        self.source = self.link.source
         self.top, self.probe = gr.top_block(), Probe()
         self.top.msg_connect((self.source, "pdus"), (self.probe, "pdus"))
 
@@ -40,7 +41,7 @@ class Running:
     def __exit__(self, *_: object) -> None:
         self.top.stop()
         self.top.wait()
-        self.source.close()
+        self.link.close()
 
     @property
     def submitted(self) -> dict[str, int]:
@@ -49,7 +50,7 @@ class Running:
 
 @pytest.mark.parametrize("middleware", ["memory", "dds", "rclpy"])
 def test_types_and_qos_are_those_of_the_graph(
-    middleware: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    middleware: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     if middleware == "rclpy":
         pytest.importorskip("rclpy", reason="needs a sourced ROS 2")
@@ -60,7 +61,7 @@ def test_types_and_qos_are_those_of_the_graph(
     topics = ["odom", "auto", "-camera", "/elsewhere"]
     with (
         MIDDLEWARE.load(middleware)(domain_id=domain) as robot,
-        Running(tmp_path, topics=topics, middleware=middleware, domain_id=domain) as running,
+        Running(topics=topics, graph_middleware=middleware, graph_domain_id=domain) as running,
     ):
         waiting = Waiting(running.source)
         assert running.source.found.unmatched() == ["/robot_1/odom", "/elsewhere"]
@@ -87,19 +88,14 @@ def test_types_and_qos_are_those_of_the_graph(
     assert f"topic /robot_1/wheels ({unknown}) of the ROS graph is sent" in caplog.text
 
 
-def test_what_cannot_be_sent_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_cannot_be_sent_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     (domain,) = free_domains(1)
     caplog.set_level(logging.INFO, "gr_ros2.gr.source")  # a test with debug may have left another one
-    options = {"scan": {"codec": "none"}, "odom": {"quantize": "no_such_field=1"}}
-    values: dict[str, Any] = {
-        "middleware": "memory",
-        "domain_id": domain,
-        "compression": True,
-        "topic_options": options,
-    }
+    options = {"scan*": {"codec": "none"}, "odo?": {"quantize": "no_such_field=1"}}
+    values: dict[str, Any] = {"graph_middleware": "memory", "graph_domain_id": domain}
     with (
         MemoryMiddleware(domain_id=domain) as robot,
-        Running(tmp_path, topics="auto, /scan", **values) as running,
+        Running(topics={"auto": {}, "/scan": {}, **options}, **values) as running,
     ):
         waiting = Waiting(running.source)
         assert waiting.look() == "no publisher on /scan yet; nothing else is published on the graph"
@@ -121,11 +117,11 @@ def test_what_cannot_be_sent_is_said_once(tmp_path: Path, caplog: pytest.LogCapt
     assert running.source.subscriptions.registry.named("scan").options.codec == "none"
 
 
-def test_a_source_that_sends_nothing_yet_says_what_it_looks_for(tmp_path: Path) -> None:
+def test_a_source_that_sends_nothing_yet_says_what_it_looks_for() -> None:
     (domain,) = free_domains(1)
     with (
         MemoryMiddleware(domain_id=domain) as robot,
-        Running(tmp_path, topics="auto", middleware="memory", domain_id=domain) as running,
+        Running(topics="auto", graph_middleware="memory", graph_domain_id=domain) as running,
     ):
         waiting = Waiting(running.source)
         robot.advertise("/robot_2/odom", ODOM, Qos())
@@ -135,9 +131,9 @@ def test_a_source_that_sends_nothing_yet_says_what_it_looks_for(tmp_path: Path) 
         wait_for(lambda: waiting.look() == "every topic has a publisher: /robot_1/odom", "the line")
 
 
-def test_version_0_needs_a_registry() -> None:
+def test_the_papers_source_needs_a_registry() -> None:
     with pytest.raises(ConfigError, match="registry is missing"):
-        RosSource(version=0, robot_id=1, topics="auto", middleware="memory", domain_id=free_domains(1)[0])
+        RosSource(robot=1, graph_middleware="memory", graph_domain_id=free_domains(1)[0])
 
 
 class OfFastDds(MemoryMiddleware):
@@ -150,12 +146,10 @@ class OfFastDds(MemoryMiddleware):
         return frozenset(self.discover_services())
 
 
-def test_of_services_that_cannot_be_called_one_line_says_what_to_set(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_of_services_that_cannot_be_called_one_line_says_what_to_set(caplog: pytest.LogCaptureFixture) -> None:
     offered: list[str] = []
     with OfFastDds(domain_id=free_domains(1)[0]) as graph:
-        running = Running(tmp_path, topics=["auto"], middleware=graph)
+        running = Running(topics=["auto"], middleware=graph)
         running.source.found.offer_with(lambda name, _: offered.append(name))
         with running:
             wait_for(lambda: len(running.source.found.not_offered) == 2, "both services to be found")

@@ -6,9 +6,10 @@ import random
 from typing import Any
 
 from gr_ros2.link import AirPacket, Delivered, Received, ReceiverEvent
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.sender import Sender
-from gr_ros2.settings.config import SinkConfig, SourceConfig, build
+from gr_ros2.paper.receiver import MAX_BYTES, Receiver
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
+from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v0 import V0, PacketV0
 from tests.packets import data_of
@@ -19,13 +20,13 @@ def registry(topics: int = 3) -> Registry:
     return Registry.from_rows(names)
 
 
-def sender(topics: int = 3, seed: int = 0, **settings: Any) -> Sender:
-    config = build(SourceConfig, {"robot_id": 1, "version": 0, **settings})
-    return Sender(registry(topics), config, rng=random.Random(seed))
+def sender(rows: int = 3, seed: int = 0, **settings: Any) -> Sender:
+    return Sender(registry(rows), *paper_from(**{"robot": 1, **settings}), rng=random.Random(seed))
 
 
-def receiver(topics: int = 3, **settings: Any) -> Receiver:
-    return Receiver(registry(topics), build(SinkConfig, {"version": 0, **settings}))
+def receiver(rows: int = 3, max_bytes: int = MAX_BYTES, **settings: Any) -> Receiver:
+    own = None if "robot" in settings else NOBODY
+    return Receiver(registry(rows), *paper_from(**{"robot": 0, **settings}), own=own, max_bytes=max_bytes)
 
 
 def drain(engine: Sender, now: float = 0.0) -> list[bytes]:

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import pytest
 
 from gr_ros2.link import AirPacket, Delivered
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.settings.config import SinkConfig, build
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 from tests.link.engines import delivered, receiver, registry
-from tests.link.v0.test_receiver import packet
+from tests.paper.test_receiver import packet
 
 MESSAGES = 500
 PACKET_RATE = 100.0
@@ -79,7 +79,7 @@ def backwards(total: int, *, sequential: bool) -> Sending:
 def carry(send: Sending, loss: float, seed: int) -> tuple[int, set[int]]:
     """Deliveries that are mixed, or the second of their message, and the messages that were delivered."""
     rng = random.Random(seed)
-    sink = Receiver(registry(1), build(SinkConfig, {"version": 0, "packet_len": 64}))
+    sink = Receiver(registry(1), *paper_from(robot=0, packet_len=64))
     got: set[int] = set()
     corrupt = 0
     for number, piece in enumerate(send(rng)):

@@ -14,7 +14,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import SentPacket
 from gr_ros2.link.queues import OVERLOAD_S, Outgoing, PublisherQos, TopicQueue, queue_for
 from gr_ros2.link.v1.endpoint import EndpointV1
-from gr_ros2.settings.config import TopicOptions, build
+from gr_ros2.settings.config import SendOptions, build
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.v1 import TABLE_TOPIC, Part
 from tests.link.engines import sender
@@ -23,7 +23,7 @@ from tests.link.v1.air import Robot
 
 def robot(topics: int = 1, packet_rate: float | str = "auto", **options: Any) -> Robot:
     """A robot of version 1, which has these policies, in packets of 64 B with room for 51."""
-    found = [Topic(n, f"t{n}", "std_msgs/msg/String", TopicOptions(**options)) for n in range(topics)]
+    found = [Topic(n, f"t{n}", "std_msgs/msg/String", SendOptions(**options)) for n in range(topics)]
     return Robot(1, Registry(found), hears=False, repair="off", packet_rate=packet_rate)
 
 
@@ -148,7 +148,7 @@ def test_what_waited_on_the_ros_graph_leaves_where_the_computer_keeps_up() -> No
 
 
 def test_a_robot_that_nobody_hears_is_not_too_slow() -> None:
-    found = [Topic(0, "t", "std_msgs/msg/String", TopicOptions(queue="fifo"))]
+    found = [Topic(0, "t", "std_msgs/msg/String", SendOptions(queue="fifo"))]
     source = Robot(1, Registry(found), hears=True, beacon_s=1.0)
     leave(source, 0.0)
     source.end.pace.credit(1, 0.0)
@@ -174,9 +174,9 @@ def test_latest_holds_a_recording_back_while_one_waits() -> None:
 
 
 def test_a_queue_follows_the_depth_of_its_topic() -> None:
-    assert queue_for(TopicOptions(depth=1)) == ("latest", 0.0)
-    assert queue_for(TopicOptions(depth=10)) == queue_for(TopicOptions()) == ("fifo", 0.0)
-    assert queue_for(TopicOptions(depth=1, queue="fifo")) == ("fifo", 0.0)
+    assert queue_for(SendOptions(depth=1)) == ("latest", 0.0)
+    assert queue_for(SendOptions(depth=10)) == queue_for(SendOptions()) == ("fifo", 0.0)
+    assert queue_for(SendOptions(depth=1, queue="fifo")) == ("fifo", 0.0)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_a_lifespan_found_late_holds_for_what_waits() -> None:
 
 def test_a_deadline_queue_needs_a_deadline() -> None:
     with pytest.raises(ConfigError, match="deadline_s is missing"):
-        build(TopicOptions, {"queue": "deadline"})
+        build(SendOptions, {"queue": "deadline"})
 
 
 def test_what_has_waited_too_long_is_stale() -> None:
@@ -252,7 +252,7 @@ def test_what_has_become_pointless_is_abandoned_and_the_next_leaves() -> None:
 
 
 def test_the_pace_of_credits_is_learnt_while_busy() -> None:
-    source = sender(topics=1, packet_len=64, queue_depth=0)
+    source = sender(rows=1, packet_len=64, queue_depth=0)
     source.pace.use_credit()
     assert source.pace.interval == 0.0
     for number in range(20):
@@ -264,7 +264,7 @@ def test_the_pace_of_credits_is_learnt_while_busy() -> None:
 
 
 def test_idle_time_is_no_pace() -> None:
-    source = sender(topics=1, packet_len=64)
+    source = sender(rows=1, packet_len=64)
     source.pace.use_credit()
     for number in range(5):
         source.pace.credit()

@@ -22,8 +22,9 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.link import Delivered
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.sender import Sender
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.phy import PHY
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import SampleRecording, deliver, modulated, record
@@ -31,7 +32,7 @@ from gr_ros2.phy.theory import half_point
 from gr_ros2.phy.threads import run_flowgraph
 from gr_ros2.phy.wifi import WifiOptions, WifiPhy, band_snr_db
 from gr_ros2.phy.wifi_frames import ENCODINGS, MAX_PACKET, DataFrames, Encoding, FrameDecoder, scrambler, training
-from gr_ros2.settings.config import ChannelConfig, SinkConfig, SourceConfig
+from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
@@ -328,7 +329,7 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
 def test_messages_of_odometry_arrive_at_20_db() -> None:
     """Each message in one packet of 760 B, unchanged and in order."""
     registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
-    sender = Sender(registry, SourceConfig(packet_len=760, robot_id=1, queue_depth=0))
+    sender = Sender(registry, *paper_from(packet_len=760, robot=1, queue_depth=0))
     fleet = Fleet(SimSettings(robots=1, odom_rate=100))
     messages = [message.payload for message in fleet.messages(2.0, topics={"/robot_1/odom"})]
     packets = []
@@ -339,7 +340,7 @@ def test_messages_of_odometry_arrive_at_20_db() -> None:
     assert len(packets) == len(messages) == 200
     phy = make(760)
     arrived = deliver(phy, modulated(phy, packets), ChannelConfig(snr_db=20, seed=1))
-    receiver = Receiver(registry, SinkConfig(packet_len=760))
+    receiver = Receiver(registry, *paper_from(robot=0, packet_len=760))
     events = [event for packet in arrived for event in receiver.receive(AirPacket(packet), 0.0)]
     delivered = [event.payload for event in events if isinstance(event, Delivered)]
     assert delivered == messages

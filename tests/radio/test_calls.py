@@ -12,13 +12,15 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
 from gr_ros2.core.errors import ConfigError, MiddlewareError, RegistryError
-from gr_ros2.gr import RosLink, RosSink, RosSource
+from gr_ros2.gr import RosLink
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.paper import RosSink
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.settings.registry import MAX_TOPICS, Registry
 from gr_ros2.settings.robot import RobotConfig
 from tests.domains import free_domains
+from tests.gr.ends import link
 from tests.middleware.calling import ADD, Adder, Caller
 from tests.radio.calling_robots import Robots
 from tests.waiting import wait_for
@@ -124,18 +126,18 @@ def test_the_parameters_of_a_node_are_set_across_the_link(tmp_path: Path) -> Non
         assert answers == [(3, asked + b" and its reply")]
 
 
-def test_a_service_needs_both_directions_and_version_1() -> None:
+def test_a_service_needs_both_directions_of_a_link() -> None:
     rows = Registry.from_rows({"add": ADD})
-    with pytest.raises(ConfigError, match="add is a service, which needs both directions of a link and version 1"):
-        RosSource(rows, robot_id=1, middleware=MemoryMiddleware(domain_id=1), version=1)
+    with pytest.raises(ConfigError, match="add is a service, which needs both directions of a link"):
+        link(robot=1, registry=rows, middleware=MemoryMiddleware(domain_id=1), direction="send")
     with pytest.raises(ConfigError, match="add is a service"):
         RosSink(rows, middleware=MemoryMiddleware(domain_id=1))
     psk = {"name": "psk", "sample_rate": 1e6}
-    link = RobotLink(
+    running = RobotLink(
         link_from({"robot": 1, "graph": {"middleware": "memory"}, "phy": psk, "front_end": {"name": "sim"}})
     )
-    assert link.stats()["calls"] == {}
-    link.stop()
+    assert running.stats()["calls"] == {}
+    running.stop()
 
 
 @pytest.mark.slow

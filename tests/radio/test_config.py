@@ -8,11 +8,14 @@ from typing import Any
 import pytest
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import EXAMPLES_DIR, LinkConfig, link_from, load_link
 from gr_ros2.settings.config import build
-from gr_ros2.settings.robot import halves
+from gr_ros2.settings.registry import Registry
+from tests.domains import domain
 
 EXAMPLES = sorted(EXAMPLES_DIR.glob("link-*.yaml"))
 SMALL: dict[str, Any] = {
@@ -30,7 +33,7 @@ def test_every_front_end_has_an_example() -> None:
 def test_examples_hold_no_wrong_setting(path: Path) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     config = load_link(path)
-    assert len(config.load_registry()) > 0
+    assert len(Registry.from_csv(config.registry)) > 0
     phy = PHY.load(config.phy.name)(config.packet_len, config.phy.sample_rate, **config.phy.options)
     phy.check_channel(config.channel)
     build(FRONT_ENDS.load(config.front_end_name).Options, config.front_end_options)
@@ -56,8 +59,26 @@ def test_what_is_sent_is_words_a_list_or_a_mapping() -> None:
 
 
 def test_the_depths_of_a_graph_are_those_of_its_blocks() -> None:
-    source, sink = halves(link_from({**SMALL, "graph": {"depth": 7}, "publish": {"depth": 3}}))
-    assert (source.subscriber_depth, sink.publisher_depth) == (7, 3)
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    from tests.gr.ends import link
+
+    depths: list[int] = []
+
+    class Told(MemoryMiddleware):
+        def subscribe(self, topic: str, type_name: str, qos: Qos, callback: Any) -> Any:
+            depths.append(qos.depth)
+            return super().subscribe(topic, type_name, qos, callback)
+
+        def advertise(self, topic: str, type_name: str, qos: Qos) -> Any:
+            depths.append(qos.depth)
+            return super().advertise(topic, type_name, qos)
+
+    rows = Registry.from_rows({"odom": "nav_msgs/Odometry"})
+    with Told(domain_id=domain(1)) as graph:
+        one = link(robot=1, graph_depth=7, publish_depth=3, registry=rows, middleware=graph)
+        one.sink.outputs.announce(2, [0])
+        one.close()
+    assert depths == [7, 3]
 
 
 def test_options_of_one_topic_leave_the_choice_of_topics(tmp_path: Path) -> None:
@@ -114,5 +135,4 @@ def test_a_missing_file_is_named() -> None:
 
 
 def test_without_a_registry_nothing_is_registered() -> None:
-    assert not link_from({key: value for key, value in SMALL.items() if key != "registry"}).load_registry()
     assert LinkConfig(**{**SMALL, "registry": "x"}).name == "link"

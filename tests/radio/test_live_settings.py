@@ -12,13 +12,13 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr import RosSink, RosSource
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.live_settings import LiveSettings
 from gr_ros2.settings.fields import settings_of
 from gr_ros2.settings.robot import RobotConfig
 from tests.domains import free_domains
+from tests.gr.ends import link
 from tests.gr.test_found_topics import text
 from tests.middleware.support import STRING
 from tests.waiting import wait_for
@@ -29,13 +29,15 @@ TO = "topics.goal.to"
 @pytest.mark.parametrize("found", [False, True], ids=["registry", "found on the graph"])
 def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -> None:
     domains = free_domains(3)
-    common: dict[str, Any] = {"version": 1, "middleware": "memory"}
+    common: dict[str, Any] = {"graph_middleware": "memory"}
     (tmp_path / "topics.csv").write_text(f"goal,{STRING}\n")
     topics = {"topics": ["goal"]} if found else {"registry": str(tmp_path / "topics.csv")}
-    source = RosSource(robot_id=1, domain_id=domains[0], state=str(tmp_path / "state"), **topics, **common)
-    sinks = [
-        RosSink(robot_id=robot, domain_id=domain, **common) for robot, domain in zip((2, 3), domains[1:], strict=True)
+    one = link(robot=1, direction="send", graph_domain_id=domains[0], graph_namespace="", **topics, **common)
+    others = [
+        link(robot=robot, direction="receive", graph_domain_id=domain, **common)
+        for robot, domain in zip((2, 3), domains[1:], strict=True)
     ]
+    source, sinks = one.source, [other.sink for other in others]
     near, *far = (MemoryMiddleware(domain_id=domain) for domain in domains)
     heard: list[list[bytes]] = [[], []]
     for graph, payloads in zip(far, heard, strict=True):
@@ -58,7 +60,7 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
                 said[place] += [text(number)] * (to in (robot, "auto"))
             wait_for(lambda: heard == said, f"{said}, not {heard}")
         with pytest.raises(ConfigError, match="goal: codec cannot change while running; these can: to, "):
-            source.set_topic_options({"goal": {"codec": "zstd"}})
+            source.set_topics({"goal": {"codec": "zstd"}})
         with pytest.raises(ConfigError, match="to = 256"):
             live.change(TO, 256)
         with pytest.raises(
@@ -69,22 +71,22 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
         (counted,) = source.stats()["topics"].values()
         assert (counted["submitted"], counted["types"], counted["sent"]) == (5, 1, 5)
         assert [sink.stats()["topics"]["/rx_robot_1/goal"]["delivered"] for sink in sinks] == [3, 3]
-        assert source.config.topic_options["goal"].to == 2
+        assert source.config.topics["goal"].to == 2
         assert sorted(str(topic.options.to) for _, topic in source.subscriptions.named()) == ["2", "3", "auto"]
         assert {name for name, _ in source.subscriptions.named()} == {"/goal"}
     finally:
         top.stop()
         top.wait()
-        ends: list[Any] = [source, *sinks, near, *far]
+        ends: list[Any] = [one, *others, near, *far]
         for end in ends:
             end.close()
 
 
 def test_what_can_change_is_what_the_blocks_say(tmp_path: Path) -> None:
     (tmp_path / "topics.csv").write_text(f"goal,{STRING}\n")
-    common: dict[str, Any] = {"version": 1, "middleware": "memory", "registry": str(tmp_path / "topics.csv")}
-    common["domain_id"] = free_domains(1)[0]
-    source, sink = RosSource(robot_id=1, **common), RosSink(robot_id=2, **common)
+    common: dict[str, Any] = {"graph_middleware": "memory", "registry": str(tmp_path / "topics.csv")}
+    both = link(robot=1, graph_domain_id=free_domains(1)[0], **common)
+    source, sink = both.source, both.sink
     try:
         live = LiveSettings(source, sink)
         ours = {"packet_rate", "repeat_s", "queue_depth", "debug"}
@@ -104,5 +106,4 @@ def test_what_can_change_is_what_the_blocks_say(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="queue_depth = -1"):
             live.change("queue_depth", -1)
     finally:
-        source.close()
-        sink.close()
+        both.close()

@@ -44,14 +44,16 @@ def test_what_may_have_been_meant_comes_first(found: list[TopicInfo], said: str)
 
 def test_a_line_is_told_when_it_changes() -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    from gr_ros2.gr import RosSource
     from gr_ros2.middleware.memory import MemoryMiddleware
     from gr_ros2.radio.waiting import ALL_THERE, Waiting
     from gr_ros2.settings.registry import Registry
     from tests.domains import domain
+    from tests.gr.ends import link
 
     with MemoryMiddleware(domain_id=domain(1)) as robot, MemoryMiddleware(domain_id=domain(1)) as ours:
-        source = RosSource(Registry.from_rows({"odom": ODOM}), middleware=ours, namespace="/robot_1")
+        rows = Registry.from_rows({"odom": ODOM})
+        both = link(registry=rows, middleware=ours, robot="/robot_1", direction="send")
+        source = both.source
         try:
             waiting = Waiting(source)
             assert waiting.look() == "no publisher on /robot_1/odom yet; nothing else is published on the graph"
@@ -68,7 +70,7 @@ def test_a_line_is_told_when_it_changes() -> None:
             assert waiting.look() is None
             assert source.stats()["unmatched"] == []
         finally:
-            source.close()
+            both.close()
 
 
 @pytest.mark.parametrize(

@@ -109,10 +109,10 @@ def test_systemd_hears_of_a_link_that_runs(tmp_path: Path, systemd: socket.socke
 
 HANGS = """
 import runpy, threading
-from gr_ros2.gr.source import RosSource
+from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.radio import robot_link
 robot_link.STALLED_S = 1.0
-RosSource._compose = lambda self: threading.Event().wait() and []
+SendingBlock._compose = lambda self: threading.Event().wait() and []
 runpy.run_module("gr_ros2.cli", run_name="__main__")
 """
 

@@ -20,8 +20,6 @@ from gr_ros2.settings.config import (
     PhyConfig,
     ScenarioChannel,
     SendOptions,
-    SourceConfig,
-    TopicOptions,
     build,
 )
 from gr_ros2.settings.effect import conditions_of
@@ -122,15 +120,13 @@ for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
     ):
         IDLE[cls, name] = (given, beside, {**beside, "gains_db": -90.0}, "set gains_db, or channel.from: positions")
     IDLE[cls, "channel.snr_db"] = ({"channel": {"snr_db": 9.0}}, {**beside, "gains_db": -90.0}, beside, "leave one")
-for cls in (SendOptions, TopicOptions):
-    for option, given in BY_TYPE.items():
-        IDLE[cls, option] = (given, {"codec": "zstd"}, {}, "leave codec out")
+for option, given in BY_TYPE.items():
+    IDLE[SendOptions, option] = (given, {"codec": "zstd"}, {}, "leave codec out")
 for cls, values in ((CameraOptions, CAMERA), (DepthOptions, DEPTH)):
     for name, value in values.items():
         IDLE[cls, name] = ({name: value}, {"off": True}, {}, "leave off out")
 for name, value in {"range": 30.0, "keep": "rgb"}.items():
     IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
-IDLE[TopicOptions, "queue_depth"] = IDLE[SendOptions, "queue_depth"]
 NEVER = {(Scenario, "robots.*.state")}
 """Nothing makes them act."""
 
@@ -171,6 +167,7 @@ def test_what_has_no_effect_is_refused_in_a_line(cls: type[Any], name: str) -> N
 
 
 def test_a_default_is_taken_wherever_it_stands() -> None:
-    assert build(SourceConfig, {"repair": "off", "expected_loss": 0.2}) == SourceConfig(repair="off")
+    given = {"robot": 1, "repair": "off", "expected_loss": 0.2}
+    assert build(RobotConfig, given) == RobotConfig(robot=1, repair="off")
     assert build(PhyConfig, {"sample_rate": 1e6, "headroom": 1.2}) == PhyConfig(sample_rate=1e6)
     assert made(Scenario, {"bag_speed": 1, "robots": [{"tx_power_dbm": "auto"}, {}]}) == made(Scenario)

@@ -16,7 +16,7 @@ from pydantic import Field, TypeAdapter
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.config import LinkConfig
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO, REQUIRED, Auto, Setting, label, meanings, members, settings_of
 from gr_ros2_lab.medium.process import MediumConfig
 from gr_ros2_lab.race.race_settings import RaceSettings
@@ -24,7 +24,7 @@ from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.study.sweep.definition import Sweep
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-ROOTS = (Scenario, LinkConfig, MediumConfig, Sweep, RaceSettings, TopicOptions)
+ROOTS = (Scenario, LinkConfig, MediumConfig, Sweep, RaceSettings, SendOptions)
 ANOTHER_TIME = {"max_rate", "packet_rate", "speed", "bag_speed", "clock_rate", "time"}
 """Rates and clocks: no durations."""
 

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError, RegistryError
-from gr_ros2.settings.config import SinkConfig, TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import MAX_TOPICS, Registry, Topic, check_outputs, normalize_type
+from gr_ros2.settings.robot import PublishConfig, PublishOptions
 
 ODOM = "nav_msgs/msg/Odometry"
 
@@ -158,11 +159,9 @@ def test_named_columns_are_options_and_empty_cells_defaults(tmp_path: Path) -> N
         "scan,sensor_msgs/LaserScan\n"
     )
     odom, map_, scan = read(tmp_path, text)
-    assert odom.options == TopicOptions(
-        qos="latency", queue_depth=1, publish_as="/fleet/r{robot}/odom", reliability="best_effort"
-    )
-    assert map_.options == TopicOptions(qos="bulk", depth=1, durability="volatile")
-    assert scan.options == TopicOptions()
+    assert odom.options == SendOptions(qos="latency", queue_depth=1, reliability="best_effort")
+    assert map_.options == SendOptions(qos="bulk", depth=1, durability="volatile")
+    assert scan.options == SendOptions()
 
 
 @pytest.mark.parametrize(
@@ -199,7 +198,7 @@ def test_names_on_both_graphs() -> None:
     assert clock.on_graph("/robot_1") == "/clock"
     assert odom.republished("/rx_robot_{robot}", 7) == "/rx_robot_7/odom"
     assert clock.republished("rx_{robot}/", 7) == "/rx_7/clock"
-    assert Topic(0, "odom", ODOM, TopicOptions(publish_as="r{robot}/pose")).republished("/any", 3) == "/r3/pose"
+    assert Topic(0, "odom", ODOM, publish_as="r{robot}/pose").republished("/any", 3) == "/r3/pose"
 
 
 @pytest.mark.parametrize(
@@ -215,7 +214,7 @@ def test_names_on_both_graphs() -> None:
     ],
 )
 def test_latched_by_convention_or_as_registered(name: str, durability: str, latched: bool) -> None:
-    options = TopicOptions(durability=durability)  # type: ignore[arg-type]
+    options = SendOptions(durability=durability)  # type: ignore[arg-type]
     assert Topic(0, name, ODOM, options).latched is latched
 
 
@@ -229,13 +228,13 @@ def test_a_row_is_found_with_and_without_slash() -> None:
 
 def test_configured_options_go_over_the_registrys(tmp_path: Path) -> None:
     registry = read(tmp_path, "topic,type,qos,depth\nodom,nav_msgs/Odometry,latency,5\nscan,a/B,bulk,\n")
-    changed = registry.with_options({"/odom": TopicOptions(depth=7)})
-    assert changed[0].options == TopicOptions(qos="latency", depth=7)
+    changed = registry.with_options({"/odom": SendOptions(depth=7)})
+    assert changed[0].options == SendOptions(qos="latency", depth=7)
     assert changed[1] == registry[1]
     assert registry[0].options.depth == 5
     assert changed.digest == registry.digest
     with pytest.raises(ConfigError, match="topic 'map' is not in the registry"):
-        registry.with_options({"map": TopicOptions()})
+        registry.with_options({"map": SendOptions()})
 
 
 def test_the_digest_tells_what_both_ends_must_agree_on(tmp_path: Path) -> None:
@@ -321,10 +320,10 @@ def test_calls_have_a_row_of_their_own_behind_the_others(tmp_path: Path) -> None
 
 def test_options_may_be_of_topics_that_others_announce() -> None:
     registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
-    options = {"odom": TopicOptions(depth=3), "/scan": TopicOptions(depth=4)}
+    options = {"odom": PublishOptions(depth=3), "/scan": PublishOptions(depth=4)}
     assert [topic.options.depth for topic in registry.with_options(options, announced=True)] == [3]
     with pytest.raises(ConfigError, match="topic '/scan' is not in the registry"):
         registry.with_options(options)
-    check_outputs(registry, SinkConfig(topic_options=options))
+    check_outputs(registry, PublishConfig(topics=options))
     with pytest.raises(ConfigError, match="topic '/scan' is not in the registry"):
-        check_outputs(registry, SinkConfig(topic_options=options, version=0))
+        check_outputs(registry, PublishConfig(topics=options), announced=False)

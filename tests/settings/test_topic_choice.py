@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.settings.config import SourceConfig, build
+from gr_ros2.settings.config import build
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.settings.topic_choice import TopicChoice
 
 GRAPH = (
@@ -20,7 +21,7 @@ NAMES = st.from_regex(r"[a-z]{1,3}(/[a-z]{1,3})?", fullmatch=True)
 
 def chosen(words: str, namespace: str = "/robot_1") -> dict[str, str]:
     """What is sent of GRAPH, and under which names."""
-    choice = TopicChoice(build(SourceConfig, {"topics": words}).topics, namespace)
+    choice = TopicChoice(build(RobotConfig, {"robot": 1, "topics": words}).words, namespace)
     return {name: row for name in GRAPH if (row := choice.row_name(name)) is not None}
 
 
@@ -55,13 +56,13 @@ def test_in_the_root_namespace_what_every_node_has_is_not_meant() -> None:
 
 def test_a_list_and_a_text_are_the_same_setting() -> None:
     for value in (["auto", "-camera/*"], "auto,-camera/*", "auto -camera/*"):
-        assert build(SourceConfig, {"topics": value}).topics == ("auto", "-camera/*")
+        assert build(RobotConfig, {"robot": 1, "topics": value}).words == ("auto", "-camera/*")
 
 
 @pytest.mark.parametrize("word", ["od om!", "1st", "a//b", "-", "a/", "ä"])
 def test_a_word_that_can_be_no_topic_is_refused(word: str) -> None:
     with pytest.raises(ConfigError, match="topics = "):
-        build(SourceConfig, {"topics": [word]})
+        build(RobotConfig, {"robot": 1, "topics": [word]})
 
 
 def test_of_a_registry() -> None:

@@ -16,7 +16,6 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.access import Access
 from gr_ros2.link.endpoint import LIVE_OPTIONS, HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
@@ -172,7 +171,7 @@ class EndpointV1:
             self.pace,
             room=room,
             turn_s=settings.turn_s,
-            fixed=settings.fixed,
+            any_length=settings.any_length,
             neighbours=neighbours.all,
             relayed=settings.relay,
         )
@@ -207,11 +206,6 @@ class EndpointV1:
         return sum(neighbour.inbox.held for neighbour in self.neighbours.all.values())
 
     def reconfigure(self, **changes: Any) -> None:
-        if (dst_id := changes.pop("dst_id", self.settings.dst_id)) != self.settings.dst_id:
-            raise ConfigError(
-                f"dst_id = {dst_id}: another destination needs a restart of the link: repairs combine packets to "
-                f"{self.settings.dst_id}, and nobody else may recover these"
-            )
         check_live(changes, self.live_settings)
         self.settings = settings = replace(self.settings, **changes)
         self._sending.reconfigure(settings, self._now)

@@ -9,10 +9,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.air import Air
 from gr_ros2.link.v1.repair import RepairMode
 from gr_ros2.settings.commands import COMMAND_TYPES
-from gr_ros2.settings.config import NOBODY, SinkConfig, SourceConfig, robot_of
+from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire.v1 import BROADCAST, HEADER_LEN, REPAIR_HEADER_LEN, TAG_LEN
 
 TURN_S = 1 / 3
@@ -27,7 +29,7 @@ class Settings:
 
     :param src_id: 0..254; ``NOBODY`` at an end that only receives. Such an end takes packets for any robot
     :param packet_len: bytes of the longest packet, the same at all ends
-    :param fixed: every packet has ``packet_len`` bytes; otherwise only as many as it needs
+    :param any_length: packets have only as many bytes as they need; otherwise every one has ``packet_len``
     :param dst_id: id of the robot that packets are for, 255 = all robots
     :param repair: what idle slots carry; auto takes ``thrifty`` where reports come and ``idle`` where none do
     :param expected_loss: share of packets that are lost, used until a report gives it
@@ -54,7 +56,7 @@ class Settings:
 
     src_id: int
     packet_len: int = 220
-    fixed: bool = True
+    any_length: bool = False
     dst_id: int = BROADCAST
     repair: RepairMode | Auto = AUTO
     expected_loss: float = 0.2
@@ -99,51 +101,33 @@ class Settings:
         return self.airtime_share == 1 and not (self.half_duplex or self.shares)
 
 
-def settings_of(
-    source: SourceConfig | None,
-    sink: SinkConfig | None,
-    *,
-    hears: bool,
-    half_duplex: bool = False,
-    fixed: bool = True,
-    airtime_share: float = 1.0,
-    airtime_s: float = 0.0,
-    relay: bool = False,
-) -> Settings:
-    """The settings of an end, made from those of its blocks.
+def settings_of(robot: RobotConfig, air: Air, *, loops_back: bool = False) -> Settings:
+    """The settings of a robot's end.
 
-    :param hears: whether it receives and can report
-    :param fixed: whether every packet must be as long as the longest
-    :param airtime_share: see :class:`Settings`
-    :param airtime_s: of the longest packet, s; 0 = not known
-    :param relay: likewise
-    :raises ConfigError: neither block names the robot, although it would send something
+    :param loops_back: whether it receives what it sends itself, and takes packets of and for any robot
+    :raises ConfigError: for settings that contradict each other
     """
-    send = SourceConfig() if source is None else source
-    take = SinkConfig() if sink is None else sink
+    taken = robot.publish.topics.items()
     return Settings(
-        src_id=robot_of(source, sink),
-        packet_len=take.packet_len if source is None else source.packet_len,
-        fixed=fixed,
-        dst_id=send.dst_id,
-        repair=send.repair,
-        expected_loss=send.expected_loss,
-        hears=hears,
-        half_duplex=half_duplex,
-        relay=relay,
-        hold_s=take.hold_s,
-        max_age_s=take.max_age_s,
-        max_ages={name: options.max_age_s for name, options in take.topic_options.items() if options.max_age_s != AUTO},
-        repeat_s=send.repeat_s,
-        max_source_bytes=take.max_source_bytes,
-        max_sources=take.max_sources,
-        packet_rate=send.packet_rate,
-        queue_depth=send.queue_depth,
-        commands=send.commands,
-        deadlines={
-            name: options.deadline_s for name, options in take.topic_options.items() if options.deadline_s != AUTO
-        },
-        airtime_share=airtime_share,
-        turn_s=lambda: airtime_s,
-        beacon_s=send.beacon_s,
+        src_id=NOBODY if loops_back else robot.robot_id,
+        packet_len=robot.packet_len,
+        any_length=air.any_length,
+        repair=robot.repair,
+        expected_loss=robot.expected_loss,
+        hears=air.hears,
+        half_duplex=air.half_duplex,
+        relay=air.relay,
+        hold_s=robot.hold_s,
+        max_age_s=robot.max_age_s,
+        max_ages={name: options.max_age_s for name, options in taken if options.max_age_s != AUTO},
+        repeat_s=robot.repeat_s,
+        max_source_bytes=robot.max_source_bytes,
+        max_sources=robot.max_sources,
+        packet_rate=robot.packet_rate,
+        queue_depth=robot.queue_depth,
+        commands=robot.commands,
+        deadlines={name: options.deadline_s for name, options in taken if options.deadline_s != AUTO},
+        airtime_share=air.airtime_share,
+        turn_s=lambda: air.airtime_s,
+        beacon_s=robot.beacon_s,
     )

@@ -58,7 +58,7 @@ class SentFrames:
     :param room: bytes of the longest body
     :param turn_s: tells s from one packet to the next, 0 = not known
     :param neighbours: the robots that are heard
-    :param fixed: whether every packet is as long as the longest
+    :param any_length: whether packets are only as long as they need
     :param relayed: see :class:`gr_ros2.link.frames.FrameSide`
     """
 
@@ -72,13 +72,13 @@ class SentFrames:
         *,
         room: int,
         turn_s: Callable[[], float],
-        fixed: bool,
+        any_length: bool,
         neighbours: Mapping[int, Neighbour],
         relayed: bool,
     ) -> None:
         self.relayed = relayed
         self._topics, self._outlet, self._packets, self._peers, self._pace = topics, outlet, packets, peers, pace
-        self._room, self._turn_s, self._fixed, self._neighbours = room, turn_s, fixed, neighbours
+        self._room, self._turn_s, self._any_length, self._neighbours = room, turn_s, any_length, neighbours
         self._sent: dict[int, deque[Message]] = {}
         """Frames of each topic that have begun to leave or wait, oldest first, until all who report have them."""
         self._ages: dict[int, float] = {}
@@ -125,7 +125,7 @@ class SentFrames:
         """A packet has left."""
         if not self._sent:
             return
-        others = self._room if self._fixed else len(sent.data)
+        others = len(sent.data) if self._any_length else self._room
         if sent.kind == "new":
             entries = [entry for entry in sent.packet.entries if isinstance(entry, Part)]
             others = sum(len(part.payload) + ENTRY for part in entries if part.topic_id not in self._sent)

@@ -31,7 +31,7 @@ from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.packing import ENTRY, Packing
 from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopic, SentTopics
-from gr_ros2.settings.config import QueuePolicy, TopicOptions
+from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOPIC
@@ -144,7 +144,7 @@ class Outbox:
         self.tabulate()
         return self.queue(topic_id) != before
 
-    def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:
+    def change(self, topic_id: int, options: SendOptions) -> tuple[Registry, Topic]:
         before = self.sent[topic_id]
         name, type_name = before.topic.name, before.topic.type_name
         check_live_options(name, before.topic.options, options)

@@ -15,7 +15,7 @@ from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class
 from gr_ros2.link.v1.lifetime import Lifetimes
 from gr_ros2.link.v1.message import Message
 from gr_ros2.settings.commands import is_command
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
 from gr_ros2.wire import QOS_BULK
@@ -138,7 +138,7 @@ class SentTopic:
         else:
             self.queue.change(*queue_for(topic.options, publishers, command=self.command))
 
-    def change(self, options: TopicOptions) -> None:
+    def change(self, options: SendOptions) -> None:
         """Use other options from now on, for the same robot."""
         self._check(options)
         self.topic = replace(self.topic, options=options)
@@ -155,7 +155,7 @@ class SentTopic:
         if self.topic.options.qos == AUTO:
             self.qos = QOS_BULK
 
-    def _check(self, options: TopicOptions) -> None:
+    def _check(self, options: SendOptions) -> None:
         if self.command and options.keep_s:
             raise ConfigError(
                 f"topic {self.topic.name}: keep_s = {options.keep_s:g}, but commands come in time or not at all, and "

@@ -77,7 +77,7 @@ class PacketWriter:
         self._window, self._rate, self._stats, self._hold, self._observer = window, rate, stats, hold, observer
         self.sealed, self._encrypts = keys.sealed, keys.encrypts
         self.room = room_of(settings, keys, block=shares)
-        self._end_of_body = settings.packet_len - keys.trailer_len if settings.fixed else 0
+        self._end_of_body = 0 if settings.any_length else settings.packet_len - keys.trailer_len
         """Number of bytes to which the packet with its padded body extends."""
         # An end without an id only listens and closes no packet. Its id makes no key.
         self._trailer = Checksum(boot) if settings.src_id == NOBODY else keys.own(settings.src_id, boot)

@@ -25,7 +25,7 @@ from gr_ros2.settings.files import find_registry
 from gr_ros2_lab.record.team_numbers import TEAM_VALUES
 from gr_ros2_lab.run.builtin import SCENARIO_DIR
 from gr_ros2_lab.run.load import check_channels, make_phy, source_names
-from gr_ros2_lab.run.robot_settings import sources_of
+from gr_ros2_lab.run.robot_settings import senders_of
 from gr_ros2_lab.run.scenario import Experiment, Scenario, Time, changed, dump, load_scenario
 
 BUILTIN_DIR = Path(__file__).resolve().parents[2] / "sweeps"
@@ -239,7 +239,7 @@ def _check(sweep: Sweep, scenario: Scenario, phys: dict[str, Phy]) -> None:
     if beside_channel not in phys:
         phys[beside_channel] = make_phy(scenario, registry)
     check_channels(scenario, phys[beside_channel])
-    names = [name for source in sources_of(scenario.all_robots) for name in source_names(source, registry)]
+    names = [name for robot in senders_of(scenario.all_robots) for name in source_names(robot, registry)]
     if sweep.topic and sweep.topic not in names:
         raise ConfigError(f"topic = {sweep.topic!r}: not sent; sent are {', '.join(names)}")
     if not sweep.topic and len(names) > 1 and sweep.value not in OF_THE_LINK:

@@ -27,9 +27,10 @@ from gr_ros2.link.events import (
     SentEntry,
     SentPacket,
 )
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.sender import Sender
-from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.v0 import PacketV0
 from gr_ros2_lab.record.ledger import REORDER_WINDOW, Ledger, TopicLedger
@@ -334,12 +335,14 @@ class Erring(LinkCodec):
 @pytest.mark.parametrize(("decoder", "wrong"), [(LinkCodec, 0), (Erring, 20)])
 def test_what_a_codec_changes_on_purpose_is_delivered_and_nothing_else_is(decoder: type[LinkCodec], wrong: int) -> None:
     """Fields quantised, garbage in the alignment gaps: as sent, unless the codec errs."""
-    options = TopicOptions(quantize="pose.pose=0.001 twist.twist.linear=0.01")
+    options = SendOptions(quantize="pose.pose=0.001 twist.twist.linear=0.01")
     registry = Registry([Topic(0, "odom", "nav_msgs/msg/Odometry", options)])
     ledger = Ledger()
-    config = SourceConfig(robot_id=SRC, packet_len=220, compression=True)
-    sender = Sender(registry, config, codec=LinkCodec(registry), observer=lambda event: ledger.sender_event(SRC, event))
-    receiver = Receiver(registry, SinkConfig(packet_len=220), codec=decoder(registry))
+    config = paper_from(robot=SRC, packet_len=220, compression=True)
+    sender = Sender(
+        registry, *config, codec=LinkCodec(registry), observer=lambda event: ledger.sender_event(SRC, event)
+    )
+    receiver = Receiver(registry, *paper_from(robot=0, packet_len=220), codec=decoder(registry))
     delivered: list[bytes] = []
     written = [Writer(random.Random(seed)).message("nav_msgs/msg/Odometry")[0] for seed in range(60)]
     for now, payload in enumerate(written):
@@ -372,9 +375,9 @@ def test_the_engines_over_a_bad_link(
     rng = random.Random(seed)
     registry = Registry.from_rows({"odom": "nav_msgs/Odometry", "map": "nav_msgs/OccupancyGrid"})
     ledger = Ledger()
-    source = SourceConfig(robot_id=SRC, packet_len=64, queue_depth=queue_depth, repeat_s=0.5)
-    sender = Sender(registry, source, rng=rng, observer=lambda event: ledger.sender_event(SRC, event))
-    receiver = Receiver(registry, SinkConfig(version=0, packet_len=64, reassembly_timeout_s=0.2))
+    source = paper_from(robot=SRC, packet_len=64, queue_depth=queue_depth, repeat_s=0.5)
+    sender = Sender(registry, *source, rng=rng, observer=lambda event: ledger.sender_event(SRC, event))
+    receiver = Receiver(registry, *paper_from(robot=0, packet_len=64, reassembly_timeout_s=0.2))
     air: list[bytes] = []
     submitted = [0, 0]
     outcome = [0, 0]

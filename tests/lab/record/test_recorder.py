@@ -7,10 +7,10 @@ import random
 import pytest
 
 from gr_ros2.link import AirPacket
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.sender import Sender
 from gr_ros2.observe.positions import humble_types
-from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
 from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.record.recorder import Recorder
 from tests.packets import data_of
@@ -30,11 +30,11 @@ def test_a_run_over_the_engines() -> None:
     recorder = Recorder(registry, {4: "/robot_4"})
     sender = Sender(
         registry,
-        SourceConfig(robot_id=4, packet_len=64),
+        *paper_from(robot=4, packet_len=64),
         rng=random.Random(1),
         observer=lambda event: recorder.sender_event(4, event),
     )
-    receiver = Receiver(registry, SinkConfig(packet_len=64))
+    receiver = Receiver(registry, *paper_from(robot=0, packet_len=64))
     for step in range(100):
         now = 100 + step / 10
         sender.submit(0, _point_stamped(step, 2 * step), now)
@@ -93,7 +93,7 @@ def test_only_the_topics_asked_for_are_listed() -> None:
 
 def test_what_does_not_deserialize_has_no_position_and_is_counted() -> None:
     recorder = Recorder(REGISTRY, {1: ""})
-    sender = Sender(REGISTRY, SourceConfig(robot_id=1), observer=lambda event: recorder.sender_event(1, event))
+    sender = Sender(REGISTRY, *paper_from(robot=1), observer=lambda event: recorder.sender_event(1, event))
     sender.submit(0, b"no odometry", 0.0)
     odom = recorder.finish(1, 1)[0]
     assert odom.path_error_m is None

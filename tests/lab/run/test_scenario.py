@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.settings.config import ChannelConfig, replaced
 from gr_ros2.settings.files import parse_override
 from gr_ros2.settings.robot import RobotConfig
@@ -26,7 +27,7 @@ def test_the_built_in_ones() -> None:
     assert (demo.packet_len, demo.phy.name, demo.phy.sample_rate, demo.phy.headroom) == (220, "ofdm", "auto", 1.2)
     assert (direct.packet_len, direct.sim.odom_rate, direct.duration_s, direct.phy.name) == (64, 30, 15, "direct")
     assert (ofdm.packet_len, ofdm.sim.odom_rate, ofdm.duration_s, ofdm.phy.sample_rate) == (64, 35, 38, 100_000)
-    assert (ofdm.first.packet_rate, ofdm.drain_s, ofdm.first.queue_depth, ofdm.first.version) == (0, 0, 0, 0)
+    assert (ofdm.first.packet_rate, ofdm.drain_s, ofdm.first.queue_depth, ofdm.paper) == (0, 0, 0, PaperConfig())
     assert BUILTIN["paper-ofdm-paced"].first.packet_rate == "auto"
     assert BUILTIN["paper-ofdm-paced"].first.queue_depth > 0
 
@@ -86,8 +87,8 @@ def test_what_robots_share_stands_above_them_and_what_they_do_not_in_them() -> N
 def test_two_robots_that_send_hear_each_other_over_channels_of_their_own() -> None:
     scenario = load_scenario("two-way", ["channel.snr_db=20", "robots.1.publish.depth=7"], seed=5)
     here, other = scenario.all_robots
-    assert here.source is not None and here.sink is not None and other.source is not None and other.sink is not None
-    assert (here.sink.publisher_depth, other.sink.publisher_depth) == (1000, 7)
+    assert all(robot.config.sends and robot.takes for robot in (here, other))
+    assert (here.config.publish.depth, other.config.publish.depth) == (1000, 7)
     (there,), (back,) = here.paths, other.paths
     assert (there.receiver, back.receiver) == (1, 0)
     assert there.channel.snr_db == back.channel.snr_db == 20
@@ -99,8 +100,7 @@ def test_two_robots_that_send_hear_each_other_over_channels_of_their_own() -> No
 def test_a_part_is_changed_at_all_robots() -> None:
     for name in ("two-way", "team", "demo"):
         scenario = changed(BUILTIN[name], RobotConfig, lambda robot: replaced(robot, packet_len=99))
-        halves = [half for robot in scenario.all_robots for half in (robot.source, robot.sink) if half is not None]
-        assert {scenario.packet_len, *(half.packet_len for half in halves)} == {99}
+        assert {scenario.packet_len, *(robot.config.packet_len for robot in scenario.all_robots)} == {99}
 
 
 def test_one_robot_of_a_list_is_changed_by_its_place() -> None:

@@ -13,7 +13,7 @@ from gr_ros2.core.errors import RunError
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import AirPacket, Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.airtime import LEAD_S
-from gr_ros2.link.v0.endpoint import EndpointV0
+from gr_ros2.paper.endpoint import EndpointV0
 from gr_ros2.phy.direct import DirectPhy
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2_lab.medium import FixedPaths
@@ -203,9 +203,10 @@ def test_a_robot_may_answer_what_it_hears() -> None:
     robots = []
     for number, one in enumerate(settings.all_robots):
         told: list[SenderEvent] = []
-        codecs = message_codec(registry), message_codec(registry)
         kind = Answering if number else EndpointV0
-        endpoint = kind(registry, one.source, one.sink, codecs=codecs, observer=told.append)
+        assert settings.paper is not None
+        codec = message_codec(registry)
+        endpoint = kind(registry, one.config, settings.paper, codec=codec, observer=told.append)
         messages = iter(() if number else coming)
         common: dict[str, Any] = {"src_id": one.robot_id, "airtime": lambda *_: 0.01}
         robots.append(Robot(settings, number, endpoint, events=told, messages=messages, **common))
@@ -233,7 +234,8 @@ class Stuck(EndpointV0):
 def test_a_simulation_that_stands_still_says_which_end_and_which_timer() -> None:
     settings = scenario("paper-ofdm", "time=packets", duration=2.0)
     registry = settings.load_registry()
-    endpoint = Stuck(registry, settings.first, None)
+    assert settings.paper is not None
+    endpoint = Stuck(registry, settings.first, settings.paper, codec=None)
     messages = iter([Offered(0.5, 0, bytes(51))])
     stuck = Robot(settings, 0, endpoint, src_id=1, airtime=lambda *_: 0.0, events=[], messages=messages)
     medium = PacketMedium(FixedPaths([[]]), [DirectPhy(220)])

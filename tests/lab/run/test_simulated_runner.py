@@ -20,9 +20,9 @@ from pydantic import TypeAdapter
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.dashboard.monitor import RunMonitor
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
-from gr_ros2.link.v0.endpoint import EndpointV0
 from gr_ros2.middleware.bag_files import bag_topics, read_bag
 from gr_ros2.observe.observers import LiveRun
+from gr_ros2.paper.endpoint import EndpointV0
 from gr_ros2.phy import measure
 from gr_ros2_lab.medium import loss_table
 from gr_ros2_lab.record.result import Result, read_result

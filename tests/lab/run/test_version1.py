@@ -154,7 +154,7 @@ def test_paths_take_over_what_is_not_set_but_the_seed() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"packet_len": 30}, "packet_len = 30: version 1 needs at least 40"),
+        ({"packet_len": 30}, "packet_len = 30: robots need at least 40"),
         ({"version": 1}, "version is no setting any more"),
         ({"back": {}}, "back is no setting any more: write robots"),
         ({"paths": [{"from": 7}]}, "paths: there is no robot 7; there are 1, 2"),

@@ -13,7 +13,7 @@ from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys, SealMode
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.link.v1.invariants import PacketsEnd
 from tests.packets import data_of
@@ -22,9 +22,9 @@ KEY = bytes(range(32))
 SLOT_S = 1 / 75
 
 
-def registry(**options: TopicOptions) -> Registry:
+def registry(**options: SendOptions) -> Registry:
     """Topics by name with their options; odom, scan and map where none are named."""
-    named = options or {"odom": TopicOptions(), "scan": TopicOptions(queue="latest"), "map": TopicOptions(qos="bulk")}
+    named = options or {"odom": SendOptions(), "scan": SendOptions(queue="latest"), "map": SendOptions(qos="bulk")}
     return Registry([Topic(n, name, "std_msgs/msg/String", option) for n, (name, option) in enumerate(named.items())])
 
 

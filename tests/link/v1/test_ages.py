@@ -14,7 +14,7 @@ from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.relaying import FORGET_S, Relaying
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
 from gr_ros2.wire.relayed import Relayed, write_relayed
 from gr_ros2.wire.v1 import RELAYED_TOPIC
@@ -167,19 +167,19 @@ def test_nothing_of_a_robot_is_sent_on_long_after_it_was_there() -> None:
 
 
 def test_commands_are_not_kept_for_late_robots() -> None:
-    latched = Registry([Topic(0, "cmd_vel", TWIST, TopicOptions(durability="transient_local"))])
+    latched = Registry([Topic(0, "cmd_vel", TWIST, SendOptions(durability="transient_local"))])
     end = robot(1, topics=latched).end
     end.messages.submit(0, b"go", 0.0)
     assert not end.messages.kept.marks(100.0)
     assert not end.messages.sent[0].announced("").latched
     with pytest.raises(ConfigError, match="leave keep_s out"):
-        robot(1, topics=Registry([Topic(0, "cmd_vel", TWIST, TopicOptions(keep_s=5.0))]))
+        robot(1, topics=Registry([Topic(0, "cmd_vel", TWIST, SendOptions(keep_s=5.0))]))
     with pytest.raises(ConfigError, match="leave keep_s out"):
-        robot(1, topics=COMMANDS).end.messages.change(0, TopicOptions(keep_s=5.0))
+        robot(1, topics=COMMANDS).end.messages.change(0, SendOptions(keep_s=5.0))
 
 
 def test_a_kept_message_is_not_sent_again_after_its_deadline() -> None:
-    rows = registry(map=TopicOptions(durability="transient_local", queue="deadline", deadline_s=2.0))
+    rows = registry(map=SendOptions(durability="transient_local", queue="deadline", deadline_s=2.0))
     one, later = Robot(1, rows), 1.5
     one.end.messages.submit(0, b"map", 0.0)
     for slot in range(5):

@@ -11,14 +11,14 @@ from gr_ros2.compression import LinkCodec
 from gr_ros2.compression.link_codec import ANNOUNCED
 from gr_ros2.link.events import Lost, SentPacket
 from gr_ros2.link.fates import Fate
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import TABLE_TOPIC, Part
 from tests.link.v1.air import SLOT_S, Air, Robot
 
 THING = "my_msgs/msg/Thing"
-TOPICS = Registry([Topic(0, "thing", THING, TopicOptions())])
+TOPICS = Registry([Topic(0, "thing", THING, SendOptions())])
 TYPES = get_types_from_msg("int32 number\nfloat64[6] values\n", THING)
 
 

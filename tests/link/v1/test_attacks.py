@@ -15,7 +15,7 @@ from gr_ros2.link.fates import Fate
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Seal, SealMode, subkey
 from gr_ros2.link.v1.unreported import MEETING_S
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.wire.control import Ask, Report
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
@@ -389,7 +389,7 @@ def test_recordings_make_a_robot_that_starts_again_meet_nobody(mode: SealMode) -
 
 def test_forged_requests_take_a_share_of_the_air() -> None:
     """Anybody may ask where no key is set. 20 kB are a third of what this robot can send in the time."""
-    topics = registry(map=TopicOptions(qos="bulk", durability="transient_local"))
+    topics = registry(map=SendOptions(qos="bulk", durability="transient_local"))
     one, forger = Robot(1, topics, packet_len=220), Robot(2, registry(), packet_len=220, hears=False)
     air = Air(one, forger)
     one.end.messages.submit(0, bytes(range(256)) * 80, air.now)
@@ -452,7 +452,7 @@ def test_a_state_that_cannot_be_stored(hears: bool) -> None:
 
 def test_what_was_withheld_for_long_is_not_executed() -> None:
     """Packets withheld for 45 s, then released after their sender has stopped: nothing with a deadline is taken."""
-    rows = registry(cmd_vel=TopicOptions(queue="deadline", deadline_s=1.0), log=TopicOptions())
+    rows = registry(cmd_vel=SendOptions(queue="deadline", deadline_s=1.0), log=SendOptions())
     one, two = Robot(1, rows, mode="encrypt"), Robot(2, registry(), mode="encrypt")
     air = Air(one, two, loss=0.2)
     for number in range(100):
@@ -501,7 +501,7 @@ def test_a_sealed_robot_that_nobody_hears_falls_silent() -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 def test_what_is_fresh_is_taken(loss: float) -> None:
-    rows = registry(cmd_vel=TopicOptions(queue="deadline", deadline_s=1.0))
+    rows = registry(cmd_vel=SendOptions(queue="deadline", deadline_s=1.0))
     one, two = Robot(1, rows, mode="encrypt"), Robot(2, registry(), mode="encrypt")
     air = Air(one, two, loss=loss)
     air.run(2.0)

@@ -7,10 +7,10 @@ import pytest
 from bench.repair_backlog import CASES, LOSSES, OLDER, run
 from gr_ros2.link.events import SentPacket
 from gr_ros2.link.v1.receiving import GIVE_UP_S
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Air, Robot, registry
 
-FIFO = TopicOptions(queue="fifo", reliability="reliable")
+FIFO = SendOptions(queue="fifo", reliability="reliable")
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -33,7 +33,7 @@ def test_long_messages_arrive_one_way_too(name: str, odometry: bool) -> None:
 
 def test_a_full_link_repairs_what_later_messages_wait_for() -> None:
     """Best-effort messages take every slot."""
-    one, two = Robot(1, registry(few=FIFO, many=TopicOptions(reliability="best_effort", queue="latest"))), Robot(2)
+    one, two = Robot(1, registry(few=FIFO, many=SendOptions(reliability="best_effort", queue="latest"))), Robot(2)
     air = Air(one, two, loss=0.2)
     air.run(1.0)
     for number in range(100):
@@ -47,7 +47,7 @@ def test_a_full_link_repairs_what_later_messages_wait_for() -> None:
 
 def test_a_message_given_up_by_its_sender_keeps_nothing_back() -> None:
     """Its lifespan is over before it could be repaired; no timer of the receiver runs."""
-    stale = TopicOptions(queue="fifo", deadline_s=0.1)
+    stale = SendOptions(queue="fifo", deadline_s=0.1)
     one, two = Robot(1, registry(stale=stale, fifo=FIFO)), Robot(2, hold_s=1000.0)
     air = Air(one, two)
     air.run(2.0)

@@ -83,7 +83,7 @@ def test_a_sealed_robot_that_comes_back_after_millions_of_packets() -> None:
 
 
 def test_jumps_of_short_packets_cost_no_more_than_others() -> None:
-    end = EndpointV1(None, Settings(2, 64, fixed=False), boot=1)
+    end = EndpointV1(None, Settings(2, 64, any_length=True), boot=1)
     end.receive(AirPacket(hello(7, 0)), 0.0)
     trailer = keys("none").own(1, 7)
     for step in range(1, 200):

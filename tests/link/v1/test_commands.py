@@ -8,18 +8,19 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
-from gr_ros2.settings.config import SourceConfig, TopicOptions, build
+from gr_ros2.settings.config import SendOptions, build
 from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.robot import RobotConfig
 from tests.link.v1.air import SLOT_S, Air, Robot
 
 TWIST = "geometry_msgs/msg/Twist"
 
 
-def robot(**options: TopicOptions) -> Robot:
+def robot(**options: SendOptions) -> Robot:
     """It sends commands and large strings."""
     names = {"cmd_vel": TWIST, "text": "std_msgs/msg/String"}
     return Robot(
-        1, Registry([Topic(n, name, names[name], options.get(name, TopicOptions())) for n, name in enumerate(names)])
+        1, Registry([Topic(n, name, names[name], options.get(name, SendOptions())) for n, name in enumerate(names)])
     )
 
 
@@ -63,9 +64,9 @@ def test_no_command_comes_late_and_those_that_would_are_counted(loss: float) -> 
 
 
 def test_the_options_of_a_topic_say_otherwise() -> None:
-    assert max(ages(robot(cmd_vel=TopicOptions(deadline_s=0.0)))) > 0.8
-    assert robot(cmd_vel=TopicOptions(deadline_s=1.0)).end.messages.queue(0) == ("deadline", 1.0)
-    assert robot(cmd_vel=TopicOptions(queue="latest")).end.messages.queue(0) == ("latest", COMMAND_DEADLINE_S)
+    assert max(ages(robot(cmd_vel=SendOptions(deadline_s=0.0)))) > 0.8
+    assert robot(cmd_vel=SendOptions(deadline_s=1.0)).end.messages.queue(0) == ("deadline", 1.0)
+    assert robot(cmd_vel=SendOptions(queue="latest")).end.messages.queue(0) == ("latest", COMMAND_DEADLINE_S)
 
 
 def test_what_a_user_names_is_a_command_and_with_no_name_nothing_is() -> None:
@@ -78,7 +79,7 @@ def test_what_a_user_names_is_a_command_and_with_no_name_nothing_is() -> None:
     assert is_command("/arm/goal", "x/msg/Y", ("arm/goal",))
     assert not is_command("alarm/goal", "x/msg/Y", ("arm/*",))
     with pytest.raises(ConfigError, match="neither a type such as"):
-        build(SourceConfig, {"commands": ["two words"]})
+        build(RobotConfig, {"robot": 1, "commands": ["two words"]})
 
 
 def test_a_lifespan_of_the_publishers_goes_before_the_default() -> None:

@@ -13,7 +13,7 @@ from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.link.v1.sequences import Sequences
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.relayed import PLACES, Relayed, read_carried, write_carried
 from gr_ros2.wire.v1 import CARRIED_TOPIC, QOS_REPAIR, TABLE_TOPIC, read_header, read_repair_header
@@ -24,7 +24,7 @@ LAST = 4
 
 
 def named(last: int = LAST, **options: Any) -> Registry:
-    return registry(odom=TopicOptions(queue="latest"), goal=TopicOptions(to=last, **options), map=TopicOptions(to=last))
+    return registry(odom=SendOptions(queue="latest"), goal=SendOptions(to=last, **options), map=SendOptions(to=last))
 
 
 def custody_of(one: Robot) -> Custody:
@@ -115,7 +115,7 @@ def test_what_the_next_robot_has_not_taken_goes_over_another_one() -> None:
 
 
 def test_a_kept_message_is_sent_to_a_robot_that_comes_within_reach_of_others() -> None:
-    rows = registry(odom=TopicOptions(queue="latest"), map=TopicOptions(to=LAST, durability="transient_local"))
+    rows = registry(odom=SendOptions(queue="latest"), map=SendOptions(to=LAST, durability="transient_local"))
     line = Line(robot(1, topics=rows), *(robot(src_id) for src_id in (2, 3)))
     line.run(8)
     line.robots[0].end.messages.submit(1, b"the map", line.now)

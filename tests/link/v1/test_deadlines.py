@@ -8,7 +8,7 @@ import pytest
 
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.relayed import age_of
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
@@ -16,12 +16,12 @@ from tests.link.v1.test_ages import MODES, absent
 from tests.link.v1.test_relaying import Line, robot
 
 WITHIN_S = 4.0
-SCAN = TopicOptions(queue="deadline", deadline_s=WITHIN_S)
+SCAN = SendOptions(queue="deadline", deadline_s=WITHIN_S)
 LATE_S = (1.0, 10.0, 3600.0)
 
 
-def rows(**options: TopicOptions) -> Registry:
-    return registry(odom=TopicOptions(queue="latest"), **options)
+def rows(**options: SendOptions) -> Registry:
+    return registry(odom=SendOptions(queue="latest"), **options)
 
 
 @pytest.mark.parametrize("after_s", LATE_S[:2])
@@ -65,7 +65,7 @@ def test_a_rare_message_that_is_repaired_in_time_comes(mode: SealMode, limit_s: 
 @pytest.mark.parametrize("together", [True, False])
 def test_what_its_origin_may_repair_for_longer_counts_from_the_packet_before(together: bool) -> None:
     """It is missed 8 s after the packet before it, and also has a message that is never too old, or not."""
-    sender, receiver = Robot(1, rows(scan=SCAN, text=TopicOptions())), Robot(2)
+    sender, receiver = Robot(1, rows(scan=SCAN, text=SendOptions())), Robot(2)
     air = Air(sender, receiver)
     air.run(3.0)
     now, number = air.now + 2 * WITHIN_S, sender.end.window.packets.newest + 1
@@ -85,7 +85,7 @@ def test_what_its_origin_may_repair_for_longer_counts_from_the_packet_before(tog
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("after_s", LATE_S)
 def test_what_repair_brings_counts_from_the_packet_before_it(mode: SealMode, after_s: float) -> None:
-    sender, receiver = Robot(1, rows(scan=SCAN, text=TopicOptions()), mode=mode), Robot(2, mode=mode)
+    sender, receiver = Robot(1, rows(scan=SCAN, text=SendOptions()), mode=mode), Robot(2, mode=mode)
     air = Air(sender, receiver)
     air.run(3.0)
     held = []
@@ -105,7 +105,7 @@ def test_what_repair_brings_counts_from_the_packet_before_it(mode: SealMode, aft
 @pytest.mark.parametrize("latched", [False, True])
 def test_a_relay_hands_nothing_on_that_is_over(mode: SealMode, away_s: float, latched: bool) -> None:
     """Robot 3 is away when robot 1 says it, and comes when robot 1 is off; kept for a late robot or not."""
-    scan = TopicOptions(queue="deadline", deadline_s=WITHIN_S, durability="transient_local" if latched else "auto")
+    scan = SendOptions(queue="deadline", deadline_s=WITHIN_S, durability="transient_local" if latched else "auto")
     line = Line(robot(1, mode, rows(scan=scan)), *(robot(src_id, mode) for src_id in (2, 3)))
     line.run(12)
     absent(line, 3)
@@ -125,7 +125,7 @@ def test_a_relay_hands_nothing_on_that_is_over(mode: SealMode, away_s: float, la
 @pytest.mark.parametrize("stands_s", [1.0, 3.5])
 def test_what_is_sent_again_to_a_late_robot_counts_from_when_it_was_published(stands_s: float) -> None:
     """It is asked for in time; the link stands still then."""
-    kept = TopicOptions(durability="transient_local", queue="deadline", deadline_s=WITHIN_S)
+    kept = SendOptions(durability="transient_local", queue="deadline", deadline_s=WITHIN_S)
     sender = Robot(1, rows(map=kept))
     air = Air(sender, Robot(2))
     air.run(3.0)
@@ -141,14 +141,14 @@ def test_what_is_sent_again_to_a_late_robot_counts_from_when_it_was_published(st
 
 
 def test_the_row_follows_options_and_publishers() -> None:
-    messages = Robot(1, rows(scan=SCAN, free=TopicOptions())).end.messages
+    messages = Robot(1, rows(scan=SCAN, free=SendOptions())).end.messages
 
     def told() -> list[float]:
         return [row.deadline_s for row in messages.sent.table()]
 
     assert told() == [0.0, WITHIN_S, 0.0]
     messages.follow(2, PublisherQos(lifespan_s=0.123))
-    messages.change(1, TopicOptions(deadline_s=1.0))
+    messages.change(1, SendOptions(deadline_s=1.0))
     assert told() == [0.0, 1.0, 0.13], "rounded up"
     messages.follow(2, PublisherQos(lifespan_s=age_of(254) + 1))
     assert told()[2] == 0.0, "longer than a row can say"

@@ -12,7 +12,7 @@ from gr_ros2.link.events import SenderEvent, SentPacket
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hold import SURPLUS, Hold, Period
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 
 AIRTIME = 0.013
@@ -166,7 +166,7 @@ class Sending:
 
     def __init__(self, periods: list[float]) -> None:
         self.events: list[SenderEvent] = []
-        names = [Topic(n, f"t{n}", "std_msgs/msg/String", TopicOptions()) for n in range(len(periods))]
+        names = [Topic(n, f"t{n}", "std_msgs/msg/String", SendOptions()) for n in range(len(periods))]
         one_way = Settings(1, packet_len=64, hears=False)
         self.end = EndpointV1(Registry(names), one_way, boot=5, observer=self.events.append)
         self.end.pace.use_credit()

@@ -16,20 +16,20 @@ from gr_ros2.link.events import Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.endpoint import EndpointV1
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.codecs.test_instances import TF, diagnostics, joints, transforms
 from tests.link.v1.air import Air, Robot
 
 JOINTS, STATUS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray"
-LATCHED = TopicOptions(durability="transient_local")
+LATCHED = SendOptions(durability="transient_local")
 
 
 class Sender(Robot):
     """A robot that codes its messages and tells their instances apart."""
 
     def __init__(self, src_id: int, type_name: str, **options: Any) -> None:
-        rows = Registry([Topic(0, "topic", type_name, TopicOptions(**options))])
+        rows = Registry([Topic(0, "topic", type_name, SendOptions(**options))])
         super().__init__(src_id, rows, coding=(LinkCodec(rows), None), packet_len=220)
 
     def start(self, boot: int | None = None) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.queues import PublisherQos
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.link.v1.air import Air, Robot
 
@@ -19,7 +19,7 @@ def best_effort(robot: Robot) -> Robot:
 
 
 def stopper(**options: float) -> Robot:
-    return best_effort(Robot(1, Registry([Topic(0, "e_stop", STRING, TopicOptions(**options))])))  # type: ignore[arg-type]
+    return best_effort(Robot(1, Registry([Topic(0, "e_stop", STRING, SendOptions(**options))])))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("loss", [0.3, 0.6])
@@ -51,7 +51,7 @@ def test_keep_s_says_how_long_a_robot_out_of_range_can_still_get_it(
 
 def test_a_base_station_sends_corrections_to_robots_that_send_telemetry() -> None:
     """One full-duplex channel, a fifth of the packets lost; every robot has the newest correction within a second."""
-    base = Robot(1, Registry([Topic(0, "rtcm", "rtcm_msgs/msg/Message", TopicOptions(keep_s=10.0))]))
+    base = Robot(1, Registry([Topic(0, "rtcm", "rtcm_msgs/msg/Message", SendOptions(keep_s=10.0))]))
     rovers = [Robot(n, Registry([Topic(0, "fix", "sensor_msgs/msg/NavSatFix")])) for n in range(2, 6)]
     air = Air(base, *rovers, loss=0.2)
     air.run(3.0)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError, WireError
 from gr_ros2.link.events import Delivered
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import MAX_TOPICS
 from gr_ros2.wire import FORMATS
@@ -23,7 +23,7 @@ from tests.link.v1.invariants import PacketsEnd
 from tests.link.v1.test_custody import line_of
 from tests.link.v1.test_relaying import robot
 
-GOAL = TopicOptions()
+GOAL = SendOptions()
 
 
 class Sender:
@@ -35,7 +35,7 @@ class Sender:
 
     def address(self, to: int, now: float) -> None:
         self.end.next_departure()
-        options = TopicOptions(to=AUTO if to == BROADCAST else to)
+        options = SendOptions(to=AUTO if to == BROADCAST else to)
         self.row = self.end.messages.change(self.row, options)[1].topic_id
         self.to, self.now = to, now
 
@@ -113,7 +113,7 @@ def test_whoever_a_message_is_for_gets_it_and_nobody_else(
 
 def test_over_hops_goals_reach_the_robot_that_they_were_for() -> None:
     line = line_of(
-        robot(1, topics=registry(odom=TopicOptions(queue="latest"), goal=TopicOptions(to=4))), *map(robot, (2, 3, 4))
+        robot(1, topics=registry(odom=SendOptions(queue="latest"), goal=SendOptions(to=4))), *map(robot, (2, 3, 4))
     )
     sender = Sender(line.robots[0], 1)
     for to in (4, 3, 2, 4, 2):

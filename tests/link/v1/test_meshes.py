@@ -12,7 +12,7 @@ import pytest
 
 from gr_ros2.link.events import Delivered, Ended
 from gr_ros2.mac import Slots
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.link.v1.air import SLOT_S, Robot
 from tests.link.v1.test_commands import TWIST
@@ -27,7 +27,7 @@ LATE_S = 2 * 0.5 + 0.3
 
 
 def topics(to: int) -> Registry:
-    options = TopicOptions(queue="latest"), TopicOptions(to=to), TopicOptions(), TopicOptions()
+    options = SendOptions(queue="latest"), SendOptions(to=to), SendOptions(), SendOptions()
     names = ("odom", STRING), ("goal", STRING), ("all", STRING), ("cmd_vel", TWIST)
     return Registry([Topic(n, *name, option) for n, (name, option) in enumerate(zip(names, options, strict=True))])
 

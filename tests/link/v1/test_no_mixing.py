@@ -12,7 +12,7 @@ import pytest
 from bench.hostile import GROWTH, Kind, attack
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, write_body
 from tests.link.v1.air import SLOT_S, Robot, registry
@@ -27,7 +27,7 @@ end AFTER."""
 
 
 def topics() -> Registry:
-    return registry(a=TopicOptions(), b=TopicOptions(queue="latest"), c=TopicOptions(qos="bulk"))
+    return registry(a=SendOptions(), b=SendOptions(queue="latest"), c=SendOptions(qos="bulk"))
 
 
 def message(rng: random.Random, topic: int, serial: int) -> bytes:
@@ -71,7 +71,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -
     """In each run both ends have several lives, in which packet numbers pass their half and come round."""
     rng = random.Random(int(loss * 1000))
     starts = random.Random(int(loss * 1000))  # of the receiver, whatever else is drawn
-    one, two = Robot(1, topics(), fixed=False), Robot(2)
+    one, two = Robot(1, topics(), any_length=True), Robot(2)
     invariant = PacketsEnd((one, two))
     sent: list[dict[bytes, int]] = [{} for _ in range(TOPICS)]
     latest = [-1] * TOPICS

@@ -6,16 +6,16 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Air, Robot, registry
 
 MODES: tuple[SealMode, ...] = ("none", "encrypt")
 EVERY_S = 0.05
 TOPICS = registry(
-    goal=TopicOptions(reliability="reliable", queue="fifo"),
-    odom=TopicOptions(queue="latest"),
-    path=TopicOptions(reliability="reliable", queue="fifo", qos="bulk"),
-    imu=TopicOptions(queue="deadline", deadline_s=0.2),
+    goal=SendOptions(reliability="reliable", queue="fifo"),
+    odom=SendOptions(queue="latest"),
+    path=SendOptions(reliability="reliable", queue="fifo", qos="bulk"),
+    imu=SendOptions(queue="deadline", deadline_s=0.2),
 )
 SIZES = (40, 100, 500, 20)
 
@@ -56,8 +56,8 @@ class Talk:
 
 
 def two(mode: SealMode, *, both: bool, **settings: object) -> tuple[Robot, Robot]:
-    one = Robot(1, TOPICS, mode=mode, packet_len=220, fixed=False, **settings)
-    return one, Robot(2, TOPICS if both else None, mode=mode, packet_len=220, fixed=False, **settings)
+    one = Robot(1, TOPICS, mode=mode, packet_len=220, any_length=True, **settings)
+    return one, Robot(2, TOPICS if both else None, mode=mode, packet_len=220, any_length=True, **settings)
 
 
 LATER = [
@@ -134,7 +134,7 @@ def test_a_reliable_topic_goes_on_one_way_after_an_outage(mode: SealMode) -> Non
 @pytest.mark.parametrize("mode", MODES)
 def test_a_robot_that_is_out_of_range_keeps_nothing_back_from_a_third(mode: SealMode) -> None:
     one, other = two(mode, both=False)
-    third = Robot(3, None, mode=mode, packet_len=220, fixed=False)
+    third = Robot(3, None, mode=mode, packet_len=220, any_length=True)
     talk = Talk(one, other, third, loss=0.1)
     talk.run(5)
     talk.part((1, 2), (2, 1))
@@ -251,7 +251,7 @@ def test_new_messages_cross_while_those_of_a_long_outage_are_repaired(loss: floa
 
 def test_a_full_link_says_after_an_outage_what_it_does_not_repair() -> None:
     """Reports name the newest packets and the oldest missing ones in turn: the former do not end the wait for these."""
-    one, other = Robot(1, registry(goal=TopicOptions(), odom=TopicOptions(queue="latest"))), Robot(2)
+    one, other = Robot(1, registry(goal=SendOptions(), odom=SendOptions(queue="latest"))), Robot(2)
     air, goals = Air(one, other), []
     air.lost = lambda *_: 3 <= air.now < 9
     for slot in range(1275):

@@ -25,12 +25,12 @@ class Fleet:
         self.snrs = snrs
         self.sent: list[SentPacket] = []
         self.now = 0.0
-        settings = Settings(1, packet_len=64, fixed=False, dst_id=dst_id, packet_rate=0)
+        settings = Settings(1, packet_len=64, any_length=True, dst_id=dst_id, packet_rate=0)
         self.sender = EndpointV1(TOPICS, settings, boot=5, observer=self._observe, mcs_table=MCS_TABLE)
         self.receivers = {
             number: EndpointV1(
                 None,
-                Settings(number, packet_len=64, fixed=False),
+                Settings(number, packet_len=64, any_length=True),
                 boot=5,
                 mcs_table=MCS_TABLE,
             )
@@ -110,7 +110,7 @@ def test_without_an_mcs_table_nothing_is_chosen_and_without_an_snr_none_is_repor
 def test_reports_leave_at_the_most_robust_rate() -> None:
     fleet = Fleet({2: 30.0})
     fleet.run(100)
-    settings = Settings(3, packet_len=64, fixed=False, packet_rate=0)
+    settings = Settings(3, packet_len=64, any_length=True, packet_rate=0)
     told: list[SenderEvent] = []
     other = EndpointV1(TOPICS, settings, boot=6, observer=told.append, mcs_table=MCS_TABLE)
     for number in range(100):

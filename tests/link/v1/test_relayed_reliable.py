@@ -7,12 +7,12 @@ from collections.abc import Callable
 import pytest
 
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_relaying import Line, robot
 
-TOPICS = registry(odom=TopicOptions(queue="latest"), goal=TopicOptions())
-LATE = registry(odom=TopicOptions(queue="latest"), map=TopicOptions(durability="transient_local"))
+TOPICS = registry(odom=SendOptions(queue="latest"), goal=SendOptions())
+LATE = registry(odom=SendOptions(queue="latest"), map=SendOptions(durability="transient_local"))
 Apart = Callable[[int, int], bool]
 """Whether two robots are out of reach of each other now."""
 

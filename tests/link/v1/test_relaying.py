@@ -12,7 +12,7 @@ from gr_ros2.gr.factory import message_codec
 from gr_ros2.link.events import Announced, Delivered
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.mac import Slots
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
 from tests.link.v1.air import SLOT_S, Robot, registry
@@ -20,7 +20,7 @@ from tests.link.v1.invariants import PacketsEnd
 
 STEPS = 8
 """Moments of a slot at which a packet may leave."""
-ODOM = registry(odom=TopicOptions(queue="latest"))
+ODOM = registry(odom=SendOptions(queue="latest"))
 
 
 def robot(src_id: int, mode: SealMode = "none", topics: Registry = ODOM, **settings: Any) -> Robot:
@@ -120,7 +120,7 @@ def test_without_the_key_nobody_relays_or_is_relayed() -> None:
 
 
 def test_a_topic_for_one_robot_comes_out_at_that_one_only_also_over_hops() -> None:
-    goal = registry(goal=TopicOptions(queue="latest", to=4))
+    goal = registry(goal=SendOptions(queue="latest", to=4))
     line = Line(robot(1, topics=goal), *(robot(src_id) for src_id in (2, 3, 4)))
     line.run(20)
     assert [len(one.delivered(1)) > 5 for one in line.robots] == [False, False, False, True]
@@ -133,7 +133,7 @@ def test_packets_for_others_keep_their_slots_and_are_confirmed_by_that_robot_onl
     """1 and 2 address each other, 3 and 4 all."""
     addressed = {1: 2, 2: 1}
     everybody = [
-        robot(src_id, topics=registry(goal=TopicOptions()), relay=False, dst_id=addressed.get(src_id, 255))
+        robot(src_id, topics=registry(goal=SendOptions()), relay=False, dst_id=addressed.get(src_id, 255))
         for src_id in (1, 2, 3, 4)
     ]
     line = Line(*everybody, loss=0.1)
@@ -154,7 +154,7 @@ def test_packets_for_others_keep_their_slots_and_are_confirmed_by_that_robot_onl
 
 def test_frames_are_not_passed_on() -> None:
     """A chain of frames would be of no use to who lacks one of them."""
-    topics = registry(odom=TopicOptions(queue="latest"), image=TopicOptions())
+    topics = registry(odom=SendOptions(queue="latest"), image=SendOptions())
     known = message_codec()
 
     def decoder_for(rows: tuple[AnnouncedTopic, ...]) -> Any:

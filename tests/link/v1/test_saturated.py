@@ -7,7 +7,7 @@ import pytest
 from bench.saturated import SCENARIOS, TOLERANCE, paced_ratios, ratios, run
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.queues import PublisherQos
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Air, Robot, registry
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
@@ -66,7 +66,7 @@ def test_nothing_waits_for_long_on_a_full_link_where_topics_of_all_kinds_lose_pa
     loss: float, best_effort: tuple[str, ...], seed: int
 ) -> None:
     """A message in order waits for every packet before it, also for those of the table and of best-effort topics."""
-    sender, receiver = Robot(1, registry(odom=TopicOptions(), imu=TopicOptions())), Robot(2)
+    sender, receiver = Robot(1, registry(odom=SendOptions(), imu=SendOptions())), Robot(2)
     for topic_id, name in enumerate(("odom", "imu")):
         sender.end.messages.follow(topic_id, PublisherQos(reliable=name not in best_effort))
     air = Air(sender, receiver, loss=loss, seed=seed)

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from gr_ros2.link.events import Announced
 from gr_ros2.link.v1.reassembly import Reassembly
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import Part
 from tests.link.v1.air import Air, Robot, registry
 
 NAMES = [f"subsystem_{n % 7}/sensor_{n}" for n in range(40)]
-DEFAULT, LATCHED = TopicOptions(), TopicOptions(durability="transient_local")
+DEFAULT, LATCHED = SendOptions(), SendOptions(durability="transient_local")
 
 
 def rows(robot: Robot) -> tuple[AnnouncedTopic, ...]:
@@ -25,7 +25,7 @@ def rows(robot: Robot) -> tuple[AnnouncedTopic, ...]:
 
 
 def one_way(
-    *names: str, loss: float, seed: int = 1, options: TopicOptions = DEFAULT, **settings: float
+    *names: str, loss: float, seed: int = 1, options: SendOptions = DEFAULT, **settings: float
 ) -> tuple[Robot, Robot, Air]:
     topics = registry(**dict.fromkeys(names, options))
     one, two = Robot(1, topics, hears=False, repair="off", **settings), Robot(2, hears=False)
@@ -93,12 +93,12 @@ def test_a_start_whose_first_second_is_lost_is_made_up_for_in_two_seconds() -> N
 
 @pytest.mark.parametrize("hears", [True, False])
 def test_a_row_that_changes_is_told_alone_and_one_that_ends_is_gone(hears: bool) -> None:
-    one = Robot(1, registry(**dict.fromkeys(NAMES, TopicOptions())), hears=hears)
+    one = Robot(1, registry(**dict.fromkeys(NAMES, SendOptions())), hears=hears)
     two = Robot(2, hears=hears)
     air = Air(one, two)
     air.run(5.0)
     before = one.end.sent.repeats
-    one.end.messages.change(3, TopicOptions(qos="bulk"))
+    one.end.messages.change(3, SendOptions(qos="bulk"))
     one.end.messages.offer(5, offered=False)
     air.run(0.3)
     assert one.end.sent.repeats <= before + 2

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.link.events import Delivered
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import SLOT_S, Robot, registry
 from tests.link.v1.invariants import PacketsEnd
 from tests.packets import data_of
@@ -47,8 +47,8 @@ _SETTINGS = st.fixed_dictionaries(
 def test_what_is_due_next_is_later(
     steps: list[tuple[int, int, float]], options: dict[str, object], queue: str, max_rate: float, loss: float
 ) -> None:
-    topic = TopicOptions(queue=queue, deadline_s=0.2, max_rate=max_rate)  # type: ignore[arg-type]
-    topics = registry(a=topic, b=TopicOptions(), c=TopicOptions(durability="transient_local"), d=topic)
+    topic = SendOptions(queue=queue, deadline_s=0.2, max_rate=max_rate)  # type: ignore[arg-type]
+    topics = registry(a=topic, b=SendOptions(), c=SendOptions(durability="transient_local"), d=topic)
     one, two = Robot(1, topics, **options), Robot(2, **options)
     rng, invariant = random.Random(len(steps)), PacketsEnd((one, two))
     now = slot = 0.0
@@ -84,7 +84,7 @@ def test_what_is_due_next_is_later(
 
 
 def ages(
-    topics: dict[str, TopicOptions], offered: list[tuple[float, int, int]], **options: Any
+    topics: dict[str, SendOptions], offered: list[tuple[float, int, int]], **options: Any
 ) -> dict[int, list[float]]:
     """s from submission to delivery of (time, topic id, bytes), per topic."""
     one, two = Robot(1, registry(**topics), packet_len=200, **options), Robot(2, packet_len=200)
@@ -104,6 +104,6 @@ def ages(
 
 
 def test_a_topic_above_its_rate_is_thinned_out_and_not_delayed() -> None:
-    found = ages({"odom": TopicOptions(max_rate=5)}, [(n / 35, 0, 20) for n in range(350)])
+    found = ages({"odom": SendOptions(max_rate=5)}, [(n / 35, 0, 20) for n in range(350)])
     assert 48 <= len(found[0]) <= 52
     assert max(found[0]) < 1 / 35 + 3 * SLOT_S

@@ -8,7 +8,7 @@ from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.relayed import Relayed, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, write_table
@@ -62,7 +62,7 @@ def count(one: Robot, line: Line, seconds: float) -> int:
 @pytest.mark.parametrize("reliable", [False, True])
 def test_a_false_number_does_not_silence_a_robot_that_is_heard(mode: SealMode, reliable: bool) -> None:
     topics = Registry(
-        [Topic(0, "odom", "std_msgs/msg/String", TopicOptions() if reliable else TopicOptions(queue="latest"))]
+        [Topic(0, "odom", "std_msgs/msg/String", SendOptions() if reliable else SendOptions(queue="latest"))]
     )
     line = Line(*(robot(src_id, mode, topics) for src_id in (1, 2, 3)))
     line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]

@@ -24,8 +24,8 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from gr_ros2.link.v0.partials import Partial, Partials
-from gr_ros2.link.v0.sequence import CountRate
+from gr_ros2.paper.partials import Partial, Partials
+from gr_ros2.paper.sequence import CountRate
 from gr_ros2.wire import unwrap
 from gr_ros2.wire.v0 import V0, EntryV0
 

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import Accepted, AirPacket, Missed, Refused, SenderEvent, SentPacket
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.schedule import PaperScheduler
-from gr_ros2.link.v0.sender import Sender
-from gr_ros2.settings.config import SinkConfig, SourceConfig, TopicOptions, build
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.schedule import PaperScheduler
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
 from tests.link.engines import delivered, drain, read, registry, sender, trace
 from tests.packets import data_of
@@ -59,7 +60,7 @@ def test_three_topics_take_turns() -> None:
 
 
 def test_small_messages_share_one_packet_up_to_fifteen_entries() -> None:
-    engine = sender(topics=16, packet_len=220)
+    engine = sender(rows=16, packet_len=220)
     for topic in range(16):
         engine.submit(topic, b"tiny", 0.0)
     assert [len(entries) for entries in trace(drain(engine))] == [15, 1]
@@ -92,7 +93,7 @@ def test_min_fragment_above_k_2_gives_single_entry_packets() -> None:
 
 def test_min_fragment_that_cannot_fit_is_refused() -> None:
     with pytest.raises(ConfigError, match="min_fragment = 52 does not fit packet_len = 64; at most 51"):
-        build(SourceConfig, {"version": 0, "packet_len": 64, "min_fragment": 52})
+        paper_from(robot=1, packet_len=64, min_fragment=52)
 
 
 def test_a_message_over_255_shared_entries_is_cut_at_the_full_packet() -> None:
@@ -107,7 +108,7 @@ def test_a_message_over_255_entries_is_refused_with_the_remedy() -> None:
     events: list[SenderEvent] = []
     engine = Sender(
         Registry.from_rows({"map": "nav_msgs/OccupancyGrid"}),
-        build(SourceConfig, {"robot_id": 1, "packet_len": 64}),
+        *paper_from(robot=1, packet_len=64),
         rng=random.Random(0),
         observer=events.append,
     )
@@ -187,9 +188,9 @@ def test_credit_lets_exactly_so_many_packets_go() -> None:
 
 
 def test_qos_of_a_packet_is_latency_if_any_bulk_only_if_all() -> None:
-    options = {"t0": TopicOptions(qos="latency"), "t2": TopicOptions(qos="bulk")}
+    options = {"t0": SendOptions(qos="latency"), "t2": SendOptions(qos="bulk")}
     for topics, expected in (((0, 1), 1), ((1,), 0), ((2,), 2), ((1, 2), 0), ((0, 2), 1)):
-        engine = sender(packet_len=220, topic_options=options)
+        engine = sender(packet_len=220, topics=options)
         for topic in topics:
             engine.submit(topic, b"x", 0.0)
         assert [read(data).qos for data in drain(engine)] == [expected]
@@ -210,7 +211,7 @@ def test_ids_count_up_per_topic_from_a_seeded_start() -> None:
 
 
 def test_transient_local_topics_are_repeated_as_bulk_with_a_fresh_id() -> None:
-    engine = sender(packet_len=64, repeat_s=10, topic_options={"t1": TopicOptions(durability="transient_local")})
+    engine = sender(packet_len=64, repeat_s=10, topics={"t1": SendOptions(durability="transient_local")})
     engine.submit(1, b"latched", 0.0)
     first = read(drain(engine, 0.0)[0])
     assert engine.next_timeout() == pytest.approx(10.0)
@@ -226,9 +227,9 @@ def test_transient_local_topics_are_repeated_as_bulk_with_a_fresh_id() -> None:
 
 def test_a_repeat_says_which_message_it_repeats() -> None:
     events: list[SenderEvent] = []
-    options = {"t1": TopicOptions(durability="transient_local")}
-    config = SourceConfig(robot_id=1, packet_len=64, repeat_s=10, topic_options=options)
-    engine = Sender(registry(), config, observer=events.append)
+    options = {"t1": SendOptions(durability="transient_local")}
+    config = paper_from(robot=1, packet_len=64, repeat_s=10, topics=options)
+    engine = Sender(registry(), *config, observer=events.append)
     for number in range(3):
         engine.submit(number % 2, b"message %d" % number, 0.0)
     drain(engine, 0.0)
@@ -246,19 +247,6 @@ def test_live_settings_change() -> None:
         engine.reconfigure(dst_id=256)
 
 
-@pytest.mark.parametrize(
-    ("namespace", "expected"), [("/robot_34/base", 34), ("robot_1", 1), ("/r2d2", 2), ("/a7/b", 7), ("/robot_0", 0)]
-)
-def test_robot_id_comes_from_the_last_digits_of_the_namespace(namespace: str, expected: int) -> None:
-    assert SourceConfig(namespace=namespace).src_id() == expected
-
-
-@pytest.mark.parametrize("namespace", ["", "/robot", "/robot_255", "/robot_1000"])
-def test_no_robot_id_in_the_namespace_is_an_error(namespace: str) -> None:
-    with pytest.raises(ConfigError, match="robot_id"):
-        SourceConfig(namespace=namespace).src_id()
-
-
 @given(
     st.lists(st.tuples(st.integers(0, 5), st.integers(0, 900)), max_size=40),
     st.integers(40, 300),
@@ -271,17 +259,7 @@ def test_every_message_leaves_whole_once_in_topic_order(
     events: list[SenderEvent] = []
     engine = Sender(
         Registry.from_rows({f"t{number}": "a/B" for number in range(6)}),
-        build(
-            SourceConfig,
-            {
-                "robot_id": 1,
-                "version": 0,
-                "packet_len": packet_len,
-                "greedy": greedy,
-                "min_fragment": min_fragment,
-                "queue_depth": 0,
-            },
-        ),
+        *paper_from(robot=1, packet_len=packet_len, greedy=greedy, min_fragment=min_fragment, queue_depth=0),
         rng=random.Random(1),
         observer=events.append,
     )
@@ -323,7 +301,7 @@ def test_a_codec_shrinks_what_is_sent_and_events_keep_what_was_submitted() -> No
     events: list[SenderEvent] = []
     engine = Sender(
         registry(2),
-        build(SourceConfig, {"robot_id": 1, "packet_len": 64}),
+        *paper_from(robot=1, packet_len=64),
         codec=Halving(),
         rng=random.Random(0),
         observer=events.append,
@@ -336,13 +314,13 @@ def test_a_codec_shrinks_what_is_sent_and_events_keep_what_was_submitted() -> No
     assert packet.entries[0].payload == b"\1" + bytes(range(50))
     assert isinstance(events[0], Accepted)
     assert events[0].payload == message
-    sink = Receiver(registry(2), SinkConfig(packet_len=64), codec=Halving())
+    sink = Receiver(registry(2), *paper_from(robot=0, packet_len=64), codec=Halving())
     assert delivered(sink.receive(AirPacket(data), 0.0)) == [message]
 
 
 def test_what_the_graph_lost_before_submission_is_observed_once() -> None:
     events: list[SenderEvent] = []
-    engine = Sender(registry(2), build(SourceConfig, {"robot_id": 1}), rng=random.Random(0), observer=events.append)
+    engine = Sender(registry(2), *paper_from(robot=1), rng=random.Random(0), observer=events.append)
     for total in (0, 2, 2, 5):
         engine.missed(1, total)
     assert events == [Missed(1, 2), Missed(1, 3)]
@@ -351,14 +329,14 @@ def test_what_the_graph_lost_before_submission_is_observed_once() -> None:
 
 
 def test_a_message_that_fits_only_coded_is_sent() -> None:
-    engine = Sender(registry(1), build(SourceConfig, {"robot_id": 1, "packet_len": 64}), codec=Halving())
+    engine = Sender(registry(1), *paper_from(robot=1, packet_len=64), codec=Halving())
     engine.submit(0, bytes(255 * 51 + 100), 0.0)
     assert len(drain(engine)) == 129
 
 
 def test_nothing_is_composed_before_it_is_asked_for() -> None:
     """What came last before the credit goes, whatever was waiting when the credit before was used."""
-    engine = sender(topics=1, packet_len=64, queue_depth=1)
+    engine = sender(rows=1, packet_len=64, queue_depth=1)
     engine.pace.use_credit()
     engine.submit(0, b"old", 0.0)
     assert engine.next_packet(0.0) is None
@@ -370,7 +348,7 @@ def test_nothing_is_composed_before_it_is_asked_for() -> None:
 
 
 def test_a_plan_is_made_only_when_something_changed(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = sender(topics=1, packet_len=64)
+    engine = sender(rows=1, packet_len=64)
     made = []
 
     def plan(self: PaperScheduler, queues: Any, plan: Any = PaperScheduler.plan) -> Any:

@@ -14,9 +14,9 @@ import pytest
 
 from gr_ros2.link import AirPacket, Delivered, SenderEvent, SentPacket
 from gr_ros2.link.events import SentEntry
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.sender import Sender
-from gr_ros2.settings.config import SinkConfig, SourceConfig, build
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import paper_from
 from tests.link.engines import registry
 from tests.packets import data_of
 
@@ -46,7 +46,7 @@ class Link:
         self.rng = random.Random(self.seed)
         self.receiver = Receiver(
             registry(self.topics),
-            build(SinkConfig, {"version": 0, "packet_len": 64, "reassembly_timeout_s": self.timeout}),
+            *paper_from(robot=0, packet_len=64, reassembly_timeout_s=self.timeout),
         )
         self.arrived: dict[bytes, int] = {}
         self.complete: set[bytes] = set()
@@ -56,10 +56,8 @@ class Link:
         self.restart()
 
     def restart(self) -> None:
-        config = build(
-            SourceConfig, {"version": 0, "robot_id": 1, "packet_len": 64, "queue_depth": 0, "entry_ids": self.entry_ids}
-        )
-        self.sender = Sender(registry(self.topics), config, rng=self.rng, observer=self.observe)
+        config = paper_from(robot=1, packet_len=64, queue_depth=0, entry_ids=self.entry_ids)
+        self.sender = Sender(registry(self.topics), *config, rng=self.rng, observer=self.observe)
         self.payloads: list[bytes] = []
         self.delayed.clear()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.link.v0.partials import Partial, Partials
+from gr_ros2.paper.partials import Partial, Partials
 from gr_ros2.wire.v0 import EntryV0
 
 TOTAL = 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gr_ros2.link.v0.sequence import NEAR, Arrival, CountRate, SequenceTracker
+from gr_ros2.paper.sequence import NEAR, Arrival, CountRate, SequenceTracker
 
 
 def place(tracker: SequenceTracker, seq: int, now: float = 0.0, data: bytes | None = None) -> Arrival:

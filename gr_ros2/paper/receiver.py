@@ -15,17 +15,20 @@ from gr_ros2.link.events import AirPacket, Delivered, Lost, Received, ReceiverEv
 from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.stats import ReceiverStats
-from gr_ros2.link.v0.partials import Partial, Partials
-from gr_ros2.link.v0.reassemble import Context, TopicReassembler
-from gr_ros2.link.v0.sequence import Arrival, SequenceTracker
-from gr_ros2.settings.config import SinkConfig
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.paper.partials import Partial, Partials
+from gr_ros2.paper.reassemble import Context, TopicReassembler
+from gr_ros2.paper.sequence import Arrival, SequenceTracker
+from gr_ros2.paper.settings import PaperConfig
+from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.v0 import V0, PacketV0
 
 SOURCE_IDLE_S = 60.0
 """A source that was silent for this many seconds is replaced by a new one when ``max_sources`` are known."""
+MAX_BYTES = 64_000_000
+"""Of incomplete messages of all senders."""
 
 
 @dataclass(slots=True)
@@ -42,17 +45,23 @@ class Receiver:
 
     :param registry: says which topic ids exist and which are transient-local
     :param codec: decodes messages from packets with C = 1; without it, such packets are ``unsupported``
+    :param own: number of the robot, None as the settings say; ``NOBODY`` takes packets of all robots for all
+    :param max_bytes: of incomplete messages in all
     """
 
     def __init__(
         self,
         registry: Registry,
-        config: SinkConfig,
+        robot: RobotConfig,
+        paper: PaperConfig,
         *,
         codec: MessageCodec | None = None,
+        own: int | None = None,
+        max_bytes: int = MAX_BYTES,
     ) -> None:
-        self.config = config
-        self.registry = registry.with_options(config.topic_options)
+        self.robot, self.paper, self._max_bytes = robot, paper, max_bytes
+        self._own = robot.robot_id if own is None else own
+        self.registry = registry.with_options(robot.publish.topics)
         self.stats = ReceiverStats()
         self._topics = len(self.registry)
         self._latched = {topic.topic_id for topic in self.registry if topic.latched}
@@ -65,7 +74,7 @@ class Receiver:
         data = arrival.data
         events = self.handle_timeout(now) if self._partials.size else []
         try:
-            packet = V0.decode(data, self.config.packet_len)
+            packet = V0.decode(data, self.robot.packet_len)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
             events.append(Rejected(data, error))
@@ -87,7 +96,7 @@ class Receiver:
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, None if no message is incomplete."""
         for partial in self._partials:
-            return partial.last + self.config.reassembly_timeout_s
+            return partial.last + self.paper.reassembly_timeout_s
         return None
 
     def unpublished(self, event: Delivered) -> Lost:
@@ -110,8 +119,8 @@ class Receiver:
 
     def _admit(self, packet: PacketV0, now: float) -> _Source | None:
         """The source of a packet, None if the packet is not for this receiver."""
-        own = self.config.robot_id
-        if own != AUTO:
+        own = self._own
+        if own != NOBODY:
             if packet.src_id == own:
                 self.stats.dropped["own"] += 1
                 return None
@@ -120,7 +129,7 @@ class Receiver:
                 return None
         source = self._sources.get(packet.src_id)
         if source is None:
-            if len(self._sources) >= self.config.max_sources:
+            if len(self._sources) >= self.robot.max_sources:
                 idle = min(self._sources, key=lambda src_id: self._sources[src_id].last)
                 if now - self._sources[idle].last < SOURCE_IDLE_S or self._partials.size_of(idle):
                     self.stats.dropped["max_sources"] += 1
@@ -167,9 +176,9 @@ class Receiver:
         source.epoch += placed.arrival is Arrival.LATE
         if not self._partials.size:
             return
-        while self._partials.size_of(src_id) > self.config.max_source_bytes:
+        while self._partials.size_of(src_id) > self.robot.max_source_bytes:
             events.append(self._given_up(self._partials.take(self._partials.oldest(src_id)), Fate.MEMORY))
-        while self._partials.size > self.config.max_bytes:
+        while self._partials.size > self._max_bytes:
             events.append(self._given_up(self._partials.take(self._partials.oldest()), Fate.MEMORY))
 
     def _deliver(

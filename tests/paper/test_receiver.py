@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.link import Delivered, Lost, Rejected
-from gr_ros2.settings.config import TopicOptions
+from gr_ros2.settings.robot import PublishOptions
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 from tests.link.engines import delivered, drain, receiver, sender, take
 
@@ -22,7 +22,7 @@ def packet(
 
 
 def test_out_of_order_interleaved_and_duplicated() -> None:
-    engines = [sender(packet_len=64, robot_id=robot, seed=robot) for robot in (1, 2)]
+    engines = [sender(packet_len=64, robot=robot, seed=robot) for robot in (1, 2)]
     messages = {}
     packets = []
     for engine in engines:
@@ -116,7 +116,7 @@ def test_a_message_is_given_up_when_64_ids_would_have_passed_unseen() -> None:
 
 
 def test_own_packets_and_those_for_others_are_counted_and_dropped() -> None:
-    sink = receiver(packet_len=64, robot_id=7)
+    sink = receiver(packet_len=64, robot=7)
     entry = EntryV0(0, 5, 0, 1, b"a")
     assert take(sink, packet(0, entry, src_id=7), 0.0) == []
     assert take(sink, packet(1, entry, dst_id=8), 0.0) == []
@@ -134,7 +134,7 @@ def test_sources_beyond_the_bound_wait_until_one_has_gone_silent() -> None:
 
 
 def test_memory_is_bounded_oldest_incomplete_first() -> None:
-    sink = receiver(topics=1, packet_len=4095, max_source_bytes=10_000, reassembly_timeout_s=1e9)
+    sink = receiver(rows=1, packet_len=4095, max_source_bytes=10_000, reassembly_timeout_s=1e9)
     events = []
     for number in range(5):
         events += take(sink, packet(number, EntryV0(0, number, 0, 2, bytes(4000)), length=4095), 0.0)
@@ -150,7 +150,7 @@ def test_what_the_receiver_cannot_undo_is_unsupported_and_never_delivered() -> N
 
 
 def test_a_topic_id_beyond_the_registry_is_counted() -> None:
-    sink = receiver(topics=2, packet_len=64)
+    sink = receiver(rows=2, packet_len=64)
     assert take(sink, packet(0, EntryV0(9, 0, 0, 1, b"a"), EntryV0(1, 0, 0, 1, b"b")), 0.0) == [
         Delivered(1, 1, b"b", 0, 0)
     ]
@@ -158,7 +158,7 @@ def test_a_topic_id_beyond_the_registry_is_counted() -> None:
 
 
 def test_a_repeat_of_a_transient_local_message_is_not_delivered_again() -> None:
-    sink = receiver(packet_len=64, topic_options={"t0": TopicOptions(durability="transient_local")})
+    sink = receiver(packet_len=64, publish_topics={"t0": PublishOptions(durability="transient_local")})
     events = []
     for seq, payload in enumerate([b"A", b"A", b"B", b"A"]):
         events += take(sink, packet(seq, EntryV0(0, seq, 0, 1, payload), EntryV0(1, seq, 0, 1, payload)), 0.0)
@@ -169,7 +169,7 @@ def test_a_repeat_of_a_transient_local_message_is_not_delivered_again() -> None:
 
 
 def test_what_was_not_published_is_lost_and_its_repeat_comes_out() -> None:
-    sink = receiver(packet_len=64, topic_options={"t0": TopicOptions(durability="transient_local")})
+    sink = receiver(packet_len=64, publish_topics={"t0": PublishOptions(durability="transient_local")})
     (event,) = take(sink, packet(0, EntryV0(0, 0, 0, 1, b"A")), 0.0)
     assert isinstance(event, Delivered)
     assert sink.unpublished(event) == Lost(1, 0, "publish_failed", 0)
@@ -204,7 +204,7 @@ def test_a_restart_is_no_loss(start: int) -> None:
 
 @given(st.lists(st.binary(max_size=80), max_size=60), st.integers(14, 80))
 def test_garbage_is_rejected_by_name_and_loses_nothing_else(garbage: list[bytes], packet_len: int) -> None:
-    engine, sink = sender(packet_len=packet_len, min_fragment=1), receiver(packet_len=packet_len)
+    engine, sink = sender(packet_len=packet_len, min_fragment=1), receiver(packet_len=packet_len, min_fragment=1)
     engine.submit(0, bytes(range(100)), 0.0)
     good = drain(engine)
     events = []
@@ -219,7 +219,7 @@ def test_garbage_is_rejected_by_name_and_loses_nothing_else(garbage: list[bytes]
 @pytest.mark.slow
 @given(st.data())
 def test_forged_packets_never_raise_and_memory_stays_bounded(data: st.DataObject) -> None:
-    sink = receiver(topics=4, packet_len=40, max_source_bytes=4096, max_bytes=8192, max_sources=3)
+    sink = receiver(rows=4, packet_len=40, max_source_bytes=4096, max_bytes=8192, max_sources=3)
     byte = st.integers(0, 255)
     now = 0.0
     for _ in range(data.draw(st.integers(0, 60))):

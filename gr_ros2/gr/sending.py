@@ -1,4 +1,4 @@
-"""ROS Source: ROS topics in, packets out on message port `pdus` (the paper, sections 4.1 and 4.3).
+"""The half of a link's block that sends: ROS topics in, packets out on message port `pdus`.
 
 Invariants: this block is a thin shell. All behaviour is in the link's engine, which one lock protects. One pump thread
 composes each packet just before it leaves. A callback of the middleware blocks only with ``backpressure``. Every
@@ -8,11 +8,9 @@ dropped message is counted by name.
 from __future__ import annotations
 
 import logging
-import random
 import time
-import weakref
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from math import inf
 from typing import Any
 
@@ -20,32 +18,28 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.core.guard import Guard
-from gr_ros2.gr.block_settings import read_registry, settings
-from gr_ros2.gr.factory import EndpointSetup, make_endpoint
-from gr_ros2.gr.found_topics import FoundTopics
 from gr_ros2.gr.live_end import LiveEnd
-from gr_ros2.gr.loops import Graph
 from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
-from gr_ros2.gr.starts import start_of
 from gr_ros2.gr.subscriptions import Subscriptions
 from gr_ros2.link import AirPacket, Ended, Refused, SenderEvent, SentPacket
+from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.link.rate import Mcs
 from gr_ros2.middleware import Middleware
 from gr_ros2.phy.pdus import CREDIT, PduPort, credited
 from gr_ros2.phy.threads import BlockThread
-from gr_ros2.settings.config import SourceConfig, replaced
+from gr_ros2.settings.config import replaced
 from gr_ros2.settings.fields import Auto
 from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 32
 """Number of packets composed before the lock is released, so that callbacks do not wait long."""
 
 
-class RosSource(gr.basic_block):  # type: ignore[misc]
+class SendingBlock(gr.basic_block):  # type: ignore[misc]
     """Subscribes to topics of a ROS graph and emits their messages as packets.
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
@@ -55,52 +49,34 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     that the time since the last one is not the pace of the PHY. An integer alone says nothing of the air, and any other
     message lets one packet leave.
 
-    The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` leaves the
-    graph, and so does the end of the process. A middleware that is passed in open must be started and closed by the
-    caller.
+    The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` ends both.
 
-    :param registry: CSV path or Registry
-    :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
+    :param registry: the topics that it may send
+    :param end: the robot's endpoint
+    :param graph: the robot's participant on its ROS graph, which the caller closes
     :param observer: called with every SenderEvent, in order, while the block's lock is held. It must not call the
         block. An observer that raises is not called again
     :param clock: s, monotonic
-    :param seed: seed of sequence number and entry ids; None: random
-    :param any_length: whether the PHY carries shorter packets in less time (:attr:`gr_ros2.phy.Phy.any_length`). Then
-        packets of version 1 are only as long as they need; those of version 0 always have ``packet_len`` bytes
-    :param mcs_table: the rates of an adaptive rate (:attr:`gr_ros2.phy.Phy.mcs_table`). Each packet then is a PDU whose
-        metadata names its ``mcs``
-    :param end: endpoint of both directions, shared with a sink; None: an endpoint that only sends is made
-    :ivar live: this endpoint
-    :param values: the fields of :class:`gr_ros2.settings.config.SourceConfig`
-    :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
+    :param backpressure: holds the middleware back instead of dropping when a queue is full (bags)
     """
+
+    _subscribes: type[Subscriptions] = Subscriptions
 
     def __init__(
         self,
-        registry: str | Registry = "",
+        config: RobotConfig,
+        registry: Registry,
+        end: LiveEnd[Endpoint],
+        graph: Middleware,
         *,
-        middleware: str | Middleware | None = None,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
-        seed: int | None = None,
-        any_length: bool = False,
-        mcs_table: Sequence[Mcs] = (),
-        end: LiveEnd | None = None,
-        **values: Any,
+        backpressure: bool = False,
     ) -> None:
         super().__init__("ros2_source", None, None)
-        self.config = settings(SourceConfig, values, registry, middleware)
-        topics = read_registry(registry, needed=not self.config.version)
-        self.src_id = self.config.src_id()
+        self.config = config
+        self.src_id = config.robot_id
         """The source id on the wire."""
-        self._start = EndpointSetup()
-        if end is None:
-            setup = EndpointSetup(any_length=any_length, mcs_table=mcs_table)
-            start = self._start = start_of(self.config, self.src_id, setup)
-            rng = random.Random(seed)
-            end = LiveEnd(
-                lambda observer: make_endpoint(topics, self.config, None, start=start, rng=rng, observer=observer)
-            )
         end.observer = self._observe
         self.live, self._end = end, end.endpoint
         self._observer = observer
@@ -109,7 +85,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._pdus = PduMaker()
         self._mcs = 0
         """MCS of the newest packet."""
-        self._log = debug_logger("gr_ros2.gr.source", self.config.debug)
+        self._log = debug_logger("gr_ros2.gr.source", config.debug)
         self._lock, self._work = end.lock, end.work
         self._running = False
         self._thread = BlockThread()
@@ -121,26 +97,26 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         self._port = PduPort(self)
         self.message_port_register_in(CREDIT)
         self.set_msg_handler(CREDIT, self._credit)
-        node_name = f"gr_ros2_source_{self.src_id}"
-        self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, node_name)
-        self._finalizer = weakref.finalize(self, self._graph.close)
-        self.subscriptions = Subscriptions(
-            topics, self.config, self._graph, end, clock=clock, counters=self._counters, log=self._log
+        self.middleware = graph
+        """The robot's participant on the ROS graph."""
+        self._backpressure = backpressure
+        self.subscriptions = self._subscribes(
+            registry,
+            config,
+            graph,
+            end,
+            clock=clock,
+            counters=self._counters,
+            log=self._log,
+            backpressure=backpressure,
         )
         """What it sends."""
-        self.found = FoundTopics(self.config, self.middleware, self.subscriptions, self._log)
-        """What it looks for."""
         self._room = self.subscriptions.room
         try:
             self.subscriptions.open()
         except GrRos2Error:
             self.close()
             raise
-
-    @property
-    def middleware(self) -> Middleware:
-        """This block's participant on the ROS graph."""
-        return self._graph.middleware
 
     @property
     def idle(self) -> bool:
@@ -151,7 +127,11 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     @property
     def matched(self) -> bool:
         """Whether every subscription has found a publisher."""
-        return not self.found.unmatched()
+        return not self.unmatched()
+
+    def unmatched(self) -> list[str]:
+        """Names, on the ROS graph, of the topics without a publisher."""
+        return self.subscriptions.unmatched()
 
     def stalled_s(self, now: float) -> float:
         """As :meth:`LiveEnd.stalled_s`; infinite if the sending thread has ended.
@@ -186,11 +166,9 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             self._running = True
         self._thread.start(self._pump, f"gr-ros2-source-{self.src_id}")
-        self.found.start()
         return True
 
     def stop(self) -> bool:
-        self.found.stop()
         with self._lock:
             self._running = False
             self.subscriptions.take_losses()
@@ -199,11 +177,8 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         return True
 
     def close(self) -> None:
-        """Leave the ROS graph. A callback held back by ``backpressure`` returns without submitting. Idempotent."""
-        self.found.stop()
+        """Take no further messages. A callback held back by ``backpressure`` returns without submitting. Idempotent."""
         self.subscriptions.close()
-        self._finalizer()
-        self._start.close()
 
     def stats(self) -> dict[str, Any]:
         """A snapshot of the counters of packets and messages, per topic and in total."""
@@ -218,20 +193,15 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
                 "air": dict(stats.air),
                 **{name: self._counters[name] for name in _COUNTED},
                 "observer_missed": self._guard.missed,
-                "unmatched": self.found.unmatched(),
+                "unmatched": self.unmatched(),
                 "topics": topics,
                 "middleware": dict(self.middleware.counters),
             }
 
     @property
     def live_settings(self) -> tuple[str, ...]:
-        """Settings that may change while it runs, each by its setter. They depend on the version."""
-        return (*self._end.live_settings, *["topic_options"] * bool(self.live_options), "debug")
-
-    @property
-    def live_options(self) -> Sequence[str]:
-        """Options of a topic that may change while it runs."""
-        return self._end.live_options
+        """Settings that may change while it runs, each by its setter."""
+        return (*self._end.live_settings, "debug")
 
     def set_packet_rate(self, packet_rate: float | Auto) -> None:
         """Set the largest packet rate, packets/s. With auto, the credits set the pace; with 0 there is no limit.
@@ -240,10 +210,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
         """
         self._reconfigure(packet_rate=packet_rate)
 
-    def set_dst_id(self, dst_id: int) -> None:
-        """Set the destination id; 255 is broadcast. With version 0 only."""
-        self._reconfigure(dst_id=dst_id)
-
     def set_queue_depth(self, queue_depth: int) -> None:
         """Set how many messages may wait per topic; 0 is unlimited."""
         self._reconfigure(queue_depth=queue_depth)
@@ -251,16 +217,6 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
     def set_repeat_s(self, repeat_s: float) -> None:
         """Set the time between repeats of a transient-local topic, s; 0 is off."""
         self._reconfigure(repeat_s=repeat_s)
-
-    def set_topic_options(self, topic_options: Mapping[str, Any]) -> None:
-        """Set the options of single topics, of which ``live_options`` may change. A message is for the robot that
-        ``to`` named when the ROS graph handed it over."""
-        with self._lock:
-            config = replaced(self.config, topic_options=topic_options)
-            self.subscriptions.change(config.topic_options)
-            self.config = config
-            self.live.wake()
-            self._room.notify_all()
 
     def set_debug(self, debug: bool) -> None:
         """Turn the readable log of headers, topic ids and entries on or off."""
@@ -278,7 +234,7 @@ class RosSource(gr.basic_block):  # type: ignore[misc]
 
     def _credit(self, message: Any) -> None:
         packets, since = credited(message)
-        if self.config.backpressure and since != inf:
+        if self._backpressure and since != inf:
             since = None  # whoever waits for room in a queue wants nothing dropped
         with self._lock:
             self._end.pace.credit(max(0, packets), since)

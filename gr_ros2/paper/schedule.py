@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from gr_ros2.link.v0.fragment import Fragmented
-from gr_ros2.settings.config import SourceConfig
+from gr_ros2.paper.fragment import Fragmented
+from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.wire.v0 import V0
 
 
@@ -33,8 +33,8 @@ class PaperScheduler:
     A topic that got an entry goes to the end of the queue; a topic whose next fragment did not fit keeps its place.
     """
 
-    def __init__(self, config: SourceConfig) -> None:
-        self.config = config
+    def __init__(self, packet_len: int, paper: PaperConfig) -> None:
+        self.packet_len, self.paper = packet_len, paper
         self._line: list[int] = []
 
     def plan(self, queues: Mapping[int, Sequence[Fragmented]]) -> Plan | None:
@@ -45,32 +45,31 @@ class PaperScheduler:
         for topic_id in pending:
             if topic_id not in self._line:
                 self._line.append(topic_id)
-        config = self.config
         picks: list[Fragmented] = []
         chosen: list[int] = []
         payload = 0
         for topic_id in self._line:
             for message in queues.get(topic_id, ()):
-                cut = fragment_len(len(message.payload), len(pending), config.packet_len, config.min_fragment)
+                cut = fragment_len(len(message.payload), len(pending), self.packet_len, self.paper.min_fragment)
                 lengths = self._fitting(message, cut, len(picks), payload)
                 picks += [message] * len(lengths)
                 chosen += lengths
                 payload += sum(lengths)
                 whole = message.index + len(lengths) == message.total
-                if not (config.greedy and lengths and whole):
+                if not (self.paper.greedy and lengths and whole):
                     break
             if len(picks) == V0.max_entries:
                 break
-        room = V0.room(config.packet_len, len(picks), payload)
-        return Plan(tuple(picks), tuple(chosen), room < config.min_fragment)
+        room = V0.room(self.packet_len, len(picks), payload)
+        return Plan(tuple(picks), tuple(chosen), room < self.paper.min_fragment)
 
     def _fitting(self, message: Fragmented, cut: int, entries: int, payload: int) -> list[int]:
         """Lengths of the next fragments of a message that fit beside ``entries`` with ``payload`` bytes."""
         lengths: list[int] = []
         length = message.plan(cut)
         index, remaining = message.index, message.remaining
-        room, packet_len = V0.room, self.config.packet_len
-        most = V0.max_entries if self.config.greedy else 1
+        room, packet_len = V0.room, self.packet_len
+        most = V0.max_entries if self.paper.greedy else 1
         while len(lengths) < most and index < message.total:
             if length > room(packet_len, entries + len(lengths), payload):
                 break

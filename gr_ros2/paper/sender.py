@@ -8,7 +8,7 @@ composed when it is requested, never before; time is an argument and never goes 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable
 from math import inf
 from typing import Any
 from zlib import crc32
@@ -20,11 +20,13 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.link.v0.fragment import Fragmented
-from gr_ros2.link.v0.schedule import PaperScheduler, Plan
-from gr_ros2.settings.config import QueuePolicy, SourceConfig, TopicOptions, replaced
+from gr_ros2.paper.fragment import Fragmented
+from gr_ros2.paper.schedule import PaperScheduler, Plan
+from gr_ros2.paper.settings import PaperConfig
+from gr_ros2.settings.config import QueuePolicy, replaced
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.registry import NewTopic, Registry, Topic
+from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire import FORMATS, QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.v0 import V0, EntryV0, PacketV0
 
@@ -34,7 +36,7 @@ Observer = Callable[[SenderEvent], None]
 class Sender:
     """Cuts, queues and packs messages of one source.
 
-    :param registry: gives topic ids their options; ``config.topic_options`` override them
+    :param registry: gives topic ids their options; those of the robot override them
     :param codec: codes every message, and every packet then has C = 1; events carry the message as submitted
     :param rng: seeds the first sequence number and entry ids, and gives random ids where those are configured
     :param observer: called with every SenderEvent, in order
@@ -43,27 +45,28 @@ class Sender:
     def __init__(
         self,
         registry: Registry,
-        config: SourceConfig,
+        robot: RobotConfig,
+        paper: PaperConfig,
         *,
         codec: MessageCodec | None = None,
         rng: random.Random | None = None,
         observer: Observer | None = None,
     ) -> None:
-        self.config = config
+        self.robot, self.paper = robot, paper
         if len(registry) > V0.max_topics:
             beyond = registry[V0.max_topics]
             raise ConfigError(
-                f"topic {V0.max_topics + 1}, {beyond.name!r}: version 0 carries {V0.max_topics} topics; leave some "
-                f"out, or set version: 1, which carries {FORMATS[1].max_topics}"
+                f"topic {V0.max_topics + 1}, {beyond.name!r}: the paper's packets carry {V0.max_topics} topics; "
+                f"leave some out, or take a ROS Link, which carries {FORMATS[1].max_topics}"
             )
-        self.registry = registry.with_options(config.topic_options)
-        self.src_id = config.src_id()
+        self.registry = registry.with_options(robot.options)
+        self.src_id = robot.robot_id
         self.stats = SenderStats()
         self._rng = rng if rng is not None else random.Random()
         self._observer = observer
         self._codec = codec
-        self._largest = V0.largest_message(config.packet_len)
-        self._scheduler = PaperScheduler(config)
+        self._largest = V0.largest_message(robot.packet_len)
+        self._scheduler = PaperScheduler(robot.packet_len, paper)
         self._queues: dict[int, TopicQueue[Fragmented]] = {
             topic.topic_id: TopicQueue("fifo") for topic in self.registry
         }
@@ -78,7 +81,7 @@ class Sender:
         self._next_id = [self._rng.randrange(self._ids) for _ in self.registry]
         self._seq = self._rng.randrange(self._numbers)
         self._serial = 0
-        self.pace = Pace(config.packet_rate)
+        self.pace = Pace(robot.packet_rate)
         """When packets may leave."""
         self._latched: dict[int, tuple[int, bytes]] = {}
         """Per topic, serial and coded bytes of the message for robots that join late."""
@@ -122,7 +125,7 @@ class Sender:
         self._stale = True
         if topic_id in self._keeps:
             self._latched[topic_id] = (serial, payload)
-            self._repeat_at[topic_id] = now + self.config.repeat_s
+            self._repeat_at[topic_id] = now + self.robot.repeat_s
 
     def missed(self, topic_id: int, total: int) -> None:
         """Record how many messages of a topic the ROS graph has lost so far, before they could be submitted.
@@ -152,43 +155,14 @@ class Sender:
         """Earliest time at which ``next_packet`` may return a packet without a further submit or credit."""
         if self.pace.out_of_credit:
             return None
-        times = list(self._repeat_at.values()) if self.config.repeat_s > 0 else []
+        times = list(self._repeat_at.values()) if self.robot.repeat_s > 0 else []
         plan = self._planned()
         if plan is not None:
             times.append(self._departure(plan))
         return max(min(times), self.pace.slot) if times else None
 
-    def add(self, topics: Sequence[NewTopic]) -> Registry:
-        """Refuse: both ends of version 0 have the same registry.
-
-        :raises ConfigError: always
-        """
-        raise ConfigError(f"version 0 cannot announce {topics[0][0]!r}: give both ends the same registry")
-
-    def change(self, topic_id: int, options: TopicOptions) -> tuple[Registry, Topic]:  # noqa: ARG002
-        """Refuse: both ends of version 0 have the same options.
-
-        :raises ConfigError: always
-        """
-        raise ConfigError(
-            f"topic {self.registry[topic_id].name}: with version 0, its options change with a restart only"
-        )
-
-    def offer(self, topic_id: int, *, offered: bool) -> None:  # noqa: ARG002
-        """Refuse: version 0 carries no services.
-
-        :raises ConfigError: always
-        """
-        raise ConfigError("version 0 carries no services; set version to 1")
-
-    def forget_kept(self, topic_id: int) -> None:
-        """Do nothing: the types of version 0 never change."""
-
-    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
-        """Do nothing: both ends of version 0 code by the same dictionaries."""
-
     def follow(self, topic_id: int, publishers: PublisherQos) -> bool:  # noqa: ARG002
-        """Do nothing: version 0 delivers as it comes, and the registry says the rest at both ends."""
+        """Do nothing: messages come as they come, and the registry says the rest at both ends."""
         return False
 
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:  # noqa: ARG002 - all topics have the same
@@ -197,7 +171,7 @@ class Sender:
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
         depth = self._depths[topic_id]
-        return self.config.queue_depth if depth == AUTO else depth
+        return self.robot.queue_depth if depth == AUTO else depth
 
     def room(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without dropping another one."""
@@ -217,13 +191,15 @@ class Sender:
 
         :raises ConfigError: for a value out of range
         """
-        before, self.config = self.config, replaced(self.config, **settings)
+        before = self.robot
+        if "dst_id" in settings:
+            self.paper = self._scheduler.paper = replaced(self.paper, dst_id=settings.pop("dst_id"))
+        self.robot = replaced(self.robot, **settings)
         for topic_id in self._repeat_at:
-            self._repeat_at[topic_id] += self.config.repeat_s - before.repeat_s
-        self._scheduler.config = self.config
+            self._repeat_at[topic_id] += self.robot.repeat_s - before.repeat_s
         self._stale = True
         if "packet_rate" in settings:
-            self.pace.change(self.config.packet_rate)
+            self.pace.change(self.robot.packet_rate)
 
     def _planned(self) -> Plan | None:
         """The next packet's content; planned again only when something has changed."""
@@ -234,13 +210,12 @@ class Sender:
 
     def _departure(self, plan: Plan) -> float:
         """When a planned packet may leave: at once if it is full, otherwise after ``flush_timeout_s``."""
-        if plan.full or self.config.flush_timeout_s == 0:
+        if plan.full or self.paper.flush_timeout_s == 0:
             return -inf
         waits = (min(message.submitted, self._queues[message.topic_id].since) for message in plan.picks)
-        return min(waits) + self.config.flush_timeout_s
+        return min(waits) + self.paper.flush_timeout_s
 
     def _compose(self, plan: Plan, now: float) -> SentPacket:
-        config = self.config
         entries = []
         record = []
         for message, length in zip(plan.picks, plan.lengths, strict=True):
@@ -257,14 +232,14 @@ class Sender:
                 self.stats.sent[message.topic_id] += not message.repeat
         packet = PacketV0(
             self.src_id,
-            config.dst_id,
+            self.paper.dst_id,
             self._seq,
-            config.hop,
+            self.paper.hop,
             tuple(entries),
             qos=_packet_qos(plan),
             compressed=self._codec is not None,
         )
-        data = V0.encode(packet, config.packet_len)
+        data = V0.encode(packet, self.robot.packet_len)
         sent = SentPacket(data, packet, self.src_id, 0, self._seq, crc32(data), tuple(record), now)
         self._seq = (self._seq + 1) % self._numbers
         self._scheduler.sent(plan)
@@ -278,7 +253,7 @@ class Sender:
         return sent
 
     def _take_id(self, topic_id: int) -> int:
-        if self.config.entry_ids == "random":
+        if self.paper.entry_ids == "random":
             return self._rng.randrange(self._ids)
         entry_id = self._next_id[topic_id]
         self._next_id[topic_id] = (entry_id + 1) % self._ids
@@ -286,11 +261,11 @@ class Sender:
 
     def _repeat(self, now: float) -> None:
         """Queue the message for robots that join late again, if nothing newer of that topic is waiting."""
-        if self.config.repeat_s <= 0:
+        if self.robot.repeat_s <= 0:
             return
         for topic_id, at in self._repeat_at.items():
             if now >= at:
-                self._repeat_at[topic_id] = now + self.config.repeat_s
+                self._repeat_at[topic_id] = now + self.robot.repeat_s
                 if not self._queues[topic_id]:
                     serial, payload = self._latched[topic_id]
                     self._queues[topic_id].append(Fragmented(serial, topic_id, payload, QOS_BULK, now, repeat=True))
@@ -300,7 +275,7 @@ class Sender:
     def _too_large(self, size: int) -> str:
         needed = V0.smallest_packet_len(size)
         remedy = f"packet_len {needed} would carry it" if needed else "no packet_len would carry it"
-        return f"{size} bytes need over {V0.max_fragments} entries at packet_len {self.config.packet_len}; {remedy}"
+        return f"{size} bytes need over {V0.max_fragments} entries at packet_len {self.robot.packet_len}; {remedy}"
 
     def _refuse(self, serial: int, topic_id: int, reason: Fate, detail: str) -> None:
         self.stats.refused[topic_id, reason.value] += 1

@@ -3,65 +3,61 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from gr_ros2.core.errors import ConfigError
-from gr_ros2.link.endpoint import HeardRobot, Questions, check_live
+from gr_ros2.link.endpoint import HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.stats import ReceiverStats, SenderStats
-from gr_ros2.link.v0.receiver import Receiver
-from gr_ros2.link.v0.sender import Sender
-from gr_ros2.settings.config import SinkConfig, SourceConfig
+from gr_ros2.paper.receiver import Receiver
+from gr_ros2.paper.sender import Sender
+from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire import AnnouncedTopic
+from gr_ros2.settings.robot import RobotConfig
 
 
 class EndpointV0:
-    """An end of version 0. Its receiving half passes nothing on to its sending half.
+    """An end of version 0. What it receives changes nothing of what it sends.
 
-    :param source: settings of its sending half; None if it sends nothing
-    :param sink: settings of its receiving half; None if it receives nothing
-    :param codecs: codecs of messages sent and received, if the link compresses
+    :param robot: what it sends (``sends``) and receives (``receives``)
+    :param codec: codes messages sent, if the link compresses, and decodes those received
+    :param own: see :class:`Receiver`
     :param rng: see :class:`Sender`
     :param observer: called with every SenderEvent, in order
     """
 
     answers = urged = False
-    boot = 0
     frames = None
     mcs_table: Sequence[Mcs] = ()
     live_settings = ("packet_rate", "dst_id", "repeat_s", "queue_depth")
-    live_options = ()
 
     def __init__(
         self,
         registry: Registry,
-        source: SourceConfig | None,
-        sink: SinkConfig | None,
+        robot: RobotConfig,
+        paper: PaperConfig,
         *,
-        codecs: tuple[MessageCodec | None, MessageCodec | None] = (None, None),
+        codec: MessageCodec | None,
+        own: int | None = None,
         rng: random.Random | None = None,
         observer: Callable[[SenderEvent], None] | None = None,
     ) -> None:
-        to_air, from_air = codecs
-        self._sender = None if source is None else Sender(registry, source, codec=to_air, rng=rng, observer=observer)
-        self._receiver = None if sink is None else Receiver(registry, sink, codec=from_air)
+        to_air = codec if paper.compression else None
+        sends, receives = robot.sends, robot.receives
+        self._sender = Sender(registry, robot, paper, codec=to_air, rng=rng, observer=observer) if sends else None
+        self._receiver = Receiver(registry, robot, paper, codec=codec, own=own) if receives else None
         self.sent = SenderStats() if self._sender is None else self._sender.stats
         self.received = ReceiverStats() if self._receiver is None else self._receiver.stats
         self.pace = Pace(AUTO) if self._sender is None else self._sender.pace
 
     @property
     def messages(self) -> Sender:
-        """Its sending half.
-
-        :raises ConfigError: there is no such half
-        """
-        if self._sender is None:
-            raise ConfigError("an end that sends nothing was asked to; give it a source")
+        """Its message side; only an end that sends is asked for it."""
+        assert self._sender is not None
         return self._sender
 
     @property
@@ -73,7 +69,7 @@ class EndpointV0:
     def held_bytes(self) -> int:
         return 0 if self._receiver is None else self._receiver.held_bytes
 
-    def reconfigure(self, **changes: float) -> None:
+    def reconfigure(self, **changes: Any) -> None:
         check_live(changes, self.live_settings)
         self.messages.reconfigure(**changes)
 
@@ -96,15 +92,8 @@ class EndpointV0:
         assert self._receiver is not None
         return self._receiver.unpublished(event)
 
-    @property
-    def questions(self) -> Questions:
-        raise ConfigError("version = 0: a robot can be asked with version 1 only; set version to 1 at every end")
-
     def peers(self, now: float) -> list[HeardRobot]:  # noqa: ARG002 - senders are not followed
         return []
 
     def knows(self, src_id: int) -> bool:
         return self._receiver is not None and self._receiver.knows(src_id)
-
-    def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:  # noqa: ARG002 - nobody announces any
-        return {}

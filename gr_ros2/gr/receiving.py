@@ -1,4 +1,5 @@
-"""ROS Sink: packets in on message port `pdus`, ROS topics out (the paper, sections 4.2 and 4.4).
+"""The half of a link's block that receives: packets in on message port `pdus`, ROS topics out (the paper, sections 4.2,
+4.4).
 
 Invariants: this block is a thin shell. All behaviour is in the link's engine, which one lock protects. Only the bytes
 of a PDU are trusted. The message handler and the timeout thread never raise, because an exception would end them while
@@ -10,7 +11,6 @@ from __future__ import annotations
 
 import logging
 import time
-import weakref
 from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import Any, Protocol
@@ -19,17 +19,15 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.core.guard import Guard
-from gr_ros2.gr.block_settings import read_registry, settings
 from gr_ros2.gr.early import CHECK_S
-from gr_ros2.gr.factory import EndpointSetup, make_endpoint
 from gr_ros2.gr.failures import Failures
 from gr_ros2.gr.latency import RECENT
 from gr_ros2.gr.live_end import LiveEnd
-from gr_ros2.gr.loops import LOOP_GUARD, Graph
+from gr_ros2.gr.loops import LOOP_GUARD
 from gr_ros2.gr.outputs import Outputs
 from gr_ros2.gr.readable import debug_logger, describe
-from gr_ros2.gr.starts import start_of
 from gr_ros2.link import AirPacket, Delivered, Received, ReceiverEvent, Rejected
+from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import Announced
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
@@ -38,8 +36,9 @@ from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import PDUS, PduPort, packets_of
 from gr_ros2.phy.threads import BlockThread
-from gr_ros2.settings.config import SinkConfig, replaced, robot_of
-from gr_ros2.settings.registry import Registry, Topic, check_outputs
+from gr_ros2.settings.config import replaced
+from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.robot import RobotConfig
 
 _SHORTEST_WAIT_S = 1e-3
 _MOST_JOINED = 65535
@@ -60,60 +59,42 @@ class Services(Protocol):
         """Take over the topics and services that a robot announces now."""
 
 
-class RosSink(gr.basic_block):  # type: ignore[misc]
+class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
     """Reassembles packets into messages and publishes them on a ROS graph.
 
     Message port: `pdus` in (PMT pair of anything and a u8vector). The first message of each sender and topic creates a
-    publisher. ``close`` leaves the graph, and so does the end of the process. A middleware that is passed in open must
-    be closed by the caller.
+    publisher.
 
-    :param registry: CSV path or Registry, the same as at the source; '' with version 1, where senders announce their
-        topics
-    :param middleware: a name of ``gr_ros2.middleware.MIDDLEWARE`` or an open Middleware
+    :param registry: the topics of other robots that announce none, with configured options
+    :param end: the robot's endpoint
+    :param graph: the robot's participant on its ROS graph, which the caller closes
     :param observer: called with every ReceiverEvent, in order; with Delivered after the message was published. An
         observer that raises is not called again
     :param clock: s, monotonic
-    :param end: endpoint of both directions, shared with a source; None: an endpoint that only receives is made
-    :ivar live: this endpoint
-    :ivar live_settings: settings that may change while it runs, each by its setter
-    :param values: the fields of :class:`gr_ros2.settings.config.SinkConfig`
-    :raises ConfigError: for a wrong setting; the message names the key, the value and what is allowed
+    :raises ConfigError: when it would publish what a robot of this process sends
     """
 
     live_settings = ("debug",)
+    """Settings that may change while it runs, each by its setter."""
 
     def __init__(
         self,
-        registry: str | Registry = "",
+        config: RobotConfig,
+        registry: Registry,
+        end: LiveEnd[Endpoint],
+        graph: Middleware,
         *,
-        middleware: str | Middleware | None = None,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
-        end: LiveEnd | None = None,
-        **values: Any,
     ) -> None:
         super().__init__("ros2_sink", None, None)
-        self.config = settings(SinkConfig, values, registry, middleware)
-        topics = read_registry(registry, needed=not self.config.version)
-        self.registry = topics
-        if topics:
-            check_outputs(topics, self.config)
-            self.registry = topics.with_options(self.config.topic_options, announced=self.config.version != 0)
-        self._start = EndpointSetup()
-        if end is None:
-            start = self._start = start_of(self.config, robot_of(None, self.config), EndpointSetup())
-            if self.config.key:
-                debug_logger("gr_ros2.gr.sink", self.config.debug).warning(
-                    "ros2_sink: one way, a key keeps out what is forged or was heard before; what never came here is "
-                    "taken from a recording, however old it is"
-                )
-            end = LiveEnd(lambda observer: make_endpoint(topics, None, self.config, start=start, observer=observer))
+        self.config, self.registry = config, registry
         self.live, self._end = end, end.endpoint
         self._calls: Services | None = None
         self._observer = observer
         self._guard = Guard("observer of ros2_sink")
         self._clock = clock
-        self._log = debug_logger("gr_ros2.gr.sink", self.config.debug)
+        self._log = debug_logger("gr_ros2.gr.sink", config.debug)
         self._lock = end.lock
         self._timer_idle = False
         self._running = False
@@ -128,15 +109,15 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         self.message_port_register_in(PDUS)
         self.set_msg_handler(PDUS, self._handle)
         PduPort.readable_by(self)
-        self._graph = Graph(middleware, self.config.middleware, self.config.domain_id, "gr_ros2_sink")
-        self._finalizer = weakref.finalize(self, self._graph.close)
+        self.middleware = graph
+        """The robot's participant on the ROS graph."""
         try:
-            LOOP_GUARD.add_sink(self, self._graph, self.config, self.registry)
+            LOOP_GUARD.add_sink(self, graph, config.publish, registry)
             self.outputs = Outputs(
                 self,
-                self.registry,
-                self.config,
-                self._graph,
+                registry,
+                config,
+                graph,
                 end,
                 tell=self._tell,
                 clock=clock,
@@ -146,19 +127,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
             """What it publishes."""
         except GrRos2Error:
             LOOP_GUARD.remove(self)
-            self._finalizer()
-            self._start.close()
             raise
-
-    @property
-    def graph(self) -> Graph:
-        """The ROS graph on which it publishes."""
-        return self._graph
-
-    @property
-    def middleware(self) -> Middleware:
-        """This block's participant on the ROS graph."""
-        return self._graph.middleware
 
     def share(self, calls: Services) -> None:
         """Hand over what concerns services."""
@@ -187,12 +156,10 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
         return True
 
     def close(self) -> None:
-        """Leave the ROS graph. Idempotent."""
+        """Publish nothing any more. Idempotent."""
         self._stop_search()
         self.outputs.close()
         LOOP_GUARD.remove(self)
-        self._finalizer()
-        self._start.close()
 
     def stats(self) -> dict[str, Any]:
         """A snapshot. ``packet_loss_est`` and ``message_loss_est`` are estimates from gaps in numbers."""
@@ -213,7 +180,7 @@ class RosSink(gr.basic_block):  # type: ignore[misc]
                 "silence_s": {src_id: self._clock() - at for src_id, at in self._heard.items()},
                 "held_bytes": self._end.held_bytes,
                 "no_table": [peer.robot for peer in self._end.peers(self._clock()) if peer.no_table],
-                "latency_clock": "stamp_sim" if self.config.use_sim_time else "stamp_wall",
+                "latency_clock": "stamp_sim" if self.config.graph.use_sim_time else "stamp_wall",
                 "middleware": dict(self.middleware.counters),
             }
         # There may be thousands of latencies. They are sorted without the lock, because the next packet waits for it.

@@ -1,1 +1,0 @@
-"""The engines of version 0, the paper's."""
