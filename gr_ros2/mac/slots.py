@@ -406,9 +406,9 @@ class Slots:
             assert slot is not None
             self._elsewhere = dict.fromkeys(self._robots, began)
             self._start_over(slot)
-        if trusted and slot is None and src_id != self.src_id:
-            if not self._elsewhere:
-                self._answer(self.clock.slot(began))
+        if slot is None and (trusted or checked) and not self._elsewhere:
+            self._answer(self.clock.slot(began))
+        if trusted and slot is None:
             self._elsewhere[src_id] = began
         elif trusted and self._elsewhere:
             self._elsewhere.pop(src_id, None)

@@ -22,7 +22,7 @@ _WAITING = 256
 
 
 ARRIVING_S = 1.0
-"""s for which more of what a robot sends again is waited for before it is asked for it."""
+"""s for which more of what a robot sends again is waited for before it is asked for it; more on a slow channel."""
 
 
 class AnnouncedTopics:
@@ -105,10 +105,10 @@ class AnnouncedTopics:
         """The rows that are known."""
         return write_table(row for _, row in sorted(self._rows.items()))
 
-    def lacks(self, digest: int, number: int, now: float) -> bool:
-        """Whether rows of a table, named in a hello at a packet number, are neither here nor arriving."""
+    def lacks(self, digest: int, number: int, since: float) -> bool:
+        """Whether rows of a table, named in a hello at a packet number, are not here, and none came since then, s."""
         newest, at = self.newest
-        return digest != self.digest and newest <= number and at <= now - ARRIVING_S
+        return digest != self.digest and newest <= number and at <= since
 
     def waiting(self) -> list[Ready]:
         """The messages that have waited for a table, in order; they are returned once."""

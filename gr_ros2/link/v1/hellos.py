@@ -51,6 +51,9 @@ EAGER_S = 0.1
 delivered."""
 EAGER = 20
 """Number of these hellos."""
+RESTS = 2
+"""Packets of messages, if any wait, between two hellos on a slow channel: a row of the table and its message, for
+example. A robot that starts, or is met, would say nothing but hellos there for its first five turns."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
 
@@ -85,6 +88,8 @@ class Hellos:
         self._answering = False
         self.due = -inf
         """When the next hello is due, s."""
+        self.rests = 0
+        """Packets of messages, if any wait, that leave before the next hello, unless this answers another robot."""
         self.talks = False
         """Whether messages have left since the last hello."""
 
@@ -124,7 +129,7 @@ class Hellos:
         if late < 0 or idle or self._answering:
             return late >= 0
         if self._starting:
-            return late >= latency * LATENCY_S
+            return late >= latency * LATENCY_S and not (self.rests and self._settings.slower > 1)
         return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
 
     @property
@@ -156,7 +161,7 @@ class Hellos:
         """
         window, neighbours = self._window, self._neighbours
         wants = neighbours.unproven
-        self._answering = False
+        self._answering, self.rests = False, RESTS
         if self._apart:
             apart, self._apart = self._apart, []
             self.due = self._next(now, wants=wants)
@@ -171,6 +176,7 @@ class Hellos:
             self._apart, proofs = [*proofs], []
         free -= len(proofs) * HEARD_LEN
         named, self._mark = _in_turn(marks, self._mark, free // MARK_LEN)
+        self._answering = bool(self._apart)
         self.due = now if self._apart else self._next(now, wants=wants)
         reported = bool(window.peers) and self._settings.repair != "off"
         capabilities = self._capabilities | reported * REPORTED | wants * WANTS_PROOF

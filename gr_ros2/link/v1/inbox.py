@@ -113,7 +113,7 @@ class Inbox:
     ) -> None:
         self.src_id, self.boot = src_id, boot
         self.deliveries = DeliveryRules(settings, marks)
-        self._room = room
+        self._room, self._settings = room, settings
         self._control, self._relaying = control, relaying
         self._outcomes, self._stats = outcomes, outcomes.stats
         bounds = Bounds.of(settings.max_source_bytes, room)
@@ -251,9 +251,10 @@ class Inbox:
     def lacks(self, mark: tuple[int, int], number: int, now: float) -> bool:
         """Whether a latched message or the table, named in a hello at a packet number, is neither here, nor a newer one
         of its topic, nor arriving."""
-        growing = self._reassembly.growing(mark[0], now - ARRIVING_S)
+        since = now - ARRIVING_S * self._settings.slower
+        growing = self._reassembly.growing(mark[0], since)
         if mark[0] == TABLE_TOPIC:
-            return self.announced.lacks(mark[1], number, now) and not growing
+            return self.announced.lacks(mark[1], number, since) and not growing
         topic = self.announced.topics.get(mark[0])
         if topic is not None and not self.deliveries.is_for_us(topic):
             return False

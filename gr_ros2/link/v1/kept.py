@@ -125,7 +125,7 @@ class KeptMessages:
         left, at = self._answers.get(topic_id, (ANSWERS, now))
         left = min(left + (now - at) / pause, ANSWERS)
         if left >= 1:
-            left -= self.ask(topic_id, now)
+            left -= self._tell_anew(now) if topic_id == TABLE_TOPIC else self.ask(topic_id, now)
             self._answers[topic_id] = left, now
             return True
         return False
@@ -138,6 +138,18 @@ class KeptMessages:
         waiting = {message.payload for message in queue}
         new = [row for row in rows.values() if row.named == inf and row.payload not in waiting]
         self._send_rows(new, self._table_qos, now)
+
+    def _tell_anew(self, now: float) -> bool:
+        """Send all rows of the table, first those of topics whose messages wait; returns whether there are any."""
+        self._starting_until = min(self._starting_until, now + STARTING_S * self._settings.slower)
+        queue = self._topics[TABLE_TOPIC].queue
+        for message in [message for message in queue if not message.started]:
+            queue.remove(message)
+        leaving = {message.payload for message in queue}
+        waits = {topic_id for topic_id, topic in self._topics.items() if topic.queue}
+        rows = [self._rows[topic_id] for topic_id in sorted(self._rows, key=lambda topic_id: topic_id not in waits)]
+        self._send_rows([row for row in rows if row.payload not in leaving], self._table_qos, now)
+        return bool(rows)
 
     def ask(self, topic_id: int, now: float, *, fills: bool = False) -> bool:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already; returns

@@ -23,6 +23,7 @@ from gr_ros2.link.events import (
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import RateController
+from gr_ros2.link.v1.announced import ARRIVING_S
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
@@ -50,7 +51,7 @@ from gr_ros2.wire.control import (
 )
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import BROADCAST, EntryV1, Header, PacketV1, RepairHeader, read_body, read_header
+from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC, EntryV1, Header, PacketV1, RepairHeader, read_body, read_header
 
 GIVE_UP_S = 10.0
 """s of silence after which a robot is regarded as gone."""
@@ -296,6 +297,8 @@ class ReceivingSide:
         if self.relaying is not None:
             self.relaying.met(neighbour)
         self._greeted(neighbour)
+        if self._settings.shares and self._settings.slower > 1:  # its table comes unasked
+            neighbour.asked[TABLE_TOPIC] = now + ARRIVING_S * self._settings.slower
         if neighbour.proofs.proven is not None:
             neighbour.inbox.order.repaired_from(neighbour.proofs.proven - REACH)
 

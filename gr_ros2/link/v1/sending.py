@@ -132,6 +132,7 @@ class SendingSide:
         filling = self._messages.packing.fill(number, room - reports.reserved, now, spare=spare)
         if filling is None:
             return None
+        self.hellos.rests -= self.hellos.rests > 0
         self._slowness.waited(filling.since, now)
         reports.add(filling.parts, room - filling.used, due, now)
         if self._relaying is not None:
@@ -166,6 +167,8 @@ class SendingSide:
             self._plan_repeat(now)
         if self.settings.hears:
             self.hellos.met(now)
+        if self.settings.shares and self.settings.slower > 1 and self._started:
+            self._messages.kept.asked(TABLE_TOPIC, now)  # it lacks the table, and would say so some turns later
 
     def reconfigure(self, settings: Settings, now: float) -> None:
         """Use other settings from now on."""

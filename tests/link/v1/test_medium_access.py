@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable
 from itertools import pairwise
 from math import inf
+from statistics import median
 
 import pytest
 
@@ -22,8 +23,8 @@ SHORT = 0.0006
 """s that the shortest packet lasts."""
 
 
-def robot(src_id: int, mode: SealMode) -> tuple[Robot, Slots]:
-    access = Slots(src_id, SLOT, random.Random(src_id))
+def robot(src_id: int, mode: SealMode, slot_s: float = SLOT, seed: int = 0) -> tuple[Robot, Slots]:
+    access = Slots(src_id, slot_s, random.Random(src_id + 1000 * seed))
     return Robot(src_id, registry(), mode=mode, access=access), access
 
 
@@ -56,7 +57,13 @@ Junk = Callable[[float], list[bytes]]
 
 
 def talk(
-    robots: list[Robot], begin: float, seconds: float, *, every: float = inf, junk: Junk = lambda _: []
+    robots: list[Robot],
+    begin: float,
+    seconds: float,
+    *,
+    every: float = inf,
+    junk: Junk = lambda _: [],
+    airtime_s: float = AIRTIME,
 ) -> list[tuple[float, Robot, bytes]]:
     """Let robots send, each once it may; what overlaps is lost.
 
@@ -68,12 +75,12 @@ def talk(
         one.end.handle_timeout(begin)
     while now < begin + seconds:
         now, at = min((max(now, r.end.next_departure(credited=True) or now), n) for n, r in enumerate(robots))
-        if due + AIRTIME < now:
+        if due + airtime_s < now:
             for number, other_data in enumerate(junk(due) if due >= busy else ()):
                 for other in robots:
-                    other.receive(other_data, due + AIRTIME, due + number * SHORT)
+                    other.receive(other_data, due + airtime_s, due + number * SHORT)
             due += every
-            now = due - every + AIRTIME
+            now = due - every + airtime_s
             continue
         data = robots[at].slot(now)
         if data is None:
@@ -81,8 +88,8 @@ def talk(
         if now >= busy - 1e-9:
             for other in robots:
                 if other is not robots[at]:
-                    other.receive(data, now + AIRTIME, now)
-        busy = now + AIRTIME
+                    other.receive(data, now + airtime_s, now)
+        busy = now + airtime_s
         sent.append((now, robots[at], data))
     return sent
 
@@ -170,6 +177,21 @@ def test_messages_cross_where_packets_are_handed_over_long_ahead_as_to_a_sound_c
         air = [one for one in air if one[0] > now - 2]
     assert sum(len(robot.delivered()) for robot in robots) == sent == 2 * seconds
     assert late == 0
+
+
+@pytest.mark.parametrize(("mode", "most"), [("none", 42), ("encrypt", 50)])
+def test_the_first_message_comes_after_some_turns_however_long_a_packet_lasts(mode: SealMode, most: int) -> None:
+    """From cold: a robot that starts, or is met, does not only say that it is there."""
+    airtime_s, took = 0.526, []
+    for seed in range(15):
+        robots = [robot(src_id, mode, airtime_s + SLOT - AIRTIME, seed)[0] for src_id in (1, 2)]
+        for one in robots:
+            one.end.messages.submit(0, b"%d" % one.src_id, 0.0)
+        now = 0.0
+        while now < 100 * airtime_s and not all(one.delivered() for one in robots):
+            now = airtime_s + max([now, *(at for at, _, _ in talk(robots, now, airtime_s, airtime_s=airtime_s))])
+        took.append(round(now / airtime_s))
+    assert median(took) <= most
 
 
 def team(size: int) -> tuple[list[Robot], list[Slots]]:
