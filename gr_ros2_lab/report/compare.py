@@ -93,7 +93,7 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
 
 def _settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
     """A line per setting. Where a block follows from another setting, such as packet_len, only the latter is named."""
-    flat = [dict(_flat(config)) for config in configs]
+    flat = [{name: text for name, text in _flat(config) if name != "description"} for config in configs]
     names = dict.fromkeys(name for settings in flat for name in settings)
     lines = {name: ("setting", name, *(settings.get(name, _DASH) for settings in flat)) for name in names}
     return [
