@@ -76,6 +76,10 @@ class _Sent:
         while self._lately[0][0] < now - _SECONDS:
             self._lately.popleft()
 
+    def lives(self, now: float) -> bool:
+        """Whether messages have come lately."""
+        return bool(self._lately) and self._lately[-1][0] >= now - _SECONDS
+
     def words(self, now: float, age_s: float) -> str:
         """What has become of the topic lately."""
         lately = [item for item in self._lately if item[0] >= now - _SECONDS]
@@ -141,7 +145,7 @@ class FrameSender:
         """A message that is to be encoded now. ``done`` has to follow."""
         for topic_id, sent in self._sent.items():
             if sent.pull.waits(now):
-                share = sent.weight / sum(other.weight for other in self._sent.values())
+                share = sent.weight / sum(other.weight for other in self._sent.values() if other.lives(now))
                 pull = sent.pull.pull(now, self._frames.progress(topic_id, now), share)
                 if pull is not None:
                     return Job(topic_id, pull, sent.encoder)

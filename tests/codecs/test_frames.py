@@ -308,6 +308,27 @@ def test_two_cameras_share_what_is_free_by_weight() -> None:
     assert 2 < sizes[1] / sizes[0] < 4
 
 
+def test_a_camera_that_shows_nothing_takes_no_share() -> None:
+    def sent(*topics: Topic) -> int:
+        sender = Robot(1, Registry(topics), 256)
+        air = Air(sender, Robot(2, None, 256))
+        air.feed(sender, 0, 10, picture)
+        air.run(4.0)
+        return sum(len(event.payload) for event in sender.events if isinstance(event, Accepted))
+
+    front, rear = Topic(0, "front/image", IMAGE), Topic(1, "rear/image", IMAGE)
+    assert sent(front, rear) == pytest.approx(sent(front), rel=0.05)
+
+
+def test_options_change_while_it_is_sent() -> None:
+    air = link()
+    air.run(2.0)
+    sender = air.robots[0]
+    sender.sender.add(Topic(CAMERA, "camera/image", IMAGE, SendOptions(max_rate=3.0)))
+    air.run(6.0)
+    assert 8 <= len([now for now, _ in air.robots[1].of(1) if now > 3]) <= 10
+
+
 def test_a_thousand_frames_of_any_size_arrive_whole_and_in_order() -> None:
     sender, receiver = Robot(1, registry(off=True), 1000), Robot(2, None, 1000)
     air = Air(sender, receiver, loss=0.2)
