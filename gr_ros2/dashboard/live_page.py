@@ -91,7 +91,7 @@ class LivePage:
         self._style = style = InlineStyleSheet(css=(_TEMPLATES / "parts.css").read_text("utf-8"))
         self._html = {
             name: Div(name=name, stylesheets=[style], sizing_mode="stretch_width", disable_math=True)
-            for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "packets", "note")
+            for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "seen", "packets", "note")
         }
         self._sources = {
             name: ColumnDataSource({key: [] for key in columns.split()})
@@ -100,6 +100,8 @@ class LivePage:
                 "sent": "name x y",
                 "received": "name x y",
                 "gap": "x y",
+                "picture": "image x y dw dh",
+                "grid": "image x y dw dh",
                 "ends": "x y colour",
                 "error": "name colour t m",
                 "latency": "name colour ms share",
@@ -156,6 +158,7 @@ class LivePage:
         self._html["packets"].text = packets_html(snapshot)
         self._draw_series(snapshot)
         self._draw_paths(snapshot)
+        self._draw_pictures(snapshot)
         if snapshot.team is not None:
             self._draw_team(snapshot.team)
         self._draw_radio(radio)
@@ -223,6 +226,21 @@ class LivePage:
             "t": [_small(path.error_t) for path in paths],
             "m": [_small(path.errors_m) for path in paths],
         }
+
+    def _draw_pictures(self, snapshot: Snapshot) -> None:
+        """Pictures of cameras beside each other, and the newest map below the paths."""
+        for name, is_map in (("picture", False), ("grid", True)):
+            views = [view for view in snapshot.pictures if view.is_map == is_map]
+            views = sorted(views, key=lambda view: view.age_s)[:1] if is_map else views
+            lefts = [view.place[0] for view in views] if is_map else _beside([view.place[2] for view in views])
+            self._sources[name].data = {
+                "image": [view.pixels for view in views],
+                "x": lefts,
+                "y": [view.place[1] for view in views],
+                "dw": [view.place[2] for view in views],
+                "dh": [view.place[3] for view in views],
+            }
+        self._html["seen"].text = "<br>".join(escape(view.words) for view in snapshot.pictures)
 
     def _draw_team(self, team: TeamView) -> None:
         """The newest slots of the channel, and for each robot where the others believe it is, with a line to it."""
@@ -307,10 +325,14 @@ class LivePage:
     def _build(self, instance: str) -> None:
         sources = self._sources
         map_ = _plot("map", "name", "x [m]", "y [m]", match_aspect=True)
+        map_.image_rgba("image", "x", "y", "dw", "dh", source=sources["grid"], alpha=0.7)
         map_.multi_line("x", "y", source=sources["sent"], color=_SENT, line_width=6, alpha=0.4)
         map_.multi_line("x", "y", source=sources["received"], color=_RECEIVED, line_width=1.5)
         map_.multi_line("x", "y", source=sources["gap"], color=_SOFT, line_width=1.5, line_dash="dotted")
         map_.scatter("x", "y", source=sources["ends"], color="colour", line_color="white", size=12)
+        camera = _plot("camera", "", "", "", match_aspect=True)
+        camera.image_rgba("image", "x", "y", "dw", "dh", source=sources["picture"])
+        camera.axis.visible = camera.grid.visible = False
         error = _plot("error", "name", "time [s]", "error [m]")
         error.multi_line("t", "m", source=sources["error"], color="colour", line_width=1.5)
         error.y_range.start = 0
@@ -345,7 +367,7 @@ class LivePage:
         beliefs = _plot("beliefs", "", "x [m]", "y [m]", match_aspect=True)
         beliefs.multi_line("x", "y", source=sources["beliefs"], color="colour", line_width=3)
         beliefs.scatter("x", "y", source=sources["places"], color="colour", line_color="white", size=13)
-        plots = [map_, error, constellation, spectrum, latency, air, snr, loss, strip, beliefs]
+        plots = [map_, camera, error, constellation, spectrum, latency, air, snr, loss, strip, beliefs]
         series: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
             ("pdr", "pdr", "share", {"y_range": Range1d(0, 1.1)}),
             ("goodput", "goodput", "kB/s", {}),
@@ -370,7 +392,9 @@ class LivePage:
         )
         document = self.document
         document.title = "gr-ros2 · live"
-        texts = [self._html[name] for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "packets")]
+        texts = [
+            self._html[name] for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "seen", "packets")
+        ]
         with document.models.freeze():  # otherwise the document walks through all models for every root
             for root in (*plots, channel, self._pause, *texts):
                 document.add_root(root)
@@ -395,6 +419,11 @@ def _small(values: Any) -> Any:
     return np.asarray(values if len(values) else [np.nan], dtype=np.float32)
 
 
+def _beside(widths: list[float]) -> list[float]:
+    """Where pictures of these widths begin, with a gap between them."""
+    return [sum(widths[:place]) + 0.05 * place for place in range(len(widths))]
+
+
 def _slider(name: str, title: str, ends: tuple[float, float], value: float) -> Slider:
     start, end = ends
     return Slider(name=name, title=title, start=start, end=end, step=0.5, value=value, sizing_mode="stretch_width")
@@ -403,7 +432,9 @@ def _slider(name: str, title: str, ends: tuple[float, float], value: float) -> S
 def _empty_cards(snapshot: Snapshot, radio: RadioView) -> Iterator[str]:
     """The cards that have nothing to show, by the names that the template gives them."""
     has = {
-        "path": any(len(path.sent_x) or len(path.received_x) for path in snapshot.paths),
+        "path": any(len(path.sent_x) or len(path.received_x) for path in snapshot.paths)
+        or any(view.is_map for view in snapshot.pictures),
+        "camera": any(not view.is_map for view in snapshot.pictures),
         "error": any(len(path.errors_m) for path in snapshot.paths),
         "pdr": any(np.isfinite(line.pdr).any() for line in snapshot.series) and snapshot.delivered > 0,
         "age": any(topic.age_now_s is not None or topic.age_mean_s is not None for topic in snapshot.topics),

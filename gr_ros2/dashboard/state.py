@@ -17,6 +17,7 @@ import numpy as np
 
 from gr_ros2.core.watch import Watch
 from gr_ros2.dashboard.packets import missing_before, packet_views
+from gr_ros2.dashboard.pictures import newest_picture
 from gr_ros2.dashboard.topic_names import Key, TopicNames
 from gr_ros2.dashboard.views import GOOD, SILENT_S, AirView, PathView, RobotView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import RATE_S, AgeMeter, PathComparison, Rate
@@ -63,7 +64,7 @@ _PATH_STEP_S = 0.1
 class _Topic:
     """One topic of one source."""
 
-    def __init__(self, read_position: PositionReader | None, history: int) -> None:
+    def __init__(self, type_name: str, history: int) -> None:
         self.sent = 0
         self.delivered = 0
         self.repaired = 0
@@ -73,9 +74,14 @@ class _Topic:
         self.delivered_rate = Rate()
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         self.age = AgeMeter()
-        self.read_position = read_position
+        self.mean(type_name)
         self.belief = PathComparison(int(HISTORY_S / _PATH_STEP_S), _PATH_STEP_S)
         self.history: deque[tuple[float, float, float, float, float]] = deque(maxlen=history)
+
+    def mean(self, type_name: str) -> None:
+        """Its messages are of this type."""
+        self.read_position: PositionReader | None = position_reader(type_name)
+        self.picture = newest_picture(type_name)
 
     def fates(self) -> dict[str, int]:
         """The ledger fates as far as the events alone show them. An observer of both ends uses the ledger instead."""
@@ -285,6 +291,12 @@ class DashboardState:
                 paths=tuple(
                     self._path(place, key, start) for place, key in enumerate(keys) if self._topics[key].read_position
                 ),
+                pictures=tuple(
+                    view
+                    for key in keys
+                    if (picture := self._topics[key].picture) is not None
+                    and (view := picture.view(self._names.full(key), now)) is not None
+                ),
                 packets={
                     "sent": self._packets["sent"],
                     "received": received,
@@ -425,12 +437,12 @@ class DashboardState:
 
     def _learn(self, key: Key, name: str, type_name: str, full_name: str = "") -> None:
         if self._names.learn(key, name, type_name, full_name=full_name) and key in self._topics:
-            self._topics[key].read_position = position_reader(type_name)
+            self._topics[key].mean(type_name)
 
     def _topic(self, key: Key) -> _Topic:
         topic = self._topics.get(key)
         if topic is None:
-            topic = self._topics[key] = _Topic(position_reader(self._names.type_name(key)), self._history)
+            topic = self._topics[key] = _Topic(self._names.type_name(key), self._history)
         return topic
 
     def _accepted(self, source: _SourceWindow, src_id: int, event: Accepted) -> None:
@@ -484,6 +496,8 @@ class DashboardState:
         if message is not None:
             topic.latencies.append(now - message.t_sent)
             topic.age.delivered(message.t_sent, now)
+        if topic.picture is not None:
+            topic.picture.take(event.message, now - event.age_s if message is None else message.t_sent)
         if topic.read_position is not None:
             point = topic.read_position(event.payload)
             if point is not None:

@@ -8,6 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+import numpy.typing as npt
+
 from gr_ros2.dashboard.windows import Floats, Point
 from gr_ros2.observe.latency import Latency
 from gr_ros2.observe.team import TeamView
@@ -71,6 +74,29 @@ class PathView:
     error_m: float | None
     error_t: Floats
     errors_m: Floats
+
+
+@dataclass(frozen=True)
+class PictureView:
+    """The newest picture of a camera, or the newest map.
+
+    :param pixels: RGBA in 32 bits each, the lowest row first
+    :param age_s: s since it was made
+    :param frozen: it is a picture of a camera and old, and therefore grey
+    :param place: left, bottom, width and height: of a map in m
+    """
+
+    name: str
+    pixels: npt.NDArray[np.uint32]
+    age_s: float
+    frozen: bool
+    place: tuple[float, float, float, float]
+    is_map: bool = False
+
+    @property
+    def words(self) -> str:
+        """Its name and age."""
+        return f"{self.name}: {'frozen, ' if self.frozen else ''}{self.age_s:.1f} s old"
 
 
 @dataclass(frozen=True)
@@ -187,6 +213,7 @@ class Snapshot:
     topics: tuple[TopicView, ...] = ()
     series: tuple[SeriesView, ...] = ()
     paths: tuple[PathView, ...] = ()
+    pictures: tuple[PictureView, ...] = ()
     last_packets: tuple[PacketView, ...] = ()
     packets: Mapping[str, int] = field(default_factory=dict)
     packets_now: tuple[float, float] = (0.0, 0.0)

@@ -19,6 +19,7 @@ from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import set_option
 from gr_ros2.cli.pcap import capture, pcap_option
+from gr_ros2.codecs import CODECS
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.observe.observers import RunObserver
 from gr_ros2.settings.fields import AUTO
@@ -82,12 +83,19 @@ def run(scenario: str, **options: Any) -> int:
 @click.command()
 @click.option("--wire", type=click.Choice(["0", "1"]), default="1", help="Of the wire format; 0 repairs nothing.")
 @click.option("--robots", type=click.IntRange(2, 6), help="So many robots that all send, on one channel, in slots.")
+@click.option("--camera", is_flag=True, help="What a robot sees: its camera as video, its map, where it is.")
 @_with_options
-def demo(wire: str, robots: int | None, overrides: tuple[str, ...], **options: Any) -> int:
+def demo(wire: str, robots: int | None, camera: bool, overrides: tuple[str, ...], **options: Any) -> int:
     """Two simulated robots: the topics of one cross an OFDM link that loses packets, and come out at the other.
 
-    With --robots, that many drive apart among obstacles and tell each other where they are on one channel.
+    With --robots, that many drive apart among obstacles and tell each other where they are on one channel. With
+    --camera and --dashboard, a page shows what one of them sees.
     """
+    if camera:
+        if wire == "0" or robots is not None:
+            raise click.UsageError("--camera: leave --wire and --robots out")
+        CODECS.modules("camera")  # says what to install
+        return _run("demo-camera", overrides=overrides, **options)
     if robots is not None:
         if wire == "0":
             raise click.UsageError("--robots: version 0 says nothing about slots; leave --wire out")

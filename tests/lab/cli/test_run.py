@@ -70,3 +70,16 @@ def test_progress_is_told_where_the_output_is_no_terminal(
     told = [line for line in capsys.readouterr().out.splitlines() if " s of 10 s, " in line]
     assert told
     assert all(re.fullmatch(r"paper-direct: \d+\.\d s of 10 s, \d+ sent, \d+ delivered", line) for line in told)
+
+
+def test_a_demonstration_with_a_camera_shows_what_a_robot_sees(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("av", reason="needs PyAV")
+    words = ["demo", "--camera", "--duration", "3", "--set", "time=packets", "--no-report", "--out", str(tmp_path)]
+    assert command.run(words) == 0
+    topics = {topic["topic"]: topic for topic in json.loads((tmp_path / "result.json").read_text())["topics"]}
+    assert set(topics) == {"/robot_1/odom", "/robot_1/camera", "/robot_1/map"}
+    assert topics["/robot_1/camera"]["delivered"] > 10
+    assert command.run(["demo", "--camera", "--robots", "3"]) != 0
+    assert "--camera: leave --wire and --robots out" in capsys.readouterr().err

@@ -199,7 +199,7 @@ def test_a_file_with_a_registry_beside_it(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_neither_a_file_nor_built_in() -> None:
     with pytest.raises(
-        ConfigError, match=r"'dmeo' is neither a file nor built in; built in are channel-awgn, .*paper-direct"
+        ConfigError, match=r"'dmeo' is neither a file nor built in; built in are cameras, .*paper-direct"
     ):
         load_scenario("dmeo")
 
