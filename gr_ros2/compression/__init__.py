@@ -6,7 +6,7 @@ format.
 
 from __future__ import annotations
 
-from gr_ros2.compression.dictionary import Dictionary, load, shipped
+from gr_ros2.compression.dictionary import Dictionary, shipped
 from gr_ros2.compression.link_codec import CODECS, MAX_MESSAGE, LinkCodec
 
-__all__ = ["CODECS", "MAX_MESSAGE", "Dictionary", "LinkCodec", "load", "shipped"]
+__all__ = ["CODECS", "MAX_MESSAGE", "Dictionary", "LinkCodec", "shipped"]

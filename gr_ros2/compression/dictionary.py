@@ -5,9 +5,7 @@ for each type the float class of its fields, frequent sets of static values, a z
 where ROS 2 Humble has none or another one.
 
 Invariants: a dictionary never changes; different content is a different dictionary with a different id. The sets
-shipped with gr-ros2 are named by number in the first byte of a message; ``digest`` of each is pinned by a test. A
-user's own dictionaries are named by the first two bytes of their SHA-256. A file that is not a dictionary is a
-ConfigError that names the file.
+shipped with gr-ros2 are named by number in the first byte of a message; ``digest`` of each is pinned by a test.
 """
 
 from __future__ import annotations
@@ -19,7 +17,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 from gr_ros2.compression.floats import CLASSES, KnownNumbers
@@ -33,8 +30,6 @@ SHIPPED = (1, 2)
 since, up to Lyrical. A sender uses the last one with a definition that fits the message."""
 GENERAL = 1
 """The set whose words and constants serve the types that no set has."""
-OWN = 15
-"""Number in the first byte for a user's own dictionary; its id follows."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ class Dictionary:
     """The content of one dictionary.
 
     :param name: for people
-    :param number: 1..13 for a shipped set, OWN for a user's
+    :param number: 1..13
     :param words: strings without terminator, most frequent first
     :param constants: bits of doubles, most frequent first
     """
@@ -72,13 +67,8 @@ class Dictionary:
     @property
     def digest(self) -> str:
         """64 hex digits over everything that coding depends on; the name is not part of it."""
-        content = {key: value for key, value in self._as_json().items() if key != "name"}
+        content = {key: value for key, value in self.as_json().items() if key != "name"}
         return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-    @property
-    def prefix(self) -> bytes:
-        """The bytes after the first byte of a message: the id of a user's own dictionary, otherwise empty."""
-        return bytes.fromhex(self.digest[:4]) if self.number == OWN else b""
 
     def model(self, type_name: str) -> Model:
         """The model for the codec ``fields``; words and constants also apply to types without an entry."""
@@ -89,18 +79,8 @@ class Dictionary:
     def _lists(self) -> tuple[Words, KnownNumbers]:
         return Words([word.encode() + b"\0" for word in self.words]), KnownNumbers(self.constants)
 
-    def save(self, path: str | Path) -> None:
-        """Write the file.
-
-        :raises ConfigError: when it cannot be written
-        """
-        text = json.dumps(self._as_json(), indent=1, ensure_ascii=True)
-        try:
-            Path(path).write_text(text + "\n", encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"dictionary {path}: cannot be written ({error.strerror})") from error
-
-    def _as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
+        """What its file has."""
         return {
             "format": FORMAT,
             "name": self.name,
@@ -116,20 +96,6 @@ class Dictionary:
                 for name, entry in sorted(self.types.items())
             },
         }
-
-
-def load(path: str | Path, number: int = OWN) -> Dictionary:
-    """Read a dictionary from its file.
-
-    :raises ConfigError: when the file is not a dictionary; names the file
-    """
-    try:
-        return _parse(json.loads(Path(path).read_text(encoding="utf-8")), number)
-    except OSError as error:
-        raise ConfigError(f"dictionary {path}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"dictionary {path}: no dictionary of format {FORMAT} ({reason})") from error
 
 
 @cache

@@ -1,9 +1,9 @@
 """The message codec of a link: for each topic, the codec that its registry row and options select.
 
 First byte of a coded message: high nibble, the dictionaries used (0 none, 1..13 a shipped set; 14 the structure of the
-type, as the sender has announced it, and 15 a user's own dictionary, whose two-byte id follows); low nibble, the codec
-(0 stored, 1 zstd, 2 fields, 3 fields with a second part, 4 a frame of a codec for this type alone, such as that of
-clouds, 5 a frame of a coded topic, which the receiver's chain of frames decodes). 0x00 is stored as it is.
+type, as the sender has announced it); low nibble, the codec (0 stored, 1 zstd, 2 fields, 3 fields with a second part,
+4 a frame of a codec for this type alone, such as that of clouds, 5 a frame of a coded topic, which the receiver's chain
+of frames decodes). 0x00 is stored as it is.
 After 0x06 a byte follows that has no meaning, and then a coded message: so a message that says the same as an earlier
 one is not taken for its repeat.
 
@@ -22,11 +22,10 @@ from binascii import crc_hqx
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
-from pathlib import Path
 from typing import Any, Protocol
 
 from gr_ros2.compression import bounds
-from gr_ros2.compression.dictionary import GENERAL, OWN, SHIPPED, Dictionary, load, shipped
+from gr_ros2.compression.dictionary import GENERAL, SHIPPED, Dictionary, shipped
 from gr_ros2.compression.fields import FieldsCodec
 from gr_ros2.compression.quantize import Quantizer, parse_steps
 from gr_ros2.compression.schema import Composite, Types, tree_of
@@ -50,6 +49,8 @@ ANNOUNCED = 14
 """Number in the first byte for the structure that the sender has announced; two bytes of its CRC follow."""
 MAX_ANNOUNCEMENT = 255
 """Bytes of what a table says about the coding of a topic. A type whose structure is longer is not announced."""
+MAX_SHARED = 2 * max(version.max_topics for version in FORMATS.values())
+"""Codecs that topics share at most."""
 MAX_LEARNED = 8
 """Definitions of one type that are learned at most, as publishers of different age come and go."""
 
@@ -70,34 +71,26 @@ class Whole(Protocol):
 class LinkCodec:
     """Implements :class:`gr_ros2.link.message_codec.MessageCodec` for some topics.
 
-    Both ends need the same topics and dictionaries; ``codec`` and ``quantize`` of a topic matter to the sender only.
+    Both ends need the same topics; ``codec`` and ``quantize`` of a topic matter to the sender only.
 
-    :param dictionaries: a user's own dictionaries, or their files; the first one with a topic's type is used, otherwise
-        the shipped one
     :param max_size: bytes; larger messages are stored, and nothing larger is decoded
     :param whole: makes the codec that a topic's type has for itself; None from it: the type has none
-    :raises ConfigError: a file that is not a dictionary, two that share an id, a wrong ``codec`` or ``quantize``
+    :raises ConfigError: a wrong ``codec`` or ``quantize``
     """
 
     def __init__(
         self,
         topics: Iterable[Topic],
-        dictionaries: Sequence[Dictionary | str | Path] = (),
         *,
         max_size: int = MAX_MESSAGE,
         whole: Callable[[Topic], Whole | None] = lambda _: None,
     ) -> None:
         self._whole = whole
-        own = [item if isinstance(item, Dictionary) else load(item) for item in dictionaries]
-        by_id: dict[bytes, Dictionary] = {}
-        for item in own:
-            other = by_id.setdefault(item.prefix, item)
-            if other is not item and other.digest != item.digest:
-                raise ConfigError(f"dictionaries {other.name!r} and {item.name!r} share the id {item.prefix.hex()}")
-        self._sets = [*by_id.values(), *(shipped(number) for number in reversed(SHIPPED))]
+        self._sets = [shipped(number) for number in reversed(SHIPPED)]
         self._max_size = max_size
         self._made: dict[tuple[Any, ...], TopicCodec] = {}
-        """Codecs by type, ``codec``, ``quantize`` and ``cloud``: topics that have these in common share one."""
+        """Codecs by type, ``codec``, ``quantize`` and ``cloud``: topics that have these in common share one. Others
+        name types as they like, so there are at most ``MAX_SHARED``; the oldest is not shared any more."""
         self._topics: dict[int, TopicCodec] = {}
         for topic in topics:
             self.add(topic)
@@ -105,11 +98,13 @@ class LinkCodec:
     def add(self, topic: Topic) -> None:
         key = (topic.type_name, topic.options.codec, topic.options.quantize, topic.options.cloud)
         if key not in self._made:
+            if len(self._made) == MAX_SHARED:
+                del self._made[next(iter(self._made))]
             self._made[key] = TopicCodec(topic, self._sets, self._max_size, self._whole(topic))
         self._topics[topic.topic_id] = self._made[key]
 
     def of(self, topics: Iterable[Topic], announcements: Mapping[int, str] | None = None) -> LinkCodec:
-        """A codec of other topics, which shares dictionaries and everything made so far with this one.
+        """A codec of other topics, which shares everything made so far with this one.
 
         :param announcements: what their sender says about the coding of some of them, by topic id
         """
@@ -182,7 +177,7 @@ class TopicCodec:
         self._mode: str = topic.options.codec
         if self._mode not in CODECS:
             raise ConfigError(f"codec = {self._mode!r}: topic {topic.name!r} takes one of {', '.join(CODECS)}")
-        self._held = {item.number.to_bytes(1, "big") + item.prefix: _Coders.of(topic, item) for item in sets}
+        self._held = {item.number.to_bytes(1, "big"): _Coders.of(topic, item) for item in sets}
         self._choices: list[_Coders] = []
         """Coders for sending, the preferred one first: one for each definition of the type."""
         for item, coders in zip(sets, self._held.values(), strict=True):
@@ -269,15 +264,14 @@ class TopicCodec:
             return self._whole.decode(coded[1:], min(self._max_size, bounds.largest(len(coded) - 1)))
         if codec not in (ZSTD, FIELDS, FIELDS_AND_MORE) or (number == 0 and codec != ZSTD):
             raise CodecError(f"unknown codec {codec} with dictionaries {number}")
-        start = 3 if number in (OWN, ANNOUNCED) else 1
+        start = 3 if number == ANNOUNCED else 1
         body = coded[start:]
         max_size = min(self._max_size, bounds.largest(len(body)))
         if number == 0:
             return self._plain.decompress(body, max_size)
         coders = self._held.get(bytes([number]) + coded[1:start])
         if coders is None:
-            names = {OWN: f"own dictionary {coded[1:start].hex()}", ANNOUNCED: f"structure {coded[1:start].hex()}"}
-            which = names.get(number, f"shipped dictionaries {number}")
+            which = f"structure {coded[1:start].hex()}" if number == ANNOUNCED else f"shipped dictionaries {number}"
             raise UnknownDictionaryError(f"message coded with {which}, not held here")
         if codec == ZSTD:
             if coders.zstd is None:
@@ -375,7 +369,7 @@ class _Coders:
     def of(cls, topic: Topic, dictionary: Dictionary) -> _Coders:
         """The coders of one set of dictionaries."""
         own = {name: entry.definition for name, entry in dictionary.types.items() if entry.definition}
-        head = dictionary.number.to_bytes(1, "big") + dictionary.prefix
+        head = dictionary.number.to_bytes(1, "big")
         made = cls(topic.type_name, head, dictionary, Types(own).tree(topic.type_name))
         entry = dictionary.types.get(topic.type_name)
         made.zstd = Zstd(entry.zstd) if entry is not None and entry.zstd else None

@@ -14,7 +14,6 @@ import struct
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -237,12 +236,6 @@ class Set:
 @cache
 def shipped(number: int, type_name: str) -> Set:
     return Set(json.loads((SETS / f"shipped-{number}.json").read_text()), type_name)
-
-
-def own_id(data: Mapping[str, Any]) -> bytes:
-    """The two bytes that name a user's own dictionary."""
-    content = {key: value for key, value in data.items() if key != "name"}
-    return sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).digest()[:2]
 
 
 # zstd
@@ -641,12 +634,10 @@ def decode(
     type_name: str,
     announced: str = "",
     max_size: int = 1 << 24,
-    own: Mapping[str, Any] | None = None,
 ) -> bytes:
     """The message.
 
     :param announced: what the table of topics says about its coding
-    :param own: the content of a user's own dictionary
     """
     if not coded:
         raise Refused("damaged")
@@ -670,9 +661,6 @@ def decode(
                 raise Refused("unknown_dictionary")
         elif number in (1, 2):
             known = shipped(number, type_name)
-            node, dictionary = known.type, known.zstd
-        elif number == 15 and own is not None and coded[1:3] == own_id(own):
-            known = Set(own, type_name)
             node, dictionary = known.type, known.zstd
         else:
             raise Refused("unknown_dictionary")

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import random
 import struct
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from runpy import run_path
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -12,7 +16,7 @@ from rosbags.typesys.store import Typestore
 
 from gr_ros2.compression import Dictionary, LinkCodec
 from gr_ros2.settings.config import SendOptions
-from gr_ros2.settings.registry import Registry, Topic, normalize_type
+from gr_ros2.settings.registry import Topic, normalize_type
 from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
 
@@ -124,7 +128,22 @@ class Writer:
 def codec_for(type_name: str, *dictionaries: Dictionary, max_size: int = 1 << 20, **options: Any) -> LinkCodec:
     """The codec of a link with one topic."""
     topic = Topic(0, "topic", normalize_type(type_name), SendOptions(**options))
-    return LinkCodec(Registry([topic]), dictionaries, max_size=max_size)
+    made = LinkCodec((), max_size=max_size)
+    made._sets = [*dictionaries, *made._sets]
+    made.add(topic)
+    return made
+
+
+@cache
+def trainer() -> Any:
+    """What trains the sets that are shipped: ``learn(samples, name)``."""
+    return run_path(str(Path(__file__).parents[2] / "tools" / "train-dictionaries"))["learn"]
+
+
+def learn(samples: Iterable[tuple[str, bytes]], name: str, **options: Any) -> Dictionary:
+    """A set that is not shipped."""
+    made: Dictionary = trainer()(samples, name, **{"number": 13, **options})
+    return made
 
 
 def simulated(topic: str, seconds: float = 10.0, **settings: Any) -> list[bytes]:

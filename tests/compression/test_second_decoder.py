@@ -15,13 +15,10 @@ from hypothesis import strategies as st
 from fuzz.compression import TYPES
 from gr_ros2.compression import LinkCodec
 from gr_ros2.compression.ans import _LENGTHS
-from gr_ros2.compression.dictionary import shipped
 from gr_ros2.compression.floats import class_table
 from gr_ros2.compression.schema import tree_of
-from gr_ros2.compression.train import learn
 from gr_ros2.core.errors import CodecError
 from gr_ros2.middleware.bag_files import read_bag
-from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.compression import second_decoder as second
 from tests.compression.support import STORE, Writer
@@ -101,20 +98,6 @@ def test_recordings(drive: Drive) -> None:
             assert second.decode(coded, "my_msgs/msg/Thing", learned.announcement(0)) == clean
             found += 1
         assert found > 100
-
-
-def test_a_dictionary_of_a_user(tmp_path: Path) -> None:
-    type_name = SIMULATED.topics["odom"]
-    payloads = [message.payload for message in read_bag(SIMULATED.path, ["/robot_1/odom"])]
-    made = learn([(type_name, payload) for payload in payloads[::2]], "mine", base=shipped())
-    made.save(tmp_path / "mine.json")
-    own = json.loads((tmp_path / "mine.json").read_text())
-    for mode in ("fields", "zstd"):
-        sender = LinkCodec([Topic(0, "odom", type_name, SendOptions(codec=mode))], [made])
-        for payload in payloads[:50]:
-            coded = sender.encode(0, payload)
-            assert coded[0] >> 4 == 15
-            assert second.decode(coded, type_name, own=own) == sender.canonical(0, payload)
 
 
 @given(st.sampled_from(TYPES), st.sampled_from(VECTORS["messages"]), st.integers(0, 1 << 32), st.data())
