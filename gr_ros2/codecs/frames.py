@@ -11,7 +11,7 @@ cannot be coded ends nothing but itself.
 from __future__ import annotations
 
 import logging
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Mapping
 from math import inf
 from typing import Any, NamedTuple
@@ -30,6 +30,9 @@ from gr_ros2.wire import AnnouncedTopic
 
 CODING_S = 0.008
 """s that coding takes: one of 640 × 480 pixels needs half of it, and the computer has more to do."""
+MOST_DECODERS = 32
+"""Topics of others that are decoded at a time; each may hold some pictures. The one that was used longest ago begins
+anew with a key frame."""
 _SECONDS = 2.0
 """s over which what is said of a topic is a mean."""
 _log = logging.getLogger(__name__)
@@ -145,7 +148,9 @@ class FrameSender:
         """A message that is to be encoded now. ``done`` has to follow."""
         for topic_id, sent in self._sent.items():
             if sent.pull.waits(now):
-                share = sent.weight / sum(other.weight for other in self._sent.values() if other.lives(now))
+                share = sent.weight / sum(
+                    other.weight for other in self._sent.values() if other is sent or other.lives(now)
+                )
                 pull = sent.pull.pull(now, self._frames.progress(topic_id, now), share)
                 if pull is not None:
                     return Job(topic_id, pull, sent.encoder)
@@ -241,7 +246,9 @@ class FrameReceiver:
 
     def __init__(self, max_size: int = MAX_SIZE) -> None:
         self._max_size = max_size
-        self._decoders: dict[tuple[int, int], tuple[str, str, TopicDecoder]] = {}
+        self._topics: dict[tuple[int, int], tuple[str, str, CodedTopic]] = {}
+        self._decoders: OrderedDict[tuple[int, int], TopicDecoder] = OrderedDict()
+        """Those that were used last, the newest last."""
         self._sizes: dict[tuple[int, str], tuple[int, int] | None] = {}
         """Width and height of the newest picture in a namespace of a robot; None for one that has its own size."""
 
@@ -254,16 +261,15 @@ class FrameReceiver:
         """
         output = frames_output(told)
         if output is None:
-            self._decoders.pop(key, None)
+            self._topics.pop(key, None)
             return told.type_name
-        if key not in self._decoders or self._decoders[key][:2] != (told.type_name, output):
+        if key not in self._topics or self._topics[key][:2] != (told.type_name, output):
             coded = CodedTopic(told.type_name, {"camera": {"output_type": output}})
             if coded.missing:
                 raise BackendMissingError(f"topic {told.name} comes as video: {coded.missing}")
-            self._decoders[key] = told.type_name, output, coded.decoder(self._max_size)
-        from gr_ros2.codecs.camera import OUTPUTS
-
-        return OUTPUTS.get(output, told.type_name)
+            self._topics[key] = told.type_name, output, coded
+            self._decoders.pop(key, None)
+        return next(iter(self._topics[key][2].codecs.values())).output
 
     def decode(self, key: tuple[int, int], name: str, payload: bytes) -> bytes:
         """The message of a frame, and any other as it is.
@@ -271,13 +277,16 @@ class FrameReceiver:
         :param name: of its topic
         :raises CodecError: the frame before is missing, or it is damaged
         """
-        known = self._decoders.get(key)
-        if known is None:
+        if key not in self._topics:
             return payload
-        message = known[2].decode(payload)
+        decoder = self._decoders.setdefault(key, self._topics[key][2].decoder(self._max_size))
+        self._decoders.move_to_end(key)
+        if len(self._decoders) > MOST_DECODERS:
+            self._decoders.popitem(last=False)
+        message = decoder.decode(payload)
         # Plug-ins of image_transport publish camera/image/compressed beside camera/camera_info.
         base = name.removesuffix("/compressed").removesuffix("/compressedDepth")
-        self._sizes[key[0], base.rpartition("/")[0]] = known[2].size
+        self._sizes[key[0], base.rpartition("/")[0]] = decoder.size
         return message
 
     def scaled(self, src_id: int, name: str, type_name: str, message: bytes) -> bytes:

@@ -12,12 +12,15 @@ import pytest
 
 pytest.importorskip("av", reason="needs PyAV")
 
-from gr_ros2.codecs.frames import FrameReceiver
-from gr_ros2.codecs.messages import CAMERA_INFO, IMAGE, VIDEO, read
+from gr_ros2.codecs import CodedTopic
+from gr_ros2.codecs.frames import MOST_DECODERS, FrameReceiver
+from gr_ros2.codecs.messages import CAMERA_INFO, GRID, IMAGE, VIDEO, read
+from gr_ros2.core.errors import BackendMissingError, MissingFrameError
 from gr_ros2.link.events import Accepted, Delivered, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.wire import AnnouncedTopic
 from tests.codecs import scenes
 from tests.codecs.camera_link import CAMERA, ODOMETRY, Air, Robot, registry
 
@@ -329,6 +332,27 @@ def test_options_change_while_it_is_sent() -> None:
     assert 8 <= len([now for now, _ in air.robots[1].of(1) if now > 3]) <= 10
 
 
+def test_the_memory_for_topics_of_others_is_bounded() -> None:
+    receiver, encoder = FrameReceiver(), CodedTopic(IMAGE).encoder()
+    key_frame, following = (encoder.encode(picture(number), 900).data for number in range(2))
+    keys = [(robot, topic) for robot in range(1, 4) for topic in range(20)]
+    for key in keys:
+        assert receiver.announce(key, AnnouncedTopic(key[1], f"image_{key[1]}", IMAGE, codec="frames")) == IMAGE
+        receiver.decode(key, "camera/image", key_frame)
+    assert len(receiver._decoders) == MOST_DECODERS < len(keys)
+    receiver.decode(keys[-1], "camera/image", following)
+    with pytest.raises(MissingFrameError):
+        receiver.decode(keys[0], "camera/image", following)
+
+
+def test_maps_need_no_package_of_video(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.delitem(sys.modules, "gr_ros2.codecs.camera", raising=False)
+    assert FrameReceiver().announce((1, 0), AnnouncedTopic(0, "map", GRID, codec="frames")) == GRID
+    with pytest.raises(BackendMissingError, match="video"):
+        FrameReceiver().announce((1, 0), AnnouncedTopic(0, "image", IMAGE, codec="frames"))
+
+
 def test_a_thousand_frames_of_any_size_arrive_whole_and_in_order() -> None:
     sender, receiver = Robot(1, registry(off=True), 1000), Robot(2, None, 1000)
     air = Air(sender, receiver, loss=0.2)
@@ -370,3 +394,16 @@ def test_a_picture_that_passes_exactly_is_repaired_however_long_it_takes() -> No
     sent = [event for event in air.robots[0].events if isinstance(event, Accepted) and event.topic_id == CAMERA]
     assert len(shown) >= len(sent) - 1 >= 4
     assert set(shown) <= set(odd)
+
+
+def test_a_picture_that_waited_out_an_outage_is_sent_although_none_followed() -> None:
+    air = link()
+    air.run(3.0)
+    lost, air.lost = air.lost, lambda _, __: True
+    air.run(4.0)
+    last = picture(60)
+    air._feeds[0] = air.robots[0], CAMERA, 0.01, lambda _: last, 0
+    air.run(8.0)
+    air.lost = lost
+    air.run(9.0)
+    assert number_of(air.robots[1].of(1)[-1][1]) == 60
