@@ -56,8 +56,12 @@ class Combining:
         packets = self._packets
         self._place = (self._place + _GOLDEN) % 1
         span = packets.newest - packets.needed + 1
-        first = packets.needed + min(max(int(self._place * span) - MAX_WINDOW // 2, 0), max(span - MAX_WINDOW, 0))
-        last = min(first + MAX_WINDOW - 1, packets.newest)
+        if span <= MAX_WINDOW:
+            first, last = packets.needed, packets.newest
+        else:
+            shift = min(max(int(self._place * span) - MAX_WINDOW // 2, 0), span - MAX_WINDOW)
+            first = packets.needed + shift
+            last = first + MAX_WINDOW - 1
         found = packets.live(first, last, now)
         while not found and last < packets.newest:  # continue at the next live one
             first, last = last + 1, min(last + MAX_WINDOW, packets.newest)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import inf
 from zlib import crc32
 
@@ -37,6 +38,25 @@ MAX_AGE_S = 15.0
 next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """What holds for the messages of one row of a table of topics, by the settings here and by the row.
+
+    :param withheld_s: s for which they may have been withheld; infinite for any time, None for ``DeliveryRules``'
+    :param deadline_s: s for which they may be under way; infinite for any time
+    """
+
+    topic: AnnouncedTopic
+    withheld_s: float | None
+    deadline_s: float
+
+    @classmethod
+    def of(cls, topic: AnnouncedTopic, settings: Settings) -> _Limits:
+        told = options_of(topic.name, settings.max_ages, settings.max_age_s)
+        withheld_s = (None if topic.fresh else inf) if told == AUTO else told or inf
+        return cls(topic, withheld_s, options_of(topic.name, settings.deadlines, topic.deadline_s) or inf)
+
+
 class DeliveryRules:
     """See the module.
 
@@ -52,9 +72,8 @@ class DeliveryRules:
         self.newest: dict[int, tuple[int, int]] = {}
         self._own, self._settings = settings.src_id, settings
         self._silent_before = 0
-        self._max_age_s, self._max_ages = settings.max_age_s, settings.max_ages
         self._relays = settings.relay
-        self._deadlines = settings.deadlines
+        self._limits: dict[int, _Limits] = {}
         self._reached: deque[tuple[int, float, bool]] = deque(maxlen=_REACHED)
         """Numbers that the robot's packets have reached, when, s, and whether it may have reached them long before."""
         self._over: dict[tuple[int, tuple[int, int]], None] = {}
@@ -154,12 +173,14 @@ class DeliveryRules:
         """Why a message is not delivered; None for one that is, or that is here already."""
         if topic.dst_id != BROADCAST and self._own not in (topic.dst_id, NOBODY):
             return Fate.NOT_FOR_US
-        withheld_s, deadline_s = self._limits(topic)
+        limits = self._limits_of(topic)
+        withheld_s = self.withheld_s if limits.withheld_s is None else limits.withheld_s
         if withheld_s < inf:
             oldest = self.sealed(ready) if ready.over is None else min(ready.sealed, ready.made)
             if now - oldest > withheld_s:
                 return Fate.NOT_FRESH
-        if now - ready.made > min(deadline_s, ready.limit_s):
+        under_way_s = now - ready.made
+        if under_way_s > limits.deadline_s or under_way_s > ready.limit_s:
             return Fate.LATE
         before = ready.over is None and ready.order[0] < self._silent_before
         if before and (topic.fresh or not (topic.reliable or topic.latched)):
@@ -188,20 +209,19 @@ class DeliveryRules:
 
     def limit_s(self, topic: AnnouncedTopic) -> float:
         """Age in s at which a message of a topic that came over others is of no more use."""
-        return min(self._limits(topic))
-
-    def _limits(self, topic: AnnouncedTopic) -> tuple[float, float]:
-        """s for which a message of a topic may have been withheld, and s for which it may have been under way; infinite
-        for any time."""
-        withheld_s = options_of(topic.name, self._max_ages, self._max_age_s)
-        if withheld_s == AUTO:
-            withheld_s = self.withheld_s if topic.fresh else 0.0
-        return withheld_s or inf, self.deadline_s(topic)
+        limits = self._limits_of(topic)
+        return min(self.withheld_s if limits.withheld_s is None else limits.withheld_s, limits.deadline_s)
 
     def deadline_s(self, topic: AnnouncedTopic) -> float:
         """s for which a message of a topic may be under way, as this robot or else the one that sends it says; infinite
         for any time."""
-        return options_of(topic.name, self._deadlines, topic.deadline_s) or inf
+        return self._limits_of(topic).deadline_s
+
+    def _limits_of(self, topic: AnnouncedTopic) -> _Limits:
+        limits = self._limits.get(topic.topic_id)
+        if limits is None or limits.topic is not topic:
+            limits = self._limits[topic.topic_id] = _Limits.of(topic, self._settings)
+        return limits
 
     def _passed(self, ready: Ready) -> bool:
         """Whether a message whose order is not the newest of its topic comes after a later one."""

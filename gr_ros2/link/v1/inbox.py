@@ -350,8 +350,9 @@ class Inbox:
         :param repaired_s: s for which its sender repairs the packet that brought it
         """
         topic = self.announced.topics.get(ready.topic_id)
-        of_use_s = inf if topic is None else self.deliveries.deadline_s(topic)
-        ready.made = self.deliveries.made(ready, self.began, repaired_s if repaired_s <= of_use_s else inf)
+        if repaired_s < inf and topic is not None and repaired_s > self.deliveries.deadline_s(topic):
+            repaired_s = inf
+        ready.made = self.deliveries.made(ready, self.began, repaired_s)
         if ready.topic_id > TABLE_TOPIC:
             if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
                 self.order.wait(ready)

@@ -90,21 +90,19 @@ class Packing:
         :return: None if nothing may be sent
         """
         heap = self._heap(now)
-        if self.fills and not spare and len(self._open) == 1:
+        if not heap or (len(heap) == 1 and not spare and heap[0][2] == TABLE_TOPIC and self.fills):
             return None
-        if not heap:
-            return None
-        picks: list[tuple[Message, int]] = []
+        picks: list[tuple[Message, int, int]] = []
         used = 0
         while heap and used < room:
             _, _, topic_id, position = heappop(heap)
             queue = self._open[topic_id]
             message = queue[position]
-            remaining = message.remaining
-            taken, size = fit(room - used, remaining, message.back(number), message.offset)
+            remaining, back = len(message.payload) - message.offset, message.back(number)
+            taken, size = fit(room - used, remaining, back, message.offset)
             if taken < 0 or not (taken == remaining or _may_cut(message, taken, used, room)):
                 continue
-            picks.append((message, taken))
+            picks.append((message, taken, back))
             used += size
             if taken == remaining and position + 1 < len(queue):
                 following = queue[position + 1]
@@ -162,14 +160,14 @@ class Packing:
         heapify(heap)
         return heap
 
-    def _take(self, picks: list[tuple[Message, int]], number: int, used: int, now: float) -> Filling:
+    def _take(self, picks: list[tuple[Message, int, int]], number: int, used: int, now: float) -> Filling:
         parts: list[EntryV1] = []
         sent: list[SentEntry] = []
         lifetimes: list[Lifetime] = []
         stats, qos, since = self._stats, picks[0][0].qos, inf
-        for place, (message, taken) in enumerate(picks):
+        for place, (message, taken, back) in enumerate(picks):
             topic_id, offset, lifetime = message.topic_id, message.offset, message.lifetime
-            topic, back = self._topics[topic_id], message.back(number)
+            topic, queue = self._topics[topic_id], self._topics[topic_id].queue
             if not message.index:
                 message.begin, message.place = number - back, -1 if back else place
                 lifetime.chained = topic.coded
@@ -177,15 +175,15 @@ class Packing:
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
                 lifetime.long = self._long(message)
                 lifetime.fresh = not (lifetime.in_order or topic.kept or topic_id > TABLE_TOPIC)
-                topic.queue.started(message, now)
+                queue.started(message, now)
             if message.submitted < since and not topic.topic.options.max_rate:
                 since = message.submitted
-            lifetime.awaited = len(topic.queue) > 1
+            lifetime.awaited = len(queue) > 1
             if topic.coded:
                 message.numbers.append(number)
             payload = message.take(taken)
             last = message.offset == len(message.payload)
-            on_air = min(topic_id, CARRIED_TOPIC)
+            on_air = topic_id if topic_id < CARRIED_TOPIC else CARRIED_TOPIC
             parts.append(Part(on_air, payload, back, offset, last, message.coded))
             named = (number, place) if message.place < 0 else (message.begin, message.place)
             of, key = message.carried or (topic_id, Key(self._boot, *named))
@@ -197,13 +195,13 @@ class Packing:
             stats.payload_bytes += taken
             if last:
                 lifetime.left, message.left_at = True, now
-                topic.queue.popleft()
-                if not (topic.queue and topic.queue[0].repeat):  # what is repeated together is worth the same
-                    topic.newest = max(topic.newest, message.submitted)
+                queue.popleft()
+                if message.submitted > topic.newest and not (queue and queue[0].repeat):
+                    topic.newest = message.submitted  # what is repeated together is worth the same
                 stats.sent[of] += not message.repeat
                 self._left(message, now)
         # On a shared channel a topic that goes along in a packet has had a turn: fresh messages are in every packet.
-        self.turns.sent([message.topic_id for message, _ in picks] if self._shares else [self._holder])
+        self.turns.sent([message.topic_id for message, _, _ in picks] if self._shares else [self._holder])
         stats.entries += len(picks)
         return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, since)
 

@@ -147,7 +147,7 @@ class Peers:
         """A source packet leaves, after ``SentPackets.newest``."""
         for lifetime in lifetimes:
             if lifetime.in_order:
-                self._ordered = max(self._ordered, number)
+                self._ordered = number if number > self._ordered else self._ordered
                 break
         before = self._times.get(self._packets.newest)
         if before is not None:
