@@ -174,6 +174,12 @@ class FrameSender:
         if sent.is_map:
             sent.encoder.confirmed(made.name)  # frames arrive in order
 
+    def end(self) -> None:
+        """Code nothing more: messages that wait are not sent."""
+        for topic_id, sent in self._sent.items():
+            if sent.pull.end():
+                self._frames.refuse(topic_id, Fate.SUPERSEDED, "sending ended before the air was free for it")
+
     def stats(self, topic_id: int, now: float) -> dict[str, Any] | None:
         """What is made of a topic: frames so far, messages that could not be coded, and in words what the newest frame
         leaves out and what the topic has become lately; None for one that is not sent as frames."""

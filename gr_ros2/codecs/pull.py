@@ -93,6 +93,11 @@ class StatePull:
         self._coding = False
         self._key = self._key or key
 
+    def end(self) -> bool:
+        """Code nothing more. Returns whether a message was waiting."""
+        waited, self._new, self._newest = self._new, False, None
+        return waited
+
 
 class FramePull:
     """The frames of one topic at its sender.
@@ -157,3 +162,8 @@ class FramePull:
         self._coding = False
         if key:
             self._key, self._keyed = True, -inf
+
+    def end(self) -> bool:
+        """Code nothing more. Returns whether a message was waiting."""
+        waited, self._newest = self._newest is not None, None
+        return waited

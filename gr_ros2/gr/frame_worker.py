@@ -50,6 +50,7 @@ class FrameWorker:
         """Encode nothing more. Called without the lock."""
         with self._live.lock:
             self._running, self._live.look = False, lambda: None
+            self._sender.end()
             self._work.notify()
         if self._thread is not None:
             self._thread.join(_PATIENCE_S)

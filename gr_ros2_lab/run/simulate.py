@@ -466,6 +466,13 @@ class Robot:
         if at is not None and at <= now:
             yield from ((now, self, self._shown(event)) for event in self.endpoint.handle_timeout(now))
 
+    def finish(self, now: float) -> Iterator[TimedEvent]:
+        """Say what becomes of messages that still wait to be coded."""
+        if self._frames is not None:
+            self._frames.end()
+            yield from ((now, self, event) for event in self._events)
+            self._events.clear()
+
     def _code(self, now: float) -> None:
         """Encode the pictures that are due."""
         if self._coder is not None:
@@ -549,6 +556,7 @@ class EventLoop:
                 raise self._stalled()
         for robot in self._robots:
             yield from robot.expire(self.now)
+            yield from robot.finish(self.now)
 
     def _stalled(self) -> RunError:
         """The error that names the robots whose timers are due without effect."""

@@ -407,3 +407,17 @@ def test_a_picture_that_waited_out_an_outage_is_sent_although_none_followed() ->
     air.lost = lost
     air.run(9.0)
     assert number_of(air.robots[1].of(1)[-1][1]) == 60
+
+
+def test_a_picture_that_waits_at_the_end_has_a_fate() -> None:
+    air = link(kbit_s=64)
+    sender = air.robots[0]
+    air.run(2.0)
+    for number in range(2):
+        sender.sender.offer(CAMERA, picture(number), air.now)
+    before = [event for event in sender.events if isinstance(event, Refused)]
+    sender.sender.end()
+    (last,) = [event for event in sender.events if isinstance(event, Refused)][len(before) :]
+    assert last.reason == Fate.SUPERSEDED
+    assert "ended" in last.detail
+    assert sender.sender.next(air.now) is None
