@@ -35,6 +35,16 @@ CAMERA: Final = "camera"
 ALL_TYPES: Final = {**TYPES, RTCM: "rtcm_msgs/msg/Message", CAMERA: "sensor_msgs/msg/Image"}
 """And the corrections of a base station, in the type that GNSS drivers use for them, and a camera."""
 GRAVITY: Final = 9.80665
+SCAN_RANGE: Final = 12.0
+"""Farthest range that the scanner measures, m; beyond it a beam reads +inf (REP 117)."""
+SCAN_NOISE: Final = 0.01
+"""Standard deviation of a range, m."""
+IMU_GYRO_NOISE: Final = 0.01
+"""Standard deviation of a turn rate, rad/s."""
+IMU_ACCEL_NOISE: Final = 0.1
+"""Standard deviation of an acceleration, m/s^2."""
+IMU_ORIENTATION_NOISE: Final = 0.01
+"""Standard deviation of the orientation about each axis, rad."""
 _SCAN_MIN: Final = 0.05
 _STORE: Final = get_typestore(Stores.ROS2_HUMBLE)
 _STORE.register(get_types_from_msg("std_msgs/Header header\nuint8[] message\n", ALL_TYPES[RTCM]))
@@ -61,8 +71,8 @@ class Sensors:
         self._odom_pose = (start.x, start.y, start.heading)
         self._odom_t = 0.0
         rng = self._rng["imu"]
-        self._gyro_bias = rng.normal(0.0, settings.imu_gyro_noise / 5, 3)
-        self._accel_bias = rng.normal(0.0, settings.imu_accel_noise / 5, 3)
+        self._gyro_bias = rng.normal(0.0, IMU_GYRO_NOISE / 5, 3)
+        self._accel_bias = rng.normal(0.0, IMU_ACCEL_NOISE / 5, 3)
         turn = 2 * math.pi / settings.beams
         self._bearings: Floats = -math.pi + turn * np.arange(settings.beams, dtype=np.float64)
         # Variances as drivers fill them in: position, height, roll, pitch and heading.
@@ -70,8 +80,7 @@ class Sensors:
         twist = (settings.odom_linear_noise**2, 1e-6, 1e6, 1e6, 1e6, settings.odom_angular_noise**2)
         self._pose_covariance, self._twist_covariance = np.diag(pose).ravel(), np.diag(twist).ravel()
         self._imu_covariance = [
-            np.diag([noise**2] * 3).ravel()
-            for noise in (settings.imu_orientation_noise, settings.imu_gyro_noise, settings.imu_accel_noise)
+            np.diag([noise**2] * 3).ravel() for noise in (IMU_ORIENTATION_NOISE, IMU_GYRO_NOISE, IMU_ACCEL_NOISE)
         ]
 
     def read(self, topic: str, t: float, state: State, others: Sequence[State]) -> bytes:
@@ -97,8 +106,8 @@ class Sensors:
         settings = self._settings
         round_things = np.array([(other.x, other.y, RADIUS) for other in others], dtype=np.float64).reshape(-1, 3)
         ranges = self._world.cast(state.x, state.y, self._bearings + state.heading, round_things)
-        ranges = ranges + self._rng["scan"].normal(0.0, settings.scan_noise, settings.beams)
-        ranges = np.where(ranges > settings.scan_range, np.inf, np.maximum(ranges, _SCAN_MIN))
+        ranges = ranges + self._rng["scan"].normal(0.0, SCAN_NOISE, settings.beams)
+        ranges = np.where(ranges > SCAN_RANGE, np.inf, np.maximum(ranges, _SCAN_MIN))
         turn = 2 * math.pi / settings.beams
         return _TYPE["sensor_msgs/msg/LaserScan"](
             header=self._header(t, "laser"),
@@ -108,7 +117,7 @@ class Sensors:
             time_increment=0.0,
             scan_time=1.0 / settings.scan_rate,
             range_min=_SCAN_MIN,
-            range_max=settings.scan_range,
+            range_max=SCAN_RANGE,
             ranges=ranges.astype(np.float32),
             intensities=np.empty(0, dtype=np.float32),
         )
@@ -133,10 +142,10 @@ class Sensors:
         )
 
     def _imu(self, t: float, state: State, others: Sequence[State]) -> Any:  # noqa: ARG002
-        settings, noise = self._settings, self._rng["imu"].standard_normal((3, 3))
-        tilt = (settings.imu_orientation_noise * noise[0]).tolist()
-        gyro = (self._gyro_bias + settings.imu_gyro_noise * noise[1]).tolist()
-        accel = (self._accel_bias + settings.imu_accel_noise * noise[2]).tolist()
+        noise = self._rng["imu"].standard_normal((3, 3))
+        tilt = (IMU_ORIENTATION_NOISE * noise[0]).tolist()
+        gyro = (self._gyro_bias + IMU_GYRO_NOISE * noise[1]).tolist()
+        accel = (self._accel_bias + IMU_ACCEL_NOISE * noise[2]).tolist()
         orientation, angular, linear = self._imu_covariance
         return _TYPE["sensor_msgs/msg/Imu"](
             header=self._header(t, "imu_link"),

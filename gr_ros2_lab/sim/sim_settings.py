@@ -34,14 +34,9 @@ class SimSettings:
     :param rtcm_rate: RTK corrections of a base station, Hz; 0 = there are none
     :param camera_rate: pictures of 320 × 240, Hz; 0 = there is no camera
     :param beams: of a laser scan, over the full turn
-    :param scan_range: farthest range the scanner measures, m; beyond it a beam reads +inf (REP 117)
     :param map_cells: cells along each side of the map
-    :param scan_noise: standard deviation of a range, m
     :param odom_linear_noise: of the measured forward speed, m/s; the odometry pose integrates it, so it drifts
     :param odom_angular_noise: of the measured turn rate, rad/s; integrated likewise
-    :param imu_gyro_noise: rad/s
-    :param imu_accel_noise: m/s^2
-    :param imu_orientation_noise: rad, about each axis
     :param start_time_s: s, what the stamps begin at
     :param prefix_frames: frame ids carry the robot's name (robot_1/odom), for robots that share one graph
     :param transforms: robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries
@@ -61,14 +56,9 @@ class SimSettings:
     rtcm_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
     camera_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
     beams: Annotated[int, Field(ge=1, le=10_000)] = 360
-    scan_range: Annotated[float, Field(ge=1, le=1000)] = 12.0
     map_cells: Annotated[int, Field(ge=10, le=2000)] = 100
-    scan_noise: Noise = 0.01
     odom_linear_noise: Noise = 0.02
     odom_angular_noise: Noise = 0.01
-    imu_gyro_noise: Noise = 0.01
-    imu_accel_noise: Noise = 0.1
-    imu_orientation_noise: Noise = 0.01
     start_time_s: Annotated[float, Field(ge=0, le=2**31 - 1)] = 0.0
     prefix_frames: bool = False
     transforms: bool = False

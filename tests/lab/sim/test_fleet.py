@@ -15,7 +15,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import build
 from gr_ros2_lab.sim.fleet import Fleet, SimMessage
 from gr_ros2_lab.sim.motion import ACCELERATION, MAX_TURN, RADIUS, TURN_ACCELERATION
-from gr_ros2_lab.sim.sensors import GRAVITY, TYPES
+from gr_ros2_lab.sim.sensors import GRAVITY, IMU_ACCEL_NOISE, IMU_GYRO_NOISE, IMU_ORIENTATION_NOISE, SCAN_NOISE, TYPES
 from gr_ros2_lab.sim.sim_settings import SimSettings
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -143,8 +143,8 @@ def test_scans_agree_with_geometry(fleet: Fleet, messages: list[SimMessage]) -> 
         assert scan.angle_max == pytest.approx(scan.angle_min + 359 * scan.angle_increment, abs=1e-5)
     every = np.concatenate(errors)
     # float32 angles move a beam that grazes an edge past it, so single beams may be far off: median, not mean
-    assert np.median(np.abs(every)) == pytest.approx(0.6745 * fleet.settings.scan_noise, rel=0.05)
-    assert np.mean(np.abs(every) > 6 * fleet.settings.scan_noise) < 1e-3
+    assert np.median(np.abs(every)) == pytest.approx(0.6745 * SCAN_NOISE, rel=0.05)
+    assert np.mean(np.abs(every) > 6 * SCAN_NOISE) < 1e-3
 
 
 def test_odometry_is_noisy_and_drifts_little(fleet: Fleet, messages: list[SimMessage]) -> None:
@@ -169,13 +169,13 @@ def test_imu_measures_motion_and_gravity(fleet: Fleet, messages: list[SimMessage
     truth = [fleet.state(1, t) for t, _ in readings]
     gyro = np.array([m.angular_velocity.z for _, m in readings]) - [s.turn for s in truth]
     sideways = np.array([m.linear_acceleration.y for _, m in readings]) - [s.speed * s.turn for s in truth]
-    assert gyro.std() == pytest.approx(fleet.settings.imu_gyro_noise, rel=0.15)
-    assert sideways.std() == pytest.approx(fleet.settings.imu_accel_noise, rel=0.15)
+    assert gyro.std() == pytest.approx(IMU_GYRO_NOISE, rel=0.15)
+    assert sideways.std() == pytest.approx(IMU_ACCEL_NOISE, rel=0.15)
     assert np.mean([m.linear_acceleration.z for _, m in readings]) == pytest.approx(GRAVITY, abs=0.2)
     for (_, m), state in zip(readings, truth, strict=True):
         q = m.orientation
         yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
-        assert math.cos(yaw - state.heading) > math.cos(6 * fleet.settings.imu_orientation_noise)
+        assert math.cos(yaw - state.heading) > math.cos(6 * IMU_ORIENTATION_NOISE)
         assert q.x**2 + q.y**2 + q.z**2 + q.w**2 == pytest.approx(1.0)
 
 
