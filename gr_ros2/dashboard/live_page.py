@@ -325,11 +325,11 @@ class LivePage:
     def _build(self, instance: str) -> None:
         sources = self._sources
         map_ = _plot("map", "name", "x [m]", "y [m]", match_aspect=True)
-        map_.image_rgba("image", "x", "y", "dw", "dh", source=sources["grid"], alpha=0.7)
         map_.multi_line("x", "y", source=sources["sent"], color=_SENT, line_width=6, alpha=0.4)
         map_.multi_line("x", "y", source=sources["received"], color=_RECEIVED, line_width=1.5)
         map_.multi_line("x", "y", source=sources["gap"], color=_SOFT, line_width=1.5, line_dash="dotted")
         map_.scatter("x", "y", source=sources["ends"], color="colour", line_color="white", size=12)
+        map_.image_rgba("image", "x", "y", "dw", "dh", source=sources["grid"], alpha=0.7, level="underlay")
         camera = _plot("camera", "", "", "", match_aspect=True)
         camera.image_rgba("image", "x", "y", "dw", "dh", source=sources["picture"])
         camera.axis.visible = camera.grid.visible = False
