@@ -27,6 +27,9 @@ from gr_ros2.wire.mac_block import SLOT_NUMBERS
 
 GAIN = 0.2
 """Share of a difference by which the clock follows. 1 would pass on the jitter of each packet."""
+FIRST_GAIN = 0.5
+"""The same while nobody agrees. Two robots that began apart by a fifth of a slot, and move towards each other, agree
+after one packet of each; by ``GAIN`` their packets overlap at the edges for some more, where they use slots in turn."""
 TOLERANCE = 0.25
 """Slots. Sender and receiver still agree on the number of a slot, whatever the jitter within the guard."""
 PATIENCE = 105
@@ -107,9 +110,11 @@ class SlotClock:
         error = (exact - number + SLOT_NUMBERS / 2) % SLOT_NUMBERS - SLOT_NUMBERS / 2
         slot = round(exact - error)
         if -TOLERANCE <= error <= TOLERANCE:
+            agreeing, guessed = self.agreeing(began), self._doubtful or self._unsaid
             self._doubtful = self._doubtful and not checked
-            if trusted or (checked and not self.agreeing(began)):
-                self._zero += GAIN * error * self.slot_s
+            if trusted or (checked and not agreeing):
+                self._zero += (1 if guessed else GAIN if agreeing else FIRST_GAIN) * error * self.slot_s
+                self._unsaid = False
             if trusted:
                 self._agreed[src_id] = self._agreed_at = began
                 self._odd.pop(src_id, None)

@@ -127,3 +127,10 @@ def test_a_clock_that_nobody_can_follow_yet_moves_to_whoever_is_heard() -> None:
         made.start(100.0)
         assert made.heard(2, 0, 110.0 + error, trusted=True) is not None
         assert made.jumps == 1
+
+
+def test_two_that_began_a_part_of_a_slot_apart_agree_after_a_packet_of_each() -> None:
+    one, two = clock(100.0), clock(100.0 + 0.2 * SLOT)
+    assert two.heard(1, 3, one.begin(3), trusted=True) == 3
+    assert one.heard(2, 5, 100.0 + 5.2 * SLOT, trusted=True) == 5  # it had left before
+    assert one.begin(7) == pytest.approx(two.begin(7), abs=1e-6)

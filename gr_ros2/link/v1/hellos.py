@@ -52,8 +52,8 @@ delivered."""
 EAGER = 20
 """Number of these hellos."""
 RESTS = 2
-"""Packets of messages, if any wait, between two hellos on a slow channel: a row of the table and its message, for
-example. A robot that starts, or is met, would say nothing but hellos there for its first five turns."""
+"""Packets of messages, if any wait, between two hellos on a slow channel where somebody is heard: a row of the table
+and its message, for example. Who is met would say nothing but hellos there for its next five turns."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
 
@@ -129,14 +129,18 @@ class Hellos:
         if late < 0 or idle or self._answering:
             return late >= 0
         if self._starting:
-            return late >= latency * LATENCY_S and not (self.rests and self._settings.slower > 1)
+            rests = self.rests > 0 and self._settings.slower > 1 and self._hears_others
+            return late >= latency * LATENCY_S and not rests
         return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
 
     @property
     def lone(self) -> bool:
         """Whether nothing of any robot comes, though it could, and nothing is said for robots that only listen."""
-        heard = any(not neighbour.silent for neighbour in self._neighbours.all.values())
-        return self._settings.hears and not self.talks and not heard
+        return self._settings.hears and not self.talks and not self._hears_others
+
+    @property
+    def _hears_others(self) -> bool:
+        return any(not neighbour.silent for neighbour in self._neighbours.all.values())
 
     @property
     def _period(self) -> float:
