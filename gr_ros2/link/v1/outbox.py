@@ -94,6 +94,8 @@ class Outbox:
         self._observer = observer
         self._serial = 0
         self.asks: Counter[int] = Counter()
+        self._kept_frames: dict[int, tuple[int, bytes]] = {}
+        """Serial and bytes of the newest frame of each latched topic, which may be sent again."""
         self.sent = SentTopics(codec, settings.commands, instances)
         self.kept = KeptMessages(self.sent, room, settings, self.stats, self._admit)
         self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)
@@ -264,17 +266,23 @@ class Outbox:
         topic_id = topic.topic.topic_id
         self._owner.submitted(topic_id, now)
         self.packing.turns.join(topic_id)
-        serial = self._new(topic_id)
-        if self._observer is not None:
-            self._observer(Accepted(serial, topic_id, frame, came))
+        serial, before = self._kept_frames.get(topic_id, (-1, b""))
+        again = topic.kept and frame == before
+        if again:
+            self.stats.repeats += 1
+        else:
+            serial = self._new(topic_id)
+            if self._observer is not None:
+                self._observer(Accepted(serial, topic_id, frame, came))
         payload = FRAME + frame
         if len(payload) > MAX_MESSAGE:
             self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return None
         message = Message(serial, topic_id, payload, topic.qos, came, topic.weight, coded=True, key=key)
-        message.dst_id = topic.dst_id
+        message.dst_id, message.repeat = topic.dst_id, again
         if topic.kept:
             self.kept.keep(topic, message)
+            self._kept_frames[topic_id] = serial, frame
         topic.queue.append(message)
         return message
 
