@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ pytest.importorskip("gr_ros2.radio.audio_card", reason="needs sounddevice and li
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.phy.psk import PskPhy
+from gr_ros2.radio import PRESETS
 from gr_ros2.radio.audio import AudioFrontEnd
 from gr_ros2.radio.audio_card import look_again
 from gr_ros2.radio.permission import permitted
+from tests.middleware.support import message
 from tests.radio.robots import Robot
 from tests.radio.sound_server import SoundServer, sound_server_or_skip
 from tests.radio.test_ptt import Rigctld
@@ -91,6 +94,38 @@ def test_a_server_that_ends_and_comes_back_is_waited_for(
         alone.say(2)
         wait_for(lambda: serve(alone) and len(alone.heard) > before)
         assert all("\n" not in record.message for record in caplog.records)
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+@pytest.mark.usefixtures("server")
+@pytest.mark.parametrize("numbers", [(1, 2), (1, 2, 3)])
+def test_robots_that_all_hear_each_other_take_turns_and_lose_no_message(
+    monkeypatch: pytest.MonkeyPatch, numbers: tuple[int, ...]
+) -> None:
+    """One null sink for all, with the packets of half a second of preset ``sound``."""
+    at(monkeypatch, "a", "a")
+    front_end, phy = (
+        {**SOUND, "half_duplex": True},
+        {"name": "ofdm", "sample_rate": 8e3, "options": dict(PRESETS["sound"].phy_options)},
+    )
+    front_end.pop("centre_hz")
+    with ExitStack() as stack:
+        robots = [
+            stack.enter_context(
+                Robot(number, front_end, tuple({*numbers} - {number}), phy=phy, packet_len=64, medium="slots")
+            )
+            for number in numbers
+        ]
+        said = []
+        for number, each in enumerate(robots):
+            said.append(message(number, 8))
+            each.publish(said[-1])
+        packets = lambda: [each.link.stats()["packets"]["out"] for each in robots]  # noqa: E731
+        wait_for(lambda: serve(*robots) and any(each.heard for each in robots), "a message", packets)
+        assert max(packets()) <= 20, "a message does not wait for hellos"
+        everybody = [sorted({*said} - {own}) for own in said]
+        wait_for(lambda: serve(*robots) and [sorted(each.heard) for each in robots] == everybody, "all", packets)
 
 
 @pytest.mark.real_time
