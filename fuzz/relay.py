@@ -25,7 +25,7 @@ def relay(data: bytes) -> None:
     gains = Gains(1)
     now = 0.0
     topics, window = SentTopics(None, ()), RepairWindow("off", 200)
-    topics.carry()
+    topics.relay()
     custody = Custody(
         (1, 1),
         topics,

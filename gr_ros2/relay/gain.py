@@ -20,7 +20,7 @@ the caller does not drop.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import NamedTuple
 
@@ -140,6 +140,16 @@ class Gains:
         robot = self._heard.get(src_id)
         return robot is not None and self.near(robot.at, now) and self.src_id in robot.named
 
+    def heard_by(self, src_id: int) -> list[int]:
+        """The robots that are heard here and that a robot says it hears."""
+        robot = self._heard.get(src_id)
+        return [] if robot is None else [name for name in robot.named if name in self._heard]
+
+    def apart(self, origin: int, now: float) -> list[int]:
+        """The robots that are heard and do not say that they hear another one."""
+        near = self._neighbours(now)
+        return [src_id for src_id in near if src_id != origin and origin not in self._heard[src_id].named]
+
     def message(self, via: int, stream: Stream, number: int, now: float, made: float | None = None) -> bool:
         """A message was heard.
 
@@ -178,14 +188,18 @@ class Gains:
         """Whether a neighbour is likely to lack its newest message."""
         return self.gain(stream, now) >= LIKELY * self._streams[stream].period
 
-    def best(self, now: float, cost: Callable[[Stream], float] = lambda _: 1.0) -> tuple[Stream | None, float]:
+    def best(
+        self, now: float, cost: Callable[[Stream], float] = lambda _: 1.0, others: Sequence[float] = ()
+    ) -> tuple[Stream | None, float]:
         """The stream whose gain squared is largest for its cost, and its gain in s; None where nothing is gained.
 
         :param cost: of sending a stream's newest message, above 0; infinite where it is not to be considered
+        :param others: gains of other messages, which count for the weight
         """
         neighbours = self._neighbours(now)
         best: Stream | None = None
-        most = worth = total = 0.0
+        most = worth = 0.0
+        largest, total = max(others, default=0.0), sum(gain * gain for gain in others)
         for stream, state in self._streams.items():
             gain = self._gain(stream, state, neighbours)
             total += gain * gain
@@ -193,7 +207,7 @@ class Gains:
                 best, most, worth = stream, gain, gain * gain / cost(stream)
         own = len(neighbours) * (now - self._chosen_at)  # of a message made since the choice before
         self._chosen_at = now
-        self._worth += SMOOTHING * (max(total / max(most, own, 1e-9) ** 2, 1.0) - self._worth)
+        self._worth += SMOOTHING * (max(total / max(most, largest, own, 1e-9) ** 2, 1.0) - self._worth)
         return best, most
 
     @property
@@ -211,6 +225,11 @@ class Gains:
         for robot in self._neighbours(now):
             if robot != stream.origin:
                 self._count_as_heard(state, robot, state.newest, OWN)
+
+    @property
+    def others(self) -> int:
+        """Streams of other robots."""
+        return sum(stream.origin != self.src_id for stream in self._streams)
 
     def tells(self, count: int = TOLD) -> list[Newest]:
         """The newest numbers that are here of other robots' streams, in turn."""

@@ -19,7 +19,7 @@ _mark = Struct(">BI")
 _report = Struct(">BHHQB")
 _ping = Struct(">BHBHHQB")
 _about = Struct(">HII")
-_newest = Struct(">BBBH")
+_newest, _whole = Struct(">BBBH"), Struct(">BBBIB")
 _REPLY, _WANTS_ABOUT = 1, 2
 _UNKNOWN_SNR = 255
 _LEAST_SNR_DB, _MOST_SNR_DB, _SNR_STEPS = -40, 60, 2
@@ -32,7 +32,8 @@ HEARD_LEN = 2 + _heard.size
 PING_LEN = 2 + _ping.size
 ABOUT_LEN = 2 + _about.size
 """Bytes without its text."""
-NEWEST_LEN = 2 + _newest.size
+NEWEST_LEN, WHOLE_LEN = 2 + _newest.size, 2 + _whole.size
+"""Bytes of the newest message of a topic, and of one up to which all are there."""
 HELD_STEP_S = 1e-4
 ECHO_LEN = 4
 
@@ -193,25 +194,33 @@ class About(NamedTuple):
 
 
 class Newest(NamedTuple):
-    """The newest message that the sender has of a topic of another robot, where messages are relayed.
+    """The newest message that the sender has of a topic of another robot, where messages are relayed; of a reliable
+    topic for all robots the newest up to which all are there.
 
     :param origin: the robot whose topic it is
     :param start: the low 8 bits of that robot's boot number
     :param topic_id: in that robot's table
-    :param number: of that robot's packet in which the message began, mod 2^16
+    :param number: of that robot's packet in which the message began, mod 2^16; mod 2^32 with a place
+    :param place: of a message of a reliable topic among the entries there, 255 for all; None for other topics
     """
 
     origin: int
     start: int
     topic_id: int
     number: int
+    place: int | None = None
 
     def describe(self) -> str:
         """The entry in words."""
         return (
             f"newest, of robot {self.origin} (boot ends in {self.start:02x}) topic {self.topic_id}, "
-            f"from its packet {self.number}"
+            f"from its packet {self.number}" + ("" if self.place is None else f".{self.place}, and all before it")
         )
+
+
+def length_of(newest: Newest) -> int:
+    """Bytes of an entry."""
+    return NEWEST_LEN if newest.place is None else WHOLE_LEN
 
 
 Control = Hello | Ask | Report | Heard | Ping | About | Newest
@@ -248,7 +257,7 @@ def write_control(entry: Control) -> bytes:
             snr = _UNKNOWN_SNR if snr_db is None else _snr_byte(snr_db)
             name, data = _PING, _ping.pack(robot, number, flags, arrived, held, clock_us, snr)
         elif isinstance(entry, Newest):
-            name, data = _NEWEST, _newest.pack(*entry)
+            name, data = _NEWEST, _newest.pack(*entry[:4]) if entry.place is None else _whole.pack(*entry)
         elif isinstance(entry, About):
             name, data = _ABOUT, _about.pack(*entry[:3]) + entry.text
         else:
@@ -317,9 +326,9 @@ def _read_exchange(name: int, body: bytes, start: int, stop: int) -> Control | N
         snr_db = None if snr == _UNKNOWN_SNR else _snr_db(snr)
         return Ping(robot, number, reply, wants_about, arrived, held, clock_us, snr_db)
     if name == _NEWEST:
-        if size != _newest.size:
+        if size not in (_newest.size, _whole.size):
             raise EntryBoundsError(f"a note of the newest message, of {size} bytes")
-        return Newest(*_newest.unpack_from(body, start))
+        return Newest(*(_newest if size == _newest.size else _whole).unpack_from(body, start))
     if name == _ABOUT:
         if size < _about.size:
             raise EntryBoundsError(f"an about of {size} bytes")

@@ -6,16 +6,22 @@ bytes 1, 2    the low 16 bits of its boot number
 bytes 3..6    number of its packet in which the message began
 byte 7        place of the message among the entries there
 byte 8        topic id in its table; 240 for the table itself, behind 8 bytes of its boot number
-byte 9        C, A, hops      C = 1: coded; A = 1: for one robot; 0..63 robots that have sent it on, this one included
+byte 9        C, A, P, hops   C = 1: coded; A = 1: for one robot; P = 1: the message before it is told; 0..31 robots
+                              that have sent it on, this one included
 byte 10       age of the message when this packet leaves, see below
 byte 11       if A: the robot for which it is
+varint        if P: how many packets before its own the message of its topic before it began, and
+byte          if P: the place of that one among the entries there
 then          the message
 ```
 
+Only messages of reliable topics for all robots have P = 1. Between the message that it tells and this one no other of
+the topic was begun; the one that it tells need not exist (place 255: all that began in that packet).
+
 A message of topic 242 is *carried*: A is 1, and in front stand three bytes more: the robot that is to take it on; the
 age at which the message is of no more use; and how many messages of its topic before it, with the places before its
-own, its origin still keeps (0..127). One of topic 240 is a receipt: it says what has come of the messages of the robot
-for which it is, in entries of 8 bytes.
+own, its origin still keeps (0..127). P is 0. One of topic 240 is a receipt: it says what has come of the messages of
+the robot for which it is, in entries of 8 bytes.
 
 ```text
 bytes 0, 1    the low 16 bits of the boot number of the robot for which the receipt is
@@ -42,9 +48,10 @@ from struct import error as struct_error
 from typing import NamedTuple
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
-from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC
+from gr_ros2.wire.format import varint
+from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC, read_varint
 
-MOST_HOPS = 63
+MOST_HOPS = 31
 AGE_STEP_S = 0.01
 NO_AGE = 255
 """Code of an age that is greater than all others or unknown, and of no limit."""
@@ -55,7 +62,8 @@ RECEIPT_TOPIC = TABLE_TOPIC
 _head, _receipt = Struct(">BHIBBBB"), Struct(">HBIB")
 RELAYED_LEN = _head.size
 """Bytes in front of a message for everybody. One for a single robot has one more."""
-_CODED, _ADDRESSED = 0x80, 0x40
+_CODED, _ADDRESSED, _FOLLOWS = 0x80, 0x40, 0x20
+_MOST_BACK = (1 << 28) - 1
 _STEPS = [code if code < 16 else (16 + code % 16) << (code // 16 - 1) for code in range(NO_AGE)]
 """The ages for which codes stand, in steps."""
 
@@ -74,6 +82,8 @@ class Relayed(NamedTuple):
     :param age: code of its age when it is sent on
     :param limit: code of the age at which it is of no more use; only carried messages have one
     :param waits: where it is carried: messages of its topic before it that its origin keeps
+    :param after: number and place of the message of its topic before it, or of what was known to be before it; None
+        where that is not told
     """
 
     origin: int
@@ -88,13 +98,15 @@ class Relayed(NamedTuple):
     age: int = NO_AGE
     limit: int = NO_AGE
     waits: int = 0
+    after: tuple[int, int] | None = None
 
     def describe(self) -> str:
         """The fields in words."""
         to = "" if self.dst_id == BROADCAST else f" to robot {self.dst_id}"
+        after = "" if self.after is None else " after {}.{}".format(*self.after)
         return (
             f"robot {self.origin}'s (boot ends in {self.start:04x}) topic {self.topic_id}{to}, from its packet "
-            f"{self.number}.{self.place}, hop {self.hops}, {_words(self.age)} old"
+            f"{self.number}.{self.place}{after}, hop {self.hops}, {_words(self.age)} old"
         )
 
 
@@ -123,14 +135,18 @@ def write_relayed(message: Relayed) -> bytes:
 
     :raises EncodeError: a field out of range
     """
-    origin, start, number, place, topic_id, hops, payload, coded, dst_id, age, *_ = message
+    origin, start, number, place, topic_id, hops, payload, coded, dst_id, age, _, _, after = message
     if not 0 <= hops <= MOST_HOPS or topic_id > TABLE_TOPIC or origin == BROADCAST:
         raise EncodeError(f"{message.describe()}: hops are 0..{MOST_HOPS}, topics 0..{TABLE_TOPIC}, robots 0..254")
-    addressed = dst_id != BROADCAST
+    addressed, before = dst_id != BROADCAST, b""
     try:
         flags = coded * _CODED | addressed * _ADDRESSED | hops
+        if after is not None:
+            if not (after[0] >= 0 and after < (number, place) and number - after[0] <= _MOST_BACK):
+                raise EncodeError(f"{message.describe()}: it cannot tell that it follows this one")
+            flags, before = flags | _FOLLOWS, varint(number - after[0]) + bytes(after[1:])
         head = _head.pack(origin, start, number, place, topic_id, flags, age)
-        return head + bytes((dst_id,)) * addressed + payload
+        return head + bytes((dst_id,)) * addressed + before + payload
     except (struct_error, ValueError) as error:
         raise EncodeError(f"{message.describe()}: a field is out of range ({error})") from error
 
@@ -141,8 +157,8 @@ def write_carried(taker: int, message: Relayed) -> bytes:
     :param taker: the robot that is to take it on
     :raises EncodeError: a field out of range
     """
-    if not 0 <= taker < BROADCAST or message.dst_id == BROADCAST:
-        raise EncodeError(f"{message.describe()}, taken on by robot {taker}: it is for no single robot")
+    if not 0 <= taker < BROADCAST or message.dst_id == BROADCAST or message.after is not None:
+        raise EncodeError(f"{message.describe()}, taken on by robot {taker}: it is for no single robot, or in a row")
     if not 0 <= message.waits < PLACES:
         raise EncodeError(f"{message.describe()}: {message.waits} messages before it; at most {PLACES - 1}")
     return bytes((taker, message.limit, message.waits)) + write_relayed(message)
@@ -155,7 +171,7 @@ def read_carried(data: bytes) -> tuple[int, Relayed]:
     :raises EntryKindError: a topic or robot that does not exist, or it is for no single robot
     """
     message = read_relayed(data[3:])
-    if data[0] == BROADCAST or data[2] >= PLACES or message.dst_id == BROADCAST:
+    if data[0] == BROADCAST or data[2] >= PLACES or message.dst_id == BROADCAST or message.after is not None:
         raise EntryKindError(f"a carried message to robot {message.dst_id} over robot {data[0]}")
     return data[0], message._replace(limit=data[1], waits=data[2])
 
@@ -193,7 +209,8 @@ def read_relayed(data: bytes) -> Relayed:
     """The message.
 
     :raises EntryBoundsError: it is cut off
-    :raises EntryKindError: a topic or robot that does not exist
+    :raises EntryKindError: a topic or robot that does not exist, or it comes before itself
+    :raises VarintError: a number that is not the shortest
     """
     if len(data) < RELAYED_LEN:
         raise EntryBoundsError(f"a relayed message of {len(data)} bytes")
@@ -205,5 +222,11 @@ def read_relayed(data: bytes) -> Relayed:
         dst_id, at = data[at], at + 1
     if topic_id > TABLE_TOPIC or origin == BROADCAST or (flags & _ADDRESSED and dst_id == BROADCAST):
         raise EntryKindError(f"a relayed message of robot {origin}, topic {topic_id}, to robot {dst_id}")
+    after = None
+    if flags & _FOLLOWS:
+        back, at = read_varint(data, at, len(data) - 1)
+        after, at = (number - back, data[at]), at + 1
+        if not after[0] >= 0 or after >= (number, place):
+            raise EntryKindError(f"a relayed message from packet {number}.{place} after {after[0]}.{after[1]}")
     hops, coded = flags & MOST_HOPS, flags & _CODED != 0
-    return Relayed(origin, start, number, place, topic_id, hops, data[at:], coded, dst_id, age)
+    return Relayed(origin, start, number, place, topic_id, hops, data[at:], coded, dst_id, age, after=after)

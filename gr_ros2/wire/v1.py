@@ -347,8 +347,8 @@ def read_body(body: bytes, room: int) -> list[EntryV1]:
         kind = flags >> 6
         back = offset = 0
         if kind >= _MIDDLE:
-            back, position = _read_varint(body, position, end)
-            offset, position = _read_varint(body, position, end)
+            back, position = read_varint(body, position, end)
+            offset, position = read_varint(body, position, end)
             if not (offset or back):
                 raise EntryKindError("a later fragment at the begin of its message")
         stop = end if length < 0 else position + length
@@ -392,7 +392,12 @@ def _varint_len(value: int) -> int:
     return 1 if value < 128 else (value.bit_length() + 6) // 7
 
 
-def _read_varint(body: bytes, position: int, end: int) -> tuple[int, int]:
+def read_varint(body: bytes, position: int, end: int) -> tuple[int, int]:
+    """The number at a position, and the position behind it.
+
+    :raises VarintError: it has more bytes than it needs, or than 4
+    :raises EntryBoundsError: it runs past ``end``
+    """
     value = shift = 0
     while position < end:
         byte = body[position]

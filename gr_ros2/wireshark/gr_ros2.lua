@@ -106,7 +106,8 @@ local f = {
     newest_origin = ProtoField.uint8("gr_ros2.newest.origin", "Robot whose topic it is"),
     newest_start = ProtoField.uint8("gr_ros2.newest.start", "Its boot number, low 8 bits", base.HEX),
     newest_topic_id = ProtoField.uint8("gr_ros2.newest.topic_id", "Topic id"),
-    newest_number = ProtoField.uint16("gr_ros2.newest.number", "Its packet, low 16 bits"),
+    newest_number = ProtoField.uint32("gr_ros2.newest.number", "Its packet"),
+    newest_place = ProtoField.uint8("gr_ros2.newest.place", "Place there, up to which all have come"),
     relayed_taker = ProtoField.uint8("gr_ros2.relayed.taker", "Taken on by robot"),
     relayed_origin = ProtoField.uint8("gr_ros2.relayed.origin", "Robot that made the message"),
     relayed_start = ProtoField.uint16("gr_ros2.relayed.start", "Its boot number, low 16 bits", base.HEX),
@@ -114,10 +115,12 @@ local f = {
     relayed_place = ProtoField.uint8("gr_ros2.relayed.place", "Place there"),
     relayed_topic_id = ProtoField.uint8("gr_ros2.relayed.topic_id", "Topic id"),
     relayed_coded = ProtoField.bool("gr_ros2.relayed.coded", "Coded", 8, nil, 0x80),
-    relayed_hops = ProtoField.uint8("gr_ros2.relayed.hops", "Hops", base.DEC, nil, 0x3F),
+    relayed_hops = ProtoField.uint8("gr_ros2.relayed.hops", "Hops", base.DEC, nil, 0x1F),
     relayed_age = ProtoField.uint8("gr_ros2.relayed.age", "Age when it was sent on, code"),
     relayed_limit = ProtoField.uint8("gr_ros2.relayed.limit", "Age at which it is of no more use, code"),
     relayed_waits = ProtoField.uint8("gr_ros2.relayed.waits", "Messages before it that its origin keeps"),
+    relayed_back = ProtoField.uint32("gr_ros2.relayed.back", "Packets to the message before it"),
+    relayed_after = ProtoField.uint8("gr_ros2.relayed.after", "Place of the message before it"),
     relayed_dst_id = ProtoField.uint8("gr_ros2.relayed.dst_id", "For robot"),
     table_topic_id = ProtoField.uint8("gr_ros2.table.topic_id", "Topic id"),
     table_name = ProtoField.string("gr_ros2.table.name", "Name"),
@@ -335,6 +338,7 @@ end
 local TABLE_TOPIC, RELAYED_TOPIC, CARRIED_TOPIC, RELAYED_LEN = 240, 241, 242, 11
 local MAX_MESSAGE, MAX_BACK = 0x1000000, 0x1FFFFF
 local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN, PING_LEN, ABOUT_LEN, NEWEST_LEN = 17, 5, 14, 7, 17, 10, 5
+local WHOLE_LEN = 8 -- a newest message of a reliable topic
 local MAX_SNR = 200 -- 60 dB
 
 -- CRC-32 of IEEE 802.3.
@@ -422,7 +426,7 @@ local function dissect_control(buffer, tree, at, limit)
         heard = size == HEARD_LEN,
         ping = size == PING_LEN,
         about = size >= ABOUT_LEN,
-        newest = size == NEWEST_LEN,
+        newest = size == NEWEST_LEN or size == WHOLE_LEN,
     }
     if sizes[name] == false then
         item:add_proto_expert_info(refused.overrun)
@@ -476,7 +480,11 @@ local function dissect_control(buffer, tree, at, limit)
         item:add(f.newest_origin, buffer(start, 1))
         item:add(f.newest_start, buffer(start + 1, 1))
         item:add(f.newest_topic_id, buffer(start + 2, 1))
-        item:add(f.newest_number, buffer(start + 3, 2))
+        local whole = size == WHOLE_LEN
+        item:add(f.newest_number, buffer(start + 3, whole and 4 or 2))
+        if whole then
+            item:add(f.newest_place, buffer(start + 7, 1))
+        end
     end
     return start + size, name
 end
@@ -584,8 +592,18 @@ local function dissect_relayed(buffer, entry, id, at, after)
     entry:add(f.relayed_coded, buffer(at + 9, 1))
     entry:add(f.relayed_hops, buffer(at + 9, 1))
     entry:add(f.relayed_age, buffer(at + 10, 1)):append_text(age_of(buffer(at + 10, 1):uint()))
-    if math.floor(buffer(at + 9, 1):uint() / 64) % 2 == 1 and after > at + RELAYED_LEN then
-        entry:add(f.relayed_dst_id, buffer(at + RELAYED_LEN, 1))
+    local flags = buffer(at + 9, 1):uint()
+    at = at + RELAYED_LEN
+    if math.floor(flags / 64) % 2 == 1 and after > at then
+        entry:add(f.relayed_dst_id, buffer(at, 1))
+        at = at + 1
+    end
+    if math.floor(flags / 32) % 2 == 1 then
+        local back, place = varint(buffer, at, after)
+        if back and place < after then
+            entry:add(f.relayed_back, buffer(at, place - at), back)
+            entry:add(f.relayed_after, buffer(place, 1))
+        end
     end
 end
 

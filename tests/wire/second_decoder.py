@@ -215,9 +215,12 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
             raise Refused("entry_bounds")
         return {"about": number(0, 2), "phy": number(2, 6), "key": number(6, 10), "text": content[10:].hex()}
     if kind == 0xFE:
-        if len(content) != 5:
+        if len(content) not in (5, 8):
             raise Refused("entry_bounds")
-        return {"newest": content[0], "start": content[1], "topic_id": content[2], "number": number(3, 5)}
+        newest = {"newest": content[0], "start": content[1], "topic_id": content[2]}
+        if len(content) == 8:
+            return {**newest, "number": number(3, 7), "place": content[7]}
+        return {**newest, "number": number(3, 5), "place": None}
     return None
 
 
@@ -229,19 +232,26 @@ def read_relayed(content: bytes) -> dict[str, object]:
     to = content[11] if begin == 12 else 255
     if content[8] > 240 or content[0] == 255 or (begin == 12 and to == 255):
         raise Refused("entry_kind")
+    name, after = [int.from_bytes(content[3:7], "big"), content[7]], None
+    if content[9] & 32:
+        back, begin = varint(content, begin, len(content) - 1)
+        after, begin = [name[0] - back, content[begin]], begin + 1
+        if after[0] < 0 or after >= name:
+            raise Refused("entry_kind")
     return {
         "origin": content[0],
         "start": int.from_bytes(content[1:3], "big"),
         "number": int.from_bytes(content[3:7], "big"),
         "place": content[7],
         "topic_id": content[8],
-        "hops": content[9] % 64,
+        "hops": content[9] % 32,
         "payload": content[begin:].hex(),
         "coded": content[9] >= 128,
         "dst_id": to,
         "age": content[10],
         "limit": 255,
         "waits": 0,
+        "after": after,
     }
 
 
@@ -253,7 +263,7 @@ def age_of(code: int) -> float:
 def read_carried(content: bytes) -> dict[str, object]:
     """A message of topic 242."""
     message = read_relayed(content[3:])
-    if content[0] == 255 or message["dst_id"] == 255 or content[2] > 127:
+    if content[0] == 255 or message["dst_id"] == 255 or content[2] > 127 or message["after"]:
         raise Refused("entry_kind")
     return {"taker": content[0], **message, "limit": content[1], "waits": content[2]}
 

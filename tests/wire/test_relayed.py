@@ -39,15 +39,22 @@ MESSAGES = st.builds(
     U8,
     st.just(NO_AGE),
     st.just(0),
+    st.none(),
 )
+IN_A_ROW = st.builds(
+    lambda message, back, place: message._replace(after=(message.number - back, place)),
+    MESSAGES,
+    st.sampled_from([0, 1, 127, 128, (1 << 28) - 1]),
+    U8,
+).filter(lambda message: message.after[0] >= 0 and message.after < (message.number, message.place))
 
 
-@given(MESSAGES)
+@given(MESSAGES | IN_A_ROW)
 def test_round_trip(message: Relayed) -> None:
     assert read_relayed(write_relayed(message)) == message
 
 
-@given(st.binary(max_size=20))
+@given(st.binary(max_size=20) | st.builds(lambda data: bytes(5) + data, st.binary(min_size=5, max_size=15)))
 def test_any_bytes(data: bytes) -> None:
     try:
         message = read_relayed(data)
@@ -86,7 +93,9 @@ def test_a_carried_message_names_two_robots(taker: int, dst_id: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"origin": 255}, {"topic_id": 241}, {"hops": 64}, {"start": 1 << 16}, {"number": -1}, {"place": 256}]
+    "change",
+    [{"origin": 255}, {"topic_id": 241}, {"hops": 32}, {"start": 1 << 16}, {"number": -1}, {"place": 256}]
+    + [{"after": after} for after in ((70_000, 1), (-1, 0), (69_999, 256))],
 )
 def test_fields_out_of_range(change: dict[str, int]) -> None:
     message = Relayed(7, 0xCAFE, 70_000, 1, 3, 2, b"odom")

@@ -19,7 +19,7 @@ from gr_ros2.link.v1.order import Ready
 from gr_ros2.relay.gain import EXPIRES_S
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import options_of
+from gr_ros2.settings.registry import CALLS_TYPE, options_of
 from gr_ros2.wire.relayed import NO_AGE, age_of
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST
@@ -33,6 +33,8 @@ _MARKS = 64
 """Messages of a topic with several kept ones that may come between two hellos that name an older one."""
 UNKNOWN_S = 2 * age_of(NO_AGE - 1)
 """s that are taken for an age that is unknown."""
+SHORT_S = 5.0
+"""s: of a topic with a shorter deadline the newest message is relayed."""
 MAX_AGE_S = 15.0
 """Default of ``max_age_s``. How long ago a packet was sealed is known to the time from one hello to the echo of the
 next: 2.7 s at most without loss, 7.6 s at 20 % and 14.7 s at 40 % of packets lost (in four minutes each)."""
@@ -226,6 +228,13 @@ class DeliveryRules:
     def _passed(self, ready: Ready) -> bool:
         """Whether a message whose order is not the newest of its topic comes after a later one."""
         return ready.over is None or min(ready.made, ready.sealed) <= self._came.get(ready.topic_id, inf) + EXPIRES_S
+
+
+def for_all_in_order(topic: AnnouncedTopic) -> bool:
+    """Whether all messages of a topic are to reach all robots, each after all earlier ones. Of one whose messages are
+    of no use soon, the newest counts."""
+    whole = topic.reliable and topic.dst_id == BROADCAST and topic.type_name != CALLS_TYPE
+    return whole and not 0 < topic.deadline_s < SHORT_S
 
 
 def passed_over(topic: AnnouncedTopic) -> Fate:

@@ -262,7 +262,7 @@ class EndpointV1:
             return None
         sent = self._sending.packet(now)
         if sent is None and self._writer.block:
-            sent = self._writer.control([], "report", now)  # who sends nothing in a slot loses it
+            sent = self._writer.control(self._sending.tells(now), "report", now)  # who sends nothing in a slot loses it
         if sent is None:
             return None
         self.pace.left(now, waiting=True)

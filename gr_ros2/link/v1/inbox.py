@@ -20,7 +20,7 @@ from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.announced import ARRIVING_S, AnnouncedTopics
 from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
-from gr_ros2.link.v1.delivery import DeliveryRules, passed_over
+from gr_ros2.link.v1.delivery import DeliveryRules, for_all_in_order, passed_over
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready
@@ -76,6 +76,12 @@ class Passing(Protocol):
     def receive(self, via: int, ready: Ready, now: float) -> None:
         """A message of another robot has come over one that is heard."""
 
+    def in_order(self, inbox: Inbox, ready: Ready, late: int) -> None:
+        """A message of a reliable topic for all has come out.
+
+        :param late: how many messages of its topic robots get that come later
+        """
+
 
 class Inbox:
     """What arrives from one start of one robot.
@@ -89,6 +95,8 @@ class Inbox:
     :param control: called with entries that are not messages
     :param relaying: is told of messages that came, where they are relayed
     :param give_up_s: s of silence after which the robot is regarded as gone
+    :param quiet_s: s of silence after which others are believed about its messages
+    :param patience_s: see :class:`gr_ros2.link.v1.order.Order`
     :ivar reports: what the robot is told of its packets
     :ivar announced: its topics
     :ivar order: which of its messages wait for an earlier one
@@ -110,6 +118,8 @@ class Inbox:
         control: Callable[[Control], None],
         relaying: Passing | None = None,
         give_up_s: float = inf,
+        quiet_s: float = inf,
+        patience_s: float = inf,
     ) -> None:
         self.src_id, self.boot = src_id, boot
         self.deliveries = DeliveryRules(settings, marks)
@@ -129,7 +139,8 @@ class Inbox:
             sure=bounds.ordered,
             fits=lambda held: held + self._others() <= self._most,
             room=room,
-            give_up_s=give_up_s,
+            quiet_s=quiet_s,
+            patience_s=patience_s,
         )
         self._reassembly = Reassembly(bounds.fragments)
         of = src_id, boot
@@ -286,7 +297,7 @@ class Inbox:
         :param late: it may have reached it long ago
         """
         self._now = now
-        self.order.over_at = inf
+        self.order.heard = now
         newest = self.decoder.newest
         if not late:
             silence, self._heard = now - self._heard, now
@@ -355,7 +366,7 @@ class Inbox:
         ready.made = self.deliveries.made(ready, self.began, repaired_s)
         if ready.topic_id > TABLE_TOPIC:
             if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
-                self.order.wait(ready)
+                self.order.wait(ready, self._now)
             else:
                 self._of_another(ready)
             return
@@ -375,10 +386,12 @@ class Inbox:
         topic = self.announced.topic_of(ready)
         if topic is None:
             self._await_table(ready)
-        elif topic.reliable and not ready.carried and ready.order[0] > self.order.low:
-            self.order.wait(ready)
-        else:
+        elif not topic.reliable or ready.carried:
             self._deliver(ready, topic)
+        elif self.order.waits(ready):
+            self.order.wait(ready, self._now)
+        else:
+            self._deliver(self.order.out(ready), topic)
 
     def _await_table(self, ready: Ready) -> None:
         for lost in self.announced.wait(ready):
@@ -398,15 +411,24 @@ class Inbox:
     def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""
         self._now = now
-        self.order.over_at = min(self.order.over_at, now)
         if ready.topic_id == TABLE_TOPIC:
             self._table(ready.payload, ready.order, direct=False)
         else:
-            if not self.deliveries.came_over(ready):
+            if not self.deliveries.came_over(ready) and not self.order.told_again(ready):
                 self._stats.repeats += 1
                 return
+            topic = self.announced.topics.get(ready.topic_id)
+            begins = topic is not None and topic.latched and ready.topic_id not in self.deliveries.newest
+            if begins or (topic is not None and not for_all_in_order(topic)):
+                ready.after = (0, 0)  # it follows whatever is here
             self._known(ready)
         self._settle()
+
+    def up_to(self, topic: AnnouncedTopic) -> tuple[int, int] | None:
+        """All messages of a topic up to this one are here; None for one that is kept, and of which none has come."""
+        if topic.latched and topic.topic_id not in self.deliveries.newest:
+            return None
+        return self.order.up_to(topic.topic_id)
 
     def overrule(self, number: int) -> bool:
         """The robot itself has reached this number: what came over others before with a greater one was false.
@@ -419,8 +441,10 @@ class Inbox:
     def adopt(self, far: Inbox) -> None:
         """Go on from what has come of this start over other robots."""
         self.deliveries.adopt(far.deliveries)
+        self.order.reached.update(far.order.reached)
+        self.order.passed_on.update(far.order.passed_on)
         for ready in far.order.without(()):
-            self.order.wait(ready)
+            self.order.wait(ready, self._now)
         if not self.announced.topics:
             self.announced = far.announced
         for ready in far.announced.waiting():
@@ -437,6 +461,9 @@ class Inbox:
         if not new:
             self._stats.repeats += 1
             return
+        if self._relaying is not None and for_all_in_order(topic) and not ready.carried:
+            self.order.reached[ready.topic_id] = ready.order
+            self._relaying.in_order(self, ready, max(topic.depth, 1) * topic.latched)
         try:
             payload = self.announced.decode(ready) if ready.coded else ready.payload
         except CodecError as error:

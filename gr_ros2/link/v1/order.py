@@ -6,8 +6,9 @@ repairs a missing packet, or says that it does not any more, also after an outag
 sender has started again, or when the messages that wait fill the memory. From a sender without reports a missing packet
 is also given up ``hold_s`` after it was missed, or at once if hardly any missing packet comes back.
 
-A message that came over other robots waits in the same way: what its sender repairs is older, and would come too late.
-Only when other robots have brought messages for ``give_up_s`` and the sender itself nothing, no message waits for it.
+A message that came over other robots waits in the same way, as long as its sender is heard. Once that is silent, it
+comes out when all up to the message are here that it tells to be before it, whatever packets are missing. Of a robot
+that was never heard itself, it waits for these no longer than ``patience_s``, since nobody else may bring them.
 
 Invariants: messages of one topic come out in the order in which they began; the bytes that wait are bounded.
 """
@@ -44,6 +45,7 @@ class Ready:
     :param made: when it was made, s, as far as that is known: not later
     :param sealed: time in s after which its last packet was sealed, where that has to be proven and it came over others
     :param limit_s: age in s at which it is of no more use
+    :param after: the order of a message of its topic, between which and this one there is no other; None if unknown
     """
 
     topic_id: int
@@ -58,6 +60,11 @@ class Ready:
     made: float = inf
     sealed: float = inf
     limit_s: float = inf
+    after: tuple[int, int] | None = None
+
+
+ALL = 255
+"""A place behind all messages that began in a packet."""
 
 
 class Order:
@@ -69,13 +76,17 @@ class Order:
     :param sure: bytes of messages that may always wait
     :param fits: whether more of them may wait
     :param room: bytes of the longest body
-    :param give_up_s: s of silence after which a sender is regarded as gone
+    :param quiet_s: s after which what others say of a sender counts
+    :param patience_s: s for which a message waits for those before it that others may bring
     :ivar contents: which topics missing packets can have carried
     :ivar told: whether the sender gets reports. It then says which packets it does not repair any more
     :ivar low: every packet before this number is here or given up
     :ivar wanted: every packet before this number is here, or is not repaired any more
     :ivar held: bytes of the messages that wait
-    :ivar over_at: when another robot brought a message for the first time since the sender was heard, s
+    :ivar heard: when the sender was heard last, s
+    :ivar all_from: from this packet number on no message was given up for want of memory
+    :ivar reached: the newest message of each topic that came out; all before it came out or are given up
+    :ivar passed_on: the newest message of each topic that is kept for others
     """
 
     def __init__(
@@ -87,17 +98,22 @@ class Order:
         sure: int,
         fits: Callable[[int], bool],
         room: int,
-        give_up_s: float = inf,
+        quiet_s: float = inf,
+        patience_s: float = inf,
     ) -> None:
         self.told = False
-        self.low = self.wanted = first
+        self.low = self.wanted = self.all_from = first
         self.held = 0
-        self.over_at = inf
+        self.heard = -inf
+        self.reached: dict[int, tuple[int, int]] = {}
+        self.passed_on: dict[int, tuple[int, int]] = {}
+        self._since: dict[int, float] = {}
+        """When a message came out last in a topic in which others wait, s."""
         self.contents = GapContents(decoder, room)
         self._passed: dict[int, int] = {}
         """By topic: no missing packet before this number can have carried something of it."""
         self._decoder = decoder
-        self._hold_s, self._give_up_s = hold_s, give_up_s
+        self._hold_s, self._quiet_s, self._patience_s = hold_s, quiet_s, patience_s
         self._sure, self._fits = sure, fits
         self._dead = first
         """The sender does not repair packets before this number any more."""
@@ -109,6 +125,8 @@ class Order:
         self._recovery = 1.0
         """Share of missing packets that are recovered in time."""
         self._waiting: dict[int, list[Ready]] = {}
+        self._asked = -inf
+        """When it was looked last, s."""
 
     def missing(self, now: float, first: int, last: int) -> None:
         """Note that these packets had not arrived when the sender went on."""
@@ -130,22 +148,65 @@ class Order:
             self._void = {left_out for left_out in self._void if left_out >= self.wanted}
             self._most_void = 2 * len(self._void) + _VOID
 
-    def wait(self, ready: Ready) -> None:
+    def wait(self, ready: Ready, now: float) -> None:
         """Keep a message until nothing before it is missing."""
+        if self.told_again(ready):
+            return
+        line = self._waiting.setdefault(ready.topic_id, [])
+        if not line:
+            self._since[ready.topic_id] = now
         self.held += len(ready.payload) + _COST
-        self._waiting.setdefault(ready.topic_id, []).append(ready)
+        line.append(ready)
+
+    def told_again(self, ready: Ready) -> bool:
+        """Whether a message waits already; it may tell better now what is before it."""
+        for other in self._waiting.get(ready.topic_id, ()):
+            if other.order == ready.order:
+                if ready.after is not None and (other.after is None or ready.after < other.after):
+                    other.after = ready.after
+                return True
+        return False
+
+    def waits(self, ready: Ready) -> bool:
+        """Whether a message cannot come out at once."""
+        return ready.order[0] > self.low and ready.order > self.reached.get(ready.topic_id, (-1, 0))
+
+    def out(self, ready: Ready) -> Ready:
+        """A message comes out."""
+        self.reached[ready.topic_id] = max(self.reached.get(ready.topic_id, ready.order), ready.order)
+        return ready
+
+    def up_to(self, topic_id: int) -> tuple[int, int]:
+        """All messages of a topic up to this one are here, or are given up."""
+        return max((self._pass(topic_id) - 1, ALL), self.reached.get(topic_id, (-1, 0)))
+
+    def before(self, ready: Ready) -> tuple[int, int] | None:
+        """Number and place of the message after which one that came out follows, as far as that is known."""
+        since = self.all_from - 1, ALL
+        last = max(self.passed_on.get(ready.topic_id, since), since)
+        return min(last, ready.after or last) if last < ready.order else ready.after
+
+    def _pass(self, topic_id: int) -> int:
+        """No missing packet before this number can have carried something of a topic."""
+        decoder, here, void, may_carry = self._decoder, self._decoder.bodies, self._void, self.contents.may_carry
+        passed, newest = max(self.low, self._passed.get(topic_id, 0)), decoder.newest
+        while passed <= newest and (passed in here or passed in void or not may_carry(passed, topic_id)):
+            passed += 1
+        self._passed[topic_id] = passed
+        return passed
 
     def settle(self, now: float) -> list[Ready]:
         """Find up to which packet everything is here or given up; the messages that waited for that, topic by topic."""
         decoder, void, gaps = self._decoder, self._void, self._gaps
+        self._asked = now
         newest, floor, here = decoder.newest, decoder.floor, decoder.bodies
         dead = self._dead if self._dead > floor else floor
         low = max(self.low, dead if dead <= newest else newest + 1)
         while gaps and gaps[0][2] < floor:
             gaps.popleft()
-        waits = (self.held <= self._sure or self._fits(self.held)) and now < self.over_at + self._give_up_s
+        waits = self.held <= self._sure or self._fits(self.held)
         if not waits:
-            low = newest + 1
+            low = self.all_from = newest + 1
         elif gaps and not self.told:
             low = self._give_up(low, dead, now)
         while low <= newest and (low in here or low in void):
@@ -156,29 +217,44 @@ class Order:
         self.wanted = wanted
         self.low = low
         due: list[Ready] = []
-        may_carry = self.contents.may_carry
+        quiet = now >= self.heard + self._quiet_s
         for topic_id, line in self._waiting.items():
             if line:
-                passed = max(low, self._passed.get(topic_id, 0))
-                while passed <= newest and (passed in here or passed in void or not may_carry(passed, topic_id)):
-                    passed += 1
-                self._passed[topic_id] = passed
+                passed = self._pass(topic_id)
                 line.sort(key=lambda ready: ready.order)
-                while line and (line[0].order[0] <= passed or not waits):
-                    due.append(line.pop(0))
-                    self.held -= len(due[-1].payload) + _COST
+                while line:
+                    ready = line[0]
+                    if waits and ready.order[0] > passed and not (quiet and self._follows(ready, passed, now)):
+                        break
+                    due.append(self.out(line.pop(0)))
+                    self._since[topic_id] = now
+                    self.held -= len(ready.payload) + _COST
         return due
 
+    def _follows(self, ready: Ready, passed: int, now: float) -> bool:
+        """Whether a message comes out that waits for others to bring those before it."""
+        here = max((passed - 1, ALL), self.reached.get(ready.topic_id, (-1, 0)))
+        if ready.order <= here or (ready.after is not None and ready.after <= here):
+            return True
+        return ready.over is not None and now >= self._since[ready.topic_id] + self._patience_s
+
     def next_timeout(self) -> float | None:
-        """Time in s at which missing packets are given up for which messages wait."""
-        if not any(self._waiting.values()):
-            return None
-        held = self._gaps[0][0] + self._hold_s if self._gaps and not self.told else inf
-        soonest = min(held, self.over_at + self._give_up_s)
+        """Time in s at which missing packets are given up for which messages wait, or what others say counts."""
+        soonest = inf
+        for topic_id, line in self._waiting.items():
+            if line and line[0].over is not None:
+                soonest = min(soonest, max(self._since[topic_id] + self._patience_s, self.heard + self._quiet_s))
+                if self._asked < self.heard + self._quiet_s:
+                    soonest = min(soonest, self.heard + self._quiet_s)
+            if line and self._gaps and not self.told:
+                soonest = min(soonest, self._gaps[0][0] + self._hold_s)
         return None if soonest == inf else soonest
 
     def beyond(self, number: int) -> list[Ready]:
         """Give up messages that wait, came over others, and began in a later packet than this one."""
+        for newest in (self.reached, self.passed_on):
+            for topic_id in [topic_id for topic_id, order in newest.items() if order[0] > number]:
+                del newest[topic_id]
         given_up: list[Ready] = []
         for line in self._waiting.values():
             given_up += [ready for ready in line if ready.over is not None and ready.order[0] > number]

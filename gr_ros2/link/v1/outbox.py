@@ -30,7 +30,7 @@ from gr_ros2.link.v1.lifetime import WORTH
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.packing import ENTRY, Packing
 from gr_ros2.link.v1.peers import Peers
-from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopic, SentTopics
+from gr_ros2.link.v1.sent_topics import LONG_CARRIED, RELAYED_IN_ORDER, SentTopic, SentTopics
 from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
@@ -99,16 +99,13 @@ class Outbox:
         self.sent = SentTopics(codec, settings.commands, instances)
         self.kept = KeptMessages(self.sent, room, settings, self.stats, self._admit)
         self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)
-        self.relayed: SentTopic | None = None
-        """The queue of messages of other robots, where they are relayed."""
-        self.relayed_left: Callable[[float], None] = lambda _: None
-        """Called when one of them has left whole."""
+        self.relayed_left: Callable[[int, float], None] = lambda _, __: None
+        """Called with its queue when a message of another robot has left whole."""
         self.custody: Custody | None = None
         """Carries messages over other robots, where they are relayed."""
         if settings.relay:
-            self.relayed = self.sent.relay()
-            self.sent.carry()
-            for topic_id in (RELAYED_TOPIC, CARRIED_TOPIC, LONG_CARRIED):
+            self.sent.relay()
+            for topic_id in self.sent:
                 self.packing.turns.join(topic_id)
         if topics:
             self.sent.add(topics)
@@ -236,7 +233,7 @@ class Outbox:
     @property
     def idle(self) -> bool:
         """Whether nothing waits."""
-        passed = (RELAYED_TOPIC, TABLE_TOPIC) if self.packing.fills else (RELAYED_TOPIC,)
+        passed = {RELAYED_TOPIC, RELAYED_IN_ORDER} | ({TABLE_TOPIC} if self.packing.fills else set())
         return not any(topic.queue for topic_id, topic in self.sent.items() if topic_id not in passed)
 
     def reconfigure(self, settings: Settings) -> None:
@@ -314,8 +311,8 @@ class Outbox:
         if message.key:
             topic.lifetimes.restart()
         self.kept.left(message, now, reported=reported)
-        if message.topic_id == RELAYED_TOPIC:
-            self.relayed_left(now)
+        if message.topic_id in (RELAYED_TOPIC, RELAYED_IN_ORDER):
+            self.relayed_left(message.topic_id, now)
         elif self.custody is not None and message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):
             self.custody.left(message, now)
 

@@ -23,9 +23,9 @@ from gr_ros2.link.v1.freshness import RANK, Turns, value
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
-from gr_ros2.link.v1.sent_topics import SentTopics
+from gr_ros2.link.v1.sent_topics import ON_AIR, SentTopics
 from gr_ros2.wire import QOS_BULK, QOS_LATENCY
-from gr_ros2.wire.v1 import CARRIED_TOPIC, TABLE_TOPIC, EntryV1, Part, fit
+from gr_ros2.wire.v1 import TABLE_TOPIC, EntryV1, Part, fit
 
 SHARE = 2
 """A fragment must fill at least one part in this many of a packet's room: a message in more packets than it needs is
@@ -183,8 +183,7 @@ class Packing:
                 message.numbers.append(number)
             payload = message.take(taken)
             last = message.offset == len(message.payload)
-            on_air = topic_id if topic_id < CARRIED_TOPIC else CARRIED_TOPIC
-            parts.append(Part(on_air, payload, back, offset, last, message.coded))
+            parts.append(Part(ON_AIR.get(topic_id, topic_id), payload, back, offset, last, message.coded))
             named = (number, place) if message.place < 0 else (message.begin, message.place)
             of, key = message.carried or (topic_id, Key(self._boot, *named))
             total = message.index if last else 0

@@ -30,11 +30,12 @@ from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.peers import REACH
-from gr_ros2.link.v1.relaying import Relaying
+from gr_ros2.link.v1.relaying import FORGET_S, Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys
 from gr_ros2.link.v1.sending import SendingSide
+from gr_ros2.relay.gain import HEARD_S
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.wire.control import (
     CAN_HEAR,
@@ -101,7 +102,9 @@ class ReceivingSide:
                 most=settings.max_source_bytes,
                 slower=lambda: settings.slower,
             )
-            self.relaying.tell(lambda src_id, boot: self._inbox(src_id, boot, 0, settings.packet_len, far=True))
+            self.relaying.tell(
+                lambda src_id, boot, first: self._inbox(src_id, boot, first, settings.packet_len, far=True)
+            )
         self._now = -inf
         self._sender: Neighbour | None = None
         """The sender of the packet that is processed."""
@@ -280,7 +283,7 @@ class ReceivingSide:
             opened.replaced.inbox.ended(now)
             self._end(opened.replaced.src_id, self._window.peers.forget)
             if self.relaying is not None:
-                self.relaying.gains.started(opened.replaced.src_id)
+                self.relaying.started(opened.replaced.src_id)
         self._sending.met(now)
 
     def _meet(self, neighbour: Neighbour, now: float) -> None:
@@ -314,7 +317,7 @@ class ReceivingSide:
             self._reported(self._sender.src_id, entry)
         elif isinstance(entry, Newest):
             if self.relaying is not None:
-                self.relaying.newest(self._sender.src_id, entry)
+                self.relaying.newest(self._sender.src_id, entry, self._now)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
             for topic_id in dict.fromkeys(entry.topic_ids):
                 if self._messages.kept.asked(topic_id, self._now):
@@ -360,7 +363,9 @@ class ReceivingSide:
             outcomes=self._outcomes,
             control=self._entry,
             relaying=self.relaying,
-            give_up_s=0.0 if far else self._give_up_s,  # who is not heard repairs nothing
+            give_up_s=self._give_up_s,
+            quiet_s=HEARD_S * self._settings.slower,
+            patience_s=FORGET_S * self._settings.slower if far else inf,
         )
         inbox.reports.tells_snr = self._rate is not None
         return inbox

@@ -4,8 +4,9 @@ A robot that is not heard directly is *far*: its table of topics and its message
 like a message, as topic 240 of its origin behind the full boot number; whoever hears the origin itself sends it on
 under the number that the origin has reached, again every ``TABLE_S``.
 
-Messages of reliable topics for one robot, and calls, are carried to it (``custody``); of all others the newest of each
-topic is relayed.
+Messages of reliable topics for one robot, and calls, are carried to it (``custody``). Of reliable topics for all, all
+messages are relayed to those who do not hear their origin, in their order, once they have come out here
+(``relay.in_order``); of all others the newest of each topic.
 
 A message has an age, which grows at every robot. Where its table is known, a robot sends nothing on that is older than
 its topic allows. All that a start of a robot has said is forgotten ``FORGET_S`` after it was last there.
@@ -21,7 +22,7 @@ Invariants: a message is delivered once, whether it comes directly or over other
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from math import inf
 from typing import NamedTuple
@@ -32,15 +33,16 @@ from gr_ros2.link.events import Gone, Met
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import FRAME
 from gr_ros2.link.v1.custody import Custody
-from gr_ros2.link.v1.delivery import UNKNOWN_S
+from gr_ros2.link.v1.delivery import UNKNOWN_S, for_all_in_order
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.outcomes import Outcomes
-from gr_ros2.link.v1.sent_topics import SentTopic
+from gr_ros2.link.v1.sent_topics import RELAYED_IN_ORDER, SentTopic, SentTopics
 from gr_ros2.link.v1.sequences import Sequences
-from gr_ros2.relay.gain import EXPIRES_S, Gains, Stream
+from gr_ros2.relay.gain import EXPIRES_S, TOLD, Gains, Stream
+from gr_ros2.relay.in_order import InOrder, Kept, Name
 from gr_ros2.relay.rooms import Rooms
 from gr_ros2.settings.registry import CALLS_TYPE
 from gr_ros2.wire import QOS_DEFAULT
@@ -66,6 +68,8 @@ TABLE_S = 5.0
 """s after which the table of a robot that is heard is worth sending on again: some may have come since."""
 MOST_STREAMS = 4096
 """Topics of other robots of which a message is kept to be sent on."""
+MOST_KEPT = 4096
+"""Messages of reliable topics for all that are kept to be sent on."""
 FORGET_S = 60.0
 """s after which nothing of a robot is sent on any more: its table comes every ``TABLE_S`` from who hears it."""
 FAR_S = 600.0
@@ -112,6 +116,10 @@ class Relaying:
         self._neighbours, self._outcomes, self._dropped = neighbours, outcomes, outcomes.stats.dropped
         self._newest: dict[Stream, _ToPass] = {}
         self._rooms: Rooms[Stream] = Rooms(MOST_STREAMS, most)
+        self._in_order = InOrder(self.gains, Rooms(MOST_KEPT, most))
+        self._next: Name | None = None
+        self._telling = deque[Stream | None]()
+        """What is told next: a reliable topic for all, or None for the newest message of the next of the others."""
         self._far_rooms: Rooms[int] = Rooms(BROADCAST, most)
         self._there: dict[int, float] = {}
         """When a robot was there last, s."""
@@ -126,10 +134,10 @@ class Relaying:
         self._chosen: Stream | None = None
         self.found: Callable[[int, float], None] = lambda _, __: None
         """Called with a robot that is reached over others for the first time."""
-        self._make_inbox: Callable[[int, int], Inbox]
+        self._make_inbox: Callable[[int, int, int], Inbox]
 
-    def tell(self, make_inbox: Callable[[int, int], Inbox]) -> None:
-        """Use this to make the inbox of a far robot from its id and boot number."""
+    def tell(self, make_inbox: Callable[[int, int, int], Inbox]) -> None:
+        """Use this to make the inbox of a far robot from its id, its boot number and the first packet that counts."""
         self._make_inbox = make_inbox
 
     # ---- what arrives
@@ -168,10 +176,21 @@ class Relaying:
             if neighbour.inbox.overrule(number):
                 self.ahead.discard(src_id)
             self._drop_of(src_id, lambda stream: self._newest[stream].message.number > number)
+            for topic_id in neighbour.inbox.announced.topics:
+                stream = Stream(src_id, neighbour.boot & 0xFFFF, topic_id)
+                self._in_order.drop(stream, lambda order: order[0] > number)
 
-    def newest(self, src_id: int, newest: Newest) -> None:
+    def newest(self, src_id: int, newest: Newest, now: float) -> None:
         """A robot tells the newest message that it has of a topic."""
-        self.gains.told(src_id, newest)
+        if newest.place is None:
+            self.gains.told(src_id, newest)
+        else:
+            self._in_order.told(src_id, newest, now)
+
+    def started(self, src_id: int) -> None:
+        """A robot that is heard has started again: it has nothing of what it had."""
+        self.gains.started(src_id)
+        self._in_order.started(src_id)
 
     def direct(self, src_id: int, boot: int, ready: Ready, now: float) -> None:
         """A message has come from the robot that made it."""
@@ -185,11 +204,28 @@ class Relaying:
             return
         if ready.payload[:1] == FRAME and ready.coded:
             return  # a chain of frames is not passed on: who lacks one of them would have no use for the others
-        if self._carried(src_id, ready.topic_id):
+        if self._comes_whole(src_id, ready.topic_id):
             return
         message = Relayed(src_id, boot & 0xFFFF, number, place, ready.topic_id, 0, ready.payload, ready.coded)
         if now <= (until := ready.made + self._limit_s(message)):
             self._take(src_id, _ToPass(message, ready.made, until), now)
+
+    def in_order(self, inbox: Inbox, ready: Ready, late: int) -> None:
+        """A message of a reliable topic for all has come out: it is kept for those who do not hear its origin."""
+        if ready.payload[:1] == FRAME and ready.coded:
+            return
+        (number, place), after = ready.order, inbox.order.before(ready)
+        inbox.order.passed_on[ready.topic_id] = ready.order
+        stream = Stream(inbox.src_id, inbox.boot & 0xFFFF, ready.topic_id)
+        if stream in self._newest:
+            self._drop(stream)  # it came before its topic was known
+        message = Relayed(
+            *stream[:2], number, place, ready.topic_id, ready.hops, ready.payload, ready.coded, after=after
+        )
+        until = ready.made + min(self._limit_s(message), ready.limit_s)
+        via = inbox.src_id if ready.over is None else ready.over
+        if lost := self._in_order.keep(Kept(message, ready.made, until), via, late):
+            self._dropped["relay_full"] += lost
 
     def receive(self, via: int, ready: Ready, now: float) -> None:
         """A message of another robot has come over one that is heard."""
@@ -218,7 +254,7 @@ class Relaying:
             return
         self.custody.routes.note(origin, via, message.hops, ready.made)
         kept = _ToPass(message, made, made + min(limit_s, self._limit_s(message)))
-        if now > kept.until:
+        if now > kept.until and not self._in_a_row(message):
             self._dropped["too_old"] += 1
             return
         order, table = (message.number, message.place), message.topic_id == TABLE_TOPIC
@@ -234,10 +270,14 @@ class Relaying:
             self._dropped["ahead"] += 1  # its next packet tells whether it has come so far
             return
         inbox = self._inbox(origin, start)
-        if inbox is None or (not table and inbox.announced.topic_of(message) is None):
+        topic = None if inbox is None else inbox.announced.topic_of(message)
+        if inbox is None or (not table and topic is None):
             self._dropped["unknown_origin"] += 1  # not taken: who has it must not learn that it is here
             return
-        if not self._take(via, kept, now):
+        if topic is not None and for_all_in_order(topic):
+            of.after = message.after
+            self._in_order.heard(via, Name(Stream(origin, start, topic.topic_id), order), now)
+        elif not self._take(via, kept, now):
             self._dropped["relayed_before"] += 1
             return
         self.hops[origin] = message.hops
@@ -342,11 +382,13 @@ class Relaying:
         times += [at for inbox in self.far.values() if (at := inbox.next_timeout()) is not None]
         return min(times, default=None)
 
-    def _carried(self, src_id: int, topic_id: int) -> bool:
-        """Whether a robot's messages of a topic are handed on to the one for which they are."""
+    def _comes_whole(self, src_id: int, topic_id: int) -> bool:
+        """Whether all of a robot's messages of a topic are sent on, not the newest."""
         neighbour = self._neighbours.all.get(src_id)
         topic = None if neighbour is None else neighbour.inbox.announced.topics.get(topic_id)
-        return topic is not None and topic.reliable and (topic.dst_id != BROADCAST or topic.type_name == CALLS_TYPE)
+        if topic is None or for_all_in_order(topic):
+            return topic is not None
+        return topic.reliable and (topic.dst_id != BROADCAST or topic.type_name == CALLS_TYPE)
 
     def _take(self, via: int, kept: _ToPass, now: float) -> bool:
         """Keep a message to be sent on; returns whether it is newer than what is here."""
@@ -368,6 +410,12 @@ class Relaying:
         if stream == self._chosen:
             self._chosen = None
 
+    def _in_a_row(self, message: Relayed) -> bool:
+        """Whether others wait for a message, even if it is too old."""
+        inbox = self._inbox(message.origin, message.start)
+        topic = None if inbox is None else inbox.announced.topics.get(message.topic_id)
+        return topic is not None and for_all_in_order(topic)
+
     def _limit_s(self, message: Relayed) -> float:
         """Age in s at which a message is of no more use, as far as its table is known."""
         inbox = self._inbox(message.origin, message.start)
@@ -381,6 +429,7 @@ class Relaying:
             if now > at + FORGET_S * self.gains.slower():
                 self._drop_of(origin, lambda _: True)
             if now > max(at, self._came.get(origin, at)) + FAR_S:
+                self._in_order.drop_of(origin, lambda _: True)
                 del self._there[origin]
                 self._came.pop(origin, None)
                 self._forget(origin, Fate.GIVEN_UP)
@@ -397,6 +446,7 @@ class Relaying:
         self._tables[src_id] = boot, table, now
         payload = boot.to_bytes(_BOOT_LEN, "big") + table
         self._drop_of(src_id, lambda stream: stream.start != boot & 0xFFFF)
+        self._in_order.drop_of(src_id, lambda stream: stream.start != boot & 0xFFFF)
         self._take(src_id, _ToPass(Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload), now, inf), now)
 
     def _drop_of(self, origin: int, over: Callable[[Stream], bool]) -> None:
@@ -426,8 +476,9 @@ class Relaying:
                 known.ended(now)
             self._forget(origin, Fate.SENDER_RESTARTED)
             self._drop_of(origin, lambda _: True)
+            self._in_order.drop_of(origin, lambda stream: stream.start != message.start)
             if neighbour is None or neighbour.boot != boot or not neighbour.proven:
-                self.far[origin] = self._make_inbox(origin, boot)
+                self.far[origin] = self._make_inbox(origin, boot, message.number + 1)
             self._neighbours.met_over_others(origin, now)
             self.found(origin, now)
         if origin in self.far:
@@ -457,37 +508,81 @@ class Relaying:
 
     # ---- what leaves
 
-    def offer(self, topic: SentTopic, now: float, leaves: float) -> None:
-        """Let the message that is worth most compete for the next packet, unless one is leaving.
+    def offer(self, topics: SentTopics, now: float, leaves: float) -> None:
+        """Let the messages that are worth most compete for the next packet, unless some are leaving.
 
-        Its value is ``g^2 / c`` as for own messages, with g the gain per neighbour. What every neighbour is likely to
+        Their value is ``g^2 / c`` as for own messages, with g the gain per neighbour. What every neighbour is likely to
         have is not sent: repairs would wait for it, and it would have to be repaired.
 
-        :param topic: the queue of relayed messages
+        :param topics: with the queues of relayed messages
         :param leaves: when the packet leaves, s
         """
-        if topic.queue and topic.queue[0].started and now <= topic.queue[0].expires:
-            return
-        topic.queue.clear()
         for stream in [stream for stream, kept in self._newest.items() if now > kept.until]:
             self._dropped["too_old"] += self.gains.lacks(stream, now)
             self._drop(stream)
-        self._chosen, gain = self.gains.best(now, lambda stream: self._cost(stream, now))
-        if self._chosen is None:
-            return
-        message, made, until = self._newest[self._chosen]
+        name, worth, gains, late = self._in_order.best(now)
+        if late:
+            self._dropped["too_old"] += late
+        chosen, gain = self.gains.best(now, lambda stream: self._cost(stream, now), gains)
+        queue = topics[RELAYED_TOPIC].queue
+        if not (queue and queue[0].started and now <= queue[0].expires):
+            queue.clear()
+            self._chosen = chosen
+            if chosen is not None:
+                self._queue(topics[RELAYED_TOPIC], self._newest[chosen], gain, now, leaves)
+        queue = topics[RELAYED_IN_ORDER].queue
+        if not (queue and queue[0].started and now <= queue[0].expires):
+            queue.clear()
+            self._next = name
+            if name is not None:
+                self._queue(topics[RELAYED_IN_ORDER], self._in_order[name], worth, now, leaves)
+
+    def _queue(self, topic: SentTopic, to_pass: _ToPass | Kept, gain: float, now: float, leaves: float) -> None:
+        message = to_pass.message
         hops = min(message.hops + 1, MOST_HOPS)
-        payload = write_relayed(message._replace(hops=hops, age=age_code(leaves - made)))
+        payload = write_relayed(message._replace(hops=hops, age=age_code(leaves - to_pass.made)))
         topic.newest = now - gain / max(self.gains.neighbours(now), 1)
-        topic.queue.append(Message(-1, RELAYED_TOPIC, payload, QOS_DEFAULT, now, expires=until, repeat=True))
+        queued = Message(-1, topic.topic.topic_id, payload, QOS_DEFAULT, now, expires=to_pass.until, repeat=True)
+        topic.queue.append(queued)
 
     def _cost(self, stream: Stream, now: float) -> float:
         if stream not in self._newest or not self.gains.lacks(stream, now):
             return inf
         return RELAYED_LEN + len(self._newest[stream].message.payload)
 
-    def left(self, now: float) -> None:
-        """The message that was offered has left whole."""
-        if self._chosen is not None:
+    def left(self, queue: int, now: float) -> None:
+        """The message that was offered in a queue has left whole."""
+        if queue == RELAYED_IN_ORDER and self._next is not None:
+            self._in_order.sent(self._next, now)
+            self.relayed[self._next.stream.origin, self._next.stream.topic_id] += 1
+        elif queue == RELAYED_TOPIC and self._chosen is not None:
             self.gains.sent(self._chosen, now)
             self.relayed[self._chosen.origin, self._chosen.topic_id] += 1
+
+    def tells(self, now: float) -> list[Newest]:
+        """What this robot has of others' topics, in turn: of reliable topics for all, what it does not hear itself."""
+        told: list[Newest] = []
+        for _ in range(TOLD):
+            if not self._telling:
+                self._telling.extend([None] * self.gains.others)
+                self._telling.extend(self._apart(now))
+            if not self._telling:
+                break
+            stream = self._telling.popleft()
+            if stream is None:
+                told += self.gains.tells(1)
+            elif (inbox := self._inbox(stream.origin, stream.start)) is not None:
+                topic = inbox.announced.topics.get(stream.topic_id)
+                if topic is not None and (has := inbox.up_to(topic)) is not None:
+                    told.append(Newest(stream.origin, stream.start & 0xFF, stream.topic_id, *has))
+        return told
+
+    def _apart(self, now: float) -> list[Stream]:
+        """The reliable topics for all of robots that are not heard."""
+        found = []
+        for src_id in {*self._neighbours.all, *self.far}:
+            inbox, neighbour = self.present(src_id), self._neighbours.all.get(src_id)
+            if inbox is not None and not (neighbour is not None and self.gains.near(neighbour.heard, now)):
+                topics = [topic.topic_id for topic in inbox.announced.topics.values() if for_all_in_order(topic)]
+                found += [Stream(src_id, inbox.boot & 0xFFFF, topic_id) for topic_id in topics]
+        return found

@@ -25,7 +25,7 @@ from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.link.v1.writer import PacketWriter
 from gr_ros2.relay.gain import TOLD
-from gr_ros2.wire.control import NEWEST_LEN, Heard, Hello
+from gr_ros2.wire.control import NEWEST_LEN, Heard, Hello, Newest, length_of
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
 MOST_REPEATS = 32
@@ -106,9 +106,9 @@ class SendingSide:
         first = self._window.pressing and not packing.urgent
         if first and (repair := self.repairs.first(now, waiting=packing.next_timeout(now) <= now)) is not None:
             return repair
-        if self._relaying is not None and messages.relayed is not None:
+        if self._relaying is not None:
             leaves = now if self._writer.leave_at is None else max(now, self._writer.leave_at)
-            self._relaying.offer(messages.relayed, now, leaves)
+            self._relaying.offer(messages.sent, now, leaves)
             self._relaying.custody.offer(now, leaves)
         if (sent := self._fill(due, now)) is not None:
             return sent
@@ -125,9 +125,10 @@ class SendingSide:
 
     def _fill(self, due: list[Reporter], now: float, *, spare: bool = False) -> SentPacket | None:
         """A packet with messages."""
-        room, reports = self._writer.room, self.reports
+        reports, told = self.reports, self.tells(now)
+        room = self._writer.room
         if self._relaying is not None:
-            room -= TOLD * NEWEST_LEN + 1  # an entry that fills this room needs its length now
+            room -= max(TOLD * NEWEST_LEN, sum(map(length_of, told))) + 1  # an entry that fills it needs its length now
         number = self._window.packets.newest + 1
         filling = self._messages.packing.fill(number, room - reports.reserved, now, spare=spare)
         if filling is None:
@@ -135,10 +136,13 @@ class SendingSide:
         self.hellos.rests -= self.hellos.rests > 0
         self._slowness.waited(filling.since, now)
         reports.add(filling.parts, room - filling.used, due, now)
-        if self._relaying is not None:
-            filling.parts += self._relaying.gains.tells()
+        filling.parts += told
         lifetimes = () if spare else filling.lifetimes
         return self._writer.source(filling.parts, lifetimes, filling.qos, filling.sent, now)
+
+    def tells(self, now: float) -> list[Newest]:
+        """What is told of messages of others."""
+        return [] if self._relaying is None else self._relaying.tells(now)
 
     def behind(self, now: float) -> bool:
         """Whether messages that wait do so because the computer is too slow."""

@@ -25,6 +25,10 @@ from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
 
 LONG_CARRIED = CARRIED_TOPIC + 1
 """The queue of carried messages that take several packets: short ones do not wait for them."""
+RELAYED_IN_ORDER = LONG_CARRIED + 1
+"""The queue of messages of reliable topics of other robots; on the air they are of topic 241."""
+ON_AIR = {LONG_CARRIED: CARRIED_TOPIC, RELAYED_IN_ORDER: RELAYED_TOPIC}
+"""The topics of queues that have no topic id of their own."""
 
 _STARTS = 2
 """Messages kept for each of several publishers: one that has started again counts as another, and does not displace a
@@ -232,17 +236,12 @@ class SentTopics(dict[int, SentTopic]):
             if topic.topic.type_name == type_name and topic.instances is None:
                 topic.instances = self._instances(topic.topic, definitions)
 
-    def relay(self) -> SentTopic:
-        """Send messages of other robots too; returns their queue."""
-        topic = Topic(RELAYED_TOPIC, "", "")
-        self[RELAYED_TOPIC] = SentTopic(topic, TopicQueue("latest"), qos_class(topic.options), 1.0, latched=False)
-        return self[RELAYED_TOPIC]
-
-    def carry(self) -> None:
-        """Carry messages over other robots too."""
-        for topic_id in (CARRIED_TOPIC, LONG_CARRIED):
+    def relay(self) -> None:
+        """Send messages of other robots too, and carry some."""
+        for topic_id in (RELAYED_TOPIC, RELAYED_IN_ORDER, CARRIED_TOPIC, LONG_CARRIED):
             topic = Topic(topic_id, "", "")
-            self[topic_id] = SentTopic(topic, TopicQueue("fifo"), qos_class(topic.options), 1.0, latched=False)
+            queue = TopicQueue[Message]("latest" if topic_id == RELAYED_TOPIC else "fifo")
+            self[topic_id] = SentTopic(topic, queue, qos_class(topic.options), 1.0, latched=False)
 
     def find_deadlines(self) -> None:
         """Note which queues have a deadline."""

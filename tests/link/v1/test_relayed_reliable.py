@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 
 import pytest
@@ -112,16 +113,53 @@ def test_a_robot_that_starts_again_takes_nothing_from_the_others() -> None:
     assert came(first, 3)[-40:] == later == came(other, 3)[-40:]
 
 
-def test_a_robot_that_stays_out_of_reach_is_heard_over_others() -> None:
-    """They met, so goals wait for repair at first; then what others bring comes out as of any far robot."""
-    everybody = cell("encrypt", 0.1)
-    talk(everybody, 10)
-    everybody.apart = lambda one, other: {one, other} == {0, 2}
-    everybody.run(40)
-    before = everybody.now
-    everybody.robots[0].end.messages.submit(1, b"goal at last", before)
-    everybody.run(3)
-    assert came(everybody.robots[2], 1)[-1] == b"goal at last"
+@pytest.mark.parametrize("seed", range(6))
+def test_what_a_third_robot_hears_comes_out_once_and_in_order(seed: int) -> None:
+    """Two robots are out of each other's reach for 5 to 60 s, or for good."""
+    rng = random.Random(seed)
+    count, loss, away_s = rng.choice([3, 4]), rng.choice([0.0, 0.1, 0.3]), rng.choice([5, 12, 30, 60])
+    modes: list[SealMode] = ["none", "encrypt"]
+    everybody = Cell(*(robot(src_id, modes[seed % 2], TOPICS) for src_id in range(1, count + 1)))
+    everybody._loss = loss
+    everybody.run(5)
+    goals = talk(everybody, 10)
+    pair = set(rng.sample(range(count), 2))
+    everybody.apart = lambda one, other: {one, other} == pair
+    goals += talk(everybody, int(away_s / 0.3), after=len(goals))
+    if seed % 3:
+        everybody.apart = lambda _, __: False
+    goals += talk(everybody, 10, after=len(goals))
+    everybody.run(30)
+    assert whole(everybody, goals)
+
+
+def test_all_of_a_reliable_topic_crosses_a_line() -> None:
+    line = Line(*(robot(src_id, "encrypt", TOPICS) for src_id in (1, 2, 3, 4)), loss=0.2)
+    line.run(15)
+    goals = [b"goal %d" % n for n in range(40)]
+    for goal in goals:
+        for one in line.robots:
+            one.end.messages.submit(1, goal, line.now)
+        line.run(0.5)
+    line.run(30)
+    assert all(came(one, other.src_id) == goals for one in line.robots for other in line.robots if one is not other)
+
+
+@pytest.mark.parametrize("relay", [False, True])
+def test_what_its_origin_has_given_up_does_not_stop_those_who_hear_others(relay: bool) -> None:
+    """A lifespan passes while a robot is out of reach of all: what is left comes out."""
+    topics = registry(odom=SendOptions(queue="latest"), goal=SendOptions(deadline_s=8.0))
+    everybody = Cell(*(robot(src_id, "encrypt", topics, relay=relay) for src_id in (1, 2, 3)), loss=0.1)
+    everybody.run(5)
+    goals = talk(everybody, 10)
+    everybody.apart = lambda one, other: 2 in (one, other)
+    goals += talk(everybody, 60, after=len(goals))
+    everybody.apart = (lambda one, other: {one, other} == {0, 2}) if relay else (lambda _, __: False)
+    goals += talk(everybody, 20, after=len(goals))
+    everybody.run(10)
+    got = came(everybody.robots[2], 1)
+    assert got == [goal for goal in goals if goal in set(got)]
+    assert got[-15:] == goals[-15:] and goals[40] not in got
 
 
 def test_what_was_relayed_before_its_table_came_comes_out() -> None:

@@ -34,7 +34,8 @@ def says(insider: Robot, false: Relayed, now: float) -> None:
     relaying = relaying_of(insider)
     offer = relaying.offer
 
-    def once(topic, *_):  # type: ignore[no-untyped-def]
+    def once(topics, *_):  # type: ignore[no-untyped-def]
+        topic = topics[RELAYED_TOPIC]
         if not topic.queue:
             relaying.offer, relaying._chosen = offer, None  # type: ignore[method-assign]
             topic.queue.append(Message(-1, RELAYED_TOPIC, write_relayed(false), 1, now, repeat=True))
