@@ -641,6 +641,10 @@ def decode(
     """
     if not coded:
         raise Refused("damaged")
+    if coded[0] == 6:
+        coded = coded[2:] if coded[2:3] != b"\6" else b"\7"  # numbered once
+        if not coded:
+            raise Refused("damaged")
     number, codec = coded[0] >> 4, coded[0] & 15
     if coded[0] == 0:
         if len(coded) - 1 > max_size:

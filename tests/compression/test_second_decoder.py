@@ -129,3 +129,15 @@ def test_structures(type_name: str, seed: int, text: str) -> None:
     any_text = b"\xe2" + second.crc16(text.encode()).to_bytes(2, "big") + random.Random(seed).randbytes(30)
     told = ("my_msgs/msg/Thing", f"auto {text}")
     assert ours(any_text, *told) == theirs(any_text, *told)
+
+
+def test_a_numbered_message_is_what_it_is_without_its_number() -> None:
+    codec = LinkCodec([Topic(0, "mode", "std_msgs/msg/String")])
+    message = bytes((0, 1, 0, 0, 5, 0, 0, 0)) + b"auto\0"
+    coded = codec.encode(0, message)
+    numbered = [codec.numbered(coded, number) for number in (0, 1, 255)]
+    assert len(set(numbered)) == 3
+    for one in numbered:
+        assert codec.decode(0, one) == second.decode(one, "std_msgs/msg/String") == message
+        with pytest.raises(CodecError, match="unknown codec 6"):
+            codec.decode(0, codec.numbered(one, 0))
