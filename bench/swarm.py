@@ -218,6 +218,9 @@ class SwarmRobot:
     def expire(self, now: float) -> Iterable[Any]:  # noqa: ARG002
         return ()
 
+    def finish(self, now: float) -> Iterable[Any]:  # noqa: ARG002
+        return ()
+
     def wake(self, now: float) -> None:
         """Nothing waits for what is received."""
 
