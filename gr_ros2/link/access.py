@@ -20,6 +20,10 @@ class Access(Protocol):
     def turn_s(self) -> float:
         """s from one packet of this robot to its next, as it lately was."""
 
+    @property
+    def named(self) -> bool:
+        """Whether somebody has heard this robot since it last entered, as far as it can know."""
+
     def departure(self, now: float) -> float:
         """When the next packet may begin."""
 

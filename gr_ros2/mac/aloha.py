@@ -45,6 +45,10 @@ class Aloha:
     def turn_s(self) -> float:
         return max(self._every, self._airtime)
 
+    @property
+    def named(self) -> bool:
+        return True
+
     def departure(self, now: float) -> float:
         if self._next is None:
             robots = sum(at > now - HEARD * self._airtime for at in self._heard.values())

@@ -172,6 +172,10 @@ class Slots:
     def turn_s(self) -> float:
         return self._every * self.clock.slot_s
 
+    @property
+    def named(self) -> bool:
+        return self._entered_at is not None and self._confirmed_at >= self._entered_at
+
     def departure(self, now: float) -> float:
         """When the next own slot begins, s. A host that is too late for a slot takes the next one."""
         if self._since is None:

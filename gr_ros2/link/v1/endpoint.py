@@ -276,6 +276,7 @@ class EndpointV1:
             return False
         relaying = self._receiving.relaying
         block = access.block(1 if relaying is None else relaying.gains.weight)
+        self._sending.hellos.named = access.named
         self._writer.block, self._writer.leave_at = block or b"", max(begins, now)
         return block is not None
 

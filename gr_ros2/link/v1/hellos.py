@@ -53,7 +53,8 @@ EAGER = 20
 """Number of these hellos."""
 RESTS = 2
 """Packets of messages, if any wait, between two hellos on a slow channel where somebody is heard: a row of the table
-and its message, for example. Who is met would say nothing but hellos there for its next five turns."""
+and its message, for example; one less where nobody has named this robot, whose hello may be lost. Who is met would say
+nothing but hellos there for its next five turns."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
 
@@ -88,6 +89,8 @@ class Hellos:
         self._answering = False
         self.due = -inf
         """When the next hello is due, s."""
+        self.named = False
+        """Whether somebody has named this robot since it entered, on a channel that others share."""
         self.rests = 0
         """Packets of messages, if any wait, that leave before the next hello, unless this answers another robot."""
         self.talks = False
@@ -129,7 +132,7 @@ class Hellos:
         if late < 0 or idle or self._answering:
             return late >= 0
         if self._starting:
-            rests = self.rests > 0 and self._settings.slower > 1 and self._hears_others
+            rests = self.rests > (not self.named) and self._settings.slower > 1 and self._hears_others
             return late >= latency * LATENCY_S and not rests
         return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
 

@@ -31,7 +31,7 @@ def robot(src_id: int, mode: SealMode, slot_s: float = SLOT, seed: int = 0) -> t
 class Greedy:
     """Announces the next two sends of another robot as its own, and sends in any slot."""
 
-    lead_s, turn_s = 0.0, SLOT
+    lead_s, turn_s, named = 0.0, SLOT, True
 
     def __init__(self, victim: Slots) -> None:
         self.victim = victim
