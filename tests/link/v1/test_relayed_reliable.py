@@ -113,6 +113,7 @@ def test_a_robot_that_starts_again_takes_nothing_from_the_others() -> None:
     assert came(first, 3)[-40:] == later == came(other, 3)[-40:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_what_a_third_robot_hears_comes_out_once_and_in_order(seed: int) -> None:
     """Two robots are out of each other's reach for 5 to 60 s, or for good."""
@@ -133,6 +134,7 @@ def test_what_a_third_robot_hears_comes_out_once_and_in_order(seed: int) -> None
     assert whole(everybody, goals)
 
 
+@pytest.mark.slow
 def test_all_of_a_reliable_topic_crosses_a_line() -> None:
     line = Line(*(robot(src_id, "encrypt", TOPICS) for src_id in (1, 2, 3, 4)), loss=0.2)
     line.run(15)
