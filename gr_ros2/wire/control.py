@@ -26,6 +26,8 @@ _LEAST_SNR_DB, _MOST_SNR_DB, _SNR_STEPS = -40, 60, 2
 """Range of a reported SNR, dB, and its steps per dB."""
 HELLO_LEN = 2 + _hello.size
 MARK_LEN = _mark.size
+MAP = 64
+"""Number of packets that a report covers."""
 REPORT_LEN = 2 + _report.size
 """Bytes of a report without SNR. With it, a report has one more."""
 HEARD_LEN = 2 + _heard.size

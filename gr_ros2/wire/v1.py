@@ -50,6 +50,8 @@ QOS_REPAIR = 3
 """Value of the two QoS bits in packets that are not source packets."""
 REPAIR_IDS = 128
 """Most repair packets at one number."""
+SPAN = 30_000
+"""Numbers that a sender repairs and a peer remembers, if its memory allows; numbers are mod 65,536."""
 MAX_WINDOW = 127
 """Most numbers that a repair spans."""
 

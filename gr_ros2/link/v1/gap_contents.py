@@ -11,7 +11,7 @@ Invariant: work per packet is bounded: two gaps of less than ``MAP`` packets, an
 from __future__ import annotations
 
 from gr_ros2.link.v1.decoder import RepairDecoder
-from gr_ros2.link.v1.peers import MAP
+from gr_ros2.wire.control import MAP
 from gr_ros2.wire.v1 import MAX_MESSAGE, EntryV1, Part, fit, read_body
 
 _MANY = 1024

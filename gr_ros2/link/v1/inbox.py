@@ -25,13 +25,11 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready
 from gr_ros2.link.v1.outcomes import Outcomes
-from gr_ros2.link.v1.peers import MAP
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
-from gr_ros2.link.v1.sent_packets import SPAN
-from gr_ros2.wire.control import Control
+from gr_ros2.wire.control import MAP, Control
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC, EntryV1, Part, read_body
+from gr_ros2.wire.v1 import CARRIED_TOPIC, RELAYED_TOPIC, SPAN, TABLE_TOPIC, EntryV1, Part, read_body
 
 _PACKET_COST, _EQUATION_COST = 250, 350
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and

@@ -22,7 +22,7 @@ from math import inf
 
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.gap_contents import GapContents
-from gr_ros2.link.v1.peers import MAP
+from gr_ros2.wire.control import MAP
 
 _VOID = 1024
 """Packets noted as left out of repairs before the notes about old ones are dropped."""

@@ -14,6 +14,7 @@ from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.shared import SharedRepairs, newest_of
 from gr_ros2.link.v1.unreported import Unreported
+from gr_ros2.wire.control import MAP
 from gr_ros2.wire.v1 import MAX_WINDOW
 
 START = 64
@@ -21,8 +22,6 @@ START = 64
 UNDER_WAY_S = 1e-3
 """s for which a packet or a repair is under way at least. Without it, a sender with no pace would repair without end
 where a report comes at once."""
-MAP = 64
-"""Number of packets that a report covers."""
 REACH = MAX_WINDOW - 2
 """How many packets before the last one that a peer may take for a replay a combination brings back, which stands at a
 later number. A peer needs no older ones."""

@@ -19,10 +19,11 @@ from typing import Literal
 from gr_ros2.link.v1.combining import Combining, Repair
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.peers import Peers
-from gr_ros2.link.v1.sent_packets import SPAN, Sent, SentPackets
+from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.shared import SharedRepairs
 from gr_ros2.link.v1.thrift import Thrift
 from gr_ros2.link.v1.unreported import Unreported
+from gr_ros2.wire.v1 import SPAN
 
 RepairMode = Literal["idle", "thrifty", "off"]
 

@@ -8,11 +8,10 @@ from math import inf
 from gr_ros2.link.events import SentPacket
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
-from gr_ros2.link.v1.peers import MAP
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.requests import Requests
 from gr_ros2.link.v1.writer import PacketWriter
-from gr_ros2.wire.control import REPORT_LEN
+from gr_ros2.wire.control import MAP, REPORT_LEN
 from gr_ros2.wire.v1 import EntryV1
 
 REPORTS, AT_ONCE = 0.05, 8

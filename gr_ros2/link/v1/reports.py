@@ -20,10 +20,10 @@ from math import inf
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Order
-from gr_ros2.link.v1.peers import MAP, PROMPT
+from gr_ros2.link.v1.peers import PROMPT
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.snr import SnrFilter
-from gr_ros2.wire.control import REPORT_LEN, Report, reportable
+from gr_ros2.wire.control import MAP, REPORT_LEN, Report, reportable
 
 _EVERY = 5
 """Packets received from one report to the next; more while none is lost."""

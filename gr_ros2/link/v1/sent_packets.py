@@ -14,10 +14,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gr_ros2.link.v1.lifetime import Lifetime
-from gr_ros2.wire.v1 import REPAIR_IDS
+from gr_ros2.wire.v1 import REPAIR_IDS, SPAN
 
-SPAN = 30_000
-"""Numbers that a sender repairs and a peer remembers, if its memory allows; numbers are mod 65,536."""
 _ALL_USED = (1 << REPAIR_IDS) - 1
 
 

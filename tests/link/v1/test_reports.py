@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.link.events import SentPacket
-from gr_ros2.link.v1.peers import MAP
 from gr_ros2.link.v1.reports import PER_LOSS, SHARE
+from gr_ros2.wire.control import MAP
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 
 
