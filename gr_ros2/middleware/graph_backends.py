@@ -74,7 +74,9 @@ MIDDLEWARE = BackendTable(
 )
 
 
-def join_graph(name: str, *, domain_id: int | Auto, node_name: str, localhost_only: bool | Auto = AUTO) -> Middleware:
+def join_graph(
+    name: str, *, domain_id: int | Auto = AUTO, node_name: str, localhost_only: bool | Auto = AUTO
+) -> Middleware:
     """A new participant on a graph; the caller closes it.
 
     :param name: of the table

@@ -21,7 +21,7 @@ from tests.once import once
 pytestmark = pytest.mark.slow
 
 PAGE = "docs/four-robots.md"
-SHORTER = {"demo": "12", "team": "10", "at-once": "4", "samples": "20", "packets": "20"}
+SHORTER = {"demo": "12", "team": "10", "samples": "20", "packets": "20"}
 """s instead of a minute, or of 20 s: what the page says holds for them as well."""
 NAMES = ("demo", "team", "at-once", "aloha", "samples", "packets", None)
 """The last is in real time, as tests/lab/run/test_live.py has four robots."""
@@ -71,7 +71,7 @@ def test_the_demo_fades_behind_obstacles_and_shows_it(walked: Path) -> None:
 def test_in_slots_all_arrives_and_otherwise_little(walked: Path) -> None:
     slots, team = of(walked, "team")
     assert share(slots) == 1.0
-    assert not any(send.overlapped for send in team.sends if send.t > 5)
+    assert not any(send.overlapped for send in team.sends)
     at_once, team = of(walked, "at-once")
     assert share(at_once) < 0.05
     assert sum(send.overlapped for send in team.sends) > 0.9 * len(team.sends)
@@ -94,4 +94,4 @@ def test_the_page_says_the_figures_of_its_commands(walked: Path) -> None:
     text = (Path(__file__).parents[2] / PAGE).read_text("utf-8")
     said = [int(number) for number in re.findall(r"about (\d+) % of the messages arrive", text)]
     measured = [100 * share(of(walked, name)[0]) for name in ("at-once", "aloha")]
-    assert said == pytest.approx(measured, abs=5)
+    assert said == pytest.approx(measured, abs=1)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -13,7 +16,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
-from gr_ros2.middleware import Qos
+from gr_ros2.middleware import Qos, join_graph
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2_lab.sim.motion import State
@@ -49,11 +52,40 @@ class Wheels:
             return self.state.x
 
 
+def program() -> str:
+    (block,) = (block for block in blocks("python") if block.page == "docs/how-to/stop-on-loss.md")
+    return block.text
+
+
+def test_the_program_of_the_page_starts_and_stops_a_robot_that_nobody_commands(tmp_path: Path) -> None:
+    pytest.importorskip("cyclonedds", reason="needs Cyclone DDS")
+    (tmp_path / "stop_on_loss.py").write_text(program())
+    number, stopped = domain(1), threading.Event()
+    stop = b"\0\1\0\0" + bytes(48)
+    with join_graph("dds", domain_id=number, node_name="robot", localhost_only=True) as graph:
+        graph.subscribe("/robot_1/cmd_vel", TWIST, Qos(), lambda payload: stopped.set() if payload == stop else None)
+        watching = subprocess.Popen(
+            [sys.executable, "stop_on_loss.py", "/robot_1"],
+            cwd=tmp_path,
+            env={
+                **os.environ,
+                "PYTHONPATH": str(Path(__file__).resolve().parents[2]),
+                "ROS_DOMAIN_ID": str(number),
+                "ROS_LOCALHOST_ONLY": "1",
+            },
+        )
+        try:
+            wait_for(lambda: stopped.is_set() or watching.poll() is not None, "the program to stop the robot")
+            assert stopped.is_set()
+        finally:
+            watching.kill()
+            watching.wait(PATIENCE_S)
+
+
 @pytest.mark.parametrize("how", ["the operator's link is switched off", "the operator says nothing"])
 def test_the_robot_stands_still_when_its_operator_is_gone(tmp_path: Path, how: str) -> None:
     recipe: dict[str, Any] = {"__name__": "recipe"}
-    (block,) = (block for block in blocks("python") if block.page == "docs/how-to/stop-on-loss.md")
-    exec(block.text, recipe)
+    exec(program(), recipe)
     addresses = [f"ipc://{tmp_path}/{number}" for number in (1, 2)]
 
     def link(number: int, own: str, other: str) -> RobotLink:
