@@ -283,7 +283,7 @@ class ReceivingSide:
             opened.replaced.inbox.ended(now)
             self._end(opened.replaced.src_id, self._window.peers.forget)
             if self.relaying is not None:
-                self.relaying.started(opened.replaced.src_id)
+                self.relaying.started(opened.replaced, now)
         self._sending.met(now)
 
     def _meet(self, neighbour: Neighbour, now: float) -> None:

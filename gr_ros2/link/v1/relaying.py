@@ -187,10 +187,15 @@ class Relaying:
         else:
             self._in_order.told(src_id, newest, now)
 
-    def started(self, src_id: int) -> None:
-        """A robot that is heard has started again: it has nothing of what it had."""
+    def started(self, before: Neighbour, now: float) -> None:
+        """A robot that is heard has started again: it has nothing of what it had. Until its new start is proven, what
+        others bring of the one before goes on where that was."""
+        src_id = before.src_id
         self.gains.started(src_id)
         self._in_order.started(src_id)
+        if before.proven and src_id not in self.far:
+            self.far[src_id] = before.inbox
+            self._there.setdefault(src_id, now)
 
     def direct(self, src_id: int, boot: int, ready: Ready, now: float) -> None:
         """A message has come from the robot that made it."""

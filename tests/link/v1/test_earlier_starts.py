@@ -77,3 +77,25 @@ def test_what_waits_of_an_earlier_start_comes_out_before_the_new_one(mode: SealM
     brought(three, table(1, old + 1, 1, ROW), line.now)
     assert brought(three, odom(1, old + 1, 2, b"new"), line.now) == [b"new"]
     assert brought(three, odom(1, old, 10_000, b"old"), line.now) == []
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_has_come_of_a_start_is_known_until_the_next_one_is_proven(mode: SealMode) -> None:
+    """Robot 3 hears the first hello of a new start of robot 1, which never hears it; others go on with the old one."""
+    line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3)))
+    line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
+    line.run(10)
+    one, three = line.robots[0], line.robots[2]
+    old = one.boot
+    absent(line, 1)
+    line.run(20)
+    newest = relaying_of(three)._neighbours.all[1].inbox.newest
+    brought(three, table(1, old, newest + 1, ROW), line.now)
+    assert brought(three, odom(1, old, newest + 2, b"once"), line.now) == [b"once"]
+    one.start()
+    while relaying_of(three)._neighbours.all[1].boot == old:
+        line.now += 0.05
+        if (data := one.slot(line.now)) is not None:
+            three.receive(data, line.now, line.now)
+    brought(three, table(1, old, newest + 3, ROW), line.now)
+    assert brought(three, odom(1, old, newest + 2, b"once"), line.now) == []
