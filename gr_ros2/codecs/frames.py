@@ -256,7 +256,8 @@ class FrameReceiver:
         self._decoders: OrderedDict[tuple[int, int], TopicDecoder] = OrderedDict()
         """Those that were used last, the newest last."""
         self._sizes: dict[tuple[int, str], tuple[int, int] | None] = {}
-        """Width and height of the newest picture in a namespace of a robot; None for one that has its own size."""
+        """Width and height of the newest picture in a namespace of a robot; None for one that has its own size. Only of
+        the namespaces that were used last, the newest last."""
 
     def announce(self, key: tuple[int, int], told: AnnouncedTopic) -> str:
         """A robot has announced a topic. Returns the type of the messages that come out.
@@ -267,7 +268,8 @@ class FrameReceiver:
         """
         output = frames_output(told)
         if output is None:
-            self._topics.pop(key, None)
+            if self._topics.pop(key, None):
+                self._sizes.pop(_place(key, told.name), None)
             return told.type_name
         if key not in self._topics or self._topics[key][:2] != (told.type_name, output):
             coded = CodedTopic(told.type_name, {"camera": {"output_type": output}})
@@ -290,9 +292,11 @@ class FrameReceiver:
         if len(self._decoders) > MOST_DECODERS:
             self._decoders.popitem(last=False)
         message = decoder.decode(payload)
-        # Plug-ins of image_transport publish camera/image/compressed beside camera/camera_info.
-        base = name.removesuffix("/compressed").removesuffix("/compressedDepth")
-        self._sizes[key[0], base.rpartition("/")[0]] = decoder.size
+        place = _place(key, name)
+        self._sizes.pop(place, None)
+        self._sizes[place] = decoder.size
+        if len(self._sizes) > MOST_DECODERS:
+            del self._sizes[next(iter(self._sizes))]
         return message
 
     def scaled(self, src_id: int, name: str, type_name: str, message: bytes) -> bytes:
@@ -303,3 +307,10 @@ class FrameReceiver:
         from gr_ros2.codecs.camera import scaled_camera_info
 
         return scaled_camera_info(message, *size)
+
+
+def _place(key: tuple[int, int], name: str) -> tuple[int, str]:
+    """The robot and the namespace of a topic."""
+    # Plug-ins of image_transport publish camera/image/compressed beside camera/camera_info.
+    base = name.removesuffix("/compressed").removesuffix("/compressedDepth")
+    return key[0], base.rpartition("/")[0]

@@ -257,6 +257,16 @@ def test_camera_info_has_the_size_of_what_comes_out(output: str, name: str) -> N
     assert receiver.scaled(2, "camera/camera_info", CAMERA_INFO, info) == info
 
 
+def test_camera_info_is_as_it_came_once_the_camera_passes_exactly() -> None:
+    receiver, told = FrameReceiver(), AnnouncedTopic(CAMERA, "camera/image", IMAGE, codec="frames")
+    receiver.announce((1, CAMERA), told)
+    info = scenes.camera_info(640, 480)
+    receiver.decode((1, CAMERA), told.name, CodedTopic(IMAGE).encoder().encode(picture(0), 900).data)
+    assert receiver.scaled(1, "camera/camera_info", CAMERA_INFO, info) != info
+    receiver.announce((1, CAMERA), told._replace(codec=""))
+    assert receiver.scaled(1, "camera/camera_info", CAMERA_INFO, info) == info
+
+
 def test_a_longest_rate_of_the_topic_is_heeded() -> None:
     air = link(options={"max_rate": 5.0})
     air.run(4.0)
@@ -338,8 +348,8 @@ def test_the_memory_for_topics_of_others_is_bounded() -> None:
     keys = [(robot, topic) for robot in range(1, 4) for topic in range(20)]
     for key in keys:
         assert receiver.announce(key, AnnouncedTopic(key[1], f"image_{key[1]}", IMAGE, codec="frames")) == IMAGE
-        receiver.decode(key, "camera/image", key_frame)
-    assert len(receiver._decoders) == MOST_DECODERS < len(keys)
+        receiver.decode(key, f"camera_{key[1]}/image", key_frame)
+    assert len(receiver._decoders) == len(receiver._sizes) == MOST_DECODERS < len(keys)
     receiver.decode(keys[-1], "camera/image", following)
     with pytest.raises(MissingFrameError):
         receiver.decode(keys[0], "camera/image", following)
