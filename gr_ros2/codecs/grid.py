@@ -171,7 +171,9 @@ def _split(message: bytes) -> _Grid:
     info: Any = grid.info
     if info.width * info.height != len(grid.data):
         raise DamagedError(f"damaged grid: {info.width} × {info.height} cells, but {len(grid.data)} are there")
-    cells = np.frombuffer(grid.data, np.uint8).reshape(info.height, info.width)
+    # Without cells, its other side may say any number, and costs memory.
+    shape = (info.height, info.width) if len(grid.data) else (0, 0)
+    cells = np.frombuffer(grid.data, np.uint8).reshape(shape)
     # The cells are the last member: behind them stand at most three bytes of padding.
     begin = _begin(message, len(grid.data))
     end = begin + len(grid.data)

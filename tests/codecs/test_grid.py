@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -84,3 +86,17 @@ def test_any_history_is_exact(data: st.DataObject) -> None:
             arrived = [*arrived, coded.name][-KEPT:]
         if arrived and data.draw(st.booleans()):
             encoder.confirmed(data.draw(st.sampled_from(arrived)))
+
+
+@pytest.mark.parametrize("shape", [(0, (1 << 32) - 1), ((1 << 32) - 1, 0)])
+def test_a_map_without_cells_costs_nothing_whatever_its_other_side_says(shape: tuple[int, int]) -> None:
+    topic = CodedTopic(GRID)
+    encoder, decoder = topic.encoder(), topic.decoder()
+    tracemalloc.start()
+    for cells in (np.zeros((5, 5), np.int8), *[np.zeros(shape, np.int8)] * 2, np.ones((5, 5), np.int8)):
+        message = grid(cells)
+        coded = encoder.encode(message)
+        encoder.confirmed(coded.name)
+        assert decoder.decode(coded.data) == message
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
