@@ -165,6 +165,15 @@ def test_a_jpeg_that_is_cut_short_has_one_reason_and_the_next_passes() -> None:
     assert encoder.encode(compressed(good[1], "jpeg"), BUDGET).data[0] == 1
 
 
+def test_a_jpeg_is_whole_only_with_its_end() -> None:
+    whole = video.packed("mjpeg", picture(np.full((64, 64, 3), 90, np.uint8), "yuvj420p"))
+    for behind in (b"", b"\0" * 8):
+        assert video.still("mjpeg", whole + behind).width == 64
+    for size in range(2, len(whole) - 1):
+        with pytest.raises(DamagedError):
+            video.still("mjpeg", whole[:size])
+
+
 def test_another_size_encoding_or_frame_is_a_key_frame() -> None:
     topic = CodedTopic(IMAGE, {"camera": {"size": "full"}})
     encoder, decoder = topic.encoder(), topic.decoder()
