@@ -92,6 +92,8 @@ class StatePull:
         """The message was coded, or could not be; see :class:`FramePull`."""
         self._coding = False
         self._key = self._key or key
+        if key and not self._new:  # it would fail again
+            self._newest = None
 
     def end(self) -> bool:
         """Code nothing more. Returns whether a message was waiting."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.codecs.messages import GRID
-from gr_ros2.link.events import SentPacket
+from gr_ros2.link.events import Refused, SentPacket
+from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.codecs import scenes
@@ -24,6 +25,18 @@ def distinct(robot: Robot) -> list[bytes]:
 def sent_bytes(robot: Robot) -> int:
     """Bytes of maps that have left so far."""
     return sum(len(event.data) for event in robot.events if isinstance(event, SentPacket) and event.kind == "new")
+
+
+@pytest.mark.parametrize("bad", [0, 3])
+@pytest.mark.parametrize("reports", [True, False])
+def test_a_bad_map_is_counted_once_and_the_next_passes(bad: int, reports: bool) -> None:
+    mapper = Robot(1, Registry([MAP]), 128)
+    air = Air(mapper, *[Robot(2, None, 128)] * reports)
+    air.feed(mapper, 0, 1, lambda number: MAPS[number][:-1000] if number == bad else MAPS[number])
+    air.run(6.0)
+    refused = [event for event in mapper.events if isinstance(event, Refused) and event.reason == Fate.DAMAGED]
+    assert len(refused) == 1
+    assert not reports or distinct(air.robots[1])[-1] in MAPS[4:7]
 
 
 def link(loss: float = 0.0, kbit_s: float = 128.0, **values: bool) -> Air:
