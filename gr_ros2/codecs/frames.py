@@ -159,8 +159,7 @@ class FrameSender:
     def done(self, job: Job, made: Coded | CodecError, now: float) -> None:
         """What has become of a message."""
         sent = self._sent[job.topic_id]
-        failed = isinstance(made, CodecError)
-        sent.pull.done(key=failed and job.pull.key)
+        sent.pull.done(job.pull if isinstance(made, CodecError) else None)
         if isinstance(made, CodecError):
             sent.failed += 1
             self._frames.refuse(job.topic_id, Fate.DAMAGED, str(made))

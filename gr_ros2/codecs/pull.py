@@ -6,7 +6,8 @@ nothing. Frames form a chain that is sent in order and repaired until it is conf
 
 Invariants: sans-IO, as the engines of a link: ``now`` is an argument (s, monotonic) and never goes back; at most one
 frame is being coded; while each robot that reports has lacked one for ``PATIENCE_S`` none is begun but a key frame,
-once a report says that somebody is there; a key frame is asked for at most once in ``KEY_S``; memory is one message.
+once a report says that somebody is there; a key frame is asked for at most once in ``KEY_S``; memory is one message,
+and of a map the one that was coded, too.
 """
 
 from __future__ import annotations
@@ -54,6 +55,8 @@ class StatePull:
     def __init__(self, *, period_s: float = 0.0, coding_s: float = 0.008) -> None:
         self.period_s, self._coding_s = period_s, coding_s
         self._newest: bytes | None = None
+        self._pulled: bytes | None = None
+        self._coded: bytes | None = None
         self._came = self._taken = -inf
         self._new = self._coding = False
         self._key = True
@@ -85,15 +88,20 @@ class StatePull:
             return None
         request = Pull(self._newest, self._came, None, self._key or alone)
         self._new = self._key = False
-        self._coding, self._taken = True, now
+        self._coding, self._taken, self._pulled = True, now, self._newest
         return request
 
-    def done(self, *, key: bool = False) -> None:
-        """The message was coded, or could not be; see :class:`FramePull`."""
+    def done(self, failed: Pull | None = None) -> None:
+        """The message was coded, or could not be; see :class:`FramePull`. Then the one before it counts."""
         self._coding = False
-        self._key = self._key or key
-        if key and not self._new:  # it would fail again
-            self._newest = None
+        if failed is None:
+            self._coded = self._pulled
+            return
+        self._key = self._key or failed.key
+        if failed.message is self._coded:
+            self._coded = None
+        if not self._new:
+            self._newest = self._coded
 
     def end(self) -> bool:
         """Code nothing more. Returns whether a message was waiting."""
@@ -156,13 +164,13 @@ class FramePull:
         self._newest, self._coding, self._taken = None, True, now
         return request
 
-    def done(self, *, key: bool = False) -> None:
-        """The message was coded, or could not be.
+    def done(self, failed: Pull | None = None) -> None:
+        """The message was coded.
 
-        :param key: it was to be a key frame, and could not be coded
+        :param failed: what could not be coded
         """
         self._coding = False
-        if key:
+        if failed is not None and failed.key:
             self._key, self._keyed = True, -inf
 
     def end(self) -> bool:

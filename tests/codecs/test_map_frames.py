@@ -39,6 +39,18 @@ def test_a_bad_map_is_counted_once_and_the_next_passes(bad: int, reports: bool) 
     assert not reports or distinct(air.robots[1])[-1] in MAPS[4:7]
 
 
+def test_a_robot_that_joins_after_a_bad_map_gets_the_one_before() -> None:
+    mapper, late = Robot(1, Registry([MAP]), 128), Robot(3, None, 128)
+    air = Air(mapper, Robot(2, None, 128))
+    air.feed(mapper, 0, 1, lambda number: MAPS[number][:-1000] if number == 3 else MAPS[number])
+    air.run(3.5)
+    air._feeds.clear()
+    air.robots.append(late)
+    air.run(12.0)
+    assert distinct(late) == [MAPS[2]]
+    assert sum(isinstance(event, Refused) for event in mapper.events) == 1
+
+
 def link(loss: float = 0.0, kbit_s: float = 128.0, **values: bool) -> Air:
     mapper = Robot(1, Registry([MAP]), kbit_s, **values)
     air = Air(mapper, Robot(2, None, kbit_s, **values), loss=loss)

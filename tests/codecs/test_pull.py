@@ -151,7 +151,7 @@ def test_a_key_frame_that_could_not_be_coded_is_asked_for_again() -> None:
     request = pull.pull(0.0, FREE)
     assert request is not None
     assert request.key
-    pull.done(key=True)
+    pull.done(request)
     pull.offer(b"whole", PERIOD)
     request = pull.pull(PERIOD, FREE)
     assert request is not None
