@@ -318,14 +318,6 @@ class Peers:
         """Whether a peer that may need a packet may take it for a replay."""
         return any(peer.settled <= number <= peer.proven for peer in self.all.values())
 
-    def within_reach(self, window: list[Sent], number: int) -> list[Sent]:
-        """The part of a window that peers can use which start before a packet: they know nothing older than their
-        start, and a combination with it brings nothing back to them."""
-        first = max(
-            (start for peer in self.all.values() if (start := max(peer.proven + 1, peer.settled)) <= number), default=0
-        )
-        return [record for record in window if record.number >= first]
-
     def lack(self, packets: list[Sent]) -> bool:
         """Whether a report names one of these packets as lost."""
         return any(record.number in peer.lost for peer in self.all.values() if peer.lost for record in packets)

@@ -179,10 +179,7 @@ class RepairWindow:
     def _of_all(self, now: float, lost: int) -> list[Sent]:
         """The window of a combination of all that is worth one, around a packet unless that is -1."""
         assert self._shared is not None
-        window = self._shared.window(now, lost)
-        if lost >= 0:
-            window = self.peers.within_reach(window, lost)
-        window = self._combining.fitting(window, lost)
+        window = self._combining.fitting(self._shared.window(now, lost), lost)
         self._shared.combined(window, now)
         self.peers.told()
         return window

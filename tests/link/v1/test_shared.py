@@ -95,23 +95,3 @@ def test_reliable_messages_arrive_beside_fresh_ones(monkeypatch: pytest.MonkeyPa
     assert both.delays[-1] < inf
     assert both.reports <= 0.05
     assert both.age <= 1.3 * alone.age
-
-
-def test_a_repair_for_a_robot_that_started_again_needs_nothing_from_before_its_start() -> None:
-    """Another robot is out of range, for which older packets are kept: the first cannot use a combination with them."""
-    made, before = RepairWindow("thrifty", ROOM, shares=True), 12
-    for src_id in (2, 3, 4):
-        made.peers.report(src_id, 0, 0, settled=True, loss=0.1, now=0.0)
-    made.peers.leave(4)
-    for number in range(1, 21):
-        made.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number * 0.1)
-    made.peers.forget(2)
-    made.peers.meet(2, 2.1)
-    made.peers.prove(2, before)
-    made.peers.report(3, 20, (1 << 20) - 1, settled=True, loss=0.1, now=2.2)
-    made.peers.report(2, 20, (1 << 64) - 1 - (1 << 5), settled=True, loss=0.1, now=2.2)
-    repair = made.urgent(2.3)
-    assert isinstance(repair, Repair)
-    members = [repair.number - back for back in range(repair.mask.bit_length()) if repair.mask >> back & 1]
-    assert 15 in members
-    assert min(members) > before
