@@ -133,7 +133,7 @@ def _run(
             results = runner.run_repetitions(scenario, out, lambda: _advance(bar, scenario, next(turns)), seen)
     drawn = None if no_report else pictures  # None: nothing at all
     if scenario.repetitions == 1:
-        _details(console, scenario, outcome) if details else _headline(console, outcome)
+        _details(console, scenario, outcome) if details else _headline(console, scenario, outcome)
         _report_run(console, outcome, scenario.name, out, drawn)
         results = [outcome.result]
     else:
@@ -219,7 +219,7 @@ def _bar(console: Console) -> Progress:
     )
 
 
-def _headline(console: Console, outcome: Outcome) -> None:
+def _headline(console: Console, scenario: Scenario, outcome: Outcome) -> None:
     """What came of it, in few lines."""
     result = outcome.result
     late = len(lateness_lines(result))
@@ -228,6 +228,8 @@ def _headline(console: Console, outcome: Outcome) -> None:
         console.print(line, style=style, soft_wrap=True)
     if (grid := topics_grid(result)) is not None:
         console.print(as_table(grid))
+    for line in _radio(scenario, result):
+        console.print(line, soft_wrap=True)
 
 
 def _details(console: Console, scenario: Scenario, outcome: Outcome) -> None:

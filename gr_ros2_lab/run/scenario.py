@@ -7,7 +7,6 @@ the same scenario again.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from functools import cached_property
@@ -401,13 +400,14 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
     return scenario
 
 
-_DESCRIBED = ("phy", "medium", "relay", "channel", "paths", "robots", "repair", "duplex", "gains_db", "paper", "task")
-"""Settings of which the description of a scenario may speak."""
+_DESCRIBED = ("phy", "medium", "relay", "channel", "paths", "repair", "duplex", "gains_db", "paper", "task")
+"""Settings of which the description of a scenario may speak, beside how many robots there are."""
 
 
 def _contradicted(overrides: Sequence[str]) -> bool:
     """Whether the description of a scenario may not be true any more."""
-    return any(re.split(r"[.=]", override, maxsplit=1)[0].strip() in _DESCRIBED for override in overrides)
+    keys = [override.partition("=")[0].strip() for override in overrides]
+    return any(key == "robots" or key.partition(".")[0] in _DESCRIBED for key in keys)
 
 
 def _described(scenario: Scenario, overrides: Sequence[str]) -> str:

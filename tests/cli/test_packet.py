@@ -174,6 +174,8 @@ def check_entries(vector: dict[str, Any], lines: list[str]) -> None:
         "    relayed: robot 7's (boot ends in cafe) topic 3, from its packet 70000.1, hop 2, 0.05 s old",
         "    relayed: robot 7's (boot ends in cafe) topic 3 to robot 9, from its packet 70000.128, hop 2, 1 s old, "
         "taken on by robot 3",
+        "    relayed: robot 7's (boot ends in cafe) topic 3, from its packet 70000.1 after 69990.0, hop 2, more than "
+        "4915.2 s old",
     }
     assert len(lines) == len(vector["entries"])
     for line, entry in zip(lines, vector["entries"], strict=True):
