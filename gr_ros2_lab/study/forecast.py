@@ -27,7 +27,7 @@ from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.events import AirKind
-from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.message_codec import FRAME, MessageCodec
 from gr_ros2.observe.result import TopicResult
 from gr_ros2.phy import PHY, configured
 from gr_ros2.settings.config import ChannelConfig, SendOptions, replaced
@@ -581,6 +581,8 @@ class _Remembering:
         return self._codec.numbered(coded, number)
 
     def decode(self, topic_id: int, coded: bytes) -> bytes:
+        if coded[:1] == FRAME:  # of a chain, which no announcement has told this codec, since it is the sender's too
+            return coded[1:]
         payload = self._decoded.get((topic_id, coded))
         if payload is None:
             payload = self._decoded[topic_id, coded] = self._codec.decode(topic_id, coded)

@@ -43,7 +43,7 @@ def test_commands_come_in_time_on_a_link_that_is_full() -> None:
     assert now.latency_s.p99 is not None
     assert before.latency_s.p99 is not None
     assert now.latency_s.p99 < 0.33
-    assert before.latency_s.p99 > 1.5
+    assert before.latency_s.p99 > 3 * 0.33
     assert {"stale", "cannot_complete"} & now.ledger.keys(), "what is dropped is counted"
 
 
