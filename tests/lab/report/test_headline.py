@@ -34,7 +34,7 @@ def test_a_team_says_its_task_all_its_robots_and_what_was_worst() -> None:
     assert " messages of 4 robots (" in lines[1]
     assert any(line.startswith("Worst: /robot_") for line in lines)
     assert topics_grid(outcome.result) is None
-    assert len(lines) <= MOST_LINES - 5
+    assert len(lines) <= MOST_LINES - 3
     all_sent = sum(t.sent for end in (outcome.result, *outcome.result.receivers) for t in end.topics)
     assert f" of {all_sent:,} messages of 4 robots" in lines[1]
 
@@ -57,4 +57,4 @@ def test_no_run_ends_in_more_lines_than_fit(name: str) -> None:
     outcome = run_scenario(load_scenario(name, ("time=packets",), duration_s=2))
     grid = topics_grid(outcome.result)
     rows = 0 if grid is None else 1 + len(grid.sections[0])
-    assert len(headline(outcome.result, outcome.trace)) + rows <= MOST_LINES - 5
+    assert len(headline(outcome.result, outcome.trace)) + rows <= MOST_LINES - 3
