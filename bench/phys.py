@@ -17,12 +17,10 @@ from typing import Any
 import pmt
 from gnuradio import gr
 
-from bench.port import _OUT, AS_IT_IS, PACKET_LEN, _Graph, _Poster, _Taker, _wait, checked_count
+from bench.port import _OUT, PACKET_LEN, _Graph, _Poster, _Taker, _wait, checked_count, one_way
 from bench.rows import Row
 from bench.runs import DRIVE
 from gr_ros2.core.errors import BackendMissingError
-from gr_ros2.gr import RosLink
-from gr_ros2.gr.factory import Start
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.paper.sender import Sender
 from gr_ros2.paper.settings import paper_from
@@ -33,7 +31,6 @@ from gr_ros2.phy.threads import shorten_switch_interval
 from gr_ros2.phy.window import WINDOW
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.settings.registry import Registry
-from gr_ros2.settings.robot import RobotConfig
 
 SNR_DB = 20.0
 LEAST = 0.5
@@ -168,17 +165,8 @@ def _bare(phy: Phy, many: int, few: int) -> tuple[float, float]:
 
 def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
     """The same from a message at the source to the message at the sink."""
-    registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
     robot, base = _Graph(1), _Graph(2)
-    common: dict[str, Any] = {"packet_len": phy.packet_len, "graph": {"namespace": ""}}
-    sends = RosLink(
-        RobotConfig(robot=1, direction="send", **common, **AS_IT_IS),
-        registry=registry,
-        middleware=robot,
-        backpressure=True,
-        start=Start(),
-    )
-    takes = RosLink(RobotConfig(robot=2, direction="receive", **common), middleware=base, start=Start())
+    sends, takes = one_way(robot, base, phy.packet_len)
     source, sink = sends.source, takes.sink
     message = b"\0\1\0\0" + bytes(phy.packet_len - _HEADERS - 4)
     with LoopbackLink(phy, source, sink, throttled=False):

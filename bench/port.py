@@ -87,6 +87,19 @@ class _Graph(Middleware):
         pass
 
 
+def one_way(robot: _Graph, base: _Graph, packet_len: int) -> tuple[RosLink, RosLink]:
+    """A link that sends odometry as it is from one graph, and one that takes it on the other."""
+    common: dict[str, Any] = {"packet_len": packet_len, "graph": {"namespace": ""}}
+    sends = RosLink(
+        RobotConfig(robot=1, direction="send", **common, **AS_IT_IS),
+        registry=Registry.from_rows({"odom": "nav_msgs/Odometry"}),
+        middleware=robot,
+        backpressure=True,
+        start=Start(),
+    )
+    return sends, RosLink(RobotConfig(robot=2, direction="receive", **common), middleware=base, start=Start())
+
+
 class _Poster(gr.basic_block):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__("poster", None, None)
@@ -148,17 +161,8 @@ def blocks_rate(size: int, each: int) -> float:
     :param size: bytes of a message
     :param each: packets that a message of this size leaves in
     """
-    registry = Registry.from_rows({"odom": "nav_msgs/Odometry"})
     robot, base = _Graph(1), _Graph(2)
-    common: dict[str, Any] = {"packet_len": PACKET_LEN, "graph": {"namespace": ""}}
-    sends = RosLink(
-        RobotConfig(robot=1, direction="send", **common, **AS_IT_IS),
-        registry=registry,
-        middleware=robot,
-        backpressure=True,
-        start=Start(),
-    )
-    takes = RosLink(RobotConfig(robot=2, direction="receive", **common), middleware=base, start=Start())
+    sends, takes = one_way(robot, base, PACKET_LEN)
     source, sink = sends.source, takes.sink
     graph = gr.top_block()
     graph.msg_connect(source, "pdus", sink, "pdus")

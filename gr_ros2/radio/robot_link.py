@@ -292,19 +292,20 @@ class RobotLink(Flowgraph):
     def findings(self) -> list[str]:
         """What a person should know about this link and its surroundings: one line each, mostly none."""
         now, own = self._clock(), self.config.robot_id
-        heard = peers(self.end, now)
+        stats = self.stats()
+        heard = stats["peers"]
         robots = [peer["robot"] for peer in heard]
         graph = self._ros.graph
         names = {info.topic for info in graph.discover() if info.publishers}
         services = graph.discover_services() if isinstance(graph, ServiceGraph) else ()
-        full, self._outrun = outrun(self._outrun, self.source.stats()["topics"])
+        full, self._outrun = outrun(self._outrun, stats["source"]["topics"])
         lines = [
             shortcut([*names, *services], own, robots),
-            foreign(names, self.sink.stats()["topics"]),
+            foreign(names, stats["sink"]["topics"]),
             *self._same_numbers(heard),
             *without_table(peer["robot"] for peer in heard if peer["no_table"]),
             full if self._ros.shares else None,
-            *self._mismatch.lines(self.stats(), robots, now),
+            *self._mismatch.lines(stats, robots, now),
         ]
         with self.end.lock:
             if self._ros.slots is not None and self._ros.slots.unheard(now):

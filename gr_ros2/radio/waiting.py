@@ -98,10 +98,8 @@ class Waiting:
     def __init__(self, source: LinkSendingBlock) -> None:
         self._source = source
         self._last = ALL_THERE
-        self._looked = False
-        self._missing: set[str] = set()
-        self._left: set[str] = set()
-        """Topics that had a publisher, which has left."""
+        self._had: set[str] = set()
+        """Topics that had a publisher at an earlier look."""
 
     def look(self) -> str | None:
         """One line for the user; None if the last line is still true. At first, every topic is assumed to have a
@@ -110,10 +108,9 @@ class Waiting:
         :raises MiddlewareError: when the graph cannot be asked
         """
         missing = self._source.found.unmatched()
-        self._left = (self._left | (set(missing) - self._missing if self._looked else set())) & set(missing)
-        self._missing, self._looked = set(missing), True
         types = {name: topic.type_name for name, topic in self._source.subscriptions.subscribed.items()}
-        line = waiting_line(missing, types, self._others(), left=self._left) if missing else self._sent()
+        self._had |= types.keys() - set(missing)
+        line = waiting_line(missing, types, self._others(), left=self._had) if missing else self._sent()
         if line == self._last:
             return None
         self._last = line
@@ -142,7 +139,7 @@ def waiting_line(
     :param missing: topics without a publisher, at least one
     :param types: type of every topic of the link, by name
     :param found: topics on the graph
-    :param left: those that had a publisher, which has left
+    :param left: topics that had a publisher: where one is missing, it has left
     """
     published = [info for info in found if info.publishers and info.topic not in INFRASTRUCTURE]
     wrong = [info for info in published if types.get(info.topic, info.type_name) != info.type_name]

@@ -7,7 +7,7 @@ number that does not apply is None.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.result import Result, relayed
@@ -60,6 +60,14 @@ def team_pairs(result: Result) -> list[TopicResult]:
     """The pairs of a robot and a topic of another one, on which something was sent."""
     ends = [result.topics, *(receiver.topics for receiver in result.receivers)]
     return [topic for topics in ends for topic in topics if topic.sent]
+
+
+def ledger_of(pairs: Iterable[TopicResult]) -> Counter[str]:
+    """Fate -> messages, over all of these topics."""
+    ledger: Counter[str] = Counter()
+    for topic in pairs:
+        ledger.update(topic.ledger)
+    return ledger
 
 
 def jain(counts: Collection[int]) -> float | None:

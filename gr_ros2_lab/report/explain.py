@@ -15,7 +15,7 @@ import numpy as np
 from gr_ros2.link.fates import FATES, Fate, fate_order
 from gr_ros2.link.lateness import LATE_S
 from gr_ros2_lab.record.result import Result, air_uses
-from gr_ros2_lab.record.team_numbers import airtime_of_senders, team_pairs
+from gr_ros2_lab.record.team_numbers import airtime_of_senders, ledger_of, team_pairs
 from gr_ros2_lab.record.trace import Ints, Packets, Trace
 from gr_ros2_lab.report.table import milliseconds
 
@@ -52,9 +52,7 @@ def why(result: Result, trace: Trace) -> list[str]:
 
 
 def _outcome(result: Result) -> Iterator[str]:
-    ledger: Counter[str] = Counter()
-    for topic in team_pairs(result):
-        ledger.update(topic.ledger)
+    ledger = ledger_of(team_pairs(result))
     sent = ledger.total()
     if not sent:
         yield "No message was sent."

@@ -5,13 +5,12 @@ Invariants: at most ``MOST_LINES`` lines; every number in them is in the run's r
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from gr_ros2.link.fates import ARRIVED, FATES, Fate, fate_order
 from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.result import Result
-from gr_ros2_lab.record.team_numbers import TEAM_VALUES, team_pairs
+from gr_ros2_lab.record.team_numbers import TEAM_VALUES, ledger_of, team_pairs
 from gr_ros2_lab.record.trace import Trace
 from gr_ros2_lab.report.explain import air_lines, lateness_lines, percent, seconds, why
 from gr_ros2_lab.report.table import Grid, by_receiver, faults, number
@@ -59,7 +58,7 @@ def _tasks(result: Result) -> Iterator[str]:
 
 
 def _delivered(pairs: Sequence[TopicResult]) -> str:
-    ledger = _sum(pairs)
+    ledger = ledger_of(pairs)
     sent = ledger.total()
     if not sent:
         return "No message was sent."
@@ -103,10 +102,3 @@ def _lost(ledger: dict[str, int], *, short: bool = False) -> str:
 
 def _words(fate: str, *, short: bool) -> str:
     return fate.replace("_", " ") if short or fate not in FATES else FATES[fate].words
-
-
-def _sum(pairs: Sequence[TopicResult]) -> Counter[str]:
-    ledger: Counter[str] = Counter()
-    for topic in pairs:
-        ledger.update(topic.ledger)
-    return ledger
