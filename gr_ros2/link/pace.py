@@ -24,6 +24,7 @@ class Pace:
     """The pace of one sending half.
 
     :param packet_rate: see :class:`gr_ros2.settings.robot.RobotConfig`
+    :ivar known: whether the slots are known (from a rate or from credits), so that an idle slot can be noticed
     """
 
     def __init__(self, packet_rate: float | Auto) -> None:
@@ -49,6 +50,7 @@ class Pace:
         """Set the rate. The next packet need not wait for the old one."""
         self._unpaced = packet_rate == 0
         self._rate = 0.0 if packet_rate == AUTO else packet_rate
+        self.known = self._rate > 0 or (self._credits is not None and not self._unpaced)
         self.slot = -inf
         """Earliest time at which the rate lets a packet leave."""
 
@@ -56,6 +58,7 @@ class Pace:
         """From now on, a packet leaves only when there is a credit, unless every packet leaves at once (rate 0)."""
         if self._credits is None:
             self._credits = 0
+            self.known = self._rate > 0 or not self._unpaced
 
     def credit(self, packets: int = 1, since: float | None = None) -> None:
         """The PHY can take this many further packets; the first call does what ``use_credit`` does.
@@ -67,7 +70,10 @@ class Pace:
         self._since = inf if since is None else since
         if since == inf:
             self._busy_since = inf
-        self._credits = (self._credits or 0) + (0 if self._unpaced else packets)
+        if self._credits is None:
+            self.use_credit()
+        if not self._unpaced:
+            self._credits = (self._credits or 0) + packets
 
     @property
     def ready(self) -> float:
@@ -83,11 +89,6 @@ class Pace:
     def out_of_credit(self) -> bool:
         """Whether nothing leaves before the next credit, whatever is submitted."""
         return self._credits == 0 and not self._unpaced
-
-    @property
-    def known(self) -> bool:
-        """Whether the slots are known (from a rate or from credits), so that an idle slot can be noticed."""
-        return self._rate > 0 or (self._credits is not None and not self._unpaced)
 
     @property
     def interval(self) -> float:

@@ -146,7 +146,7 @@ class TopicQueue(deque[M], Generic[M]):
         self.policy = policy
         self.deadline_s = deadline_s
         for message in self:
-            message.expires = self._expiry(message)
+            message.expires = self._expiry(message) if deadline_s else inf
 
     def limit(self, max_rate: float) -> None:
         """Let so many messages/s start from now on, 0 for any number."""
@@ -172,7 +172,8 @@ class TopicQueue(deque[M], Generic[M]):
             for victim in [waiting for waiting in self if not waiting.started][: len(self) - depth + 1]:
                 self.remove(victim)
                 dropped.append(Dropped(victim, Fate.QUEUE_BOUND, f"{depth} messages were waiting"))
-        message.expires = self._expiry(message)
+        if self.deadline_s:
+            message.expires = self._expiry(message)
         self._by_age = self._by_age and message.lifespan_s >= self.deadline_s
         self.append(message)
         return dropped
@@ -229,7 +230,7 @@ class TopicQueue(deque[M], Generic[M]):
         return self._opens if self and now < self._opens and not (self[0].started or self[0].released) else inf
 
     def _expiry(self, message: Outgoing) -> float:
-        return message.submitted + min(self.deadline_s, message.lifespan_s) if self.deadline_s else inf
+        return message.submitted + min(self.deadline_s, message.lifespan_s)
 
     def _reason(self, message: Outgoing, now: float, needs: float) -> tuple[Fate, str]:
         limit = f"{min(self.deadline_s, message.lifespan_s) * 1e3:g} ms"

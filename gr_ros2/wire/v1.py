@@ -13,6 +13,7 @@ recovered.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from struct import Struct
 from struct import error as struct_error
 from typing import NamedTuple
@@ -195,6 +196,7 @@ def is_sealed(data: bytes) -> bool:
     return len(data) > HEADER_LEN and data[0] >> 4 & 7 == VERSION and data[0] & _SEALED != 0
 
 
+@lru_cache(64)
 def body_room(packet_len: int, *, sealed: bool = False, addressed: bool = False, block: bool = False) -> int:
     """Bytes of the longest body of a source packet, whatever the length of its block for medium access."""
     used = HEADER_LEN + addressed * ADDRESS_LEN + REPAIR_HEADER_LEN + (TAG_LEN if sealed else CRC_LEN)

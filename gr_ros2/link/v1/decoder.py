@@ -91,7 +91,8 @@ class RepairDecoder:
         """
         if number in self.bodies or number < self.floor:
             return []
-        self.advance(number)
+        if number > self.newest:
+            self.advance(number)
         if not self._equations:
             self.bodies[number] = body
             return [(number, body)]
@@ -106,7 +107,8 @@ class RepairDecoder:
         :param combined: the linear combination of the bodies
         :return: the packets that follow from it
         """
-        self.advance(number)
+        if number > self.newest:
+            self.advance(number)
         bodies = self.bodies
         numbers = window_numbers(number, mask)
         missing = [member for member in numbers if member not in bodies]

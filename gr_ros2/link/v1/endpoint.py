@@ -266,7 +266,8 @@ class EndpointV1:
         if sent is None:
             return None
         self.pace.left(now, waiting=True)
-        self.frames.left(sent, now)
+        if self.frames.sent:
+            self.frames.left(sent, now)
         return sent
 
     def _may_begin(self, access: Access, now: float) -> bool:

@@ -60,6 +60,7 @@ class SentFrames:
     :param neighbours: the robots that are heard
     :param any_length: whether packets are only as long as they need
     :param relayed: see :class:`gr_ros2.link.frames.FrameSide`
+    :ivar sent: frames of each coded topic that have begun to leave or wait, until all who report have them
     """
 
     def __init__(
@@ -79,8 +80,7 @@ class SentFrames:
         self.relayed = relayed
         self._topics, self._outlet, self._packets, self._peers, self._pace = topics, outlet, packets, peers, pace
         self._room, self._turn_s, self._any_length, self._neighbours = room, turn_s, any_length, neighbours
-        self._sent: dict[int, deque[Message]] = {}
-        """Frames of each topic that have begun to leave or wait, oldest first, until all who report have them."""
+        self.sent: dict[int, deque[Message]] = {}
         self._ages: dict[int, float] = {}
         self._others: deque[tuple[float, int]] = deque()
         self._sum = 0
@@ -88,7 +88,7 @@ class SentFrames:
     def begin(self, topic_id: int, output: str = "") -> None:
         """See :class:`gr_ros2.link.frames.FrameSide`."""
         self._topics[topic_id].become_frames(output)
-        self._sent.setdefault(topic_id, deque())
+        self.sent.setdefault(topic_id, deque())
         self._ages.setdefault(topic_id, 0.0)
         self._outlet.tabulate()
 
@@ -105,12 +105,12 @@ class SentFrames:
 
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
         """Send a frame."""
-        for before in self._sent[topic_id] if key else ():
+        for before in self.sent[topic_id] if key else ():
             if now - before.left_at > LONG_S:
                 before.lifetime.end()
         message = self._outlet.submit_frame(self._topics[topic_id], frame, came, now, key=key)
         if message is not None:
-            self._sent[topic_id].append(message)
+            self.sent[topic_id].append(message)
 
     def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
         """A message is not coded."""
@@ -122,13 +122,11 @@ class SentFrames:
             neighbour.lost_frames.add(topic_id)
 
     def left(self, sent: SentPacket, now: float) -> None:
-        """A packet has left."""
-        if not self._sent:
-            return
+        """A packet has left; told only once a topic is coded."""
         others = len(sent.data) if self._any_length else self._room
         if sent.kind == "new":
             entries = [entry for entry in sent.packet.entries if isinstance(entry, Part)]
-            others = sum(len(part.payload) + ENTRY for part in entries if part.topic_id not in self._sent)
+            others = sum(len(part.payload) + ENTRY for part in entries if part.topic_id not in self.sent)
         self._others.append((now, others))
         self._sum += others
         while self._others[0][0] < now - WINDOW_S:
@@ -155,7 +153,7 @@ class SentFrames:
 
     def _lags(self, topic_id: int, now: float) -> list[float]:
         """For how long each robot has lacked a frame, s. One that was heard lately lacks what it lacked then."""
-        sent, records, everybody = self._sent[topic_id], self._packets.records, self._packets.everybody
+        sent, records, everybody = self.sent[topic_id], self._packets.records, self._packets.everybody
         oldest = dict.fromkeys((peer.bit for peer in self._reporting), inf)
         for message in list(sent):
             lacking = 0

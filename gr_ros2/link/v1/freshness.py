@@ -51,9 +51,11 @@ class Turns:
 
     def holder(self, pending: Collection[int]) -> int:
         """The topic to which the next packet belongs, one of ``pending``; -1 for none."""
-        if self._packets % TURN != TURN - 1:
-            return -1
-        return next((topic_id for topic_id in self._line if topic_id in pending), -1)
+        if self._packets % TURN == TURN - 1:
+            for topic_id in self._line:
+                if topic_id in pending:
+                    return topic_id
+        return -1
 
     def sent(self, topic_ids: Iterable[int]) -> None:
         """A packet left that belonged to these topics, or to none."""

@@ -384,12 +384,10 @@ class Inbox:
         topic = self.announced.topic_of(ready)
         if topic is None:
             self._await_table(ready)
-        elif not topic.reliable or ready.carried:
+        elif not topic.reliable or ready.carried or self.order.passes(ready):
             self._deliver(ready, topic)
-        elif self.order.waits(ready):
-            self.order.wait(ready, self._now)
         else:
-            self._deliver(self.order.out(ready), topic)
+            self.order.wait(ready, self._now)
 
     def _await_table(self, ready: Ready) -> None:
         for lost in self.announced.wait(ready):

@@ -167,14 +167,13 @@ class Order:
                 return True
         return False
 
-    def waits(self, ready: Ready) -> bool:
-        """Whether a message cannot come out at once."""
-        return ready.order[0] > self.low and ready.order > self.reached.get(ready.topic_id, (-1, 0))
-
-    def out(self, ready: Ready) -> Ready:
-        """A message comes out."""
-        self.reached[ready.topic_id] = max(self.reached.get(ready.topic_id, ready.order), ready.order)
-        return ready
+    def passes(self, ready: Ready) -> bool:
+        """Whether a message comes out at once; notes that it does."""
+        reached = self.reached.get(ready.topic_id, (-1, 0))
+        if ready.order[0] > self.low and ready.order > reached:
+            return False
+        self.reached[ready.topic_id] = max(reached, ready.order)
+        return True
 
     def up_to(self, topic_id: int) -> tuple[int, int]:
         """All messages of a topic up to this one are here, or are given up."""
@@ -226,7 +225,8 @@ class Order:
                     ready = line[0]
                     if waits and ready.order[0] > passed and not (quiet and self._follows(ready, passed, now)):
                         break
-                    due.append(self.out(line.pop(0)))
+                    due.append(line.pop(0))
+                    self.reached[topic_id] = max(self.reached.get(topic_id, ready.order), ready.order)
                     self._since[topic_id] = now
                     self.held -= len(ready.payload) + _COST
         return due

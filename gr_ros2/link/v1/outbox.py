@@ -182,12 +182,13 @@ class Outbox:
         if topic is None or topic_id == TABLE_TOPIC:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._owner.submitted(topic_id, now)
-        if topic.queue and topic.is_stream and self._owner.behind(now):
+        if not topic.queue:
+            self.packing.turns.join(topic_id)
+        elif topic.is_stream and self._owner.behind(now):
             self.drop(list(topic.queue.shed(now)))
         if not (waited_s and topic.is_stream and self._owner.slow):
             waited_s = 0.0  # one delay of a computer that keeps up costs no message
         over = waited_s > OVERLOAD_S
-        self.packing.turns.join(topic_id)
         serial = self._new(topic_id)
         codec = None if over else self._codec
         plain, keys = topic.spoken_of(payload, serial if publisher is None else publisher)
@@ -310,7 +311,8 @@ class Outbox:
         )
         if message.key:
             topic.lifetimes.restart()
-        self.kept.left(message, now, reported=reported)
+        if topic.kept or message.topic_id == TABLE_TOPIC:
+            self.kept.left(message, now, reported=reported)
         if message.topic_id in (RELAYED_TOPIC, RELAYED_IN_ORDER):
             self.relayed_left(message.topic_id, now)
         elif self.custody is not None and message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):

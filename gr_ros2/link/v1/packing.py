@@ -76,7 +76,8 @@ class Packing:
         self._topics, self._stats, self._left = topics, stats, left
         self._boot = boot
         self._shares = shares
-        self._room = room
+        self._short = (1 if shares else LONG) * room
+        """Bytes of a message above which others go before it."""
         self._open: dict[int, Sequence[Message]] = {}
         """Messages that may continue or start now, by topic."""
         self._holder = -1
@@ -89,8 +90,14 @@ class Packing:
         :param spare: nothing else needs the packet
         :return: None if nothing may be sent
         """
-        heap = self._heap(now)
-        if not heap or (len(heap) == 1 and not spare and heap[0][2] == TABLE_TOPIC and self.fills):
+        self._open = {}
+        for topic_id, topic in self._topics.items():
+            if topic.queue and (ready := topic.queue.open(now)):
+                self._open[topic_id] = ready
+        if not self._open:
+            return None
+        heap = self._heap()
+        if len(heap) == 1 and not spare and heap[0][2] == TABLE_TOPIC and self.fills:
             return None
         picks: list[tuple[Message, int, int]] = []
         used = 0
@@ -134,19 +141,10 @@ class Packing:
         return any(topic.queue and topic.queue[0].qos == QOS_LATENCY for topic in self._topics.named())
 
     def _rank(self, message: Message) -> float:
-        return RANK[message.qos] + 0.5 * self._long(message)
+        return RANK[message.qos] + 0.5 * (len(message.payload) > self._short)
 
-    def _long(self, message: Message) -> bool:
-        return len(message.payload) > (1 if self._shares else LONG) * self._room
-
-    def _heap(self, now: float) -> list[tuple[float, float, int, int]]:
+    def _heap(self) -> list[tuple[float, float, int, int]]:
         """Topics that may send, the most urgent and most valuable first."""
-        self._open = {}
-        for topic_id, topic in self._topics.items():
-            if topic.queue and (ready := topic.queue.open(now)):
-                self._open[topic_id] = ready
-        if not self._open:
-            return []
         holder = self._holder = self.turns.holder(self._open)
         if len(self._open) == 1:  # nothing to choose
             (only,) = self._open
@@ -173,7 +171,7 @@ class Packing:
                 lifetime.chained = topic.coded
                 lifetime.expires, lifetime.keys = message.expires, message.keys
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
-                lifetime.long = self._long(message)
+                lifetime.long = len(message.payload) > self._short
                 lifetime.fresh = not (lifetime.in_order or topic.kept or topic_id > TABLE_TOPIC)
                 queue.started(message, now)
             if message.submitted < since and not topic.topic.options.max_rate:

@@ -81,6 +81,8 @@ class ReceivingSide:
         save: Save | None,
     ) -> None:
         self._access = access
+        self._takes = range(256) if settings.src_id == NOBODY else (BROADCAST, settings.src_id)
+        """The destinations of packets that are for this robot."""
         self._outcomes = Outcomes()
         self.stats = self._outcomes.stats
         self._settings = settings
@@ -173,7 +175,7 @@ class ReceivingSide:
             if opened is None or opened.kept:
                 return
             opened.neighbour.timeout = None
-            if self._access is not None and not self._for_us(header):
+            if self._access is not None and header.dst_id not in self._takes:
                 self.stats.dropped["not_for_us"] += 1
                 return
             if arrival.snr_db is not None and opened.new and opened.trusted:
@@ -205,7 +207,8 @@ class ReceivingSide:
             self.neighbours.check_own(data, header)
             self.stats.dropped["own"] += 1
             return None
-        if self._access is None and not self._for_us(header):  # where it is shared, all have to know whose slot it is
+        # Where a channel is shared, all have to know whose slot it is.
+        if self._access is None and header.dst_id not in self._takes:
             self.stats.dropped["not_for_us"] += 1
             return None
         if header.sealed and not self._sealed:
@@ -213,10 +216,6 @@ class ReceivingSide:
         if self._sealed and not header.sealed:
             raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
         return self.neighbours.open(data, header, now)
-
-    def _for_us(self, header: Header) -> bool:
-        own = self._settings.src_id
-        return header.dst_id in (BROADCAST, own) or own == NOBODY
 
     def _use(self, arrival: AirPacket, opened: Opened, now: float) -> None:
         """Take an opened packet."""

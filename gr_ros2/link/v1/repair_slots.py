@@ -83,7 +83,16 @@ class RepairSlots:
         self._window.mode = self.mode
         if self._window.peers.in_vain and (over := self._window.peers.over(now)) >= 0:
             return self._tell(over, now)
-        return self._repair(now)
+        self.waits_until = -inf
+        chosen = self._window.next(now, self.held)
+        held = self.waits_until > now
+        self._calm_since = now if chosen is None and not held else -inf
+        self._calm_number = self._window.packets.newest
+        if chosen is not None:
+            self._hold.repaired(waiting=held)
+            return self._writer.repair(chosen, now)
+        lifetimes = () if held else self._window.exhausted(now)
+        return self._writer.source([], lifetimes, 0, (), now) if lifetimes else None
 
     def next(self, now: float, *, waiting: bool = False) -> float:
         """When ``spare`` may have something, s; inf for never.
@@ -102,18 +111,6 @@ class RepairSlots:
         if repair is not None:
             return self._writer.repair(repair, now)
         return None if self._window.packets.unconfirmed(now) else self._writer.control([], "repair", now)
-
-    def _repair(self, now: float) -> SentPacket | None:
-        self.waits_until = -inf
-        chosen = self._window.next(now, self.held)
-        held = self.waits_until > now
-        self._calm_since = now if chosen is None and not held else -inf
-        self._calm_number = self._window.packets.newest
-        if chosen is not None:
-            self._hold.repaired(waiting=held)
-            return self._writer.repair(chosen, now)
-        lifetimes = () if held else self._window.exhausted(now)
-        return self._writer.source([], lifetimes, 0, (), now) if lifetimes else None
 
     def _next_look(self, now: float) -> float:
         """When a thrifty sender may want to repair something."""

@@ -51,8 +51,9 @@ class ReportSlots:
         """The reports that are due; on a shared channel as many as may leave, those first that miss something."""
         due = []
         for neighbour in self._neighbours:
-            report = neighbour.inbox.reports
-            if report.due(now) <= now:
+            inbox = neighbour.inbox
+            report = inbox.reports
+            if (self._shares or report.unreported or inbox.order.held) and report.due(now) <= now:
                 due.append(report)
         if self._shares:
             self._allowed = min(self._allowed + REPORTS * self._packet_len, AT_ONCE * REPORT_LEN)
@@ -107,8 +108,6 @@ class ReportSlots:
 
     def asks(self, now: float) -> SentPacket | None:
         """A packet with requests, if there are any."""
-        if now < self.requests.check_at:
-            return None
         asks = self.requests.entries(self._writer.room, now)
         return self._writer.control(asks, "hello", now) if asks else None
 

@@ -116,7 +116,8 @@ class SendingSide:
             return self._hello(now)
         if due:
             return reports.packet(due, now)
-        return reports.asks(now) or self.repairs.spare(now) or self._rows(now) or reports.early(now)
+        asks = reports.asks(now) if now >= reports.requests.check_at else None
+        return asks or self.repairs.spare(now) or self._rows(now) or reports.early(now)
 
     def _rows(self, now: float) -> SentPacket | None:
         """Rows of the table in a packet that nothing else needs."""
@@ -125,9 +126,10 @@ class SendingSide:
 
     def _fill(self, due: list[Reporter], now: float, *, spare: bool = False) -> SentPacket | None:
         """A packet with messages."""
-        reports, told = self.reports, self.tells(now)
-        room = self._writer.room
+        reports, room = self.reports, self._writer.room
+        told: list[Newest] = []
         if self._relaying is not None:
+            told = self._relaying.tells(now)
             room -= max(TOLD * NEWEST_LEN, sum(map(length_of, told))) + 1  # an entry that fills it needs its length now
         number = self._window.packets.newest + 1
         filling = self._messages.packing.fill(number, room - reports.reserved, now, spare=spare)
@@ -135,7 +137,8 @@ class SendingSide:
             return None
         self.hellos.rests -= self.hellos.rests > 0
         self._slowness.waited(filling.since, now)
-        reports.add(filling.parts, room - filling.used, due, now)
+        if due or self.settings.shares:
+            reports.add(filling.parts, room - filling.used, due, now)
         filling.parts += told
         lifetimes = () if spare else filling.lifetimes
         return self._writer.source(filling.parts, lifetimes, filling.qos, filling.sent, now)

@@ -50,6 +50,8 @@ class SentTopic:
     :param output: of frames, the type that comes out, '' = the topic's
     :param instances: what its messages speak of; None = all of the same
     :ivar dst_id: the robot for which its messages are, 255 for all
+    :ivar kept: whether its newest messages are kept for robots that lack them; commands never are
+    :ivar in_order: whether its messages are delivered in order, each after all earlier ones
     """
 
     topic: Topic
@@ -66,16 +68,21 @@ class SentTopic:
     output: str = ""
     instances: InstanceKeys | None = None
     dst_id: int = field(init=False)
+    kept: bool = field(init=False)
+    in_order: bool = field(init=False)
 
     def __post_init__(self) -> None:
         self._check(self.topic.options)
         to = self.topic.options.to
         self.dst_id = BROADCAST if to == AUTO else to
+        self._derive()
 
-    @property
-    def kept(self) -> bool:
-        """Whether its newest messages are kept for robots that lack them; commands never are."""
-        return not self.command and (self.latched or self.topic.options.keep_s > 0)
+    def _derive(self) -> None:
+        """Find what is asked for every message, after any change of what it follows from."""
+        options = self.topic.options
+        self.kept = not self.command and (self.latched or options.keep_s > 0)
+        reliable = self.publishers.reliable if options.reliability == AUTO else options.reliability == "reliable"
+        self.in_order = self.coded or (reliable and (self.queue.policy != "latest" or self.shared))
 
     @property
     def is_stream(self) -> bool:
@@ -103,15 +110,6 @@ class SentTopic:
         """Whether its newest message says nothing of what others have said before."""
         by_publisher = self.kept and self.publishers.count > 1
         return by_publisher if self.instances is None else by_publisher or self.instances.separate
-
-    @property
-    def in_order(self) -> bool:
-        """Whether its messages are delivered in order, each after all earlier ones."""
-        if self.coded:
-            return True
-        wanted = self.topic.options.reliability
-        reliable = self.publishers.reliable if wanted == AUTO else wanted == "reliable"
-        return reliable and (self.queue.policy != "latest" or self.shared)
 
     def spoken_of(self, payload: bytes, publisher: Hashable) -> tuple[bytes, Keys]:
         """A new message, merged with those that wait and say more, and the instances that it speaks of.
@@ -141,6 +139,12 @@ class SentTopic:
             self.become_frames(self.output)
         else:
             self.queue.change(*queue_for(topic.options, publishers, command=self.command))
+        self._derive()
+
+    def tell_apart(self, instances: InstanceKeys | None) -> None:
+        """Tell its instances apart from now on."""
+        self.instances = instances
+        self._derive()
 
     def change(self, options: SendOptions) -> None:
         """Use other options from now on, for the same robot."""
@@ -158,6 +162,7 @@ class SentTopic:
         self.queue.limit(0.0)
         if self.topic.options.qos == AUTO:
             self.qos = QOS_BULK
+        self._derive()
 
     def _check(self, options: SendOptions) -> None:
         if self.command and options.keep_s:
@@ -222,7 +227,7 @@ class SentTopics(dict[int, SentTopic]):
             self[topic.topic_id] = made = SentTopic(
                 topic, queue, qos, options.weight, topic.latched, hidden=hidden, command=command
             )
-            made.instances = self._instances(topic, None)
+            made.tell_apart(self._instances(topic, None))
         if TABLE_TOPIC not in self:
             table = Topic(TABLE_TOPIC, "", "")
             queue, qos = TopicQueue[Message]("fifo"), qos_class(table.options)
@@ -234,7 +239,7 @@ class SentTopics(dict[int, SentTopic]):
         """Tell apart the instances of topics whose type was not known before."""
         for topic in self.named():
             if topic.topic.type_name == type_name and topic.instances is None:
-                topic.instances = self._instances(topic.topic, definitions)
+                topic.tell_apart(self._instances(topic.topic, definitions))
 
     def relay(self) -> None:
         """Send messages of other robots too, and carry some."""

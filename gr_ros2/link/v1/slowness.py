@@ -30,9 +30,7 @@ class Slowness:
 
     def waited(self, since: float, now: float) -> None:
         """A message leaves that could have left since then, as far as it is known here."""
-        ready = self._pace.ready
-        could = since if since > ready else ready
-        if could < now:
+        if since < now and (could := max(since, self._pace.ready)) < now:
             self._idle += now - could
         if now - self._window >= _WINDOW_S:
             self.slow = self._idle > (now - self._window) / 2

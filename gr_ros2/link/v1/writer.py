@@ -97,15 +97,11 @@ class PacketWriter:
         """
         number = self._window.packets.newest + 1
         body = write_body(entries, self.room)
-        header = self._header(qos, number)
-        clear = write_header(header)
-        padded = body.ljust(self._end_of_body - len(clear), b"\0")
-        data = self._trailer.close(clear, padded, number, NOT_A_REPAIR)
-        self._window.sent(number, body, data, lifetimes, now)
+        sent = self._close(qos, number, None, body, entries, kind="new", now=now, parts=parts)
+        self._window.sent(number, body, sent.data, lifetimes, now)
         if lifetimes:
             self._hold.left(now, self._window.peers.loss)
-        packet = PacketV1(header, tuple(entries), encrypted=self._encrypts)
-        return self._leave(data, packet, number, "new", now, parts=parts)
+        return sent
 
     def control(self, entries: Sequence[EntryV1], kind: AirKind, now: float, *, clear: bool = False) -> SentPacket:
         """Write a packet of entries that are not messages; it stands at the newest number."""
@@ -115,47 +111,60 @@ class PacketWriter:
             return self.source([], window.exhausted(now), 0, (), now)
         body = write_body(entries, self.room)
         fields = RepairHeader(repair_id, oldest=not window.packets.unconfirmed(now), clear=clear)
-        return self._repair_packet(fields, window.packets.newest, body, entries, kind=kind, now=now)
+        return self._close(QOS_REPAIR, window.packets.newest, fields, body, entries, kind=kind, now=now)
 
     def repair(self, chosen: Sent | Repair, now: float) -> SentPacket:
         """Write a combination of packets, or a packet again as it was."""
         if isinstance(chosen, Repair):
             number, mask, repair_id, oldest, combined = chosen
-            return self._repair_packet(
-                RepairHeader(repair_id, mask, oldest), number, combined, (), kind="repair", now=now
-            )
+            fields = RepairHeader(repair_id, mask, oldest)
+            return self._close(QOS_REPAIR, number, fields, combined, (), kind="repair", now=now)
         if self._shares:  # with another block it is another packet, and needs a nonce of its own
             again = self._window.packets.take_repair_id(chosen.number)
             if again is None:
                 return self.control([], "repair", now)
             body = combine([(chosen.number, chosen.body)], again)
-            return self._repair_packet(RepairHeader(again, 1), chosen.number, body, (), kind="repair", now=now)
+            return self._close(QOS_REPAIR, chosen.number, RepairHeader(again, 1), body, (), kind="repair", now=now)
         header = read_header(chosen.data, self._packet_len)
         entries = tuple(read_body(chosen.body, self.room))
         packet = PacketV1(header, entries, encrypted=self._encrypts)
-        return self._leave(chosen.data, packet, chosen.number, "repair", now)
+        return self._leave(chosen.data, packet, chosen.number, NOT_A_REPAIR, kind="repair", now=now, parts=())
 
-    def _repair_packet(
-        self, repair: RepairHeader, number: int, body: bytes, entries: Sequence[EntryV1], *, kind: AirKind, now: float
+    def _close(
+        self,
+        qos: int,
+        number: int,
+        repair: RepairHeader | None,
+        body: bytes,
+        entries: Sequence[EntryV1],
+        *,
+        kind: AirKind,
+        now: float,
+        parts: tuple[SentEntry, ...] = (),
     ) -> SentPacket:
-        header = self._header(QOS_REPAIR, number)
-        clear = write_header(header) + write_repair_header(repair)
+        """Pad and seal a packet, which leaves."""
+        header = Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, self._hop, self.block)
+        clear, repair_id, combined, plain = write_header(header), NOT_A_REPAIR, b"", False
+        if repair is not None:
+            clear += write_repair_header(repair)
+            repair_id, plain = repair.repair_id, repair.clear
         body = body.ljust(self._end_of_body - len(clear), b"\0")
-        data = self._trailer.close(clear, body, number, repair.repair_id, plain=repair.clear)
-        encrypted = self._encrypts and not repair.clear
-        combined = body if repair.mask else b""
-        packet = PacketV1(header, tuple(entries), repair, combined, encrypted)
-        return self._leave(data, packet, number, kind, now)
+        if repair is not None and repair.mask:
+            combined = body
+        data = self._trailer.close(clear, body, number, repair_id, plain=plain)
+        packet = PacketV1(header, tuple(entries), repair, combined, self._encrypts and not plain)
+        return self._leave(data, packet, number, repair_id, kind=kind, now=now, parts=parts)
 
     def _leave(
         self,
         data: bytes,
         packet: PacketV1,
         number: int,
+        repair_id: int,
+        *,
         kind: AirKind,
         now: float,
-        *,
-        parts: tuple[SentEntry, ...] = (),
+        parts: tuple[SentEntry, ...],
     ) -> SentPacket:
         """A packet leaves."""
         stats = self._stats
@@ -166,16 +175,12 @@ class PacketWriter:
             mcs = self._rate.sent(None if self._dst_id == BROADCAST else self._dst_id, now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
-        repair_id = NOT_A_REPAIR if packet.repair is None else packet.repair.repair_id
         sent = SentPacket(
             data, packet, self._src_id, self._boot, number, repair_id, parts, now, kind, mcs, self.leave_at
         )
         if self._observer is not None:
             self._observer(sent)
         return sent
-
-    def _header(self, qos: int, number: int) -> Header:
-        return Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, self._hop, self.block)
 
 
 def room_of(settings: Settings, keys: Keys, *, block: bool) -> int:
