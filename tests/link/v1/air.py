@@ -39,6 +39,9 @@ class Robot:
     :param access: what decides when it may send
     """
 
+    relays = False
+    """Whether all send on what others make (``conftest.relaying``)."""
+
     def __init__(
         self,
         src_id: int,
@@ -52,7 +55,7 @@ class Robot:
         self.src_id, self.topics, self.coding = src_id, topics, coding
         self.access = access
         self.keys = keys(mode)
-        self.settings = Settings(src_id, **{"packet_len": 64, **settings})
+        self.settings = Settings(src_id, **{"packet_len": 64, "relay": self.relays, **settings})
         self.stored: dict[int, tuple[int, int]] = {}
         self.save: Callable[[int, tuple[int, int]], None] = self.stored.__setitem__
         self.boot = 1000 * abs(src_id)

@@ -12,6 +12,8 @@ from tests.link.v1.air import Air, Robot, registry
 
 FIFO = SendOptions(queue="fifo", reliability="reliable")
 
+pytestmark = pytest.mark.usefixtures("relaying")
+
 
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("name", CASES)

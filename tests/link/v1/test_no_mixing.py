@@ -25,6 +25,8 @@ HALF, ROUND = 1 << 15, 1 << 16
 """Packets of a sender's lives: some are SHORT at most, others begin BEFORE half of the numbers, or all, and
 end AFTER."""
 
+pytestmark = pytest.mark.usefixtures("relaying")
+
 
 def topics() -> Registry:
     return registry(a=SendOptions(), b=SendOptions(queue="latest"), c=SendOptions(qos="bulk"))

@@ -19,6 +19,8 @@ TOPICS = registry(
 )
 SIZES = (40, 100, 500, 20)
 
+pytestmark = pytest.mark.usefixtures("relaying")
+
 
 class Talk:
     """Robots of which each says something on every topic in turn, and what was said.
