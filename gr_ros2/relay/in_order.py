@@ -3,7 +3,8 @@
 Every message is kept with the one of its topic before it. Each robot tells up to which message of a topic it has all;
 it is sent the next ones, the oldest first. One that was sent, by this robot or by another one that it hears, is sent
 again when the robot has told since that it still lacks it: at first after ``AGAIN_S``, then after twice as long with
-each time. Of a topic that is kept for late robots, one that has told nothing yet gets the newest.
+each time, and not while packets with a part of it are being repaired for that robot. Of a topic that is kept for late
+robots, one that has told nothing yet gets the newest.
 
 Invariants: sans-IO, the caller passes in times; what is kept is bounded, and of the neighbours that brought it, the one
 with most of it loses first; work for a choice is bounded by ``WINDOW``, the robots that are heard and the topics.
@@ -41,6 +42,10 @@ class Name(NamedTuple):
     order: Order
 
 
+def _never(_robot: int, _now: float) -> bool:
+    return False
+
+
 @dataclass(slots=True)
 class Kept:
     """A message that is kept.
@@ -48,13 +53,15 @@ class Kept:
     :param message: as it came; ``after`` tells what comes before it
     :param made: when it was made, s
     :param until: when it is of no more use, s
-    :ivar sent: by robot: when it was last sent to it, s, and how often
+    :ivar sent: by robot: when it was last sent to it, or last seen to be under way, s, and how often it was sent
+    :ivar repaired: whether a part of what was sent last is being repaired for a robot, at a time in s
     """
 
     message: Relayed
     made: float
     until: float
     sent: dict[int, tuple[float, int]] = field(default_factory=dict)
+    repaired: Callable[[int, float], bool] = _never
 
 
 @dataclass(slots=True)
@@ -189,11 +196,14 @@ class InOrder:
             self._skip(name)
         return best, most, gains, len(late)
 
-    def sent(self, name: Name, now: float) -> None:
-        """A message has left."""
+    def sent(self, name: Name, now: float, repaired: Callable[[int, float], bool] = _never) -> None:
+        """A message has left.
+
+        :param repaired: see :class:`Kept`
+        """
         if name in self:
             row, kept = self._rows[name.stream], self[name]
-            row.served = now
+            row.served, kept.repaired = now, repaired
             for robot in self._gains.apart(name.stream.origin, now):
                 if row.has.get(robot, (-1, 0)) < name.order:
                     kept.sent[robot] = now, min(kept.sent.get(robot, (0.0, 0))[1] + 1, DOUBLED)
@@ -207,10 +217,13 @@ class InOrder:
         again = AGAIN_S * self._gains.slower()
         found = []
         for n in range(max(begin, 0), min(begin + WINDOW, len(row.orders))):
-            at, times = row.kept[n].sent.get(robot, (-inf, 0))
+            kept = row.kept[n]
+            at, times = kept.sent.get(robot, (-inf, 0))
             due = told > at + again / 2 and now >= at + again * 2 ** max(times - 1, 0)
-            if due or now > row.kept[n].until:
-                found.append((row.orders[n], row.kept[n]))
+            if due and times and kept.repaired(robot, now):
+                kept.sent[robot], due = (now, times), False
+            if due or now > kept.until:
+                found.append((row.orders[n], kept))
         return found
 
     def _skip(self, name: Name) -> None:

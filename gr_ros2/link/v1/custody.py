@@ -339,6 +339,19 @@ class Custody:
                     held.due = now + patience * 2 ** min(held.tries, _TRIES)
                 held.tries += 1
 
+    def repaired_for(self, message: Message) -> Callable[[int, float], bool]:
+        """For a message that leaves whole in the packet that is composed: whether a part of it is being repaired for a
+        robot at a time, s."""
+        lifetime, first, last = message.lifetime, message.begin, self._packets.newest + 1
+
+        def repaired(robot: int, now: float) -> bool:
+            peer = self._peers.all.get(robot)
+            if peer is None or now >= lifetime.expires:
+                return False
+            return self._packets.first_lacked(peer.bit, first, last, lifetime) <= last
+
+        return repaired
+
     # ---- what other robots have
 
     def reported(self, robot: int, now: float) -> None:
@@ -346,13 +359,9 @@ class Custody:
         peer = self._peers.all.get(robot)
         if peer is None:
             return
-        records = self._packets.records
         for held in [held for held in self._held.values() if held.taker == robot]:
-            while held.out is not None and 0 <= held.low <= held.last:
-                record = records.get(held.low)
-                if record is not None and not record.confirmed & peer.bit and held.out.lifetime in record.lifetimes:
-                    break
-                held.low += 1
+            if held.out is not None and 0 <= held.low <= held.last:
+                held.low = self._packets.first_lacked(peer.bit, held.low, held.last, held.out.lifetime)
             if not 0 <= held.last < held.low or held.out is None or held.out.begin > peer.settled:
                 continue  # it lacks a part, or waits there for what is missing before it
             if held.own is None:

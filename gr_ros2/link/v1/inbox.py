@@ -29,7 +29,7 @@ from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
 from gr_ros2.wire.control import MAP, Control
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import CARRIED_TOPIC, RELAYED_TOPIC, SPAN, TABLE_TOPIC, EntryV1, Part, read_body
+from gr_ros2.wire.v1 import CARRIED_TOPIC, SPAN, TABLE_TOPIC, EntryV1, Part, read_body
 
 _PACKET_COST, _EQUATION_COST = 250, 350
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
@@ -239,8 +239,10 @@ class Inbox:
             return ordered
         return waiting + _INCOMPLETE_S if ordered is None else min(ordered, waiting + _INCOMPLETE_S)
 
-    def _repaired_until_here(self, topic_id: int) -> bool:
-        topic = self.announced.topics.get(topic_id)
+    def _repaired_until_here(self, partial: PartialMessage) -> bool:
+        if partial.topic_id > TABLE_TOPIC:  # of another robot
+            return self.order.told and self.order.wanted <= partial.newest[0]
+        topic = self.announced.topics.get(partial.topic_id)
         return self.order.told and topic is not None and topic.reliable
 
     def ended(self, now: float) -> None:
@@ -399,9 +401,6 @@ class Inbox:
             self._stats.dropped["relayed"] += 1
             return
         ready.sealed = self.deliveries.sealed(ready)
-        if ready.topic_id == RELAYED_TOPIC and self._now - ready.sealed > self.deliveries.withheld_s:
-            self._stats.dropped["withheld"] += 1
-            return
         self._relaying.receive(self.src_id, ready, self._now)
 
     def relayed(self, ready: Ready, now: float) -> None:

@@ -99,8 +99,8 @@ class Outbox:
         self.sent = SentTopics(codec, settings.commands, instances)
         self.kept = KeptMessages(self.sent, room, settings, self.stats, self._admit)
         self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)
-        self.relayed_left: Callable[[int, float], None] = lambda _, __: None
-        """Called with its queue when a message of another robot has left whole."""
+        self.relayed_left: Callable[[Message, float], None] = lambda _, __: None
+        """Called when a message of another robot has left whole."""
         self.custody: Custody | None = None
         """Carries messages over other robots, where they are relayed."""
         if settings.relay:
@@ -314,7 +314,7 @@ class Outbox:
         if topic.kept or message.topic_id == TABLE_TOPIC:
             self.kept.left(message, now, reported=reported)
         if message.topic_id in (RELAYED_TOPIC, RELAYED_IN_ORDER):
-            self.relayed_left(message.topic_id, now)
+            self.relayed_left(message, now)
         elif self.custody is not None and message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):
             self.custody.left(message, now)
 

@@ -144,14 +144,14 @@ class Reassembly:
             ended.append(self._release(next(iter(self._partials.values()))))
         return ended
 
-    def expired(self, now: float, after: float, keep: Callable[[int], bool]) -> list[PartialMessage]:
+    def expired(self, now: float, after: float, keep: Callable[[PartialMessage], bool]) -> list[PartialMessage]:
         """Give up messages without a new fragment for so many s.
 
-        :param keep: whether those of a topic wait longer; asked again after as many s
+        :param keep: whether one waits longer; asked again after as many s
         """
         ended = []
         while self._partials and (partial := next(iter(self._partials.values()))).last + after <= now:
-            if keep(partial.topic_id):
+            if keep(partial):
                 partial.last = now
                 self._partials.move_to_end((partial.topic_id, partial.begin))
             else:

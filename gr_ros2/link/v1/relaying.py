@@ -33,7 +33,7 @@ from gr_ros2.link.events import Gone, Met
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import FRAME
 from gr_ros2.link.v1.custody import Custody
-from gr_ros2.link.v1.delivery import UNKNOWN_S, for_all_in_order
+from gr_ros2.link.v1.delivery import MAX_AGE_S, UNKNOWN_S, for_all_in_order
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
@@ -234,14 +234,15 @@ class Relaying:
 
     def receive(self, via: int, ready: Ready, now: float) -> None:
         """A message of another robot has come over one that is heard."""
-        taker = BROADCAST
         try:
-            if ready.topic_id == CARRIED_TOPIC:
-                taker, message = read_carried(ready.payload)
-            else:
-                message = read_relayed(ready.payload)
+            carried = ready.topic_id == CARRIED_TOPIC
+            taker, message = read_carried(ready.payload) if carried else (BROADCAST, read_relayed(ready.payload))
         except WireError as error:
             self._dropped[error.kind] += 1
+            return
+        in_a_row = self._in_a_row(message)
+        if taker == BROADCAST and not in_a_row and now - ready.sealed > MAX_AGE_S * self.gains.slower():
+            self._dropped["withheld"] += 1  # what comes in a row may have been under repair, and its topic has no limit
             return
         origin, start = message.origin, message.start
         neighbour = self._neighbours.all.get(origin)
@@ -259,7 +260,7 @@ class Relaying:
             return
         self.custody.routes.note(origin, via, message.hops, ready.made)
         kept = _ToPass(message, made, made + min(limit_s, self._limit_s(message)))
-        if now > kept.until and not self._in_a_row(message):
+        if now > kept.until and not in_a_row:
             self._dropped["too_old"] += 1
             return
         order, table = (message.number, message.place), message.topic_id == TABLE_TOPIC
@@ -555,12 +556,12 @@ class Relaying:
             return inf
         return RELAYED_LEN + len(self._newest[stream].message.payload)
 
-    def left(self, queue: int, now: float) -> None:
-        """The message that was offered in a queue has left whole."""
-        if queue == RELAYED_IN_ORDER and self._next is not None:
-            self._in_order.sent(self._next, now)
+    def left(self, message: Message, now: float) -> None:
+        """A message that was offered leaves whole in the packet that is composed."""
+        if message.topic_id == RELAYED_IN_ORDER and self._next is not None:
+            self._in_order.sent(self._next, now, self.custody.repaired_for(message))
             self.relayed[self._next.stream.origin, self._next.stream.topic_id] += 1
-        elif queue == RELAYED_TOPIC and self._chosen is not None:
+        elif message.topic_id == RELAYED_TOPIC and self._chosen is not None:
             self.gains.sent(self._chosen, now)
             self.relayed[self._chosen.origin, self._chosen.topic_id] += 1
 

@@ -133,6 +133,18 @@ class SentPackets:
             needed += 1
         self.needed = needed
 
+    def first_lacked(self, bit: int, first: int, last: int, lifetime: Lifetime) -> int:
+        """The first packet of a message that the peer of a bit has not confirmed, as far as it may still be repaired;
+        ``last + 1`` if there is none.
+
+        :param first, last: the packets that carry the message
+        """
+        for number in range(max(first, self.oldest), last + 1):
+            record = self.records.get(number)
+            if record is not None and not record.confirmed & bit and lifetime in record.lifetimes:
+                return number
+        return last + 1
+
     def unconfirmed(self, now: float) -> bool:
         """Whether anything is alive."""
         self.retire(now)

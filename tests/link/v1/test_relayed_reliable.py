@@ -147,6 +147,24 @@ def test_all_of_a_reliable_topic_crosses_a_line() -> None:
     assert all(came(one, other.src_id) == goals for one in line.robots for other in line.robots if one is not other)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+@pytest.mark.parametrize("loss", [0.1, 0.3])
+def test_long_messages_cross_a_line_in_one_try(loss: float, mode: SealMode) -> None:
+    """What of them is lost is repaired hop by hop, however long that takes; nobody sends them anew meanwhile."""
+    line = Line(*(robot(src_id, mode, TOPICS) for src_id in (1, 2, 3)), loss=loss)
+    line.run(15)
+    goals = [(b"goal %d " % n).ljust(1000, b"x") for n in range(8)]
+    relayed = line.robots[1].end._receiving.relaying.relayed  # type: ignore[union-attr]
+    before = relayed[1, 1]
+    for goal in goals:
+        line.robots[0].end.messages.submit(1, goal, line.now)
+        line.run(2)
+    line.run(60)
+    assert came(line.robots[1], 1) == came(line.robots[2], 1) == goals
+    assert relayed[1, 1] - before <= len(goals) + 1
+
+
 @pytest.mark.parametrize("relay", [False, True])
 def test_what_its_origin_has_given_up_does_not_stop_those_who_hear_others(relay: bool) -> None:
     """A lifespan passes while a robot is out of reach of all: what is left comes out."""
