@@ -108,6 +108,7 @@ class Peers:
     :ivar in_vain: whether a peer waits for a packet in vain
     :ivar urges: heap of the packets that some peer lacks and for which later messages wait, or may wait soon: whether
         all in it are long, and its number
+    :ivar urgent_from: what the peers that lack the packet which ``urgent`` gave last need begins with this one
     :ivar once: the newest packets that were neither sent again nor combined: what a report says arrived when it was
         sent
     """
@@ -133,6 +134,7 @@ class Peers:
         """The newest packet of a message that is delivered in order. A peer cannot know what a missing packet carried:
         this message waits for every packet before it. Infinite on a shared channel, where repairs are few: there only
         packets with a part of such a message are urgent."""
+        self.urgent_from = 0
         self._served: set[int] = set()
         """Peers that lack the packet that was urgent last."""
         self._period = 0.0
@@ -289,6 +291,7 @@ class Peers:
             for peer in lacking:
                 peer.lost.discard(number)
             self._served = {id(peer) for peer in lacking}
+            self.urgent_from = max(max(peer.settled, (peer.proven + 1) % (number + 1)) for peer in lacking)
             return record
         self._served = set()
         return None

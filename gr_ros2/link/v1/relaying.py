@@ -300,6 +300,10 @@ class Relaying:
                 self.custody.take(message, via, now, made=kept.made, until=kept.until)
             return
         if message.topic_id == RECEIPT_TOPIC:
+            origin = self._neighbours.all.get(message.origin)
+            if via != message.origin and origin is not None and self.gains.near(origin.heard, now) and not origin.gone:
+                self._dropped["false_origin"] += 1  # what it has it tells itself
+                return
             try:
                 self.custody.told(message.origin, read_receipts(message.payload), now)
             except WireError as error:

@@ -172,14 +172,16 @@ class RepairWindow:
 
         :param lost: a packet that it contains, -1 for none
         """
-        window = self._of_all(now, lost)
+        # A peer that has come after an older packet could never use a combination with it.
+        window = self._of_all(now, lost, self.peers.urgent_from if lost >= 0 else 0)
         self.peers.served(window)
         return self._combination(window, now) if window else None
 
-    def _of_all(self, now: float, lost: int) -> list[Sent]:
-        """The window of a combination of all that is worth one, around a packet unless that is -1."""
+    def _of_all(self, now: float, lost: int, first: int = 0) -> list[Sent]:
+        """The window of a combination of all that is worth one, from a packet on, around a lost one unless it is -1."""
         assert self._shared is not None
-        window = self._combining.fitting(self._shared.window(now, lost), lost)
+        window = [record for record in self._shared.window(now, lost) if record.number >= first]
+        window = self._combining.fitting(window, lost)
         self._shared.combined(window, now)
         self.peers.told()
         return window

@@ -10,7 +10,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from bench import reliable
 from gr_ros2.link.v1.combining import Repair
-from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.decoder import RepairDecoder, window_numbers
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.order import Order
@@ -95,3 +95,25 @@ def test_reliable_messages_arrive_beside_fresh_ones(monkeypatch: pytest.MonkeyPa
     assert both.delays[-1] < inf
     assert both.reports <= 0.05
     assert both.age <= 1.3 * alone.age
+
+
+@pytest.mark.parametrize("proven", [0, 30])
+def test_who_came_after_older_packets_is_repaired_without_them(proven: int) -> None:
+    """All of them are kept for a robot that is out of range."""
+    sender = RepairWindow("thrifty", ROOM, shares=True)
+    for src_id in (2, 3, 4):
+        sender.peers.meet(src_id, 0.0)
+    sender.peers.prove(4, proven)
+    for number in range(1, 61):
+        sender.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number / 10)
+    sender.peers.leave(3)
+    sender.peers.report(2, 60, (1 << 60) - 1, settled=True, loss=0.1, now=9.0)
+    arrived = (1 << 29) - 1 ^ 1 << 20  # packets 32 to 60, but for 40
+    sender.peers.report(4, 60, arrived, settled=proven == 0, loss=0.1, now=9.0)
+    sender.peers.all[4].settled = 31 if not proven else 0
+    repair = sender.urgent(9.0)
+    while isinstance(repair, Repair) and 40 not in window_numbers(repair.number, repair.mask):
+        sender.sent(sender.packets.newest + 1, b"", b"", (), 9.0)
+        repair = sender.urgent(9.0)
+    assert isinstance(repair, Repair)
+    assert min(window_numbers(repair.number, repair.mask)) >= 31
