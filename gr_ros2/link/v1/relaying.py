@@ -241,7 +241,7 @@ class Relaying:
             self._dropped[error.kind] += 1
             return
         in_a_row = self._in_a_row(message)
-        if taker == BROADCAST and not in_a_row and now - ready.sealed > MAX_AGE_S * self.gains.slower():
+        if not (carried or in_a_row) and now - ready.sealed > MAX_AGE_S * self.gains.slower():
             self._dropped["withheld"] += 1  # what comes in a row may have been under repair, and its topic has no limit
             return
         origin, start = message.origin, message.start
@@ -265,15 +265,15 @@ class Relaying:
             return
         order, table = (message.number, message.place), message.topic_id == TABLE_TOPIC
         payload = message.payload[_BOOT_LEN * table :]
-        of = Ready(message.topic_id, order, payload, -1, message.coded, False, message.hops, via, taker != BROADCAST)
+        of = Ready(message.topic_id, order, payload, -1, message.coded, False, message.hops, via, carried)
         of.made, of.sealed, of.limit_s = made, ready.sealed - age_s if ready.sealed < inf else inf, limit_s
-        if taker != BROADCAST:
-            self._handed(taker, via, kept, of, now)
-            return
-        if table and not self._starts(message, via, now, made, heard=heard is not None):
+        if table and not carried and not self._starts(message, via, now, made, heard=heard is not None):
             return
         if heard is not None and message.number > heard.inbox.newest and self.gains.near(heard.heard, now):
             self._dropped["ahead"] += 1  # its next packet tells whether it has come so far
+            return
+        if carried:
+            self._handed(taker, via, kept, of, now)
             return
         inbox = self._inbox(origin, start)
         topic = None if inbox is None else inbox.announced.topic_of(message)
@@ -310,7 +310,7 @@ class Relaying:
                 self._dropped[error.kind] += 1
             return
         self.hops[message.origin] = message.hops
-        new = self._carried_here.take(message, ready)
+        new = self._carried_here.take(message, ready, kept.made, now)
         if not new:
             self._dropped["custody_full" if new is None else "relayed_before"] += 1
         reported = taker == self.src_id and not message.hops  # its origin learns from a report that it is here

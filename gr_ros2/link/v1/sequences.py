@@ -3,6 +3,9 @@
 The messages of a topic have consecutive places, and each says how many before it its origin still keeps. So it waits
 for these, and for no others: their origin hands them on until it is told that they have come.
 
+A message that came over others may be false. Where it has put later ones off, one that was made ``EXPIRES_S`` after it
+came begins anew.
+
 Invariants: a message is given out once, and none after a later one of its topic; memory is bounded by ``most`` bytes
 and ``MOST_STREAMS`` topics.
 """
@@ -10,9 +13,10 @@ and ``MOST_STREAMS`` topics.
 from __future__ import annotations
 
 from collections.abc import Container
+from math import inf
 from typing import Generic, TypeVar
 
-from gr_ros2.relay.gain import Stream
+from gr_ros2.relay.gain import EXPIRES_S, Stream
 from gr_ros2.wire.relayed import PLACES, Relayed
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
@@ -29,13 +33,14 @@ class _Sequence(Generic[T]):
     :ivar next: that of the next message
     :ivar floor: the origin keeps no message before it any more
     :ivar newest: number and place of the last message that was given out
+    :ivar came: when the last one came that was new, s
     """
 
-    __slots__ = ("floor", "newest", "next", "waiting")
+    __slots__ = ("came", "floor", "newest", "next", "waiting")
 
     def __init__(self, place: int) -> None:
         self.next = self.floor = place
-        self.newest = (-1, -1)
+        self.newest, self.came = (-1, -1), -inf
         self.waiting: dict[int, tuple[Relayed, T]] = {}
 
     def take_out(self) -> tuple[Relayed, T] | None:
@@ -58,14 +63,20 @@ class Sequences(Generic[T]):
         self._most, self._bytes = most, 0
         self._all: dict[Stream, _Sequence[T]] = {}
 
-    def take(self, message: Relayed, item: T) -> bool | None:
+    def take(self, message: Relayed, item: T, made: float, now: float) -> bool | None:
         """Keep a message until its turn.
 
         :param item: what is given out with it
+        :param made: when it was made, s
         :return: whether it is new; None if there is no room for it
         """
         stream = Stream(message.origin, message.start, message.topic_id)
-        sequence = self._all.pop(stream, None)
+        sequence = self._all.get(stream)
+        passed = sequence is not None and (message.number, message.place) <= sequence.newest
+        if sequence is not None and passed and made > sequence.came + EXPIRES_S:
+            self._drop(stream)
+            sequence = None
+        self._all.pop(stream, None)
         if sequence is None:
             sequence = _Sequence(message.place - message.waits)
         self._all[stream] = sequence
@@ -80,7 +91,7 @@ class Sequences(Generic[T]):
         if self._bytes + len(message.payload) + _COST > self._most and place > max(sequence.next, sequence.floor):
             return None
         self._bytes += len(message.payload) + _COST
-        sequence.waiting[place] = message, item
+        sequence.waiting[place], sequence.came = (message, item), now
         return True
 
     def due(self, origin: int, start: int, known: Container[int] = range(TABLE_TOPIC)) -> list[T]:

@@ -176,7 +176,7 @@ def test_what_is_kept_stays_in_order_however_many_after_it_are_given_up() -> Non
     for held in reversed(own):
         held.taker = 2
         message = read_carried(kept._written(held, line.now))[1]
-        here.take(message, message.payload)
+        here.take(message, message.payload, 0.0, 0.0)
     assert here.due(1, own[0].message.start) == [held.message.payload for held in own]
     assert own[0].message.payload == b"first"
 
@@ -300,7 +300,9 @@ def test_what_waits_for_the_table_of_its_origin_has_not_come() -> None:
     assert relaying is not None
     announced = last.end.neighbours.all[1].inbox.announced
     table, announced.topics = announced.topics, {}
-    said = Relayed(1, origin.boot & 0xFFFF, 9999, 128, 1, 1, b"goal", dst_id=3, age=0)
+    said = Relayed(
+        1, origin.boot & 0xFFFF, last.end.neighbours.all[1].inbox.newest, 128, 1, 1, b"goal", dst_id=3, age=0
+    )
     carried = Ready(CARRIED_TOPIC, (1, 0), write_carried(3, said), 0, False, False, made=line.now)
     relaying.receive(2, carried, line.now)
     assert not custody_of(last)._receipts

@@ -56,7 +56,7 @@ def test_everything_comes_once_and_in_order_unless_it_is_given_up(seed: int, giv
             over.add(origin.kept.pop(rng.randrange(len(origin.kept))))
         if under_way and rng.random() < 0.8:
             n, arrived = under_way.pop(rng.randrange(len(under_way)))
-            here.take(arrived, n)
+            here.take(arrived, n, 0.0, 0.0)
             got += here.due(1, 7)
         if rng.random() < 0.5 and (newest := here.newest(OF)) is not None:
             origin.kept = [n for n in origin.kept if (message(n).number, message(n).place) > newest]
@@ -66,29 +66,35 @@ def test_everything_comes_once_and_in_order_unless_it_is_given_up(seed: int, giv
 
 def test_a_robot_that_starts_anew_waits_for_what_its_origin_keeps_and_for_nothing_else() -> None:
     here = Sequences[int](1000)
-    assert here.take(message(12, waits=2), 12)
+    assert here.take(message(12, waits=2), 12, 0.0, 0.0)
     assert here.due(1, 7) == []
     assert here.newest(OF) is None
-    assert here.take(message(10), 10)
+    assert here.take(message(10), 10, 0.0, 0.0)
     assert here.due(1, 7) == [10]
-    assert here.take(message(13, waits=1), 13)  # 11 is given up
+    assert here.take(message(13, waits=1), 13, 0.0, 0.0)  # 11 is given up
     assert here.due(1, 7) == [12, 13]
-    assert here.take(message(11), 11) is False
+    assert here.take(message(11), 11, 0.0, 0.0) is False
     assert here.newest(OF) == (message(13).number, message(13).place)
 
 
 def test_what_waits_is_bounded_and_may_come_again() -> None:
     here = Sequences[int](2000)
-    assert [here.take(message(n, waits=n, size=300), n) for n in range(1, 6)] == [True, True, True, None, None]
-    assert here.take(message(0, size=300), 0)
+    assert [here.take(message(n, waits=n, size=300), n, 0.0, 0.0) for n in range(1, 6)] == [
+        True,
+        True,
+        True,
+        None,
+        None,
+    ]
+    assert here.take(message(0, size=300), 0, 0.0, 0.0)
     assert here.due(1, 7) == [0, 1, 2, 3]
-    assert here.take(message(4, size=300), 4)
+    assert here.take(message(4, size=300), 4, 0.0, 0.0)
     assert here.due(1, 7) == [4]
 
 
 def test_topics_are_bounded() -> None:
     here = Sequences[int](1 << 30)
     for start in range(sequences.MOST_STREAMS + 1):
-        here.take(message(1, waits=1)._replace(start=start), start)
+        here.take(message(1, waits=1)._replace(start=start), start, 0.0, 0.0)
     assert here.due(1, 0) == []
     assert len(here._all) == sequences.MOST_STREAMS

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from gr_ros2.link.events import Delivered
+from gr_ros2.link.events import Delivered, Ended
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
-from gr_ros2.wire.relayed import Relayed, write_relayed
+from gr_ros2.wire.relayed import RECEIPT_TOPIC, Receipt, Relayed, write_carried, write_receipts, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, write_table
-from gr_ros2.wire.v1 import RELAYED_TOPIC, TABLE_TOPIC
-from tests.link.v1.air import Robot
+from gr_ros2.wire.v1 import CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
+from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_ages import MODES, absent, relaying_of
 from tests.link.v1.test_relaying import Line, robot
 
@@ -25,7 +25,7 @@ ROW = AnnouncedTopic(0, "odom", "std_msgs/msg/String", 1, False, False, 1, "", F
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """What was false expires after 15 s."""
-    for module in ("relay.gain", "link.v1.delivery", "link.v1.relaying"):
+    for module in ("relay.gain", "link.v1.delivery", "link.v1.relaying", "link.v1.sequences"):
         monkeypatch.setattr(f"gr_ros2.{module}.EXPIRES_S", EXPIRES_S)
 
 
@@ -50,6 +50,12 @@ def number(false: int, start: int) -> Relayed:
 def table(origin: int, boot: int, at: int, *rows: AnnouncedTopic) -> Relayed:
     payload = boot.to_bytes(8, "big") + write_table(rows)
     return Relayed(origin, boot & 0xFFFF, at, 0, TABLE_TOPIC, 1, payload, age=0)
+
+
+def carries(insider: Robot, taker: int, false: Relayed, now: float) -> None:
+    """This robot hands a message on that nobody has made."""
+    queue = insider.end.messages.sent[CARRIED_TOPIC].queue
+    queue.append(Message(-1, CARRIED_TOPIC, write_carried(taker, false), 1, now, repeat=True))
 
 
 def count(one: Robot, line: Line, seconds: float) -> int:
@@ -189,3 +195,39 @@ def test_who_brings_much_takes_no_room_of_others(monkeypatch: pytest.MonkeyPatch
     assert len(relaying._newest) <= 20
     assert {stream.topic_id for stream in relaying._newest if stream.origin == 1} == {0, TABLE_TOPIC}
     assert one.end.received.dropped["relay_full"] > 80
+
+
+@pytest.mark.parametrize("heard", [False, True])
+def test_a_false_message_for_one_robot_puts_true_ones_off_for_a_while_only(heard: bool, soon: None) -> None:  # noqa: ARG001
+    """Robot 2 makes one up in the name of 1, which 3 hears or does not hear."""
+    line = Line(robot(1, "encrypt", registry(odom=SendOptions(queue="latest"), goal=SendOptions(to=3))))
+    line.robots += [robot(src_id, "encrypt") for src_id in (2, 3)]
+    if heard:
+        line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
+    line.run(12)
+    first, liar, last = line.robots
+    false = Relayed(1, first.boot & 0xFFFF, LAST_NUMBER, 130, 1, 1, b"false", dst_id=3)
+    carries(liar, 3, false, line.now)
+    line.run(2 if heard else EXPIRES_S + 10)
+    assert (b"false" in last.delivered(1)) != heard
+    goals = [b"goal %d" % n for n in range(10)]
+    for goal in goals:
+        first.end.messages.submit(1, goal, line.now)
+        line.run(1)
+    line.run(10)
+    assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
+    assert [event.arrived for event in first.events if isinstance(event, Ended)] == [True] * 10
+
+
+def test_a_receipt_of_what_was_never_made_ends_nothing() -> None:
+    line = Line(robot(1, "encrypt", registry(odom=SendOptions(queue="latest"), goal=SendOptions(to=3))))
+    line.robots += [robot(src_id, "encrypt") for src_id in (2, 3)]
+    line.run(12)
+    first, liar, last = line.robots
+    line.near = lambda one: [[1], [0], []][one]  # type: ignore[method-assign]
+    first.end.messages.submit(1, b"goal", line.now)
+    receipt = write_receipts([Receipt(first.boot & 0xFFFF, 1, LAST_NUMBER, 0)])
+    carries(liar, 1, Relayed(3, last.boot & 0xFFFF, 1000, 200, RECEIPT_TOPIC, 1, receipt, dst_id=1), line.now)
+    line.run(3)
+    assert first.end.received.dropped["false_origin"] == 1
+    assert not [event for event in first.events if isinstance(event, Ended)]
