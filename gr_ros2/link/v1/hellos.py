@@ -52,9 +52,9 @@ delivered."""
 EAGER = 20
 """Number of these hellos."""
 RESTS = 2
-"""Packets of messages, if any wait, between two hellos on a slow channel where somebody is heard: a row of the table
-and its message, for example; one less where nobody has named this robot, whose hello may be lost. Who is met would say
-nothing but hellos there for its next five turns."""
+"""Packets of messages, if any wait, between two hellos on a slow channel where somebody has named this robot: a row of
+the table and its message, for example. Who is met would say nothing but hellos there for its next five turns. Where
+nobody has named it, its hello was lost, and nothing else tells who it is."""
 LATENCY_S = 0.15
 """s for which a hello lets messages of class latency go first."""
 
@@ -132,7 +132,7 @@ class Hellos:
         if late < 0 or idle or self._answering:
             return late >= 0
         if self._starting:
-            rests = self.rests > (not self.named) and self._settings.slower > 1 and self._hears_others
+            rests = self.rests > 0 and self.named and self._settings.slower > 1 and self._hears_others
             return late >= latency * LATENCY_S and not rests
         return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
 

@@ -225,7 +225,8 @@ class SendingSide:
 
     def _hello(self, now: float) -> SentPacket:
         window, kept, newest = self._window, self._messages.kept, self._window.packets.newest
-        if newest == self._hello_number and not window.peers and self._writer.sealed:
+        again = newest == self._hello_number and not self.hellos.starting
+        if again and not window.peers and self._writer.sealed:
             self._hello_number = -1
             # A receiver that restarts takes nothing below the number that it had stored.
             return self._writer.source([], (), 0, (), now)

@@ -145,38 +145,80 @@ def test_a_robot_without_the_key_takes_slots_from_nobody_for_longer_than_it_send
         assert after == pytest.approx(at + ahead * SLOT, abs=SLOT / 2), "each announced send takes place"
 
 
+AHEAD_S, HEARD_AFTER_S = 0.4, 0.1
+
+
+class Sound:
+    """A channel on which packets are handed over long ahead of their bursts, as to a sound card.
+
+    :param on: when each robot is switched on, s
+    """
+
+    def __init__(self, airtime_s: float, *on: float, mode: SealMode, seed: int = 0) -> None:
+        self.robots, self.now, self.late, self.sent = list[Robot](), 0.0, 0, 0
+        self._airtime_s, self._on = airtime_s, on
+        self._gates = [AirtimeClock[bytes](airtime_s, ahead=AHEAD_S) for _ in on]
+        self._air: list[tuple[float, int, bytes]] = []
+        self._steps = 0
+        for src_id in range(1, len(on) + 1):
+            rng = random.Random(100 * seed + src_id)
+            access = Slots(src_id, airtime_s + 0.05, rng, period_s=0.0, lead_s=LEAD_S + AHEAD_S)
+            self.robots.append(Robot(src_id, registry(), mode=mode, access=access))
+
+    def run(self, seconds: float, *, speak: bool = True, until: Callable[[], bool] = lambda: False) -> None:
+        """So long, or until something is so; every robot has a new message each second."""
+        end = self.now + seconds
+        while self.now < end and not until():
+            for robot, gate, on in zip(self.robots, self._gates, self._on, strict=True):
+                if self.now >= on:
+                    self._leave(robot, gate, speak=speak and not self._steps % round(1 / LEAD_S))
+            lasts = self._airtime_s + HEARD_AFTER_S
+            for began, src_id, data in [one for one in self._air if self.now - LEAD_S < one[0] + lasts <= self.now]:
+                alone = not any(o != src_id and abs(at - began) < self._airtime_s for at, o, _ in self._air)
+                for robot, on in zip(self.robots, self._on, strict=True):
+                    if alone and robot.src_id != src_id and self.now >= on:
+                        robot.receive(data, self.now, began)
+            self._air = [one for one in self._air if one[0] > self.now - 2 - self._airtime_s]
+            self._steps += 1
+            self.now = self._steps * LEAD_S
+
+    def _leave(self, robot: Robot, gate: AirtimeClock[bytes], *, speak: bool) -> None:
+        if speak:
+            robot.end.messages.submit(0, b"%d %d" % (robot.src_id, self._steps), self.now)
+            self.sent += 1
+        gate.due(self.now)
+        robot.end.pace.credit(gate.grants(self.now))
+        if (packet := robot.end.next_packet(self.now)) is not None:
+            begin = gate.offer(packet.data, self.now, leave_at=packet.leave_at)
+            assert begin is not None
+            self.late += begin < self.now + AHEAD_S - 1e-6
+            self._air.append((max(begin, self.now + AHEAD_S), robot.src_id, packet.data))
+
+
 @pytest.mark.parametrize("mode", ["none", "encrypt"])
 @pytest.mark.parametrize("airtime_s", [0.068, 0.204])
 def test_messages_cross_where_packets_are_handed_over_long_ahead_as_to_a_sound_card(
     airtime_s: float, mode: SealMode
 ) -> None:
-    ahead_s, heard_after_s, seconds = 0.4, 0.1, 60
-    robots, gates = [], []
-    for src_id in (1, 2):
-        access = Slots(src_id, airtime_s + 0.05, random.Random(src_id), period_s=0.0, lead_s=LEAD_S + ahead_s)
-        robots.append(Robot(src_id, registry(), mode=mode, access=access))
-        gates.append(AirtimeClock[bytes](airtime_s, ahead=ahead_s))
-    air: list[tuple[float, int, bytes]] = []
-    sent = late = 0
-    for step in range(round((seconds + 15) / LEAD_S)):
-        now = step * LEAD_S
-        for robot, gate in zip(robots, gates, strict=True):
-            if not step % round(1 / LEAD_S) and now < seconds:
-                robot.end.messages.submit(0, b"%d %d" % (robot.src_id, step), now)
-                sent += 1
-            gate.due(now)
-            robot.end.pace.credit(gate.grants(now))
-            if (packet := robot.end.next_packet(now)) is not None:
-                begin = gate.offer(packet.data, now, leave_at=packet.leave_at)
-                assert begin is not None
-                late += begin < now + ahead_s - 1e-6
-                air.append((max(begin, now + ahead_s), robot.src_id, packet.data))
-        for began, src_id, data in [one for one in air if now - LEAD_S < one[0] + airtime_s + heard_after_s <= now]:
-            if not any(other != src_id and abs(at - began) < airtime_s for at, other, _ in air):
-                robots[2 - src_id].receive(data, now, began)
-        air = [one for one in air if one[0] > now - 2]
-    assert sum(len(robot.delivered()) for robot in robots) == sent == 2 * seconds
-    assert late == 0
+    sound = Sound(airtime_s, 0.0, 0.0, mode=mode)
+    sound.run(60)
+    sound.run(15, speak=False)
+    assert sum(len(robot.delivered()) for robot in sound.robots) == sound.sent == 2 * 60
+    assert sound.late == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 16, 17, 20, 24, 41, 44, 78])
+def test_three_robots_with_a_key_hear_each_other_soon_where_packets_take_half_a_second(seed: int) -> None:
+    """They are switched on one after the other; without a hello nobody knows who sends. 180 packets of one fit in."""
+    rng = random.Random(seed)
+    sound = Sound(0.53, *(rng.uniform(0, 3) for _ in range(3)), mode="encrypt", seed=seed)
+
+    def whole() -> bool:
+        return all(one.delivered(other) for one in sound.robots for other in {1, 2, 3} - {one.src_id})
+
+    sound.run(100, until=whole)
+    assert whole()
 
 
 @pytest.mark.parametrize(("mode", "most"), [("none", 42), ("encrypt", 50)])
