@@ -22,6 +22,7 @@ from binascii import crc_hqx
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
+from threading import Lock
 from typing import Any, Protocol
 
 from gr_ros2.compression import bounds
@@ -123,7 +124,8 @@ class LinkCodec:
             return
         for key, codec in self._made.items():
             if key[0] == type_name:
-                codec.learn(tree)
+                with codec.lock:
+                    codec.learn(tree)
 
     def announcement(self, topic_id: int) -> str:
         return self._topics[topic_id].announcement
@@ -140,14 +142,18 @@ class LinkCodec:
 
         :raises KeyError: a topic id that it was not made for
         """
-        return self._topics[topic_id].canonical(payload)
+        codec = self._topics[topic_id]
+        with codec.lock:
+            return codec.canonical(payload)
 
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         """The coded message, at most one byte longer than the payload; never fails.
 
         :raises KeyError: a topic id that it was not made for
         """
-        return self._topics[topic_id].encode(payload)
+        codec = self._topics[topic_id]
+        with codec.lock:
+            return codec.encode(payload)
 
     def numbered(self, coded: bytes, number: int) -> bytes:
         return bytes([NUMBERED, number & 0xFF]) + coded
@@ -158,7 +164,9 @@ class LinkCodec:
         :raises CodecError: ``fate`` is unknown_dictionary, damaged or unsupported (a codec we do not know)
         :raises KeyError: a topic id that it was not made for
         """
-        return self._topics[topic_id].decode(_inner(coded))
+        codec = self._topics[topic_id]
+        with codec.lock:
+            return codec.decode(_inner(coded))
 
 
 class TopicCodec:
@@ -166,10 +174,12 @@ class TopicCodec:
 
     :param sets: dictionaries, the preferred ones first
     :param whole: the codec that its type has for itself, which a sender with ``codec`` auto prefers
+    :ivar lock: held while it codes: coders have buffers of their own, and large messages are coded in other threads
     """
 
     def __init__(self, topic: Topic, sets: Sequence[Dictionary], max_size: int, whole: Whole | None = None) -> None:
         self._whole = whole
+        self.lock = Lock()
         self._frames = False
         """Whether its sender has announced frames of a chain."""
         self._foreseen: tuple[bytes, tuple[bytes, bytes]] | None = None

@@ -206,6 +206,9 @@ class Subscriptions:
 
     def _take(self, topic_id: int, payload: bytes) -> None:
         """Accept a message of the ROS graph, in a thread of the middleware."""
+        now_id = self._now(topic_id)
+        plain = topic_id not in self._static and (self.frames is None or now_id not in self.frames)
+        prepared = self._messages.prepare(now_id, payload) if plain else None  # the sending thread goes on meanwhile
         with self._live.lock:
             now_id = self._now(topic_id)
             frames = self.frames if self.frames is not None and now_id in self.frames else None
@@ -226,7 +229,9 @@ class Subscriptions:
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
             waited_s, publisher = (0.0, None) if subscription is None else (subscription.waited_s, subscription.source)
-            self._messages.submit(now_id, whole or payload, self._clock(), waited_s=waited_s, publisher=publisher)
+            self._messages.submit(
+                now_id, whole or payload, self._clock(), waited_s=waited_s, publisher=publisher, prepared=prepared
+            )
             self._live.wake()
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import inf
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SentPacket
@@ -56,8 +56,24 @@ def check_live_options(topic: str, before: SendOptions, after: SendOptions) -> N
             )
 
 
+class CodedMessage(NamedTuple):
+    """A message that was coded before it is submitted.
+
+    :param coded: what leaves
+    :param expected: what comes out at the other end; None where nobody asks
+    """
+
+    topic_id: int
+    payload: bytes
+    coded: bytes
+    expected: bytes | None
+
+
 class MessageSide(Protocol):
     """The messages that an end sends."""
+
+    def prepare(self, topic_id: int, payload: bytes) -> CodedMessage | None:
+        """Code a message for ``submit`` if that takes long; otherwise None. The only method that needs no lock."""
 
     def submit(
         self,
@@ -69,6 +85,7 @@ class MessageSide(Protocol):
         *,
         waited_s: float = 0.0,
         publisher: Hashable = None,
+        prepared: CodedMessage | None = None,
     ) -> None:
         """Take a serialized message.
 
@@ -79,6 +96,7 @@ class MessageSide(Protocol):
         :param waited_s: s for which it has waited on this computer, and newer ones of its topic have come (version 1)
         :param publisher: whose message it is: of a latched topic, the newest of each is kept (version 1); None = not
             known
+        :param prepared: what ``prepare`` made of the same bytes
         :raises ConfigError: for a topic that is not sent
         """
 

@@ -14,6 +14,7 @@ from typing import Any
 from zlib import crc32
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.endpoint import CodedMessage
 from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
@@ -87,6 +88,9 @@ class Sender:
         """Per topic, serial and coded bytes of the message for robots that join late."""
         self._repeat_at: dict[int, float] = {}
 
+    def prepare(self, topic_id: int, payload: bytes) -> CodedMessage | None:  # noqa: ARG002
+        return None
+
     def submit(
         self,
         topic_id: int,
@@ -97,6 +101,7 @@ class Sender:
         *,
         waited_s: float = 0.0,  # noqa: ARG002
         publisher: Hashable = None,  # noqa: ARG002
+        prepared: CodedMessage | None = None,  # noqa: ARG002
     ) -> None:
         """Take a serialized message.
 

@@ -15,6 +15,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import pmt
 from gnuradio import gr
 
+from gr_ros2.compression.link_codec import TopicCodec
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr import RosLink
 from gr_ros2.gr.sending import SendingBlock
@@ -375,3 +376,34 @@ def test_stopped_started_and_closed_twice(rig: Rig) -> None:
     source.close()
     source.close()
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("gr-ros2-source")]
+
+
+def test_other_messages_leave_while_a_large_one_is_coded(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    coding, go_on = threading.Event(), threading.Event()
+    encode = TopicCodec.encode
+
+    def slow(self: TopicCodec, payload: bytes) -> bytes:
+        if len(payload) > 50_000:
+            coding.set()
+            assert go_on.wait(PATIENCE_S)
+        return encode(self, payload)
+
+    monkeypatch.setattr(TopicCodec, "encode", slow)
+    live = rig.make(of_link=True).live
+    sent = live.endpoint.sent.sent
+    odom, tf = (topic.topic_id for topic in REGISTRY)
+    rig.start()
+    large = threading.Thread(target=rig.publish, args=(bytes([0, 1, 0, 0]) + bytes(100_000),))
+    try:
+        large.start()
+        assert coding.wait(PATIENCE_S)
+        assert live.lock.acquire(timeout=PATIENCE_S)
+        live.endpoint.messages.submit(tf, bytes([0, 1, 0, 0]) + bytes(40), time.monotonic())
+        live.wake()
+        live.lock.release()
+        wait_for(lambda: sent[tf] == 1)
+        assert not sent[odom]
+    finally:
+        go_on.set()
+        large.join(PATIENCE_S)
+    wait_for(lambda: sent[odom] == 1)
