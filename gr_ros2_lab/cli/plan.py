@@ -128,7 +128,7 @@ def _tell(planner: Planner, advise: bool) -> None:
 
 def _cut(cut: Cut) -> str:
     what = f"limit {cut.topic} to {cut.rate_hz:g} Hz" if cut.rate_hz else f"drop {cut.topic}"
-    return f"{what}: load {cut.load:.0%}"
+    return f"{what}: new messages need {cut.load:.0%}"
 
 
 def _table(forecast: Forecast) -> Table:
@@ -169,7 +169,9 @@ def _verdict(forecast: Forecast) -> str:
     else:
         fits = "it fits"
     per_message = _number(forecast.air_bytes_per_message, 1, ".0f")
-    return f"Load {forecast.load:.0%}: {fits}. {per_message} bytes on the air per message delivered."
+    air = "of the air" if forecast.allowed == 1 else f"of the {forecast.allowed:.0%} of the air that may be used"
+    alone = f"New messages alone need {forecast.load:.0%} {air}: {fits}"
+    return f"{alone}. {per_message} bytes on the air per message delivered."
 
 
 def _arrives(forecast: Forecast) -> float:
