@@ -20,7 +20,7 @@ from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.dashboard.windows import RATE_S, Floats
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.observe.observers import LiveLink, LiveRun
+from gr_ros2.observe.observers import Change, LiveLink, LiveRun
 from gr_ros2.observe.result import RunResult
 from gr_ros2.settings.config import ChannelConfig
 
@@ -160,21 +160,21 @@ class RunMonitor:
 
     def set_snr_db(self, snr_db: float | None) -> None:
         """Set the SNR of every link, dB; None = no noise."""
-        self._change(lambda link: link.set_snr_db(snr_db))
+        self._change("channel.snr_db", snr_db, lambda link: link.set_snr_db(snr_db))
 
     def set_frequency_offset(self, offset: float) -> None:
         """Set the carrier frequency offset of every link, as a fraction of the sample rate."""
-        self._change(lambda link: link.set_frequency_offset(offset))
+        self._change("channel.frequency_offset", offset, lambda link: link.set_frequency_offset(offset))
 
     def set_packet_loss(self, probability: float) -> None:
         """Set the loss probability of whole packets on every link, 0..1."""
-        self._change(lambda link: link.set_packet_loss(probability))
+        self._change("channel.packet_loss", probability, lambda link: link.set_packet_loss(probability))
 
     def transmit(self, on: bool) -> None:
         """Switch sending of every link off, at once, or on again."""
-        self._change(lambda link: link.transmit(on=on))
+        self._change("transmit", on, lambda link: link.transmit(on=on))
 
-    def _change(self, change: Callable[[LiveLink], None]) -> None:
+    def _change(self, setting: str, value: float | bool | None, change: Callable[[LiveLink], None]) -> None:
         self.refused = ""
         try:
             run = self._run
@@ -182,6 +182,8 @@ class RunMonitor:
                 self._state.changed(run.clock())
             for link in () if run is None else run.links:
                 change(link)
+            if run is not None and run.links:
+                run.changed(Change(run.clock(), setting, value))
             if run is not None and not run.links:
                 self.refused = "a run on simulated time has no channel to change"
         except GrRos2Error as error:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from gr_ros2.core.backlog import Backlog
 from gr_ros2.core.errors import RunError
@@ -85,6 +85,18 @@ class LiveLink(Protocol):
         """Probability from now on that a packet is dropped, 0..1."""
 
 
+class Change(NamedTuple):
+    """What somebody has changed during a run.
+
+    :param at: s on the run's clock
+    :param setting: its name, as in a file: ``channel.snr_db``, or ``transmit`` of all robots
+    """
+
+    at: float
+    setting: str
+    value: float | bool | None
+
+
 @dataclass(frozen=True)
 class LiveRun:
     """A run, or one robot's end of a link, whose flowgraph has been built.
@@ -102,6 +114,7 @@ class LiveRun:
         where the names of ``topics`` are shown
     :param alarms: what is wrong with the robots that are heard, one line each
     :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
+    :param changed: told of each change that somebody makes while it runs
     """
 
     name: str
@@ -117,6 +130,7 @@ class LiveRun:
     received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
     alarms: Callable[[], Sequence[str]] = tuple
     heard: frozenset[int] | None = None
+    changed: Callable[[Change], None] = lambda _: None
 
 
 class RunObserver(LinkObserver, Protocol):

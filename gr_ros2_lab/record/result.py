@@ -61,6 +61,19 @@ class ReceiverResult:
     phy: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class ChangeResult:
+    """What somebody has changed during a run, by a slider of the dashboard for example.
+
+    :param t: s since the first message could be submitted
+    :param setting: its name, as in ``config``, or ``transmit`` of all robots
+    """
+
+    t: Number
+    setting: str
+    value: bool | float | None
+
+
 @dataclass(frozen=True, config=READ)
 class Result:
     """One experiment.
@@ -80,6 +93,7 @@ class Result:
     :param incomplete: other outputs of the run that are not complete, such as a capture on a full disk: one line each,
         with the reason and how much is missing. The numbers of this result are complete in any case.
     :param receivers: further receivers of the same sender
+    :param changes: what was changed while it ran, in order; ``config`` has what was set at the start
     :param task: how well robots did what they were to do together, by the names that the task gives
     """
 
@@ -97,6 +111,7 @@ class Result:
     incomplete: tuple[str, ...] = ()
     receivers: tuple[ReceiverResult, ...] = ()
     task: dict[str, Number | None] = field(default_factory=dict)
+    changes: tuple[ChangeResult, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ _SLOW = 0.01
 """A clock that lags behind real time by more than this share of the run is named."""
 _UNSEEN = 0.0005
 """Smaller shares of the air are not named."""
+_CHANGES = 6
+"""Most changes that are named."""
 _CHANNELS = 4
 """Most senders that are named with the use of their channels."""
 
@@ -37,6 +39,7 @@ def explanation(result: Result, trace: Trace) -> list[str]:
     packets = trace.packets()
     return [
         *lateness_lines(result),
+        *change_lines(result),
         *_outcome(result),
         *air_lines(result),
         *_capacity(result, trace, packets),
@@ -44,6 +47,23 @@ def explanation(result: Result, trace: Trace) -> list[str]:
         *_in_flight(result, trace, packets),
         *_trend(result, trace),
     ]
+
+
+def change_lines(result: Result) -> list[str]:
+    """What somebody changed during the run, in one line; [] for nothing. Of a setting that was drawn from one value to
+    another, the last of each second."""
+    if not result.changes:
+        return []
+    last = {(change.setting, int(change.t)): change for change in result.changes}
+    said = [f"{change.setting} to {_value(change.value)} at {change.t:.1f} s" for change in last.values()]
+    more = f", and {len(said) - _CHANGES} more" if len(said) > _CHANGES else ""
+    return [f"Changed while it ran: {', '.join(said[:_CHANGES])}{more}."]
+
+
+def _value(value: bool | float | None) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "none", True: "on", False: "off"}[value]
+    return f"{value:g}"
 
 
 def why(result: Result, trace: Trace) -> list[str]:

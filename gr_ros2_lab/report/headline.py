@@ -12,7 +12,7 @@ from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.record.team_numbers import TEAM_VALUES, ledger_of, team_pairs
 from gr_ros2_lab.record.trace import Trace
-from gr_ros2_lab.report.explain import air_lines, lateness_lines, percent, seconds, why
+from gr_ros2_lab.report.explain import air_lines, change_lines, lateness_lines, percent, seconds, why
 from gr_ros2_lab.report.table import Grid, by_receiver, faults, number
 
 MOST_LINES = 15
@@ -25,7 +25,8 @@ _TOPICS = 6
 def headline(result: Result, trace: Trace) -> list[str]:
     """The lines without the table: the computer's lateness, what the robots achieved, and what was worst and why."""
     pairs, grid = team_pairs(result), topics_grid(result)
-    lines = [*lateness_lines(result), *_tasks(result), _delivered(pairs), *_ages(pairs), *_hopeless(result, pairs)]
+    lines = [*lateness_lines(result), *change_lines(result), *_tasks(result), _delivered(pairs), *_ages(pairs)]
+    lines += _hopeless(result, pairs)
     if grid is None:
         lines += _worst(result)
     lines += [*why(result, trace), *air_lines(result), *faults(result)]

@@ -260,7 +260,7 @@ def _run_section(run: Run, out: Drawings, prefix: str, several: bool) -> Section
 def _draw(run: Run, out: Drawings, prefix: str) -> list[Picture]:
     result, trace = run.result, run.trace
     topics = run.messages()
-    packets = trace.packets()
+    packets, changes = trace.packets(), [change.t for change in result.changes if change.t is not None]
     pictures = []
     for place, path in enumerate(trace.paths()):
         figure = path_figure(path.sent, path.received, path.topic, path.published_as)
@@ -275,14 +275,14 @@ def _draw(run: Run, out: Drawings, prefix: str) -> list[Picture]:
     pictures.append(out.save(latency_figure(latencies([run])), f"{prefix}latency", _LATENCY))
     pictures.append(
         out.save(
-            delivery_figure({m.topic: Deliveries.of([m]) for m in topics}, result.duration_s),
+            delivery_figure({m.topic: Deliveries.of([m]) for m in topics}, result.duration_s, changes),
             f"{prefix}delivery",
             "Share delivered of the messages submitted in an interval, and bytes delivered in it",
         )
     )
     pictures.append(
         out.save(
-            age_figure({m.topic: {run.label: m} for m in topics}, {run.label: trace.t_end}),
+            age_figure({m.topic: {run.label: m} for m in topics}, {run.label: trace.t_end}, changes),
             f"{prefix}age",
             "Age of what the receiving robot knows: now minus the submission of the newest message delivered",
         )
@@ -291,7 +291,7 @@ def _draw(run: Run, out: Drawings, prefix: str) -> list[Picture]:
     if airtime:
         pictures.append(
             out.save(
-                airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s),
+                airtime_figure(packets, airtime / result.phy.get("channels", 1), result.duration_s, changes),
                 f"{prefix}airtime",
                 "Airtime of the packets that left the source and of those that arrived, without repairs and reports",
             )

@@ -52,11 +52,12 @@ class Deliveries:
         )
 
 
-def delivery_figure(lines: Mapping[str, Deliveries], duration_s: float) -> Figure:
+def delivery_figure(lines: Mapping[str, Deliveries], duration_s: float, changes: Sequence[float] = ()) -> Figure:
     """PDR by time of submission, and goodput by time of delivery, in intervals of equal length.
 
     :param lines: name -> its messages, one topic or one run each
     :param duration_s: s during which messages were submitted
+    :param changes: s at which somebody changed something
     """
     figure = Figure(figsize=(8.0, 5.2), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
@@ -82,15 +83,19 @@ def delivery_figure(lines: Mapping[str, Deliveries], duration_s: float) -> Figur
     for axes in (above, below):
         axes.grid(alpha=0.3)
         axes.axvline(duration_s, color="0.5", linewidth=0.8, linestyle=":")
+        _mark(axes, changes)
     _legend(figure, above, lines)
     return figure
 
 
-def age_figure(panels: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str, float]) -> Figure:
+def age_figure(
+    panels: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str, float], changes: Sequence[float] = ()
+) -> Figure:
     """Age of information: a panel per topic with a sawtooth per run.
 
     :param panels: panel name -> line name -> messages
     :param t_end: s, end of the observation by line name
+    :param changes: s at which somebody changed something
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
     figure = Figure(figsize=(8.0, 1.2 + max(1.25 * len(panels), 2.4)), layout="constrained")
@@ -112,6 +117,7 @@ def age_figure(panels: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str,
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+        _mark(axes, changes)
         if not peaks:
             axes.text(0.5, 0.5, "nothing was delivered", ha="center", va="center", transform=axes.transAxes)
     column[-1].set(xlabel="time [s]", xlim=(0, max(t_end.values(), default=1.0) or 1.0))
@@ -120,11 +126,12 @@ def age_figure(panels: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str,
     return figure
 
 
-def airtime_figure(packets: Packets, airtime_s: float, duration_s: float) -> Figure:
+def airtime_figure(packets: Packets, airtime_s: float, duration_s: float, changes: Sequence[float] = ()) -> Figure:
     """Airtime per time of the packets that left the source, and of those that arrived.
 
     :param airtime_s: s, of one packet on average
     :param duration_s: s during which messages were submitted
+    :param changes: s at which somebody changed something
     """
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")
     axes = figure.add_subplot(title="Use of the air", ylabel="airtime per time [%]")
@@ -143,6 +150,7 @@ def airtime_figure(packets: Packets, airtime_s: float, duration_s: float) -> Fig
         axes.stairs(load, edges, color=colour, label=name)
     axes.axhline(100, color="black", linewidth=1, linestyle="--", label="all the air there is")
     axes.axvline(duration_s, color="0.5", linewidth=0.8, linestyle=":")
+    _mark(axes, changes)
     axes.set(xlabel=f"time [s], in intervals of {width:g} s", xlim=(0, end), ylim=(0, None))
     axes.grid(alpha=0.3)
     figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
@@ -200,6 +208,12 @@ def packets_figure(packets: Packets, topics: Sequence[str]) -> Figure:
         keys.append(Line2D([], [], linestyle="none", marker=mark, color=colour, label=label))
     figure.legend(handles=keys, loc="outside lower center", ncols=min(len(keys), 6), fontsize="small", frameon=False)
     return figure
+
+
+def _mark(axes: Axes, changes: Sequence[float]) -> None:
+    """Draw when somebody changed something, as the dashboard does."""
+    for at in changes:
+        axes.axvline(at, color="0.4", linewidth=0.9, linestyle="--")
 
 
 def nice_step(at_least: float) -> float:

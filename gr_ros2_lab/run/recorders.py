@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 from gr_ros2.core.guard import Guard
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
-from gr_ros2.observe.observers import LiveLink, LiveRun, RunObservers
+from gr_ros2.observe.observers import Change, LiveLink, LiveRun, RunObservers
 from gr_ros2.observe.positions import position_reader
 from gr_ros2.phy import Phy
 from gr_ros2.settings.registry import Registry
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.record.recorder import Recorder
-from gr_ros2_lab.record.result import LatenessResult, ReceiverResult, Result
+from gr_ros2_lab.record.result import ChangeResult, LatenessResult, ReceiverResult, Result
 from gr_ros2_lab.record.team import TeamRecord
 from gr_ros2_lab.record.trace import Trace
 from gr_ros2_lab.run.load import published_names, source_names
@@ -117,6 +117,7 @@ class RunRecords:
             for robot in others:
                 self._hearing[robot.robot_id].append(place)
         self.team = make_team(registry, scenario, phy)
+        self._changes: list[Change] = []
         self._task, self._acting = task, Guard(f"task {scenario.task}", needed=True)
 
     def of(self, number: int) -> RobotObserver:
@@ -176,6 +177,7 @@ class RunRecords:
             heard=None
             if len(self._scenario.all_robots) == 2  # which share a recorder
             else frozenset(src_id for src_id, places in self._hearing.items() if 0 in places),
+            changed=self._changes.append,
         )
 
     def check(self) -> None:
@@ -238,6 +240,7 @@ class RunRecords:
             wall_s=time.monotonic() - began,
             lateness=lateness(trace),
             task={} if self._task is None else self._task.numbers(played),
+            changes=tuple(ChangeResult(at - begin, setting, value) for at, setting, value in self._changes),
             **rest,
         )
         return Outcome(result, trace, self.team)

@@ -55,6 +55,14 @@ def test_a_run_is_seen_changed_and_ends_with_its_result() -> None:
     (view,), (topic,) = monitor.snapshot.topics, outcome.result.topics
     assert (view.sent, view.delivered, dict(view.ledger)) == (topic.sent, topic.delivered, topic.ledger)
     assert topic.delivered < topic.sent
+    changes = outcome.result.changes
+    assert [(change.setting, change.value) for change in changes] == [
+        ("channel.snr_db", -20.0),
+        ("channel.frequency_offset", 0.001),
+        ("channel.packet_loss", 1.0),
+    ], "what was refused was not changed"
+    times = [change.t for change in changes if change.t is not None]
+    assert 0 < times[0] <= times[1] <= times[2] < 4
 
 
 def test_a_phy_without_samples_says_so_and_can_still_lose() -> None:

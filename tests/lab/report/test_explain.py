@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.link.fates import FATES, Fate
-from gr_ros2_lab.record.result import LatenessResult, air_uses
+from gr_ros2_lab.record.result import ChangeResult, LatenessResult, air_uses, read_result, write_result
 from gr_ros2_lab.report.explain import explanation
+from gr_ros2_lab.report.headline import headline
 from gr_ros2_lab.report.page import read_runs, write_report
 from gr_ros2_lab.report.table import air_grid
+from gr_ros2_lab.report.timelines import Deliveries, delivery_figure
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
 from tests.lab.record.results import RESULT
@@ -54,6 +56,21 @@ def test_an_overloaded_link_is_told_by_how_much(tmp_path: Path) -> None:
         "The messages do not fit: all of them would have needed "
         f"{(38 * 2 + 9) * 74 / 83 / 4 * 0.5:.1f} times the air that there is."
     )
+
+
+def test_what_was_changed_meanwhile_is_told_and_drawn(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    drawn = [ChangeResult(1.2 + place / 100, "channel.snr_db", 20.0 - place) for place in range(9)]
+    changed = replace(run.result, changes=(*drawn, ChangeResult(2.5, "transmit", False)))
+    line = "Changed while it ran: channel.snr_db to 12 at 1.3 s, transmit to off at 2.5 s."
+    assert line in explanation(changed, run.trace)
+    assert line in headline(changed, run.trace)
+    assert read_result(write_result(changed, tmp_path / "changed.json")).changes == changed.changes
+    messages = {m.topic: Deliveries.of([m]) for m in run.messages()}
+    figure = delivery_figure(messages, 4.0, [change.t for change in changed.changes if change.t is not None])
+    assert [len(axes.lines) for axes in figure.axes] == [
+        len(axes.lines) + 10 for axes in delivery_figure(messages, 4.0).axes
+    ]
 
 
 @pytest.mark.parametrize("airtime", [None, 0.0])
