@@ -144,8 +144,11 @@ class DdsServer(_DdsEnd, ServiceServer):
     def service(self) -> None:
         """Take requests. Called by the participant's thread."""
         with self._calling:
-            self.reader.matched()  # resets the status that triggered
-            for sample in () if self._closed else self.reader.take():
+            if self._closed:
+                return
+            self.reader.matched()  # both reset the status that triggered: otherwise the thread is called again at once
+            self.writer.matched()
+            for sample in self.reader.take():
                 client = self.reader.other(sample.source)
                 if client is not None and not client.is_cyclone:
                     self._refuse(client)

@@ -10,7 +10,7 @@ import pytest
 from gr_ros2.middleware import ros_graph
 from gr_ros2.middleware.cdr_dds import DiscoveredEndpoint
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.middleware.dds_services import with_header, without_header
+from gr_ros2.middleware.dds_services import DdsServer, with_header, without_header
 from gr_ros2.middleware.ros_graph import NodeEntities, dds_service, ros_service
 from gr_ros2.middleware.services import SERVICE_QOS
 from tests.middleware.calling import ADD, Adder, Caller, Program
@@ -47,6 +47,21 @@ def test_a_server_of_another_program_answers_and_is_seen_to_come_and_go(graph: D
             assert server.heard("took") == [[number] for number in range(start, start + 50)]
         wait_for(lambda: not caller.there, "the server to be missed")
     assert caller.got == {number: [number + 1000] for number in (*range(50), *range(100, 150))}
+
+
+def test_a_server_rests_while_nobody_calls(graph: DdsMiddleware, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A status that is not reset calls its thread again at once, for ever."""
+    looks: list[str] = []
+    service = DdsServer.service
+    monkeypatch.setattr(DdsServer, "service", lambda self: [looks.append(self.name), service(self)][1])
+    with DdsMiddleware(domain_id=domain, localhost_only=True) as other:
+        adder, caller = Adder(other, SERVICE), Caller(graph, SERVICE)
+        wait_for(lambda: caller.there, "the server to be found")
+        for number in range(20):
+            caller.call(number)
+            wait_for(lambda: number in caller.got, "the reply")  # noqa: B023 - called at once
+        assert sorted(adder.taken) == list(range(20))
+        assert len(looks) <= 2 * 20 + 10
 
 
 def test_a_client_takes_only_its_own_replies(graph: DdsMiddleware, domain: int) -> None:
