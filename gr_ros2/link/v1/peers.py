@@ -204,7 +204,7 @@ class Peers:
         peer = self.all.get(src_id)
         if peer is not None and (wanted or peer.newest < 0):  # a report shows that it knows
             peer.proven = number
-            if number <= START:
+            if number <= START and peer.newest < 0:  # later its reports name what it lacks, and make that urgent
                 records = self._packets.records
                 peer.lost.update(older for older, record in records.items() if older <= number and record.lifetimes)
             self._note()

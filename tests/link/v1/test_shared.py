@@ -117,3 +117,18 @@ def test_who_came_after_older_packets_is_repaired_without_them(proven: int) -> N
         repair = sender.urgent(9.0)
     assert isinstance(repair, Repair)
     assert min(window_numbers(repair.number, repair.mask)) >= 31
+
+
+def test_what_a_peer_lacks_stays_urgent_when_it_asks_for_a_proof_again() -> None:
+    sender = RepairWindow("thrifty", ROOM, shares=True)
+    sender.peers.meet(2, 0.0)
+    for number in range(1, 21):
+        sender.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number / 10)
+    for now in (3.0, 4.0):
+        sender.peers.report(2, 20, 0b1111, settled=True, loss=0.1, now=now)  # it lacks 1 to 16
+        found = 0
+        for _ in range(40):
+            sender.sent(sender.packets.newest + 1, b"", b"", (), now)
+            found += sender.urgent(now) is not None
+        assert found >= 16, "one repair for each"
+        sender.peers.prove(2, 16, wanted=True)
