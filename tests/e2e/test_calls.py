@@ -28,6 +28,8 @@ AT_A_TIME = 5
 """Calls under way: fewer than the depth of a client's reader, 10 in ROS."""
 DEADLINE_S = 5.0
 NEAR, FAR = "/rx_robot_2/add", "/robot_2/add"
+MOST_REPORTS = 600
+"""Reports of a link, which come every 0.2 s, within which a call is answered."""
 SWITCH = "/gr_ros2_link_1/transmit"
 """The service of the link itself, which stays on its graph."""
 
@@ -74,9 +76,10 @@ class Robots:
 
         What a client sends to a server that has just left its graph, or died, nobody hears of.
         """
-        first = self.called
+        first, begun = self.called, self.reports
         while not any(number >= first for number in self.answered):
             reports = self.reports
+            assert reports - begun < MOST_REPORTS, f"{self.called - first} calls, no answer; link 1 tells {self.told}"
             if self.clients[-1].there:
                 self.call()
             wait_for(lambda: self.reports != reports, "a report of link 1")  # noqa: B023 - called at once
