@@ -82,10 +82,11 @@ class GridEncoder:
         if key:
             self._sent.clear()
             self._base = None
-        elif self._base is not None:
+        elif self._base is not None and self._base[0] in self._sent:  # others hold the newest ``KEPT`` that they got
             changes = self._changes(*self._base, grid)
             coded = changes if len(changes.data) < len(coded.data) else coded
         self._sent[coded.name] = grid
+        self._sent.move_to_end(coded.name)  # equal maps have one name
         while len(self._sent) > KEPT:
             self._sent.popitem(last=False)
         return coded
@@ -121,7 +122,6 @@ class GridDecoder:
     def __init__(self, max_size: int) -> None:
         self._packer, self._max_size = Packer(), max_size
         self._held: OrderedDict[int, _Grid] = OrderedDict()
-        self._base: tuple[int, _Grid] | None = None
 
     def decode(self, data: bytes) -> bytes:
         form, before, body = opened(data)
@@ -131,14 +131,14 @@ class GridDecoder:
             message = self._packer.unpack(body, self._max_size)
             grid = _split(message)
         else:
-            base = self._held.get(before) or (self._base[1] if self._base and self._base[0] == before else None)
+            base = self._held.get(before)
             if base is None:
                 raise MissingFrameError("grid: the grid that this one changes was not decoded here")
             grid = self._changed(body, base)
             message = grid.message
             grid = _split(message)  # which also checks that it is one
-            self._base = (before, base)
         self._held[name_of(data)] = grid
+        self._held.move_to_end(name_of(data))
         while len(self._held) > KEPT:
             self._held.popitem(last=False)
         return message
