@@ -74,7 +74,8 @@ class GridEncoder:
     def __init__(self) -> None:
         self._packer = Packer()
         self._sent: OrderedDict[int, _Grid] = OrderedDict()
-        self._base: tuple[int, _Grid] | None = None
+        self._base: int | None = None
+        """The newest grid that was confirmed, by name."""
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:  # noqa: ARG002
         grid = _split(message)
@@ -82,18 +83,15 @@ class GridEncoder:
         if key:
             self._sent.clear()
             self._base = None
-        elif self._base is not None and self._base[0] in self._sent:  # others hold the newest ``KEPT`` that they got
-            changes = self._changes(*self._base, grid)
+        elif self._base is not None and self._base in self._sent:  # others hold the newest ``KEPT`` that they got
+            changes = self._changes(self._base, self._sent[self._base], grid)
             coded = changes if len(changes.data) < len(coded.data) else coded
-        self._sent[coded.name] = grid
-        self._sent.move_to_end(coded.name)  # equal maps have one name
-        while len(self._sent) > KEPT:
-            self._sent.popitem(last=False)
+        _keep(self._sent, coded.name, grid)
         return coded
 
     def confirmed(self, name: int) -> None:
         if name in self._sent:
-            self._base = (name, self._sent[name])
+            self._base = name
             while next(iter(self._sent)) != name:
                 self._sent.popitem(last=False)
 
@@ -137,10 +135,7 @@ class GridDecoder:
             grid = self._changed(body, base)
             message = grid.message
             grid = _split(message)  # which also checks that it is one
-        self._held[name_of(data)] = grid
-        self._held.move_to_end(name_of(data))
-        while len(self._held) > KEPT:
-            self._held.popitem(last=False)
+        _keep(self._held, name_of(data), grid)
         return message
 
     def _changed(self, body: bytes, base: _Grid) -> _Grid:
@@ -163,6 +158,14 @@ class GridDecoder:
         new = np.frombuffer(box, np.uint8).reshape(down, across)
         part[...] = part ^ new if way == _XOR else new
         return _Grid(_xor(parts[:head_size], base.head), cells, parts[head_size:], None)
+
+
+def _keep(grids: OrderedDict[int, _Grid], name: int, grid: _Grid) -> None:
+    """Keep a grid as the newest of ``KEPT``. Equal ones have one name."""
+    grids[name] = grid
+    grids.move_to_end(name)
+    while len(grids) > KEPT:
+        grids.popitem(last=False)
 
 
 def _split(message: bytes) -> _Grid:

@@ -58,7 +58,7 @@ class Pace:
         """From now on, a packet leaves only when there is a credit, unless every packet leaves at once (rate 0)."""
         if self._credits is None:
             self._credits = 0
-            self.known = self._rate > 0 or not self._unpaced
+            self.known = not self._unpaced
 
     def credit(self, packets: int = 1, since: float | None = None) -> None:
         """The PHY can take this many further packets; the first call does what ``use_credit`` does.
@@ -70,10 +70,8 @@ class Pace:
         self._since = inf if since is None else since
         if since == inf:
             self._busy_since = inf
-        if self._credits is None:
-            self.use_credit()
-        if not self._unpaced:
-            self._credits = (self._credits or 0) + packets
+        self._credits = (self._credits or 0) + (0 if self._unpaced else packets)
+        self.known = not self._unpaced
 
     @property
     def ready(self) -> float:

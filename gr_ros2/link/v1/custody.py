@@ -405,10 +405,12 @@ class Custody:
     def told(self, robot: int, receipts: list[Receipt], now: float) -> None:
         """A robot has told what has come of this one's messages."""
         for start, topic_id, number, place in receipts:
-            if start == self._start and (number, place) > self._newest.get((topic_id, robot), (-1, 0)):
+            if start != self._start:
+                continue
+            if (number, place) > self._newest.get((topic_id, robot), (-1, 0)):
                 self._dropped["false_origin"] += 1  # no such message has been made
                 continue
-            own = self._own.get((topic_id, robot), []) if start == self._start else []
+            own = self._own.get((topic_id, robot), [])
             while own and (own[0].message.number, own[0].message.place) <= (number, place):
                 self._arrived(own[0], now)
 

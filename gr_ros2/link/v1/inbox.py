@@ -71,8 +71,11 @@ class Passing(Protocol):
     def direct(self, src_id: int, boot: int, ready: Ready, now: float) -> None:
         """A message has come from the robot that made it."""
 
-    def receive(self, via: int, ready: Ready, now: float) -> None:
-        """A message of another robot has come over one that is heard."""
+    def receive(self, via: int, ready: Ready, now: float, *, withheld: bool = False) -> None:
+        """A message of another robot has come over one that is heard.
+
+        :param withheld: the packet may have been held back too long for what has to be fresh
+        """
 
     def in_order(self, inbox: Inbox, ready: Ready, late: int) -> None:
         """A message of a reliable topic for all has come out.
@@ -401,7 +404,8 @@ class Inbox:
             self._stats.dropped["relayed"] += 1
             return
         ready.sealed = self.deliveries.sealed(ready)
-        self._relaying.receive(self.src_id, ready, self._now)
+        withheld = self._now - ready.sealed > self.deliveries.withheld_s
+        self._relaying.receive(self.src_id, ready, self._now, withheld=withheld)
 
     def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""

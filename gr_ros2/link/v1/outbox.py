@@ -172,14 +172,11 @@ class Outbox:
                 self._observer(Missed(topic_id, new))
 
     def prepare(self, topic_id: int, payload: bytes) -> CodedMessage | None:
-        if self._codec is None or len(payload) < LARGE:
-            return None
-        expected = None if self._observer is None else self._codec.canonical(topic_id, payload)
-        return CodedMessage(topic_id, payload, self._codec.encode(topic_id, payload), expected)
+        return None if self._codec is None or len(payload) < LARGE else self._coded(self._codec, topic_id, payload)
 
-    def _expected(self, topic_id: int, payload: bytes, prepared: CodedMessage | None) -> bytes | None:
-        assert self._codec is not None
-        return self._codec.canonical(topic_id, payload) if prepared is None else prepared.expected
+    def _coded(self, codec: MessageCodec, topic_id: int, payload: bytes) -> CodedMessage:
+        expected = None if self._observer is None else codec.canonical(topic_id, payload)
+        return CodedMessage(topic_id, payload, codec.encode(topic_id, payload), expected)
 
     def submit(
         self,
@@ -207,17 +204,18 @@ class Outbox:
         serial = self._new(topic_id)
         codec = None if over else self._codec
         plain, keys = topic.spoken_of(payload, serial if publisher is None else publisher)
-        if prepared is not None and (prepared.topic_id != topic_id or prepared.payload is not plain):
-            prepared = None  # it was merged with others, or leaves under another id now
-        payload = plain
+        if codec is None:
+            prepared = None
+        elif prepared is None or prepared.topic_id != topic_id or prepared.payload is not plain:
+            prepared = self._coded(codec, topic_id, plain)
         if self._observer is not None:
-            expected = None if codec is None else self._expected(topic_id, payload, prepared)
-            self._observer(Accepted(serial, topic_id, payload, now, expected))
+            self._observer(Accepted(serial, topic_id, plain, now, None if prepared is None else prepared.expected))
         if over:
             self._refuse(serial, topic_id, Fate.OVERLOAD, OVERLOADED)
             return
-        if codec is not None:
-            payload = codec.encode(topic_id, payload) if prepared is None else prepared.coded
+        payload = plain
+        if codec is not None and prepared is not None:
+            payload = prepared.coded
             if topic.kept and topic.kept_depth > 1:
                 payload = codec.numbered(payload, serial)
         if len(payload) > MAX_MESSAGE:

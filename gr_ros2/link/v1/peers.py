@@ -108,7 +108,6 @@ class Peers:
     :ivar in_vain: whether a peer waits for a packet in vain
     :ivar urges: heap of the packets that some peer lacks and for which later messages wait, or may wait soon: whether
         all in it are long, and its number
-    :ivar urgent_from: what the peers that lack the packet which ``urgent`` gave last need begins with this one
     :ivar once: the newest packets that were neither sent again nor combined: what a report says arrived when it was
         sent
     """
@@ -134,7 +133,6 @@ class Peers:
         """The newest packet of a message that is delivered in order. A peer cannot know what a missing packet carried:
         this message waits for every packet before it. Infinite on a shared channel, where repairs are few: there only
         packets with a part of such a message are urgent."""
-        self.urgent_from = 0
         self._served: set[int] = set()
         """Peers that lack the packet that was urgent last."""
         self._period = 0.0
@@ -291,10 +289,17 @@ class Peers:
             for peer in lacking:
                 peer.lost.discard(number)
             self._served = {id(peer) for peer in lacking}
-            self.urgent_from = max(max(peer.settled, (peer.proven + 1) % (number + 1)) for peer in lacking)
             return record
         self._served = set()
         return None
+
+    @property
+    def needed_from(self) -> int:
+        """What those need that lack the packet that was urgent last, and may take it for no replay, begins with this
+        one: a peer that has come after an older packet could never use a combination with it. 0 where none was urgent.
+        """
+        lacking = [peer for peer in self.all.values() if id(peer) in self._served]
+        return max((max(peer.settled, peer.proven + 1) for peer in lacking), default=0)
 
     def served(self, window: list[Sent]) -> None:
         """A combination brings one packet back to each peer, beside those to whom ``urgent`` was due."""

@@ -33,7 +33,7 @@ from gr_ros2.link.events import Gone, Met
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import FRAME
 from gr_ros2.link.v1.custody import Custody
-from gr_ros2.link.v1.delivery import MAX_AGE_S, UNKNOWN_S, for_all_in_order
+from gr_ros2.link.v1.delivery import UNKNOWN_S, for_all_in_order
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
@@ -232,17 +232,19 @@ class Relaying:
         if lost := self._in_order.keep(Kept(message, ready.made, until), via, late):
             self._dropped["relay_full"] += lost
 
-    def receive(self, via: int, ready: Ready, now: float) -> None:
-        """A message of another robot has come over one that is heard."""
+    def receive(self, via: int, ready: Ready, now: float, *, withheld: bool = False) -> None:
+        """A message of another robot has come over one that is heard.
+
+        :param withheld: the packet may have been held back too long for what has to be fresh
+        """
         try:
             carried = ready.topic_id == CARRIED_TOPIC
             taker, message = read_carried(ready.payload) if carried else (BROADCAST, read_relayed(ready.payload))
         except WireError as error:
             self._dropped[error.kind] += 1
             return
-        in_a_row = self._in_a_row(message)
-        if not (carried or in_a_row) and now - ready.sealed > MAX_AGE_S * self.gains.slower():
-            self._dropped["withheld"] += 1  # what comes in a row may have been under repair, and its topic has no limit
+        if withheld and not (carried or self._in_a_row(message)):  # what comes in a row may have been under repair
+            self._dropped["withheld"] += 1
             return
         origin, start = message.origin, message.start
         neighbour = self._neighbours.all.get(origin)
@@ -260,7 +262,7 @@ class Relaying:
             return
         self.custody.routes.note(origin, via, message.hops, ready.made)
         kept = _ToPass(message, made, made + min(limit_s, self._limit_s(message)))
-        if now > kept.until and not in_a_row:
+        if now > kept.until and not self._in_a_row(message):
             self._dropped["too_old"] += 1
             return
         order, table = (message.number, message.place), message.topic_id == TABLE_TOPIC
@@ -269,11 +271,12 @@ class Relaying:
         of.made, of.sealed, of.limit_s = made, ready.sealed - age_s if ready.sealed < inf else inf, limit_s
         if table and not carried and not self._starts(message, via, now, made, heard=heard is not None):
             return
-        if heard is not None and message.number > heard.inbox.newest and self.gains.near(heard.heard, now):
+        near = heard is not None and self.gains.near(heard.heard, now)
+        if heard is not None and near and message.number > heard.inbox.newest:
             self._dropped["ahead"] += 1  # its next packet tells whether it has come so far
             return
         if carried:
-            self._handed(taker, via, kept, of, now)
+            self._handed(taker, via, kept, of, now, near=near)
             return
         inbox = self._inbox(origin, start)
         topic = None if inbox is None else inbox.announced.topic_of(message)
@@ -292,16 +295,18 @@ class Relaying:
             if table:
                 self._due(inbox, now, receipts=True)
 
-    def _handed(self, taker: int, via: int, kept: _ToPass, ready: Ready, now: float) -> None:
-        """A message was heard that is carried to one robot."""
+    def _handed(self, taker: int, via: int, kept: _ToPass, ready: Ready, now: float, *, near: bool) -> None:
+        """A message was heard that is carried to one robot.
+
+        :param near: whether the robot that made it is heard
+        """
         message = kept.message
         if message.dst_id != self.src_id:
             if taker == self.src_id:
                 self.custody.take(message, via, now, made=kept.made, until=kept.until)
             return
         if message.topic_id == RECEIPT_TOPIC:
-            origin = self._neighbours.all.get(message.origin)
-            if via != message.origin and origin is not None and self.gains.near(origin.heard, now) and not origin.gone:
+            if near and via != message.origin:
                 self._dropped["false_origin"] += 1  # what it has it tells itself
                 return
             try:

@@ -172,8 +172,7 @@ class RepairWindow:
 
         :param lost: a packet that it contains, -1 for none
         """
-        # A peer that has come after an older packet could never use a combination with it.
-        window = self._of_all(now, lost, self.peers.urgent_from if lost >= 0 else 0)
+        window = self._of_all(now, lost, self.peers.needed_from)
         self.peers.served(window)
         return self._combination(window, now) if window else None
 

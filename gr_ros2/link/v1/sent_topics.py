@@ -139,7 +139,7 @@ class SentTopic:
             self.become_frames(self.output)
         else:
             self.queue.change(*queue_for(topic.options, publishers, command=self.command))
-        self._derive()
+            self._derive()
 
     def tell_apart(self, instances: InstanceKeys | None) -> None:
         """Tell its instances apart from now on."""

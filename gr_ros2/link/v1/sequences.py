@@ -73,16 +73,14 @@ class Sequences(Generic[T]):
         stream = Stream(message.origin, message.start, message.topic_id)
         sequence = self._all.get(stream)
         passed = sequence is not None and (message.number, message.place) <= sequence.newest
-        if sequence is not None and passed and made > sequence.came + EXPIRES_S:
+        if sequence is None or (passed and made > sequence.came + EXPIRES_S):
             self._drop(stream)
-            sequence = None
+            sequence, passed = _Sequence(message.place - message.waits), False
         self._all.pop(stream, None)
-        if sequence is None:
-            sequence = _Sequence(message.place - message.waits)
         self._all[stream] = sequence
         if len(self._all) > MOST_STREAMS:
             self._drop(next(iter(self._all)))
-        if (message.number, message.place) <= sequence.newest:
+        if passed:
             return False
         place = sequence.next + (message.place - sequence.next) % PLACES
         sequence.floor = max(sequence.floor, place - message.waits)
@@ -113,4 +111,5 @@ class Sequences(Generic[T]):
         return None if sequence is None or sequence.newest[0] < 0 else sequence.newest
 
     def _drop(self, stream: Stream) -> None:
-        self._bytes -= sum(len(message.payload) + _COST for message, _ in self._all.pop(stream).waiting.values())
+        gone = self._all.pop(stream, None)
+        self._bytes -= sum(len(message.payload) + _COST for message, _ in gone.waiting.values()) if gone else 0

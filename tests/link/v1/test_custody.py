@@ -10,13 +10,12 @@ import pytest
 from gr_ros2.link.events import Delivered, Ended, Gone, Met
 from gr_ros2.link.v1 import custody
 from gr_ros2.link.v1.custody import Custody
-from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.relayed import PLACES, RECEIPT_TOPIC, Receipt, Relayed, read_carried, write_carried, write_receipts
+from gr_ros2.wire.relayed import PLACES, Relayed, read_carried, write_carried
 from gr_ros2.wire.v1 import CARRIED_TOPIC, QOS_REPAIR, TABLE_TOPIC, read_header, read_repair_header
 from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_relaying import Line, robot
@@ -224,26 +223,6 @@ def test_a_robot_that_claims_to_be_near_keeps_nothing_back(monkeypatch: pytest.M
     assert len(taken) >= 10
     assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
     assert told(first) == [True] * 10
-
-
-def test_a_robot_that_is_heard_tells_itself_what_has_come_there() -> None:
-    """3 hears nothing of 1 for a while, and 2 makes a receipt in its name."""
-    everybody = Line(robot(1, "encrypt", named(3)), *(robot(src_id, "encrypt") for src_id in (2, 3)))
-    everybody.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
-    everybody.run(12)
-    first, liar, last = everybody.robots
-    everybody.near = lambda one: [[1, 2], [0, 2], [1]][one]  # type: ignore[method-assign]
-    first.end.messages.submit(1, b"goal", everybody.now)
-    everybody.run(1)
-    receipt = write_receipts([Receipt(first.boot & 0xFFFF, 1, 2**31, 0)])
-    false = Relayed(3, last.boot & 0xFFFF, last.end.window.packets.newest, 200, RECEIPT_TOPIC, 1, receipt, dst_id=1)
-    queue = liar.end.messages.sent[CARRIED_TOPIC].queue
-    queue.append(Message(-1, CARRIED_TOPIC, write_carried(1, false), 0, everybody.now, repeat=True))
-    everybody.run(2)
-    assert not queue and told(first) == [] and b"goal" not in last.delivered(1)
-    assert first.end.received.dropped["false_origin"] == 1
-    everybody.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
-    until(everybody, 30, lambda: told(first) == [True] and last.delivered(1).count(b"goal") == 1)
 
 
 @pytest.mark.parametrize("hops", [1, 2])

@@ -21,6 +21,11 @@ def message(n: int, waits: int = 0, size: int = 1) -> Relayed:
     return Relayed(1, 7, n // 2, FIRST_PLACE + n % PLACES, 3, 0, bytes(size), dst_id=9, waits=waits)
 
 
+def take(here: Sequences[int], message: Relayed, n: int) -> bool | None:
+    """It comes at once: no false one is in question."""
+    return here.take(message, n, 0.0, 0.0)
+
+
 class Origin:
     """It keeps messages until a receipt or until it gives them up, and hands on any that it keeps at any time. From the
     first that it keeps to the newest that it made there are ``WINDOW``."""
@@ -56,7 +61,7 @@ def test_everything_comes_once_and_in_order_unless_it_is_given_up(seed: int, giv
             over.add(origin.kept.pop(rng.randrange(len(origin.kept))))
         if under_way and rng.random() < 0.8:
             n, arrived = under_way.pop(rng.randrange(len(under_way)))
-            here.take(arrived, n, 0.0, 0.0)
+            take(here, arrived, n)
             got += here.due(1, 7)
         if rng.random() < 0.5 and (newest := here.newest(OF)) is not None:
             origin.kept = [n for n in origin.kept if (message(n).number, message(n).place) > newest]
@@ -66,35 +71,35 @@ def test_everything_comes_once_and_in_order_unless_it_is_given_up(seed: int, giv
 
 def test_a_robot_that_starts_anew_waits_for_what_its_origin_keeps_and_for_nothing_else() -> None:
     here = Sequences[int](1000)
-    assert here.take(message(12, waits=2), 12, 0.0, 0.0)
+    assert take(here, message(12, waits=2), 12)
     assert here.due(1, 7) == []
     assert here.newest(OF) is None
-    assert here.take(message(10), 10, 0.0, 0.0)
+    assert take(here, message(10), 10)
     assert here.due(1, 7) == [10]
-    assert here.take(message(13, waits=1), 13, 0.0, 0.0)  # 11 is given up
+    assert take(here, message(13, waits=1), 13)  # 11 is given up
     assert here.due(1, 7) == [12, 13]
-    assert here.take(message(11), 11, 0.0, 0.0) is False
+    assert take(here, message(11), 11) is False
     assert here.newest(OF) == (message(13).number, message(13).place)
 
 
 def test_what_waits_is_bounded_and_may_come_again() -> None:
     here = Sequences[int](2000)
-    assert [here.take(message(n, waits=n, size=300), n, 0.0, 0.0) for n in range(1, 6)] == [
+    assert [take(here, message(n, waits=n, size=300), n) for n in range(1, 6)] == [
         True,
         True,
         True,
         None,
         None,
     ]
-    assert here.take(message(0, size=300), 0, 0.0, 0.0)
+    assert take(here, message(0, size=300), 0)
     assert here.due(1, 7) == [0, 1, 2, 3]
-    assert here.take(message(4, size=300), 4, 0.0, 0.0)
+    assert take(here, message(4, size=300), 4)
     assert here.due(1, 7) == [4]
 
 
 def test_topics_are_bounded() -> None:
     here = Sequences[int](1 << 30)
     for start in range(sequences.MOST_STREAMS + 1):
-        here.take(message(1, waits=1)._replace(start=start), start, 0.0, 0.0)
+        take(here, message(1, waits=1)._replace(start=start), start)
     assert here.due(1, 0) == []
     assert len(here._all) == sequences.MOST_STREAMS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gr_ros2.link.events import Delivered, Ended
+from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
@@ -13,8 +13,9 @@ from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.relayed import RECEIPT_TOPIC, Receipt, Relayed, write_carried, write_receipts, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, write_table
 from gr_ros2.wire.v1 import CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
-from tests.link.v1.air import Robot, registry
+from tests.link.v1.air import Robot
 from tests.link.v1.test_ages import MODES, absent, relaying_of
+from tests.link.v1.test_custody import custody_of, named, told, until
 from tests.link.v1.test_relaying import Line, robot
 
 LAST_NUMBER, LAST_BOOT = 2**32 - 1, 2**64 - 1
@@ -197,17 +198,29 @@ def test_who_brings_much_takes_no_room_of_others(monkeypatch: pytest.MonkeyPatch
     assert one.end.received.dropped["relay_full"] > 80
 
 
+def with_goals(*, cell: bool) -> Line:
+    """Robot 1 has goals for 3; it hears 2 alone, or both."""
+    line = Line(robot(1, "encrypt", named(3)), *(robot(src_id, "encrypt") for src_id in (2, 3)))
+    if cell:
+        line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
+    line.run(12)
+    return line
+
+
+def receipt(order: tuple[int, int], line: Line) -> Relayed:
+    """Robot 3 has what 1 has made for it up to a message, as another one says."""
+    first, _, last = line.robots
+    told = write_receipts([Receipt(first.boot & 0xFFFF, 1, *order)])
+    newest = last.end.window.packets.newest
+    return Relayed(3, last.boot & 0xFFFF, newest, 200, RECEIPT_TOPIC, 1, told, dst_id=1)
+
+
 @pytest.mark.parametrize("heard", [False, True])
 def test_a_false_message_for_one_robot_puts_true_ones_off_for_a_while_only(heard: bool, soon: None) -> None:  # noqa: ARG001
     """Robot 2 makes one up in the name of 1, which 3 hears or does not hear."""
-    line = Line(robot(1, "encrypt", registry(odom=SendOptions(queue="latest"), goal=SendOptions(to=3))))
-    line.robots += [robot(src_id, "encrypt") for src_id in (2, 3)]
-    if heard:
-        line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
-    line.run(12)
+    line = with_goals(cell=heard)
     first, liar, last = line.robots
-    false = Relayed(1, first.boot & 0xFFFF, LAST_NUMBER, 130, 1, 1, b"false", dst_id=3)
-    carries(liar, 3, false, line.now)
+    carries(liar, 3, Relayed(1, first.boot & 0xFFFF, LAST_NUMBER, 130, 1, 1, b"false", dst_id=3), line.now)
     line.run(2 if heard else EXPIRES_S + 10)
     assert (b"false" in last.delivered(1)) != heard
     goals = [b"goal %d" % n for n in range(10)]
@@ -216,18 +229,31 @@ def test_a_false_message_for_one_robot_puts_true_ones_off_for_a_while_only(heard
         line.run(1)
     line.run(10)
     assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
-    assert [event.arrived for event in first.events if isinstance(event, Ended)] == [True] * 10
+    assert told(first) == [True] * 10
 
 
 def test_a_receipt_of_what_was_never_made_ends_nothing() -> None:
-    line = Line(robot(1, "encrypt", registry(odom=SendOptions(queue="latest"), goal=SendOptions(to=3))))
-    line.robots += [robot(src_id, "encrypt") for src_id in (2, 3)]
-    line.run(12)
-    first, liar, last = line.robots
+    line = with_goals(cell=False)
+    first, liar, _ = line.robots
     line.near = lambda one: [[1], [0], []][one]  # type: ignore[method-assign]
     first.end.messages.submit(1, b"goal", line.now)
-    receipt = write_receipts([Receipt(first.boot & 0xFFFF, 1, LAST_NUMBER, 0)])
-    carries(liar, 1, Relayed(3, last.boot & 0xFFFF, 1000, 200, RECEIPT_TOPIC, 1, receipt, dst_id=1), line.now)
+    carries(liar, 1, receipt((LAST_NUMBER, 0), line), line.now)
     line.run(3)
     assert first.end.received.dropped["false_origin"] == 1
-    assert not [event for event in first.events if isinstance(event, Ended)]
+    assert told(first) == []
+
+
+def test_a_robot_that_is_heard_tells_itself_what_has_come_there() -> None:
+    """3 hears nothing of 1 for a while, and 2 makes a receipt in its name."""
+    line = with_goals(cell=True)
+    (first, liar, last), near = line.robots, line.near
+    line.near = lambda one: [[1, 2], [0, 2], [1]][one]  # type: ignore[method-assign]
+    first.end.messages.submit(1, b"goal", line.now)
+    line.run(1)
+    carries(liar, 1, receipt(custody_of(first)._newest[1, 3], line), line.now)
+    line.run(2)
+    assert not liar.end.messages.sent[CARRIED_TOPIC].queue
+    assert told(first) == [] and b"goal" not in last.delivered(1)
+    assert first.end.received.dropped["false_origin"] == 1
+    line.near = near  # type: ignore[method-assign]
+    until(line, 30, lambda: told(first) == [True] and last.delivered(1).count(b"goal") == 1)
