@@ -63,6 +63,8 @@ _PROFILE = {
 """What a QoS profile says where it says nothing."""
 _UNREADABLE = -1
 """Depth that stands for a text that is no profile."""
+_DEEPEST = 2**31 - 1
+"""Greatest depth of a topic."""
 _MESSAGE_TYPE = re.compile(r"\w+/msg/\w+")
 
 _log = logging.getLogger(__name__)
@@ -498,11 +500,12 @@ def _ext(connection: Connection) -> ConnectionExtRosbag2:
 
 
 def _offered(profile: Profile) -> Qos:
-    """A recorded profile as ``Qos``; an unknown history has the default depth, as on a graph."""
+    """A recorded profile as ``Qos``; an unknown history has the default depth, as on a graph. A depth that no topic can
+    be given (a recorder may write one of 64 bits) is the greatest one."""
     return Qos(
         "best_effort" if profile.reliability is QosReliability.BEST_EFFORT else "reliable",
         "transient_local" if profile.durability is QosDurability.TRANSIENT_LOCAL else "volatile",
-        0 if profile.history is QosHistory.KEEP_ALL else profile.depth or Qos().depth,
+        0 if profile.history is QosHistory.KEEP_ALL else min(profile.depth, _DEEPEST) or Qos().depth,
         _seconds(profile.lifespan),
         _seconds(profile.deadline),
     )

@@ -18,6 +18,7 @@ from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.gr.health import Level, LinkHealth, Status
 from gr_ros2.middleware import Middleware, Publisher, Qos
 from gr_ros2.middleware.type_definitions import typestore
+from gr_ros2.radio.findings import doubled
 from gr_ros2.radio.lost_messages import LOST_TYPE, LostMessages
 from gr_ros2.settings.config import DiagnosticsConfig
 
@@ -99,6 +100,8 @@ class Diagnostics:
         stats = self._stats()
         judged = self._health.judge(stats, self._clock())
         statuses = [*judged, *self._second_sender()]
+        if twins := doubled(stats["peers"]):
+            statuses.append(Status(f"{self._node_name}: numbers", Level.WARN, twins))
         for src_id, state in self._health.links(stats, judged[0]).items():
             if not self._stop.is_set():
                 self._link(src_id).publish(diagnostic_status(state, self._node_name))

@@ -192,6 +192,12 @@ def test_a_qos_that_cannot_be_read_is_a_remark(tmp_path: Path, text: str) -> Non
     assert bag_contents(path).topics["/b"].info.publishers == (Qos("reliable", "volatile", 10),)
 
 
+def test_a_depth_of_64_bits_is_the_greatest_that_a_registry_takes(tmp_path: Path) -> None:
+    deep = f"- {{history: keep_last, depth: {2**64 - 1}}}"
+    path = make_sqlite(tmp_path / "a.db3", [Foreign("/a"), Foreign("/b", qos=deep)])
+    assert [info.publishers[0].depth for info in bag_topics(path)] == [10, 2**31 - 1]
+
+
 def test_stamps_before_1970(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foreign_bags, "START_NS", -(10**9))
     database = make_sqlite(tmp_path / "in.db3", [Foreign("/a", count=30)])

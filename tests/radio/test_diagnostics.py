@@ -126,6 +126,22 @@ def test_a_second_link_of_the_same_robot_on_one_graph_is_told(caplog: pytest.Log
         first.stop()
 
 
+def test_two_robots_of_one_number_are_named_on_diagnostics() -> None:
+    arrays: list[Any] = []
+    doubled = {"robot": 7, "heard_s": 0.5, "hops": 0, "over": None, "doubled": True}
+    store = typestore()
+    with MemoryMiddleware(domain_id=domain()) as graph:
+        graph.subscribe(
+            "/diagnostics", DIAGNOSTICS_TYPE, Qos(), lambda p: arrays.append(store.deserialize_cdr(p, DIAGNOSTICS_TYPE))
+        )
+        diagnostics = Diagnostics(QUICK, graph, "link", lambda: {**STATS, "peers": [doubled]})
+        diagnostics.start()
+        wait_for(lambda: arrays, "diagnostics")
+        diagnostics.stop()
+    (status,) = (one for one in arrays[0].status if one.name == "link: numbers")
+    assert status.message.startswith("two robots send as robot 7")
+
+
 STATS = {
     "source": {"topics": {}},
     "sink": {
