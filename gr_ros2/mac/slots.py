@@ -151,6 +151,8 @@ class Slots:
         """Robot with other slots than this one -> when it was last heard, s."""
         self._named_at = self._confirmed_at = self._heard_at = _NEVER
         """Slots: a neighbour last named another robot; this robot; anybody was heard."""
+        self._heard_since = _NEVER
+        """The slot since which somebody has been heard."""
         self._swept = _NEVER
         """The slot at which what had passed was forgotten."""
         self._entered_at: int | None = None
@@ -161,10 +163,11 @@ class Slots:
 
     def unheard(self, now: float) -> bool:
         """Whether robots are heard, of which none has named this one for so long that none can hear it."""
-        if not self.clock.runs or self._since is None or now < self._since + 3 * HEARD * self.clock.slot_s:
+        if not self.clock.runs:
             return False
         slot = self.clock.slot(now)
-        return not self._alone(slot) and self._confirmed_at < slot - 2 * self._memory()
+        named = self._confirmed_at + 2 * self._memory(), self._heard_since + 3 * HEARD
+        return not self._alone(slot) and max(named) < slot
 
     # ---- sending
 
@@ -386,6 +389,8 @@ class Slots:
         elif slot not in robot.ahead:
             robot.named = _NEVER
         self._answer(slot)
+        if self._heard_at < slot - 2 * self._memory():
+            self._heard_since = slot
         self._heard_at = max(self._heard_at, slot)
         if slot > self._base + _SILENT:
             self._sweep(slot)

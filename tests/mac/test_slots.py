@@ -241,6 +241,21 @@ def test_a_robot_that_none_of_those_it_hears_names_knows_it(names: bool) -> None
     assert not made.unheard(made.clock.begin(5000)), "nobody is heard any more"
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_who_is_heard_for_a_moment_only_need_not_have_named_this_robot(moves: bool) -> None:
+    """It came late, or its clock has moved this one's."""
+    made = robot()
+    send(made, 0.0)
+    if moves:
+        for slot in range(40, 1000, 5):
+            hear(made, 1, slot, Block(0, (5, 5), 1, (5, NOBODY)))
+        made._start_over(1000)
+    for slot in range(1001, 1800, 5):
+        hear(made, 2, slot, Block(0, (5, 5), 1, (NOBODY, NOBODY)))
+        assert not made.unheard(made.clock.begin(slot + 1)) or slot > 1000 + 3 * HEARD
+    assert made.unheard(made.clock.begin(1800))
+
+
 def test_a_robot_that_asks_ahead_of_the_end_of_its_silence_gets_a_slot_after_it() -> None:
     made = Slots(5, SLOT, random.Random(1))
     at = made.departure(3.0)
