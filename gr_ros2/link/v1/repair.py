@@ -127,7 +127,7 @@ class RepairWindow:
             return True
         peers = self.peers
         if peers.all:
-            return peers.in_vain or bool(peers.urges)
+            return peers.in_vain or peers.urging
         return self._unreported.due(self.packets.newest)
 
     def tell(self, number: int, now: float) -> Repair | None:

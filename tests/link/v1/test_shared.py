@@ -132,3 +132,34 @@ def test_what_a_peer_lacks_stays_urgent_when_it_asks_for_a_proof_again() -> None
             found += sender.urgent(now) is not None
         assert found >= 16, "one repair for each"
         sender.peers.prove(2, 16, wanted=True)
+
+
+def test_what_a_peer_lacked_before_it_was_out_of_range_is_urgent_when_it_is_back() -> None:
+    sender = RepairWindow("thrifty", ROOM, shares=True)
+    for src_id in (2, 3):
+        sender.peers.meet(src_id, 0.0)
+    for number in range(1, 21):
+        sender.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number / 10)
+    sender.peers.report(2, 20, (1 << 20) - 1 ^ 1, settled=True, loss=0.1, now=3.0)  # it lacks 20
+    sender.peers.leave(2)
+    assert sender.urgent(3.0) is None
+    sender.peers.report(2, 20, (1 << 20) - 1 ^ 1, settled=True, loss=0.1, now=30.0)
+    assert sender.urgent(30.0) is not None
+
+
+def test_a_peer_that_lacks_much_keeps_nothing_back_from_one_that_lacks_what_is_newer() -> None:
+    sender = RepairWindow("thrifty", ROOM, shares=True)
+    for src_id in (2, 3):
+        sender.peers.meet(src_id, 0.0)
+    for number in range(1, 301):
+        sender.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number / 10)
+    sender.peers.report(2, 64, 0, settled=False, loss=0.1, now=40.0)  # it was out of range
+    sender.peers.report(3, 300, (1 << 64) - 1 ^ 1, settled=True, loss=0.1, now=40.0)
+    covered: set[int] = set()
+    for _ in range(20):
+        sender.sent(sender.packets.newest + 1, b"", b"", (), 40.0)
+        repair = sender.urgent(40.0)
+        if repair is not None:
+            mask = repair.mask if isinstance(repair, Repair) else 1
+            covered.update(window_numbers(repair.number, mask))
+    assert {1, 300} <= covered
