@@ -2,6 +2,7 @@
 
 For each pair of robots that hear each other:
 
+- *Named.* Whatever of a message in order a peer has reported as lost is urgent, or its next report makes it so.
 - *Within reach.* Whatever a receiver waits for and its sender repairs can be brought back: it is not that far below the
   last number that the receiver takes for a replay.
 - *Within a bound.* While messages wait at a receiver, the packet that they wait for comes, or is said to be over,
@@ -68,6 +69,11 @@ class PacketsEnd:
         peer = sender.end.window.peers.all.get(receiver.src_id)
         if peer is None or sender.end._sending.repairs.mode == "off":
             return
+        urgent = {number for _, number in peer.urges}
+        for number in peer.lost - urgent if peer.newest >= 0 else ():
+            assert not waited_for(sender.end, number), (
+                f"packet {number} of robot {sender.src_id} counts as lost at robot {receiver.src_id} and is not urgent"
+            )
         proven = known.proofs.proven
         if proven is not None and order.wanted < proven - REACH:
             for number in range(order.wanted, proven - REACH):
@@ -91,10 +97,15 @@ class PacketsEnd:
         )
 
 
+def waited_for(end: EndpointV1, number: int) -> bool:
+    """Whether a packet has a part of a message in order and is still repaired."""
+    record = end.window.packets.records.get(number)
+    return record is not None and any(one.in_order and end._now < one.expires for one in record.lifetimes)
+
+
 def oldest_in_order(end: EndpointV1, bit: int) -> int:
     """The oldest packet of a message in order that a sender repairs for a robot; -1 for none."""
     for number, record in end.window.packets.records.items():
-        waits = any(lifetime.in_order and end._now < lifetime.expires for lifetime in record.lifetimes)
-        if waits and not record.confirmed & bit:
+        if not record.confirmed & bit and waited_for(end, number):
             return number
     return -1
