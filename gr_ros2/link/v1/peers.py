@@ -6,6 +6,7 @@ Invariant: what is told about a packet that was never sent changes nothing.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Container
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf
@@ -236,7 +237,6 @@ class Peers:
             if peer.proven > needs + REACH:  # it has taken an earlier proof than the last one that was sent
                 peer.proven = needs + REACH
                 peer.lost.clear()
-        before = number if self._shared is None else self._shared.waited_for(now, self._period)
         missing: list[Sent] = []
         # A report of newer packets says nothing about an older one.
         waits = [peer.waits] * (not settled and 0 <= peer.waits <= number - MAP)
@@ -247,8 +247,9 @@ class Peers:
                     record.confirmed |= bit
                     peer.lost.discard(record.number)
             elif record is None or not record.alive(now):
-                if 0 < number - back <= before:
-                    waits.append(number - back)
+                older = number - back
+                if older > 0 and (self._shared is None or self._shared.waits(older, now, self._period)):
+                    waits.append(older)
             elif record.confirmed & bit:
                 continue
             elif now - record.at >= delay:
@@ -359,11 +360,12 @@ class Peers:
         waits = [p.waits for p in self.all.values() if p.waits >= 0 and p.waits_since + patience_s <= now]
         return min(waits, default=-1)
 
-    def told(self) -> None:
-        """The peers are told that what they wait for is not repaired any more."""
+    def told(self, numbers: Container[int]) -> None:
+        """The peers are told which of these packets are not repaired any more."""
         for peer in self.all.values():
-            peer.waits, peer.waits_since = -1, inf
-        self.in_vain = False
+            if peer.waits in numbers:
+                peer.waits, peer.waits_since = -1, inf
+        self.in_vain = any(peer.waits >= 0 for peer in self.all.values())
 
     def _note(self) -> None:
         """Take together what is known of the peers; every new packet asks for that."""

@@ -120,6 +120,13 @@ class RepairWindow:
             return None
         return self._combination(window, now)
 
+    def may_tell(self, *, waiting: bool) -> bool:
+        """Whether a peer may be told now what is not repaired any more, before what is urgent.
+
+        :param waiting: whether something new waits
+        """
+        return self._shared is not None and self._shared.may_leave(idle=not waiting)
+
     @property
     def pressing(self) -> bool:
         """Whether ``urgent`` or ``Peers.over`` may have something."""
@@ -136,7 +143,7 @@ class RepairWindow:
         packets = self.packets
         packets.retire(now)
         if self._shared is None:
-            self.peers.told()
+            self.peers.told(range(packets.newest + 1))
             window = self._combining.around(number, now)
         else:
             window = self._of_all(now, number)
@@ -181,8 +188,8 @@ class RepairWindow:
         assert self._shared is not None
         window = [record for record in self._shared.window(now, lost) if record.number >= first]
         window = self._combining.fitting(window, lost)
+        self.peers.told(self._shared.spanned(window))
         self._shared.combined(window, now)
-        self.peers.told()
         return window
 
     def _bring(self, record: Sent, now: float) -> Sent | Repair | None:

@@ -71,11 +71,12 @@ class RepairSlots:
             if not self._ahead:
                 return None
         self._window.mode = self.mode
-        again = self._window.urgent(now)
-        if again is not None:
-            self._ahead -= waiting
-            return self._writer.repair(again, now)
         over = self._window.peers.over(now, PATIENCE_S * self._settings.slower)
+        if over < 0 or not self._window.may_tell(waiting=waiting):
+            again = self._window.urgent(now)
+            if again is not None:
+                self._ahead -= waiting
+                return self._writer.repair(again, now)
         return self._tell(over, now) if over >= 0 else None
 
     def spare(self, now: float) -> SentPacket | None:

@@ -42,7 +42,8 @@ class SharedRepairs:
         self._since = 0
         """New packets since the last combination."""
         self._told_at = -inf
-        """When one over the oldest packet left, s: it says what is not repaired any more."""
+        self._told = range(0)
+        """The numbers of which the newest combination says what is not repaired any more, and when it left, s."""
         self._owed = 0.0
 
     def sent(self, number: int, lifetimes: tuple[Lifetime, ...], loss: float) -> None:
@@ -75,8 +76,7 @@ class SharedRepairs:
         """A combination of these packets leaves."""
         self._since = 0
         self._owed = max(self._owed - 1, 0.0)
-        if not window or window[-1].number == self._packets.oldest:
-            self._told_at = now
+        self._told, self._told_at = self.spanned(window), now
         for record in window:
             record.at = now
 
@@ -95,13 +95,23 @@ class SharedRepairs:
             window = window or [record for record in packets.live(first, newest, now)[::-1] if record.lasts(now)]
         return window
 
-    def waited_for(self, now: float, period: float) -> int:
-        """The number up to which peers may wait in vain for a packet: only messages in order wait, and only for what
-        they were not told of.
+    def spanned(self, window: list[Sent]) -> range:
+        """The numbers of which a combination of these packets tells whether they are repaired: all older ones, too, if
+        the oldest is in it."""
+        packets = self._packets
+        if not window:
+            return range(packets.newest + 1)
+        first = window[-1].number
+        return range(0 if first == packets.oldest else first, window[0].number + 1)
+
+    def waits(self, number: int, now: float, period: float) -> bool:
+        """Whether peers may wait in vain for a packet that is not repaired: only messages in order wait, and only for
+        what they were not told of.
 
         :param period: mean time between two new packets, s
         """
-        return 0 if self.within or now < self._told_at + TOLD * period else self._ordered - 1
+        told = number in self._told and now < self._told_at + TOLD * period
+        return not self.within and number < self._ordered and not told
 
 
 def newest_of(window: Iterable[Sent], lost: set[int]) -> int | None:

@@ -163,3 +163,25 @@ def test_a_peer_that_lacks_much_keeps_nothing_back_from_one_that_lacks_what_is_n
             mask = repair.mask if isinstance(repair, Repair) else 1
             covered.update(window_numbers(repair.number, mask))
     assert {1, 300} <= covered
+
+
+def test_a_peer_is_told_what_is_over_beside_one_that_lacks_much_that_is_older() -> None:
+    """Repairs of what is older say nothing about it."""
+    sender = RepairWindow("thrifty", ROOM, shares=True)
+    for src_id in (2, 3):
+        sender.peers.meet(src_id, 0.0)
+    for number in range(1, 301):
+        expires = 39.0 if number == 280 else inf
+        sender.sent(number, b"%d" % number, b"", (Lifetime(expires, in_order=True, left=True),), number / 10)
+    everything = (1 << 64) - 1
+    covered: set[int] = set()
+    for now in range(40, 60):
+        sender.peers.report(2, 64, 0, settled=False, loss=0.1, now=now)  # it was out of range
+        sender.peers.report(3, 300, everything ^ 1 << 20, settled=True, loss=0.1, now=now)
+        sender.sent(sender.packets.newest + 1, b"", b"", (), now + 0.3)
+        over = sender.peers.over(now + 0.3, 0.2)
+        repair = sender.tell(over, now + 0.3) if over >= 0 else sender.urgent(now + 0.3)
+        if isinstance(repair, Repair):
+            covered.update(range(repair.number - repair.mask.bit_length() + 1, repair.number + 1))
+            assert 280 not in window_numbers(repair.number, repair.mask)
+    assert {1, 280} <= covered
