@@ -65,7 +65,7 @@ def _nothing(*_: Any) -> None:
 
 
 RULES: dict[str, list[Patch]] = {
-    "no waiting for a message that is due": [("hold", "Hold.until", lambda _self, now, _end, _airtime: now)],
+    "no waiting for a message that is due": [("hold", "Hold.until", lambda _self, now, _end, _airtime, **_: now)],
     "waiting also where repairs are owed": [("hold", "_MOST_OWED", 0.0)],
     "waiting also where it gained nothing": [("hold", "_MOST_IN_VAIN", 0)],
     "waiting for any gain": [("hold", "_GAIN", 0.0)],

@@ -37,6 +37,10 @@ _TIMES = 512
 _INTERVAL_S = 0.1
 """s between two reports of a peer, until its reports tell. With 0, a sender repairs packets before the first report can
 come: three of 141 on ``paper-ofdm-paced`` without losses."""
+_SILENCE = 4
+"""Part of the time without a report for which a repair counts as under way. A message every .5 s to a robot that does
+not hear takes 396 packets a minute (4,241 without this, 278 with 2); with 2, a message per second at 40 % loss is 48 ms
+old instead of 38 in the mean."""
 _SOON = 2
 """Mean times between two new packets within which a report must come to be waited for. Where reports take eight slots
 at 20 % loss both ways, odometry is 14 % older without it; where they come at once or take 20 slots, it changes nothing
@@ -61,6 +65,8 @@ class Peer:
     """Mean time in s between its reports."""
     prompt: bool = False
     """Whether it reports every packet, so soon that it is better to wait for a report than to expect losses."""
+    asked: float = inf
+    """Time in s at which the first repair left that no report has followed."""
     waits: int = -1
     """The oldest packet that reports miss and that the sender does not repair any more; -1 for none."""
     waits_since: float = inf
@@ -83,6 +89,11 @@ class Peer:
     def answer(self) -> float:
         """Time in s after which a report about a packet is to be expected."""
         return max(self.answers) if self.prompt else self.delay + self.interval
+
+    def under_way(self, now: float) -> float:
+        """Time in s for which a repair may be on its way; ever longer where no report follows. Otherwise a robot that
+        is heard and does not hear would have all air that is free for as long as it is there."""
+        return max(self.answer, UNDER_WAY_S, (now - self.asked) / _SILENCE)
 
     @property
     def patience(self) -> float:
@@ -378,7 +389,7 @@ class Peers:
     def _note_times(self, peer: Peer, number: int, loss: float, now: float) -> None:
         """Note how often and how soon a peer reports."""
         peer.interval += (now - peer.heard - peer.interval) / 8
-        peer.heard, peer.loss = now, loss
+        peer.heard, peer.loss, peer.asked = now, loss, inf
         sent_at = self._times.get(number)
         if sent_at is not None and number > peer.newest:  # a report that is repeated says nothing about the way
             peer.delays.append(now - sent_at)

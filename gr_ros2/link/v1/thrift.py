@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from math import inf
 
-from gr_ros2.link.v1.peers import UNDER_WAY_S, Peers
+from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.wire.v1 import MAX_WINDOW
 
@@ -26,24 +26,26 @@ class Thrift:
     def __init__(self, packets: SentPackets, peers: Peers) -> None:
         self._packets, self._peers = packets, peers
         self._flight: deque[tuple[float, int, int]] = deque()
-        """The time until which a repair may be on its way without a report about it, and its window."""
+        """When a repair left, and its window."""
 
     def combined(self, now: float, first: int, newest: int) -> None:
         """A combination of these numbers leaves."""
-        wait = max((peer.answer for peer in self._peers.all.values()), default=inf)
-        self._flight.append((now + max(wait, UNDER_WAY_S), first, newest))
+        self._flight.append((now, first, newest))
+        for peer in self._peers.all.values():
+            peer.asked = min(peer.asked, now)
 
     def worth(self, window: list[Sent], now: float) -> bool:
         """Whether a combination of a window is worth its slot."""
-        flight = self._flight
-        while flight and (flight[0][0] <= now or flight[0][2] < self._packets.oldest):
+        flight, peers = self._flight, self._peers.all.values()
+        longest = max([peer.under_way(now) for peer in peers], default=inf)
+        while flight and (flight[0][0] + longest <= now or flight[0][2] < self._packets.oldest):
             flight.popleft()
         first, last = window[-1].number, window[0].number
-        under_way = sum(1 for _, low, high in flight if low <= last and high >= first)
-        if not self._peers:
+        under_way = [at for at, low, high in flight if low <= last and high >= first]
+        if not peers:
             loss = self._peers.loss
-            return len(window) * loss > under_way * (1 - loss) + _ENOUGH
-        for peer in self._peers.all.values():
+            return len(window) * loss > len(under_way) * (1 - loss) + _ENOUGH
+        for peer in peers:
             expected = 0.0 if peer.prompt else peer.loss
             patience, doubt = peer.patience, peer.doubt
             need = 0.0
@@ -53,14 +55,17 @@ class Thrift:
                         need += 1
                     else:
                         need += doubt if now >= record.at + patience else expected
-            if need > under_way * (1 - peer.loss) + _ENOUGH:
+            since = now - peer.under_way(now)
+            coming = sum([at > since for at in under_way])
+            if need > coming * (1 - peer.loss) + _ENOUGH:
                 return True
         return False
 
     def next_doubt(self, since: float) -> float:
         """When a report about one of the newest packets, or about a repair, is overdue first after a time, s; inf if
         none is expected."""
-        soonest = next((at for at, _, _ in self._flight if at > since), inf)
+        wait = min([peer.under_way(since) for peer in self._peers.all.values()], default=inf)
+        soonest = next((at + wait for at, _, _ in self._flight if at + wait > since), inf)
         waits = [(peer.bit, peer.patience) for peer in self._peers.all.values()]
         for record in reversed(self._packets.records.values()):
             if record.number <= self._packets.newest - MAX_WINDOW:

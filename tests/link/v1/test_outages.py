@@ -263,3 +263,21 @@ def test_a_full_link_says_after_an_outage_what_it_does_not_repair() -> None:
             one.end.messages.submit(0, goals[-1], air.now)
         air.step()
     assert [text for text in other.delivered() if len(text) < 62] == goals
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_robot_that_hears_nothing_takes_no_air_with_repairs(mode: SealMode) -> None:
+    """It is heard itself, so anybody without a key could otherwise have all that is free, by a hello now and then."""
+    one, other = Robot(1, TOPICS, mode=mode, packet_len=220), Robot(2, mode=mode, packet_len=220)
+    talk = Talk(one, other)
+    talk.run(5, 0.5)
+    talk.part((1, 2))
+    before = len(talk.air.recorded)
+    talk.run(60, 0.5)
+    sent = sum(robot is one for robot, _ in talk.air.recorded[before:])
+    assert sent < 6 * len(talk.said[1]), "before, more than 20 packets for each message"
+    talk.part()
+    talk.run(3, 0.5)
+    talk.air.run(20)
+    for topic, said in talk.reliable(1):
+        assert talk.got(other, 1, topic) == said

@@ -67,7 +67,7 @@ class Line:
         """The robots whose next packet may leave by now."""
         for n, one in enumerate(self.robots):
             departure = one.end.next_departure(credited=True)
-            if departure is not None and departure <= self.now:
+            if departure is not None and departure <= self.now + 1e-9:
                 yield n
 
 
