@@ -152,6 +152,9 @@ class Inbox:
         )
         self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
         self._now = 0.0
+        self._takes = False
+        """Whether packets are taken that are known at once. The decoder has all of them from the first one on: whoever
+        settled before the last one, as for a message of this robot that it hands on, would pass over the others'."""
         self.began = inf
 
     @property
@@ -186,11 +189,15 @@ class Inbox:
         late = number < decoder.newest
         self._advance(number, now, here=True)
         self.reports.arrived(late=late)
-        for found in decoder.source(number, body[: self._room]):
-            if found[0] == number:
-                self._take(number, entries, qos, repaired=late)
-            else:
-                self._recovered(found)
+        self._takes = True
+        try:
+            for found in decoder.source(number, body[: self._room]):
+                if found[0] == number:
+                    self._take(number, entries, qos, repaired=late)
+                else:
+                    self._recovered(found)
+        finally:
+            self._takes = False
         self._settle()
 
     def repair(
@@ -209,8 +216,12 @@ class Inbox:
         if oldest:
             self.order.repaired_from(number - window + 1)
         redundant = self.decoder.counts["redundant"]
-        for found in self.decoder.repair(number, mask, repair_id, combined):
-            self._recovered(found)
+        self._takes = True
+        try:
+            for found in self.decoder.repair(number, mask, repair_id, combined):
+                self._recovered(found)
+        finally:
+            self._takes = False
         if self.decoder.counts["redundant"] > redundant:
             self.reports.repaired_in_vain()
         if mask + 1 != 1 << window:
@@ -276,7 +287,7 @@ class Inbox:
 
     def _settle(self) -> None:
         """Deliver the messages that waited for what is here or given up now."""
-        if due := self.order.settle(self._now):
+        if not self._takes and (due := self.order.settle(self._now)):
             self._release(due)
 
     def _release(self, due: Iterable[Ready]) -> None:
