@@ -77,7 +77,8 @@ class Order:
     :param fits: whether more of them may wait
     :param room: bytes of the longest body
     :param quiet_s: s after which what others say of a sender counts
-    :param patience_s: s for which a message waits for those before it that others may bring
+    :param patience_s: s for which a message waits for those before it that others may bring, from when one of those
+        was met
     :ivar contents: which topics missing packets can have carried
     :ivar told: whether the sender gets reports. It then says which packets it does not repair any more
     :ivar low: every packet before this number is here or given up
@@ -108,7 +109,7 @@ class Order:
         self.reached: dict[int, tuple[int, int]] = {}
         self.passed_on: dict[int, tuple[int, int]] = {}
         self._since: dict[int, float] = {}
-        """When a message came out last in a topic in which others wait, s."""
+        """When a message came out last in a topic in which others wait, or a robot came that may bring others, s."""
         self.contents = GapContents(decoder, room)
         self._passed: dict[int, int] = {}
         """By topic: no missing packet before this number can have carried something of it."""
@@ -157,6 +158,10 @@ class Order:
             self._since[ready.topic_id] = now
         self.held += len(ready.payload) + _COST
         line.append(ready)
+
+    def wait_anew(self, now: float) -> None:
+        """A robot is heard, or is heard again, that may bring what is waited for."""
+        self._since = dict.fromkeys(self._since, now)
 
     def told_again(self, ready: Ready) -> bool:
         """Whether a message waits already; it may tell better now what is before it."""

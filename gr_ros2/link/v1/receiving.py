@@ -297,7 +297,7 @@ class ReceivingSide:
                 self._rate.meet(neighbour.src_id)
         self._outcomes.events.append(Met(neighbour.src_id, neighbour.boot, hears))
         if self.relaying is not None:
-            self.relaying.met(neighbour)
+            self.relaying.met(neighbour, now)
         self._greeted(neighbour)
         if self._settings.shares and self._settings.slower > 1:  # its table comes unasked
             neighbour.asked[TABLE_TOPIC] = now + ARRIVING_S * self._settings.slower

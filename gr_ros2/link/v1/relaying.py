@@ -160,14 +160,17 @@ class Relaying:
         if now > self._swept + TABLE_S:
             self._sweep(now)
 
-    def met(self, neighbour: Neighbour) -> None:
-        """A robot is heard: what is known of its start over others goes on there, and no other start is known."""
+    def met(self, neighbour: Neighbour, now: float) -> None:
+        """A robot is heard: what is known of its start over others goes on there, and no other start is known. It may
+        bring what is missing of others."""
         src_id = neighbour.src_id
         if (far := self.far.get(src_id)) is not None:
             if far.boot == neighbour.boot:
                 neighbour.inbox.adopt(far)
                 self.ahead.add(src_id)
             self._forget(src_id, Fate.SENDER_RESTARTED)
+        for inbox in self.far.values():
+            inbox.order.wait_anew(now)
 
     def reached(self, neighbour: Neighbour, number: int) -> None:
         """A robot itself has reached this number: whoever has said more was wrong."""

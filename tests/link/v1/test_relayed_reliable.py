@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Robot, registry
@@ -193,3 +194,23 @@ def test_what_was_relayed_before_its_table_came_comes_out() -> None:
         line.robots.append(robot(3, "encrypt"))
         line.run(40)
         assert line.robots[2].delivered(1).count(b"the map") == 1
+
+
+def test_a_robot_that_was_away_has_its_time_to_bring_what_is_missing() -> None:
+    """A message waits 60 s for those before it: from when somebody is heard again that may bring them."""
+    line = Line(*(robot(src_id, "encrypt", TOPICS) for src_id in (1, 2, 3)))
+    line.run(12)
+    last, near = line.robots[2], line.near
+    relaying = last.end._receiving.relaying
+    assert relaying is not None
+    order = relaying.far[1].order
+    number = line.robots[0].end.window.packets.newest + 10_000
+    order.wait(Ready(1, (number, 0), b"later", -1, False, False, 1, 2, made=line.now, after=(number - 1, 0)), line.now)
+    line.near = lambda one: [other for other in near(one) if 2 not in (one, other)]  # type: ignore[method-assign]
+    line.run(45)
+    line.near = near  # type: ignore[method-assign]
+    line.run(30)
+    assert last.delivered(2)
+    assert b"later" not in last.delivered(1)
+    line.run(60)
+    assert b"later" in last.delivered(1)
