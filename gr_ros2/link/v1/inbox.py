@@ -23,7 +23,7 @@ from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
 from gr_ros2.link.v1.delivery import DeliveryRules, for_all_in_order, passed_over
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
-from gr_ros2.link.v1.order import Order, Ready
+from gr_ros2.link.v1.order import Order, Ready, nobody
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
@@ -97,7 +97,7 @@ class Inbox:
     :param relaying: is told of messages that came, where they are relayed
     :param give_up_s: s of silence after which the robot is regarded as gone
     :param quiet_s: s of silence after which others are believed about its messages
-    :param patience_s: see :class:`gr_ros2.link.v1.order.Order`
+    :param patience_s, brings: see :class:`gr_ros2.link.v1.order.Order`
     :ivar reports: what the robot is told of its packets
     :ivar announced: its topics
     :ivar order: which of its messages wait for an earlier one
@@ -121,6 +121,7 @@ class Inbox:
         give_up_s: float = inf,
         quiet_s: float = inf,
         patience_s: float = inf,
+        brings: Callable[[float], bool] = nobody,
     ) -> None:
         self.src_id, self.boot = src_id, boot
         self.deliveries = DeliveryRules(settings, marks)
@@ -142,6 +143,7 @@ class Inbox:
             room=room,
             quiet_s=quiet_s,
             patience_s=patience_s,
+            brings=brings,
         )
         self._reassembly = Reassembly(bounds.fragments)
         of = src_id, boot

@@ -63,6 +63,11 @@ class Ready:
     after: tuple[int, int] | None = None
 
 
+def nobody(_since: float) -> bool:
+    """Nobody brings anything."""
+    return False
+
+
 ALL = 255
 """A place behind all messages that began in a packet."""
 
@@ -79,6 +84,8 @@ class Order:
     :param quiet_s: s after which what others say of a sender counts
     :param patience_s: s for which a message waits for those before it that others may bring, from when one of those
         was met
+    :param brings: whether a robot that is heard still repairs something that was missing at this time, s: it may bring
+        these, so they are waited for as long again
     :ivar contents: which topics missing packets can have carried
     :ivar told: whether the sender gets reports. It then says which packets it does not repair any more
     :ivar low: every packet before this number is here or given up
@@ -101,6 +108,7 @@ class Order:
         room: int,
         quiet_s: float = inf,
         patience_s: float = inf,
+        brings: Callable[[float], bool] = nobody,
     ) -> None:
         self.told = False
         self.low = self.wanted = self.all_from = first
@@ -114,7 +122,7 @@ class Order:
         self._passed: dict[int, int] = {}
         """By topic: no missing packet before this number can have carried something of it."""
         self._decoder = decoder
-        self._hold_s, self._quiet_s, self._patience_s = hold_s, quiet_s, patience_s
+        self._hold_s, self._quiet_s, self._patience_s, self._brings = hold_s, quiet_s, patience_s, brings
         self._sure, self._fits = sure, fits
         self._dead = first
         """The sender does not repair packets before this number any more."""
@@ -241,7 +249,18 @@ class Order:
         here = max((passed - 1, ALL), self.reached.get(ready.topic_id, (-1, 0)))
         if ready.order <= here or (ready.after is not None and ready.after <= here):
             return True
-        return ready.over is not None and now >= self._since[ready.topic_id] + self._patience_s
+        if ready.over is None or now < self._since[ready.topic_id] + self._patience_s:
+            return False
+        if self._brings(self._since[ready.topic_id]):
+            self._since[ready.topic_id] = now
+            return False
+        return True
+
+    def missing_since(self) -> float:
+        """When the packet that its sender repairs first was found to be missing, s; inf for none."""
+        if not self.told or self.wanted > self._decoder.newest:
+            return inf
+        return next((since for since, first, last in self._gaps if first <= self.wanted <= last), inf)
 
     def next_timeout(self) -> float | None:
         """Time in s at which missing packets are given up for which messages wait, or what others say counts."""

@@ -350,6 +350,11 @@ class ReceivingSide:
         if self._rate is not None:
             self._rate.forget(src_id)
 
+    def _brings(self, since: float) -> bool:
+        """Whether a robot that is heard still repairs something that was missing at this time, s."""
+        heard = [neighbour for neighbour in self.neighbours.all.values() if not neighbour.silent]
+        return any(neighbour.inbox.order.missing_since() <= since for neighbour in heard)
+
     def _inbox(self, src_id: int, boot: int, first: int, room: int, *, far: bool = False) -> Inbox:
         inbox = Inbox(
             src_id,
@@ -365,6 +370,7 @@ class ReceivingSide:
             give_up_s=self._give_up_s,
             quiet_s=HEARD_S * self._settings.slower,
             patience_s=FORGET_S * self._settings.slower if far else inf,
+            brings=self._brings,
         )
         inbox.reports.tells_snr = self._rate is not None
         return inbox

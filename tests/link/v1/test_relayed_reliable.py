@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from math import inf
 
 import pytest
 
-from gr_ros2.link.v1.order import Ready
+from gr_ros2.link.v1.decoder import RepairDecoder
+from gr_ros2.link.v1.order import Order, Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Robot, registry
@@ -214,3 +216,45 @@ def test_a_robot_that_was_away_has_its_time_to_bring_what_is_missing() -> None:
     assert b"later" not in last.delivered(1)
     line.run(60)
     assert b"later" in last.delivered(1)
+
+
+def test_who_still_repairs_what_was_missing_has_its_time_again() -> None:
+    """Of a robot that came back after minutes the oldest packets are repaired first, and may take longer than 60 s."""
+    since, missing = [], [True]
+
+    def brings(at: float) -> bool:
+        since.append(at)
+        return missing[0]
+
+    decoder = RepairDecoder(60, lambda _: True, 1000)
+    order = Order(
+        decoder, 1, 1.0, sure=10_000, fits=lambda _: True, room=60, quiet_s=3.0, patience_s=60.0, brings=brings
+    )
+    order.wait(Ready(1, (9, 0), b"later", -1, False, False, 1, 2, after=(8, 0)), 100.0)
+    assert not order.settle(159.0)
+    assert not order.settle(160.0), "somebody repairs"
+    missing[0] = False
+    assert order.next_timeout() == 220.0
+    assert not order.settle(219.0)
+    assert order.settle(220.0)
+    assert since == [100.0, 160.0]
+
+
+def test_it_is_known_since_when_the_packet_that_is_repaired_first_is_missing() -> None:
+    decoder = RepairDecoder(60, lambda _: True, 1000)
+    order = Order(decoder, 1, 1.0, sure=10_000, fits=lambda _: True, room=60)
+    order.told = True
+    for number, now, missing in ((1, 5.0, ()), (5, 6.0, (2, 4)), (8, 7.0, (6, 7))):
+        if missing:
+            order.missing(now, *missing)
+        decoder.source(number, b"")
+        order.settle(now)
+    assert order.missing_since() == 6.0
+    for number in (2, 3, 4):
+        decoder.source(number, b"")
+    order.settle(8.0)
+    assert order.missing_since() == 7.0
+    for number in (6, 7):
+        decoder.source(number, b"")
+    order.settle(9.0)
+    assert order.missing_since() == inf
