@@ -12,6 +12,7 @@ import pytest
 from bench.hostile import GROWTH, Kind, attack
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered
+from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, Part, body_room, write_body
@@ -68,12 +69,12 @@ def grow_old(robot: Robot, numbers: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("loss", [0.01, 0.1, 0.5])
-def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -> None:
+@pytest.mark.parametrize(("loss", "mode"), [(0.01, "none"), (0.1, "none"), (0.5, "none"), (0.1, "encrypt")])
+def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float, mode: SealMode) -> None:
     """In each run both ends have several lives, in which packet numbers pass their half and come round."""
     rng = random.Random(int(loss * 1000))
     starts = random.Random(int(loss * 1000))  # of the receiver, whatever else is drawn
-    one, two = Robot(1, topics(), any_length=True), Robot(2)
+    one, two = Robot(1, topics(), any_length=True, mode=mode), Robot(2, mode=mode)
     invariant = PacketsEnd((one, two))
     sent: list[dict[bytes, int]] = [{} for _ in range(TOPICS)]
     latest = [-1] * TOPICS
@@ -135,7 +136,7 @@ def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float) -
         if int(now / SLOT_S) % 8 == 0:
             one.end.handle_timeout(now)
             two.end.handle_timeout(now)
-            invariant.step()
+        invariant.step()
     assert happened["here"] > MESSAGES / 8
     for kind in (
         *("outage", "half", "thinned", "late", "twice"),
