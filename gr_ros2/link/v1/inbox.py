@@ -98,6 +98,7 @@ class Inbox:
     :param give_up_s: s of silence after which the robot is regarded as gone
     :param quiet_s: s of silence after which others are believed about its messages
     :param patience_s, brings: see :class:`gr_ros2.link.v1.order.Order`
+    :ivar first: see above
     :ivar reports: what the robot is told of its packets
     :ivar announced: its topics
     :ivar order: which of its messages wait for an earlier one
@@ -132,7 +133,7 @@ class Inbox:
         self.decoder = RepairDecoder(room, self._plausible, bounds.span, bounds.equations)
         self.decoder.begin(first)
         self.decoder.newest = first - 1
-        self._first, self._give_up_s, self._heard = first, give_up_s, inf
+        self.first, self._give_up_s, self._heard = first, give_up_s, inf
         self._most = settings.max_source_bytes
         self.order = Order(
             self.decoder,
@@ -324,7 +325,7 @@ class Inbox:
         self.deliveries.reached(number, self.began, late=late)
         gone = number - newest - here
         if gone:
-            met = newest >= self._first  # what came before the first packet that was heard is not lost
+            met = newest >= self.first  # what came before the first packet that was heard is not lost
             self._stats.missed[self.src_id] += gone * met
             self.reports.missed(gone, counts=met)
             self.order.missing(now, newest + 1, newest + gone)

@@ -121,6 +121,8 @@ class Relaying:
         self._telling = deque[Stream | None]()
         """What is told next: a reliable topic for all, or None for the newest message of the next of the others."""
         self._far_rooms: Rooms[int] = Rooms(BROADCAST, most)
+        self._first_made: dict[int, float] = {}
+        """When that was made with which each start in ``far`` began, s."""
         self._there: dict[int, float] = {}
         """When a robot was there last, s."""
         self._came: dict[int, float] = {}
@@ -286,6 +288,7 @@ class Relaying:
         if inbox is None or (not table and topic is None):
             self._dropped["unknown_origin"] += 1  # not taken: who has it must not learn that it is here
             return
+        inbox = self._begun(inbox, message.number, made)
         if topic is not None and for_all_in_order(topic):
             of.after = message.after
             self._in_order.heard(via, Name(Stream(origin, start, topic.topic_id), order), now)
@@ -457,6 +460,7 @@ class Relaying:
     def _forget(self, origin: int, reason: Fate) -> None:
         """A start of a robot that was known over others is over."""
         self._far_rooms.drop(origin)
+        self._first_made.pop(origin, None)
         if (inbox := self.far.pop(origin, None)) is not None:
             inbox.close(reason)
 
@@ -497,6 +501,7 @@ class Relaying:
             self._in_order.drop_of(origin, lambda stream: stream.start != message.start)
             if neighbour is None or neighbour.boot != boot or not neighbour.proven:
                 self.far[origin] = self._make_inbox(origin, boot, message.number + 1)
+                self._first_made[origin] = made
             self._neighbours.met_over_others(origin, now)
             self.found(origin, now)
         if origin in self.far:
@@ -504,6 +509,17 @@ class Relaying:
                 self._dropped["max_sources"] += 1
                 self._forget(lost, Fate.MEMORY)
         return True
+
+    def _begun(self, inbox: Inbox, number: int, made: float) -> Inbox:
+        """Where a message goes. The number with which its start began over others was false if the message has a lower
+        one and was made much later; this robot would say for ever that it has all up to there."""
+        origin = inbox.src_id
+        if number >= inbox.first - 1 or made <= self._first_made.get(origin, inf) + EXPIRES_S:
+            return inbox
+        anew = self.far[origin] = self._make_inbox(origin, inbox.boot, number + 1)
+        anew.adopt(inbox)
+        self._first_made[origin] = made
+        return anew
 
     def _inbox(self, origin: int, start: int) -> Inbox | None:
         """Where messages of a start of a robot come together, directly or over others; None for one that is not the

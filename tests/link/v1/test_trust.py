@@ -13,7 +13,7 @@ from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire.relayed import RECEIPT_TOPIC, Receipt, Relayed, write_carried, write_receipts, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, write_table
 from gr_ros2.wire.v1 import CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
-from tests.link.v1.air import Robot
+from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_ages import MODES, absent, relaying_of
 from tests.link.v1.test_custody import custody_of, named, told, until
 from tests.link.v1.test_relaying import Line, robot
@@ -118,6 +118,28 @@ def test_a_false_start_ends_a_robot_for_a_while_only(mode: SealMode, soon: None)
     line.run(EXPIRES_S + 10)
     assert count(line.robots[2], line, 10) > 10
     assert count(line.robots[1], line, 10) > 20
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_table_with_a_false_number_stops_reliable_topics_for_a_while_only(mode: SealMode, soon: None) -> None:  # noqa: ARG001
+    """The third robot would say for ever that it has all up to there."""
+    both = registry(odom=SendOptions(queue="latest"), all=SendOptions())
+    line = Line(*(robot(src_id, mode, both) for src_id in (1, 2, 3, 4)))
+    line.near = lambda one: {2: [3], 3: [2]}.get(one, [1 - one])  # type: ignore[method-assign]
+    line.run(10)
+    rows = [AnnouncedTopic(n, name, "std_msgs/msg/String", 0, n == 1) for n, name in enumerate(("odom", "all"))]
+    says(line.robots[3], table(1, line.robots[0].boot, LAST_NUMBER, *rows), line.now)
+    line.run(2)
+    assert relaying_of(line.robots[2]).far[1].first > LAST_NUMBER
+    del line.near
+    line.run(EXPIRES_S + 10)
+    for n in range(5):
+        line.robots[0].end.messages.submit(1, b"true %d" % n, line.now)
+        line.run(1)
+    line.run(10)
+    assert [text for text in line.robots[2].delivered(1) if text.startswith(b"true")] == [
+        b"true %d" % n for n in range(5)
+    ]
 
 
 @pytest.mark.parametrize("mode", MODES)
