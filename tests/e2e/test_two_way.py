@@ -56,7 +56,8 @@ def test_losses_of_one_direction_leave_the_other_alone(tmp_path: Path, version: 
     assert back.ledger["repaired"] > 0 if version else back.delivered < back.sent
     lost = result.counters["back"]["channel"]
     assert set(lost) <= {"burst_loss", "packet_loss"}
-    assert result.packets["sent"] - result.packets["received"] == sum(lost.values())
+    under_way = result.packets["sent"] - result.packets["received"] - sum(lost.values())
+    assert 0 <= under_way <= result.phy["channels"], "at most a report of each robot left as the run ended"
     assert result.counters["channel"] == {}
 
 
