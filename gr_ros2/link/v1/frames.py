@@ -23,14 +23,14 @@ from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
 from gr_ros2.wire.v1 import Part
 
-WINDOW_S = 2.0
-"""s over which the rate that other topics leave free is a mean."""
+WINDOW, WINDOW_S = 32, 2.0
+"""Packets, and s at least, over which the rate that other topics leave free is a mean."""
 _LEAST_FREE = 0.1
 """Part of the channel that coded topics may count on; else they would never learn that more is free."""
 SILENT_S, REPORTS = 0.5, 4
 """A robot is silent when no report has come for so many s, and for so many of its mean times between two."""
 _FEW_S = 0.3
-"""s of a window at least, so that the first packets do not stand for a rate."""
+"""s of a window at least, and at least one packet, so that the first ones do not stand for a rate."""
 
 
 class Outlet(Protocol):
@@ -129,18 +129,23 @@ class SentFrames:
             others = sum(len(part.payload) + ENTRY for part in entries if part.topic_id not in self.sent)
         self._others.append((now, others))
         self._sum += others
-        while self._others[0][0] < now - WINDOW_S:
+        window_s = max(WINDOW_S, WINDOW * self._turn(now))
+        while self._others[0][0] < now - window_s:
             self._sum -= self._others.popleft()[1]
 
     def _free(self, now: float) -> float:
         """bytes/s that other topics leave."""
-        turn_s = max(self._turn_s(), self._pace.sure_interval(now))
+        turn_s = self._turn(now)
         if not turn_s:
             return inf
         capacity = self._room / turn_s
         if not self._others:
             return capacity
-        return max(_LEAST_FREE * capacity, capacity - self._sum / max(now - self._others[0][0], _FEW_S))
+        return max(_LEAST_FREE * capacity, capacity - self._sum / max(now - self._others[0][0], _FEW_S, turn_s))
+
+    def _turn(self, now: float) -> float:
+        """s from one packet to the next, 0 = not known."""
+        return max(self._turn_s(), self._pace.sure_interval(now))
 
     @property
     def _reporting(self) -> list[Peer]:

@@ -246,7 +246,7 @@ class Inbox:
         """Go on without packets that have been waited for long enough."""
         self._now = now
         self._settle()
-        for partial in self._reassembly.expired(now, _INCOMPLETE_S, self._repaired_until_here):
+        for partial in self._reassembly.expired(now, self._incomplete_s, self._repaired_until_here):
             self._lose(partial, Fate.EXPIRED)
 
     def next_timeout(self) -> float | None:
@@ -254,7 +254,12 @@ class Inbox:
         ordered, waiting = self.order.next_timeout(), self._reassembly.next_timeout()
         if waiting is None:
             return ordered
-        return waiting + _INCOMPLETE_S if ordered is None else min(ordered, waiting + _INCOMPLETE_S)
+        waiting += self._incomplete_s
+        return waiting if ordered is None else min(ordered, waiting)
+
+    @property
+    def _incomplete_s(self) -> float:
+        return _INCOMPLETE_S * self._settings.slower
 
     def _repaired_until_here(self, partial: PartialMessage) -> bool:
         if partial.topic_id > TABLE_TOPIC:  # of another robot

@@ -213,7 +213,7 @@ class Neighbours:
 
     def early(self, src_id: int, now: float) -> list[tuple[float, bytes]]:
         """Packets of a robot that could not be opened before, and when they came, s; they are returned once."""
-        return [(at, data) for at, data in self._early.pop(src_id, ()) if now <= at + _EARLY_S]
+        return [(at, data) for at, data in self._early.pop(src_id, ()) if now <= at + _EARLY_S * self._settings.slower]
 
     def silent(self, now: float, after: float) -> list[Neighbour]:
         """Robots that do not count as heard any more after so many s of silence. Their state is kept until another
@@ -315,7 +315,7 @@ class Neighbours:
         """
         if at > max(self._met_at.get(src_id, -inf), self._far_at.get(src_id, -inf)):
             first = self._again.setdefault((src_id, boot & 0xFFFF), at)
-            if at > first + _CHANGE_S:  # later than all that was under way
+            if at > first + _CHANGE_S * self._settings.slower:  # later than all that was under way
                 self._doubled[src_id] = now
             if len(self._again) > _STARTS:
                 del self._again[next(iter(self._again))]
@@ -406,7 +406,7 @@ class Neighbours:
         proven = sealed and self.own_hellos.proofs(number, entries, before)
         refused = hello.boot < boot and not proven
         if not sealed:
-            refused = neighbour is not None and now < before + _CHANGE_S
+            refused = neighbour is not None and now < before + _CHANGE_S * self._settings.slower
         if refused:
             if number >= self._ended.get((src_id, hello.boot), _MOST):
                 # No recording of what was heard: the robot of that start goes on, or what it sent then comes only now.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.gf256 import combine
@@ -33,24 +35,42 @@ class _Hands:
         self.inbox.relayed(Ready(GOAL, ready.order, ready.payload, -1, False, False, 0, 1, True, made=now), now)
 
 
-def test_what_is_known_at_once_is_taken_before_what_waited_for_it() -> None:
-    """The first of the packets that are taken hands on a message of its own robot."""
-    outcomes, hands = Outcomes(), _Hands()
-    inbox = hands.inbox = Inbox(
+def inbox_of(outcomes: Outcomes, relaying: Any = None, **settings: Any) -> Inbox:
+    inbox = Inbox(
         1,
         1,
         1,
         ROOM,
-        Settings(2, packet_len=80),
+        Settings(2, packet_len=80, **settings),
         decoder_for=None,
         marks={},
         outcomes=outcomes,
         control=lambda _: None,
-        relaying=hands,
+        relaying=relaying,
     )
-    inbox.order.told = True
     rows = AnnouncedTopic(ALL, "all", "std_msgs/msg/String", reliable=True), AnnouncedTopic(GOAL, "goal", "x/msg/Y")
     inbox.announced.take(write_table(rows), (0, 0))
+    return inbox
+
+
+@pytest.mark.parametrize(("turn_s", "waits_s"), [(0.01, 60.0), (1.0, 180.0)])
+def test_a_fragment_is_waited_for_longer_where_packets_take_long(turn_s: float, waits_s: float) -> None:
+    outcomes = Outcomes()
+    inbox = inbox_of(outcomes, turn_s=lambda: turn_s)
+    part = v1.Part(GOAL, b"the first half", last=False)
+    inbox.source(1, v1.write_body([part], ROOM).ljust(ROOM, b"\0"), [part], 0, 1.0)
+    inbox.handle_timeout(waits_s)
+    assert inbox.held
+    assert inbox.next_timeout() == pytest.approx(1.0 + waits_s)
+    inbox.handle_timeout(1.0 + waits_s)
+    assert not inbox.held
+
+
+def test_what_is_known_at_once_is_taken_before_what_waited_for_it() -> None:
+    """The first of the packets that are taken hands on a message of its own robot."""
+    outcomes, hands = Outcomes(), _Hands()
+    inbox = hands.inbox = inbox_of(outcomes, hands)
+    inbox.order.told = True
     parts = {1: v1.Part(v1.CARRIED_TOPIC, b"goal"), 2: v1.Part(ALL, b"the first"), 3: v1.Part(ALL, b"the second")}
     bodies = {number: v1.write_body([part], ROOM) for number, part in parts.items()}
     combined = combine([(number, bodies[number]) for number in (2, 1)], 5)

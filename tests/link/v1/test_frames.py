@@ -1,0 +1,28 @@
+"""What coded topics may count on of a channel."""
+
+from __future__ import annotations
+
+import pytest
+
+from gr_ros2.settings.config import SendOptions
+from tests.link.v1.air import Robot, registry
+
+CAMERA, ODOMETRY = range(2)
+
+
+@pytest.mark.parametrize("turn_s", [0.004, 0.1, 1.0])
+def test_the_rate_that_others_leave_is_a_mean_at_any_packet_length(turn_s: float) -> None:
+    topics = registry(camera=SendOptions(), odom=SendOptions(queue="latest"))
+    robot = Robot(1, topics, hears=False, repair="off", turn_s=lambda: turn_s)
+    robot.end.frames.begin(CAMERA)
+    now, free = 0.0, []
+    for turn in range(600):
+        if turn % 4 == 0:
+            robot.end.messages.submit(ODOMETRY, bytes(20), now)
+        robot.slot(now)
+        now += turn_s
+        if turn > 300:
+            free.append(robot.end.frames.progress(CAMERA, now).rate)
+    mean = sum(free) / len(free)
+    assert 0.75 * mean < min(free)
+    assert max(free) < 1.25 * mean
