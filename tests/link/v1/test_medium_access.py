@@ -244,25 +244,42 @@ def team(size: int) -> tuple[list[Robot], list[Slots]]:
     return robots, accesses
 
 
+def strangers(of: Slots, rng: random.Random) -> Junk:
+    """Short packets of robots that nobody knows, each of which wants two slots, four in a slot."""
+
+    def junk(now: float) -> list[bytes]:
+        slot = of.clock.slot(now + SLOT / 2)
+        blocks = [Block(slot % 256, (rng.randrange(2, 60), rng.randrange(2, 60))) for _ in range(4)]
+        heads = [Header(0, True, rng.randrange(100, 200), rng.randrange(1 << 16), block=write_block(b)) for b in blocks]
+        return [write_header(head) + rng.randbytes(12) for head in heads]
+
+    return junk
+
+
 @pytest.mark.parametrize("size", [2, 4])
 def test_what_nobody_can_check_takes_no_more_than_its_own_slots(size: int) -> None:
-    """An outsider takes 4 % of the air: short packets of robots that nobody knows, each of which wants two slots."""
+    """An outsider takes 4 % of the air."""
     rates = {}
     for attacked in (False, True):
         robots, accesses = team(size)
         rng = random.Random(2)
 
-        def junk(now: float, rng: random.Random = rng, of: Slots = accesses[0]) -> list[bytes]:
-            slot = of.clock.slot(now + SLOT / 2)
-            blocks = [Block(slot % 256, (rng.randrange(2, 60), rng.randrange(2, 60))) for _ in range(4)]
-            heads = [
-                Header(0, True, rng.randrange(100, 200), rng.randrange(1 << 16), block=write_block(b)) for b in blocks
-            ]
-            return [write_header(head) + rng.randbytes(12) for head in heads]
-
-        sent = talk(robots, 8.0, 6.0, every=5 * SLOT if attacked else inf, junk=junk)
+        sent = talk(robots, 8.0, 6.0, every=5 * SLOT if attacked else inf, junk=strangers(accesses[0], rng))
         rates[attacked] = len(sent)
         assert all(access.clock.jumps == 0 for access in accesses)
+    assert rates[True] > 0.9 * rates[False]
+
+
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_a_newcomer_gets_in_beside_what_nobody_can_check(size: int) -> None:
+    """An outsider takes a sixth of the slots."""
+    rates = {}
+    for attacked in (False, True):
+        robots, accesses = team(size)
+        newcomer, _ = robot(size + 1, "encrypt")
+        junk = strangers(accesses[0], random.Random(3))
+        sent = talk([*robots, newcomer], 8.0, 10.0, every=6 * SLOT if attacked else inf, junk=junk)
+        rates[attacked] = sum(sender is newcomer for _, sender, _ in sent)
     assert rates[True] > 0.9 * rates[False]
 
 
