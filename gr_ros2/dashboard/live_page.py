@@ -39,6 +39,7 @@ from gr_ros2.dashboard.monitor import RadioView, RunMonitor
 from gr_ros2.dashboard.tables import (
     alarms_html,
     colour,
+    counters_html,
     heard_html,
     packets_html,
     paths_html,
@@ -61,6 +62,8 @@ _SENT, _RECEIVED = "#3b82d6", "#d62728"
 _SOFT = "#7a8a9a"
 """Of lines beside them. Words have the page's own grey, see ``page.js``."""
 _DEFAULT_SNR_DB = 20.0
+_FIRST = {"pdr", "loss", "age"}
+"""Cards that say what they wait for. Who observes one end of a link alone never knows how much is delivered."""
 _SENDS, _SILENT = "stop sending", "sending is off: send again"
 
 
@@ -70,7 +73,9 @@ class PictureCounter(DataModel):  # type: ignore[misc]
     drawn = Int(0)
     seen = Int(0)
     empty = String("")
-    """Cards that have nothing to show, separated by spaces."""
+    """Cards that are hidden since they have nothing to show, separated by spaces."""
+    waits = String("")
+    """Cards that say what they wait for, likewise."""
     old = String("")
     """Cards that show what was received some time ago, likewise."""
     said = String("")
@@ -91,7 +96,7 @@ class LivePage:
         self._style = style = InlineStyleSheet(css=(_TEMPLATES / "parts.css").read_text("utf-8"))
         self._html = {
             name: Div(name=name, stylesheets=[style], sizing_mode="stretch_width", disable_math=True)
-            for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "seen", "packets", "note")
+            for name in ("tiles", "counters", "alarms", "topics", "heard", "team", "paths", "seen", "packets", "note")
         }
         self._sources = {
             name: ColumnDataSource({key: [] for key in columns.split()})
@@ -112,7 +117,7 @@ class LivePage:
                 "loss": "t share",
                 "changes": "t",
                 "strip": "left right robot colour",
-                "places": "x y colour",
+                "places": "x y colour robot",
                 "beliefs": "x y colour",
             }.items()
         }
@@ -149,7 +154,8 @@ class LivePage:
 
     def draw(self, snapshot: Snapshot, radio: RadioView) -> None:
         """Show a snapshot. The caller holds the lock of the document."""
-        self._html["tiles"].text = tiles_html(snapshot, radio.backlog, radio.snr_db)
+        self._html["tiles"].text = tiles_html(snapshot)
+        self._html["counters"].text = counters_html(snapshot, radio.backlog, radio.snr_db)
         self._html["alarms"].text = alarms_html(snapshot)
         self._html["topics"].text = topics_html(snapshot)
         self._html["heard"].text = heard_html(snapshot)
@@ -163,7 +169,9 @@ class LivePage:
             self._draw_team(snapshot.team)
         self._draw_radio(radio)
         self._show_channel(radio)
-        self._counter.empty = " ".join(_empty_cards(snapshot, radio))
+        empty = set(_empty_cards(snapshot, radio))
+        waits = empty & (_FIRST if snapshot.phase == "waiting" else _FIRST - {"pdr"})
+        self._counter.empty, self._counter.waits = " ".join(sorted(empty - waits)), " ".join(sorted(waits))
         self._counter.old = "constellation spectrum" if snapshot.old else ""
         self._counter.said = ". ".join((state_text(snapshot), *snapshot.alarms))
         self._counter.drawn += 1
@@ -256,6 +264,7 @@ class LivePage:
             "x": [place[0] for place in team.places.values()],
             "y": [place[1] for place in team.places.values()],
             "colour": [inks[robot] for robot in team.places],
+            "robot": [str(robot) for robot in team.places],
         }
         known = [
             (team.places[of], believed, inks[of]) for (_, of), believed in team.beliefs.items() if of in team.places
@@ -366,7 +375,15 @@ class LivePage:
         strip.hbar("robot", left="left", right="right", height=0.8, color="colour", source=sources["strip"])
         beliefs = _plot("beliefs", "", "x [m]", "y [m]", match_aspect=True)
         beliefs.multi_line("x", "y", source=sources["beliefs"], color="colour", line_width=3)
-        beliefs.scatter("x", "y", source=sources["places"], color="colour", line_color="white", size=13)
+        beliefs.scatter("x", "y", source=sources["places"], color="colour", line_color="white", size=18)
+        beliefs.text(
+            *("x", "y", "robot"),
+            source=sources["places"],
+            text_color="white",
+            text_font_size="11px",
+            text_align="center",
+            text_baseline="middle",
+        )
         plots = [map_, camera, error, constellation, spectrum, latency, air, snr, loss, strip, beliefs]
         series: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
             ("pdr", "pdr", "share", {"y_range": Range1d(0, 1.1)}),
@@ -392,9 +409,7 @@ class LivePage:
         )
         document = self.document
         document.title = "gr-ros2 · live"
-        texts = [
-            self._html[name] for name in ("tiles", "alarms", "topics", "heard", "team", "paths", "seen", "packets")
-        ]
+        texts = [text for name, text in self._html.items() if name != "note"]
         with document.models.freeze():  # otherwise the document walks through all models for every root
             for root in (*plots, channel, self._pause, *texts):
                 document.add_root(root)
@@ -436,7 +451,7 @@ def _empty_cards(snapshot: Snapshot, radio: RadioView) -> Iterator[str]:
         or any(view.is_map for view in snapshot.pictures),
         "camera": any(not view.is_map for view in snapshot.pictures),
         "error": any(len(path.errors_m) for path in snapshot.paths),
-        "pdr": any(np.isfinite(line.pdr).any() for line in snapshot.series) and snapshot.delivered > 0,
+        "pdr": any(np.isfinite(line.pdr).any() for line in snapshot.series),
         "age": any(topic.age_now_s is not None or topic.age_mean_s is not None for topic in snapshot.topics),
         "queue": any(np.isfinite(line.queued).any() for line in snapshot.series),
         "latency": any(topic.latency_cdf_s for topic in snapshot.topics),
@@ -447,8 +462,7 @@ def _empty_cards(snapshot: Snapshot, radio: RadioView) -> Iterator[str]:
         "snr": snapshot.air is not None and bool(np.isfinite(snapshot.air.snr_db).any()),
         "loss": snapshot.air is not None and bool(np.isfinite(snapshot.air.lost).any()),
     }
-    if snapshot.phase != "waiting":
-        yield from (card for card, filled in has.items() if not filled)
+    yield from (card for card, filled in has.items() if not filled)
 
 
 def _plot(name: str, hover: str, x: str, y: str, **options: Any) -> Any:

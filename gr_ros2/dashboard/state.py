@@ -496,6 +496,8 @@ class DashboardState:
         if message is not None:
             topic.latencies.append(now - message.t_sent)
             topic.age.delivered(message.t_sent, now)
+        elif source is None:  # its sender is not observed: what it has waited there is not known
+            topic.age.delivered(now - event.age_s, now)
         if topic.picture is not None:
             topic.picture.take(event.message, now - event.age_s if message is None else message.t_sent)
         if topic.read_position is not None:

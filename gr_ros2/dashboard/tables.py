@@ -30,22 +30,33 @@ def colour(place: int) -> str:
     return _GREY if place == NO_COLOUR else COLOURS[place % len(COLOURS)]
 
 
-def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) -> str:
-    """The top line: the state of the run and its most important numbers.
-
-    :param backlog: packets between source and antenna
-    :param snr_db: SNR of the received packets, dB
-    """
+def tiles_html(snapshot: Snapshot) -> str:
+    """The top line: is it up, what is lost, what is old, what is the air used for."""
     time = f"{snapshot.elapsed_s:.1f} s" + (f" of {snapshot.duration_s:g} s" if snapshot.duration_s else "")
-    sent_now, received_now = snapshot.packets_now
-    refused = sum(count for name, count in snapshot.packets.items() if name.startswith("rejected_"))
-    phase, age = state_text(snapshot), "old" if snapshot.old else ""
-    ago = f", {snapshot.silent_s:.0f} s ago" if snapshot.old else ""
+    phase, received = state_text(snapshot), "old" if snapshot.old else ""
+    oldest, busy = snapshot.oldest, snapshot.busy_now
+    age = None if oldest is None else oldest.age_now_s
     tiles = [
         _tile("phase", phase, snapshot.name or "no run", css=f"phase {snapshot.phase} {snapshot.verdict}"),
         _tile("elapsed", time, "time"),
         _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, f"main {snapshot.verdict}"),
-        _tile("lost", _share(snapshot.lost_now), "packets lost on the way, last 5 s", snapshot.lost_now, age),
+        _tile("lost", _share(snapshot.lost_now), "packets lost on the way, last 5 s", snapshot.lost_now, received),
+        _tile("oldest", _seconds(age), "age" if oldest is None else f"age of {oldest.name}, the oldest", age),
+        _tile("busy", _share(busy), "of the air used", busy),
+    ]
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def counters_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) -> str:
+    """All other counters.
+
+    :param backlog: packets between source and antenna
+    :param snr_db: SNR of the received packets, dB
+    """
+    sent_now, received_now = snapshot.packets_now
+    refused = sum(count for name, count in snapshot.packets.items() if name.startswith("rejected_"))
+    ago = f", {snapshot.silent_s:.0f} s ago" if snapshot.old else ""
+    tiles = [
         _tile("sent", f"{snapshot.sent:,}", "messages sent", snapshot.sent),
         _tile("delivered", f"{snapshot.delivered:,}", "delivered", snapshot.delivered),
         _tile(
@@ -64,7 +75,7 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
             "–" if snr_db is None else f"{snr_db:.1f} dB",
             f"SNR received{ago}",
             snr_db,
-            age,
+            "old" if snapshot.old else "",
         ),
     ]
     return f'<div class="tiles">{"".join([*tiles, *_repair_tiles(snapshot)])}</div>'
@@ -72,6 +83,10 @@ def tiles_html(snapshot: Snapshot, backlog: int | None, snr_db: float | None) ->
 
 def _share(value: Number) -> str:
     return "–" if value is None else f"{value:.1%}"
+
+
+def _seconds(value: Number) -> str:
+    return "–" if value is None else f"{value:.2f} s"
 
 
 def state_text(snapshot: Snapshot) -> str:

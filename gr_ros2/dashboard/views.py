@@ -242,6 +242,19 @@ class Snapshot:
         return self.silent_s is not None and self.silent_s > SILENT_S
 
     @property
+    def oldest(self) -> TopicView | None:
+        """The topic whose newest delivered message is the oldest, of those that come again and again."""
+        again = [topic for topic in self.topics if topic.age_now_s is not None and topic.delivered > 1]
+        return max(again, key=lambda topic: topic.age_now_s or 0.0, default=None)
+
+    @property
+    def busy_now(self) -> float | None:
+        """Share of the air that packets of all kinds took since the picture before; None where they take none."""
+        if self.air is None or not self.air.busy or not len(self.air.t):
+            return None
+        return float(sum(busy[-1] for busy in self.air.busy.values()))
+
+    @property
     def pdr(self) -> float | None:
         """Delivered / sent, over all topics."""
         return self.delivered / self.sent if self.sent else None

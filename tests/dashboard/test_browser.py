@@ -86,6 +86,16 @@ look(document);
 return pale;
 """
 """Texts with less contrast than WCAG 2 asks of small text."""
+HOLES = """
+const rows = new Map();
+for (const card of document.querySelectorAll("#page > .card, .fold > div > .card")) {
+    if (!card.checkVisibility()) continue;
+    const {top, right} = card.getBoundingClientRect();
+    rows.set(top, Math.max(rows.get(top) ?? 0, right));
+}
+return [...rows.values()].filter(right => right < document.getElementById("page").clientWidth - 20);
+"""
+"""Where rows of cards end before the page does."""
 
 
 class Viewer:
@@ -289,7 +299,9 @@ def test_it_shows_what_repair_does_and_can_be_used_with_a_keyboard_and_a_screen_
             assert ring == ["solid", "3px"], name
             stops.append(name)
         sliders = ["SNR in the sampled band [dB]", "carrier offset [1/1000 of the sample rate]", "packets lost [%]"]
-        assert stops == ["Pause", "stop sending", "noise", *sliders]
+        folds = viewer.text("summary")
+        assert len(folds) == 3
+        assert stops == ["Pause", folds[0], "stop sending", "noise", *sliders, *folds[1:]]
         assert viewer.button("Pause").get_attribute("aria-pressed") == "false"
         viewer.button("Pause").send_keys(Keys.SPACE)
         viewer.wait(lambda: viewer.button("Pause").get_attribute("aria-pressed") == "true", "a pressed toggle")
@@ -335,8 +347,18 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
         viewer.wait(lambda: viewer.phase().startswith("live"), "a state")
         picture("up")
         assert {"1"} <= set(viewer.run(f"{FIND} return found.map(row => row.dataset.robot)", ".heard tr[data-robot]"))
-        for name in ("air", "snr", "path", "channel", "constellation"):
+        for name in ("pdr", "loss", "age", "air", "path", "channel"):
             assert card(name), name
+        assert not card("constellation"), "folded"
+        for fold in viewer.run(f"{FIND} return found", "summary"):
+            fold.click()
+        for name in ("snr", "constellation", "queue"):
+            viewer.wait(lambda name=name: card(name), f"what was folded: {name}")
+        assert viewer.run(HOLES) == []
+        picture("unfolded")
+        viewer.driver.refresh()
+        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "the page again")
+        assert card("constellation"), "as it was left"
         axes = "return Bokeh.documents[0].get_model_by_name(arguments[0]).below[0].axis_label"
         assert viewer.run(axes, "spectrum") == "frequency [kHz]"
         for _ in range(5):

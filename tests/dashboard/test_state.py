@@ -197,6 +197,15 @@ def test_topics_get_the_names_that_their_robot_announces() -> None:
     assert any(path.name == topic.name for path in state.tick(3.0).paths), "its positions are shown from now on"
 
 
+def test_what_comes_of_a_sender_that_is_not_observed_has_an_age() -> None:
+    """At least: for how long it is here and was under way."""
+    state = make()
+    state.receiver_event(Delivered(9, 3, at(1, 2), 0, "key", age_s=0.25), 1.0)
+    (topic,) = [topic for topic in state.tick(4.0).topics if topic.src_id == 9]
+    assert topic.age_now_s == pytest.approx(3.25)
+    assert topic.latency_s is None
+
+
 def test_topics_found_while_the_source_runs_have_their_names_on_the_graph() -> None:
     state = make()
     found = Topic(5, "found", "nav_msgs/msg/Odometry", SendOptions())

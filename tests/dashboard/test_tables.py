@@ -4,9 +4,21 @@ from __future__ import annotations
 
 from html.parser import HTMLParser
 
+import numpy as np
+import pytest
+
 from gr_ros2.dashboard.state import DashboardState
-from gr_ros2.dashboard.tables import colour, heard_html, packets_html, paths_html, team_html, tiles_html, topics_html
-from gr_ros2.dashboard.views import RobotView, Snapshot
+from gr_ros2.dashboard.tables import (
+    colour,
+    counters_html,
+    heard_html,
+    packets_html,
+    paths_html,
+    team_html,
+    tiles_html,
+    topics_html,
+)
+from gr_ros2.dashboard.views import AirView, RobotView, Snapshot
 from gr_ros2.observe.team import PairView, TeamView
 from tests.dashboard.feed import NAMES, REGISTRY, SRC, Feed, at
 
@@ -44,7 +56,8 @@ def snapshot(name: str = "/robot_4/at") -> Snapshot:
 
 def test_what_is_written_is_well_formed_with_data_and_without() -> None:
     for shown in (Snapshot(), snapshot(), snapshot("<script>alert(1)</script>&")):
-        for text in (tiles_html(shown, 3, 12.3), tiles_html(shown, None, None), topics_html(shown), paths_html(shown)):
+        counters = counters_html(shown, 3, 12.3), counters_html(shown, None, None)
+        for text in (tiles_html(shown), *counters, topics_html(shown), paths_html(shown)):
             assert "<script" not in text
             Balanced(text)
         Balanced(packets_html(shown))
@@ -52,11 +65,11 @@ def test_what_is_written_is_well_formed_with_data_and_without() -> None:
 
 def test_the_exact_value_stands_beside_the_rounded_one() -> None:
     shown = snapshot()
-    tiles = Balanced(tiles_html(shown, 3, 12.34)).values
-    assert tiles["sent"] == "40"
+    tiles, counters = Balanced(tiles_html(shown)).values, Balanced(counters_html(shown, 3, 12.34)).values
+    assert counters["sent"] == "40"
     assert tiles["pdr"] == repr(shown.pdr)
-    assert (tiles["backlog"], tiles["snr"]) == ("3", "12.34")
-    unknown = Balanced(tiles_html(shown, None, None)).values
+    assert (counters["backlog"], counters["snr"]) == ("3", "12.34")
+    unknown = Balanced(counters_html(shown, None, None)).values
     assert unknown["backlog"] is unknown["snr"] is None
     assert Balanced(topics_html(shown)).values["sent"] == "20"
 
@@ -74,7 +87,19 @@ def test_colours_repeat_and_strangers_are_grey() -> None:
 
 
 def test_a_link_that_repairs_nothing_says_nothing_of_repair() -> None:
-    assert "repair" not in tiles_html(snapshot(), None, None)
+    assert "repair" not in counters_html(snapshot(), None, None)
+
+
+def test_the_top_line_says_what_is_old_and_what_the_air_is_used_for() -> None:
+    shown = snapshot()
+    values = Balanced(tiles_html(shown)).values
+    oldest = max((topic for topic in shown.topics if topic.age_now_s is not None), key=lambda one: one.age_now_s or 0)
+    assert values["oldest"] == repr(oldest.age_now_s)
+    assert f"age of {oldest.name}, the oldest" in tiles_html(shown)
+    busy = {"new": np.array([0.5, 0.2]), "repair": np.array([0.0, 0.1])}
+    air = AirView(np.array([1.0, 2.0]), busy, np.array([9.0, 9.0]), np.array([0.0, 0.0]))
+    assert float(Balanced(tiles_html(Snapshot(air=air))).values["busy"] or 0) == pytest.approx(0.3)
+    assert Balanced(tiles_html(Snapshot())).values["busy"] is None
 
 
 def test_who_hears_whom_has_a_cell_for_each_pair() -> None:

@@ -18,6 +18,7 @@ const show = () => {
     for (const card of document.querySelectorAll("[data-card]"))
     {
         card.hidden = pulse.empty.split(" ").includes(card.dataset.card);
+        card.classList.toggle("waiting", pulse.waits.split(" ").includes(card.dataset.card));
         card.classList.toggle("old", pulse.old.split(" ").includes(card.dataset.card));
     }
     name();
@@ -32,10 +33,15 @@ const paint = () => {
 };
 
 pulse.connect(pulse.properties.empty.change, show);
+pulse.connect(pulse.properties.waits.change, show);
 pulse.connect(pulse.properties.old.change, show);
 pulse.connect(pulse.properties.said.change, say);
 pause.connect(pause.properties.active.change, name);
 dark.addEventListener("change", paint);
+for (const fold of document.querySelectorAll("details")) {  // as this viewer has left it, also when the next run is shown
+    fold.open = localStorage.getItem(fold.id) === "open";
+    fold.addEventListener("toggle", () => localStorage.setItem(fold.id, fold.open ? "open" : ""));
+}
 show();
 say();
 paint();
