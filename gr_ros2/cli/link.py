@@ -230,6 +230,7 @@ def _live(running: RobotLink) -> LiveRun:
         links=(running.radio,),
         fates=None,
         received_as=running.sink.outputs.heard.name_of,
+        announced=running.sink.outputs.heard.announced,
         alarms=running.same_numbers,
     )
 

@@ -88,6 +88,8 @@ class RunMonitor:
             received_as=run.received_as,
             senders=run.heard,
         )
+        for src_id, name, topic in run.announced():
+            self._state.subscribed(src_id, [(name, topic)])
         self._run = run
         self.refused = ""
 
@@ -178,12 +180,12 @@ class RunMonitor:
         self.refused = ""
         try:
             run = self._run
-            if run is not None and self._state is not None:
-                self._state.changed(run.clock())
             for link in () if run is None else run.links:
                 change(link)
             if run is not None and run.links:
                 run.changed(Change(run.clock(), setting, value))
+                if self._state is not None:
+                    self._state.changed(run.clock())
             if run is not None and not run.links:
                 self.refused = "a run on simulated time has no channel to change"
         except GrRos2Error as error:

@@ -83,12 +83,15 @@ class _Topic:
         self.read_position: PositionReader | None = position_reader(type_name)
         self.picture = newest_picture(type_name)
 
-    def fates(self) -> dict[str, int]:
-        """The ledger fates as far as the events alone show them. An observer of both ends uses the ledger instead."""
+    def fates(self, *, arrives: bool) -> dict[str, int]:
+        """The ledger fates as far as the events alone show them. An observer of both ends uses the ledger instead.
+
+        :param arrives: whether it is seen what arrives
+        """
         whole = {Fate.DELIVERED.value: self.delivered - self.repaired, Fate.REPAIRED.value: self.repaired}
         fates = {fate: count for fate, count in {**whole, **self.ended}.items() if count}
         rest = self.sent - sum(fates.values())
-        return {**fates, Fate.IN_FLIGHT.value: rest} if rest > 0 else fates
+        return {**fates, Fate.IN_FLIGHT.value: rest} if rest > 0 and arrives else fates
 
 
 class _SourceWindow:
@@ -96,6 +99,8 @@ class _SourceWindow:
 
     def __init__(self) -> None:
         self.last_serial = -1
+        self.arrives = False
+        """Whether what arrives of it is seen: not at its own end of a link."""
         self.messages: Tracker[Tracked] = Tracker(UNDER_WAY)
         """Messages on their way, so that a delivery finds its submission."""
 
@@ -220,7 +225,7 @@ class DashboardState:
                 self._changes.append(now - self._start)
 
     def subscribed(self, src_id: int, topics: Iterable[tuple[str, Topic]]) -> None:
-        """Take over what a source in this process subscribes, with absolute names. More may come while it runs."""
+        """Take over what a source's topics are, with absolute names. More may come while it runs."""
         if not self._hears(src_id):
             return
         with self._lock:
@@ -261,7 +266,7 @@ class DashboardState:
             keys = sorted(self._topics)
             if not over and self._start is not None:
                 for key in keys:
-                    self._remember(self._topics[key], now, elapsed, (queued or {}).get(key))
+                    self._remember(key, now, elapsed, (queued or {}).get(key))
                 spent = (self._spent[kind] / self._tick_s for kind in get_args(AirKind))
                 known = (nan if value is None or not here else value for value in (snr_db, lost_now))
                 self._air.append((elapsed, *known, *spent))
@@ -346,12 +351,18 @@ class DashboardState:
         if poor:
             yield "degraded", poor
 
-    def _remember(self, topic: _Topic, now: float, elapsed: float, queued: int | None) -> None:
+    def _whole(self, src_id: int) -> bool:
+        """Whether it is seen both what a sender sends and what arrives of it."""
+        return self._ledger is not None or (src_id in self._sources and self._sources[src_id].arrives)
+
+    def _remember(self, key: Key, now: float, elapsed: float, queued: int | None) -> None:
+        topic = self._topics[key]
         age = topic.age.read(now)
+        pdr = _pdr_now(topic, now) if self._whole(key[0]) else None
         topic.history.append(
             (
                 elapsed,
-                nan if (pdr := _pdr_now(topic, now)) is None else pdr,
+                nan if pdr is None else pdr,
                 topic.delivered_rate.totals(now)[1] / RATE_S,
                 nan if age is None else age[0],
                 nan if queued is None else queued,
@@ -373,7 +384,8 @@ class DashboardState:
         if final is not None:
             return _final_view(place, key, final)
         # The ledger has priority: it has taken every event, also those from before this state was made.
-        fates = topic.fates() if self._ledger is None else dict(ledger.get(key, {}))
+        whole = self._whole(key[0])
+        fates = topic.fates(arrives=whole) if self._ledger is None else dict(ledger.get(key, {}))
         sent, delivered = (
             (topic.sent, topic.delivered) if self._ledger is None else (sum(fates.values()), arrived(fates))
         )
@@ -388,8 +400,8 @@ class DashboardState:
             colour=place,
             sent=sent,
             delivered=delivered,
-            pdr=delivered / sent if sent else None,
-            pdr_now=_pdr_now(topic, now),
+            pdr=delivered / sent if sent and whole else None,
+            pdr_now=_pdr_now(topic, now) if whole else None,
             goodput_Bps=topic.delivered_bytes / seconds if seconds > 0 else None,
             goodput_now_Bps=topic.delivered_rate.totals(now)[1] / RATE_S,
             latency_s=latency(latencies),
@@ -480,6 +492,7 @@ class DashboardState:
         source = self._sources.get(event.src_id)
         message = None
         if source is not None:
+            source.arrives = True
             message = source.messages.find(event)
             if message is not None:
                 source.messages.close(message)

@@ -196,8 +196,8 @@ _GROUPS: tuple[tuple[str, tuple[_Column, ...]], ...] = (
     (
         "messages",
         (
-            ("sent", "sent", lambda topic: topic.sent, _count),
-            ("delivered", "delivered", lambda topic: topic.delivered, _count),
+            ("sent", "sent", lambda topic: topic.sent if topic.goes else None, _count),
+            ("delivered", "delivered", lambda topic: topic.delivered if topic.comes else None, _count),
         ),
     ),
     (
@@ -207,7 +207,7 @@ _GROUPS: tuple[tuple[str, tuple[_Column, ...]], ...] = (
             ("pdr_now", "last 5 s", lambda topic: topic.pdr_now, _ratio),
         ),
     ),
-    ("goodput", (("goodput_Bps", "B/s", lambda topic: topic.goodput_Bps, _count),)),
+    ("goodput", (("goodput_Bps", "B/s", lambda topic: topic.goodput_Bps if topic.comes else None, _count),)),
     ("latency [ms]", tuple((f"latency_{q}", q, _latency(q), _ms) for q in ("p50", "p95", "p99", "max"))),
     (
         "age [s]",

@@ -54,7 +54,7 @@ class TopicNames:
     def _meaning(self, key: Key) -> tuple[str, str]:
         if key in self._said:
             return self._said[key]
-        if key[1] < len(self._registry):
+        if key in self._names and key[1] < len(self._registry):
             topic = self._registry[key[1]]
             return topic.name, topic.type_name
         return "", ""

@@ -58,6 +58,16 @@ class TopicView:
     path_error_m: float | None = None
     rms_error_m: float | None = None
 
+    @property
+    def goes(self) -> bool:
+        """Whether it is known how much is sent: not what other robots send."""
+        return bool(self.sent or not self.delivered)
+
+    @property
+    def comes(self) -> bool:
+        """Whether it is known how much arrives: not at others."""
+        return bool(self.delivered or self.pdr is not None or not self.sent)
+
 
 @dataclass(frozen=True)
 class PathView:
@@ -256,5 +266,7 @@ class Snapshot:
 
     @property
     def pdr(self) -> float | None:
-        """Delivered / sent, over all topics."""
-        return self.delivered / self.sent if self.sent else None
+        """Delivered / sent, over all topics of which both are known."""
+        known = [topic for topic in self.topics if topic.pdr is not None]
+        sent = sum(topic.sent for topic in known)
+        return sum(topic.delivered for topic in known) / sent if sent else None

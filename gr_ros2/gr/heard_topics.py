@@ -21,6 +21,10 @@ class HeardTopics:
         """A robot says what a topic id means."""
         self._announced[key] = topic
 
+    def announced(self) -> list[tuple[int, str, Topic]]:
+        """Source id, absolute name here and meaning of each topic that is announced now."""
+        return [(key[0], self.name(key), topic) for key, topic in list(self._announced.items())]
+
     def name_of(self, src_id: int, name: str) -> str:
         """Absolute name under which a sender's topic comes out, by its name in a registry."""
         named = options_of(name, self._publish.topics, PublishOptions()).as_

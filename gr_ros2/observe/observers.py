@@ -22,7 +22,7 @@ from gr_ros2.observe.result import RunResult
 from gr_ros2.observe.team import TeamView
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import ChannelConfig
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.registry import Registry, Topic
 
 if TYPE_CHECKING:  # they need GNU Radio, and a run in simulated time by packets does not
     from gr_ros2.gr.sending import SendingBlock
@@ -112,6 +112,7 @@ class LiveRun:
     :param team: robots that share a channel, None where none do
     :param received_as: absolute name under which a topic of a sender, by its name in a registry, comes out here; ''
         where the names of ``topics`` are shown
+    :param announced: source id, absolute name here and meaning of each topic that other robots have announced so far
     :param alarms: what is wrong with the robots that are heard, one line each
     :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
     :param changed: told of each change that somebody makes while it runs
@@ -128,6 +129,7 @@ class LiveRun:
     clock: Callable[[], float] = time.monotonic
     team: Callable[[], TeamView] | None = None
     received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
+    announced: Callable[[], Sequence[tuple[int, str, Topic]]] = tuple
     alarms: Callable[[], Sequence[str]] = tuple
     heard: frozenset[int] | None = None
     changed: Callable[[Change], None] = lambda _: None

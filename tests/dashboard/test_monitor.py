@@ -11,6 +11,9 @@ pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
 
 from gr_ros2.core.errors import RunError
 from gr_ros2.dashboard.monitor import RunMonitor
+from gr_ros2.link.events import Delivered
+from gr_ros2.observe.observers import LiveRun
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
 from tests.waiting import wait_for
@@ -61,8 +64,24 @@ def test_a_run_is_seen_changed_and_ends_with_its_result() -> None:
         ("channel.frequency_offset", 0.001),
         ("channel.packet_loss", 1.0),
     ], "what was refused was not changed"
+    assert monitor.snapshot.air is not None
+    assert len(monitor.snapshot.air.changes) == len(changes), "nor is it marked"
     times = [change.t for change in changes if change.t is not None]
     assert 0 < times[0] <= times[1] <= times[2] < 4
+
+
+def test_a_page_that_is_opened_late_knows_what_others_have_announced() -> None:
+    monitor = RunMonitor()
+    announced = (9, "/rx_robot_9/cmd_vel", Topic(0, "cmd_vel", "geometry_msgs/msg/Twist"))
+    own = Registry.from_rows({"odom": "nav_msgs/msg/Odometry"})
+    monitor.run_started(
+        LiveRun("late", 0.0, 64, own, {(1, 0): "/robot_1/odom"}, {}, (), None, announced=lambda: (announced,))
+    )
+    monitor.receiver_event(Delivered(9, 0, bytes(8), 0, "key"), 1.0)
+    assert [(topic.name, topic.type_name) for topic in monitor.tick().topics] == [
+        ("/robot_1/odom", "nav_msgs/msg/Odometry"),
+        ("/rx_robot_9/cmd_vel", "geometry_msgs/msg/Twist"),
+    ]
 
 
 def test_a_phy_without_samples_says_so_and_can_still_lose() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import re
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -206,6 +207,23 @@ def test_what_comes_of_a_sender_that_is_not_observed_has_an_age() -> None:
     assert topic.latency_s is None
 
 
+def test_one_end_of_a_link_does_not_say_what_arrives_of_what_it_sends() -> None:
+    """It sends to others, and hears others: 1 of 1 would be of different topics."""
+    state = make()
+    state.sender_event(SRC, Accepted(0, 0, at(1, 2), 1.0))
+    state.receiver_event(Delivered(9, 0, at(1, 2), 0, "key"), 1.0)
+    for shown in (state.tick(1.0), state.tick(2.0)):
+        own, other = (next(topic for topic in shown.topics if topic.src_id == src_id) for src_id in (SRC, 9))
+        assert (own.sent, other.delivered) == (1, 1)
+        assert (own.goes, own.comes, other.goes, other.comes) == (True, False, False, True)
+        assert own.pdr is own.pdr_now is other.pdr is shown.pdr is None
+        assert not own.ledger
+        assert np.isnan(shown.series[0].pdr).all()
+        assert other.name == "/source_9/topic_0", (
+            "what an id of another robot means does not stand in this one's registry"
+        )
+
+
 def test_topics_found_while_the_source_runs_have_their_names_on_the_graph() -> None:
     state = make()
     found = Topic(5, "found", "nav_msgs/msg/Odometry", SendOptions())
@@ -352,6 +370,6 @@ def test_a_dead_link_comes_before_a_late_computer_and_after_the_run_its_share_de
         shown = state.tick(step / 4, late_s=0.06)
     assert shown.state == "down"
     assert "no robot has been heard" in shown.alarms[0]
-    assert Snapshot(phase="ended", sent=10, delivered=0).verdict == "down"
-    assert Snapshot(phase="ended", sent=10, delivered=8).verdict == "degraded"
-    assert Snapshot(phase="ended", sent=10, delivered=10).verdict == "up"
+    for delivered, verdict in ((0, "down"), (8, "degraded"), (10, "up")):
+        topic = replace(shown.topics[0], sent=10, delivered=delivered, pdr=delivered / 10)
+        assert Snapshot(phase="ended", topics=(topic,)).verdict == verdict
