@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +20,6 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("selenium", reason="needs selenium")
 
 from selenium import webdriver
-from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.keys import Keys
 
 from gr_ros2.middleware import Qos
@@ -30,28 +28,11 @@ from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.settings.files import REGISTRY_DIR
 from gr_ros2_lab.record.result import Result, read_result
+from tests.browser import FIND, Browser, needed
 from tests.domains import free_domains
 from tests.waiting import PATIENCE_S, wait_for
 
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = pytest.mark.skipif(
-    not (CHROMIUM and DRIVER), reason="no chromium or chromedriver; Debian: apt-get install chromium chromium-driver"
-)
-
-FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--window-size=1500,1600"),
-)
-FIND = """
-const found = [], selector = arguments[0];
-const look = root => {
-    found.push(...root.querySelectorAll(selector));
-    for (const node of root.querySelectorAll("*")) if (node.shadowRoot) look(node.shadowRoot);
-};
-look(document);
-"""
-"""Bokeh's models live in shadow roots."""
-
+pytestmark = needed
 
 FOCUSED = """
 let node = document.activeElement;
@@ -98,18 +79,8 @@ return [...rows.values()].filter(right => right < document.getElementById("page"
 """Where rows of cards end before the page does."""
 
 
-class Viewer:
-    """One browser."""
-
-    def __init__(self, profile: Path) -> None:
-        options = webdriver.ChromeOptions()
-        options.binary_location = CHROMIUM
-        for flag in (*FLAGS, f"--user-data-dir={profile}"):
-            options.add_argument(flag)
-        self.driver = webdriver.Chrome(options=options, service=Service(DRIVER))
-
-    def run(self, script: str, *arguments: Any) -> Any:
-        return self.driver.execute_script(script, *arguments)
+class Viewer(Browser):
+    """A browser that looks at a dashboard."""
 
     def numbers(self, selector: str = ".tile b") -> dict[str, float]:
         """``data-value`` by ``data-field``."""
@@ -168,16 +139,8 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
 
 @pytest.fixture
 def viewer(browser: Viewer) -> Iterator[Viewer]:
-    """The browser with a window of the test's own."""
-    driver = browser.driver
-    (first,) = driver.window_handles
-    driver.switch_to.new_window("window")
-    driver.get_log("browser")  # what other tests have left there
-    yield browser
-    for handle in set(driver.window_handles) - {first}:
-        driver.switch_to.window(handle)
-        driver.close()
-    driver.switch_to.window(first)
+    with browser.window():
+        yield browser
 
 
 @contextmanager

@@ -7,6 +7,7 @@ finished one.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
@@ -54,8 +55,8 @@ def write_sweep(plan: SweepPlan, results: Results, failures: Sequence[str], fold
 
 
 _INTERVALS = (
-    "In brackets and as bars: 95 % intervals, of the PDR by Wilson over all messages of a cell, of other numbers by "
-    "Student over its runs."
+    "In brackets, after ± and as bars: 95 % intervals, of the PDR by Wilson over all messages of a cell, of other "
+    "numbers by Student over its runs."
 )
 
 
@@ -68,6 +69,7 @@ def summary_grid(plan: SweepPlan, found: Sequence[Summary], shown: Sequence[str]
     several = len(topics) > 2  # with one topic, "all topics" says the same
     lines: dict[int, list[tuple[str, ...]]] = {}
     first = next((summary.topic for summary in found), "")
+    columns = [_Column.of(name, [summary.numbers[name] for summary in found]) for name in shown]
     for summary in found:
         if several or summary.topic == first:
             lines.setdefault(summary.cell.number, []).append(
@@ -76,10 +78,10 @@ def summary_grid(plan: SweepPlan, found: Sequence[Summary], shown: Sequence[str]
                     *([summary.topic] if several else []),
                     str(summary.runs),
                     str(summary.sent),
-                    *(_estimate(name, summary.numbers[name]) for name in shown),
+                    *(column.cell(summary.numbers[name]) for name, column in zip(shown, columns, strict=True)),
                 )
             )
-    headings = (*plan.keys, *(["topic"] if several else []), "runs", "sent", *(VALUES[name] for name in shown))
+    headings = (*plan.keys, *(["topic"] if several else []), "runs", "sent", *(one.heading for one in columns))
     sections = [tuple(cell) for cell in lines.values()]
     if not several:
         sections = [tuple(line for section in sections for line in section)]
@@ -99,11 +101,42 @@ def _draw(plan: SweepPlan, found: Sequence[Summary], folder: Path) -> tuple[list
     return pictures, notes
 
 
-def _estimate(name: str, estimate: Estimate | None) -> str:
-    form = "{:.3f}" if name == PDR else "{:.4g}"
-    if estimate is None or estimate.low is None or estimate.high is None:
-        return number(None if estimate is None else estimate.value, form)
-    return f"{form.format(estimate.value)} [{form.format(estimate.low)}, {form.format(estimate.high)}]"
+@dataclass(frozen=True)
+class _Column:
+    """How a number of ``VALUES`` is written: with the unit and the digits that its largest value needs.
+
+    :param unit: what it is divided by
+    """
+
+    heading: str
+    unit: float
+    form: str
+    around: bool = True
+    """Whether an interval is as long on both sides."""
+
+    @classmethod
+    def of(cls, name: str, estimates: Sequence[Estimate | None]) -> _Column:
+        label = VALUES[name]
+        if name == PDR:
+            return cls(label, 1.0, "{:.3f}", around=False)
+        largest = max((abs(one.value) for one in estimates if one is not None), default=0.0)
+        for unit, factor, fits in (("B/s", 1e3, largest >= 1e3), ("s", 1e-3, largest < 1)):
+            if fits and label.endswith(f" [{unit}]"):
+                prefix = "k" if factor > 1 else "m"
+                label, largest = label.replace(f"[{unit}]", f"[{prefix}{unit}]"), largest / factor
+                break
+        else:
+            factor = 1.0
+        digits = 0 if largest >= 1000 else 1 if largest >= 10 else 3
+        return cls(label, factor, f"{{:.{digits}f}}")
+
+    def cell(self, estimate: Estimate | None) -> str:
+        if estimate is None or estimate.low is None or estimate.high is None:
+            return number(None if estimate is None else estimate.value / self.unit, self.form)
+        value, low, high = (self.form.format(one / self.unit) for one in (estimate.value, estimate.low, estimate.high))
+        if not self.around:
+            return f"{value} [{low}, {high}]"
+        return f"{value} ± {self.form.format((estimate.high - estimate.low) / 2 / self.unit)}"
 
 
 def _plain(value: object) -> str:
