@@ -37,7 +37,9 @@ examples: setup-dev
 grc: setup
 	tools/install-system window
 	$(BIN)/gr-ros2 grc-path --install
-	gnuradio-companion gr_ros2/examples/first_link.grc
+	mkdir -p results && cp gr_ros2/examples/first_link.grc results/
+	GR_CONF_GRC_XTERM_EXECUTABLE="$$(command -v x-terminal-emulator || command -v xterm)" \
+		gnuradio-companion results/first_link.grc
 
 wheel: setup
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-release.txt

@@ -18,6 +18,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.airtime import AirtimeGate
+from gr_ros2.phy.burst_blocks import BurstSink
 from gr_ros2.phy.channel import PacketLoss
 from gr_ros2.phy.flowgraph import HierBlock
 from gr_ros2.phy.path import PacketPath
@@ -46,6 +47,8 @@ class Radio(PacketPath, HierBlock):
     :param changeable: add a channel that can be changed while running, if the front end has no radio
     :param instrumented: add parts for a dashboard: a channel that can be changed, and taps for spectrum and
         constellation
+    :param shows: have two further ports for a window, where the PHY has samples: the received signal, a complex
+        stream, and `points`, the constellation, a message port on which burst PHYs send
     :raises ConfigError: for a channel that this PHY or front end cannot have, or a recording without samples
     :raises RadioError: when the recording cannot be written
     """
@@ -62,8 +65,13 @@ class Radio(PacketPath, HierBlock):
         admits: Callable[[bytes], bool] | None = None,
         changeable: bool = False,
         instrumented: bool = False,
+        shows: bool = False,
     ) -> None:
-        super().__init__("gr_ros2_radio", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
+        self._shows = shows and phy.has_samples
+        signal = gr.io_signature(1, 1, gr.sizeof_gr_complex) if self._shows else gr.io_signature(0, 0, 0)
+        super().__init__("gr_ros2_radio", gr.io_signature(0, 0, 0), signal)
+        if shows:
+            self.message_port_register_hier_out("points")
         for register in (self.message_port_register_hier_in, self.message_port_register_hier_out):
             register("pdus")
         self.message_port_register_hier_out("credit")
@@ -129,6 +137,10 @@ class Radio(PacketPath, HierBlock):
         heard = self._receive(front_end.source, faded=faded, shown=instrumented)
         if front_end.clock_offset is not None and self._receiver is not None:
             self._receiver.follow_clock(front_end.clock_offset)
+        if self._shows:
+            self.connect(heard, self)
+            if isinstance(self._receiver, BurstSink):
+                self.msg_connect(self._receiver, "points", self, "points")
         if record:
             frequency = front_end.receive_frequency
             about = SigmfRecording(
@@ -228,6 +240,7 @@ def make_radio(
     airtime_limit: str | Mapping[str, Any] = "",
     robot_id: int | Auto = AUTO,
     state: str = "",
+    shows: bool = False,
     **options: Any,
 ) -> Radio:
     """Make a radio from the names of its parts, as GRC does.
@@ -246,6 +259,7 @@ def make_radio(
         :class:`gr_ros2.settings.airtime.AirtimeConfig`; '' = no limit
     :param robot_id: with ``airtime_limit``: the robot whose account this is, as for its link
     :param state: with ``airtime_limit``: that robot's state file, beside which the account is; '' = the usual one
+    :param shows: see :class:`Radio`
     :param options: settings of the front end
     :raises ConfigError: for an unknown name or setting, or a value out of range; for a radio that nobody has allowed
         to send
@@ -273,6 +287,7 @@ def make_radio(
             listens=limits.listen_before_send and sends,
             admits=SealedOnly(kind, options) if kind.asks(options) and not open else None,
             changeable=channel is not None,
+            shows=shows,
         )
         radio.closing = undo.pop_all()
         return radio

@@ -76,6 +76,14 @@ def description(name: str) -> dict[str, Any]:
     return loaded
 
 
+def test_the_first_example_fits_one_screen() -> None:
+    loaded = yaml.safe_load(example(f"{WITH_WINDOW}.grc").read_text())
+    assert len(loaded["blocks"]) <= 9
+    places = [block["states"]["coordinate"] for block in loaded["blocks"]]
+    assert max(x for x, _ in places) < 1000
+    assert max(y for _, y in places) < 700
+
+
 @pytest.mark.parametrize("path", DESCRIPTIONS, ids=lambda path: path.name)
 def test_it_passes_grcs_own_check(path: Path) -> None:
     loaded = yaml.safe_load(path.read_text())
@@ -441,7 +449,7 @@ def test_an_example_compiles_and_carries_messages(path: Path, platform: Platform
 
 
 @pytest.mark.slow
-def test_the_first_example_shows_its_robots_topics_and_what_the_sliders_do(tmp_path: Path) -> None:
+def test_the_first_example_shows_its_robots_topics_and_what_the_slider_does(tmp_path: Path) -> None:
     """In a process of its own: what is left of Qt's windows crashed the tests that came after it."""
     pytest.importorskip("PyQt5", reason="needs PyQt5, which comes with Debian's GNU Radio")
     environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen", "XDG_RUNTIME_DIR": str(tmp_path)}

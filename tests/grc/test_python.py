@@ -72,7 +72,9 @@ def on_own_domains(name: str, home: Path) -> tuple[Path, list[int]]:
     path = home / name
     text = example(name).read_text()
     for ours, number in zip(("'41'", "'42'"), domains, strict=True):
-        text = text.replace(f"value: {ours}", f"value: '{number}'")
+        text = text.replace(f"value: {ours}", f"value: '{number}'").replace(
+            f"domain_id: {ours}", f"domain_id: '{number}'"
+        )
     path.write_text(text)
     return path, domains
 
