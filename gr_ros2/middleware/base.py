@@ -203,10 +203,15 @@ class Middleware(Closing, ABC):
         if first:
             _log.log(level, "%s (counted as %s, not logged again)", text, key)
 
-    def count_once(self, key: str, text: str) -> None:
-        """Count a lasting condition, such as incompatible endpoints, only the first time."""
+    def count_once(self, key: str, text: str, *, alike: bool = False) -> None:
+        """Count a lasting condition, such as incompatible endpoints, only the first time.
+
+        :param alike: of all keys that are the same up to a colon, the first one says it all, and it alone is a warning
+        """
         if key not in self.counters:
-            self.count(key, text)
+            kind = key.partition(":")[0] + ":"
+            told = alike and any(other.startswith(kind) for other in list(self.counters))
+            self.count(key, text, level=logging.DEBUG if told else logging.WARNING)
 
     def count_lost(self, subscription: Subscription, topic: str, text: str, n: int = 1) -> None:
         """Count messages that a subscription will not receive, from any thread."""

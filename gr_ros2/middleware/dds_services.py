@@ -137,8 +137,8 @@ class DdsServer(_DdsEnd, ServiceServer):
             if on:
                 self._participant.make_pair(self)
             else:
-                text = f"{self.name}: not offered, since every node here {OTHER_RMW}"
-                self._participant.count_once(f"not_offered:{self.name}", text)
+                text = f"{self.name} and all other services: not offered, since every node here {OTHER_RMW}"
+                self._participant.count_once(f"not_offered:{self.name}", text, alike=True)
                 self._participant.drop_pair(self)
 
     def service(self) -> None:

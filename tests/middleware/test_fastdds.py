@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import shutil
 import subprocess
@@ -250,22 +251,26 @@ def test_clients_and_servers_of_fast_dds_are_refused_by_name(
 
 
 def test_no_service_is_offered_where_every_node_would_wait_in_vain(
-    middleware: DdsMiddleware, peer: Callable[..., Peer]
+    middleware: DdsMiddleware, peer: Callable[..., Peer], caplog: pytest.LogCaptureFixture
 ) -> None:
     """A node of Fast DDS that finds a server expects an answer."""
-    server = middleware.serve("/served", ADD, lambda *_: None)
+    server, other = (middleware.serve(name, ADD, lambda *_: None) for name in ("/served", "/other"))
     names = (ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
     with DdsMiddleware(domain_id=domain(2), node_name="link") as another_link:  # no node of ROS
         wait_for(lambda: "/served" in another_link.discover_services(), "the service")
         node = peer("pub", "", Qos("reliable", "transient_local", 1), names=names)
         wait_for(lambda: "/served" not in another_link.discover_services(), "the service to go")
+        wait_for(lambda: "not_offered:/other" in middleware.counters, "the other one to go")
         assert middleware.counters["not_offered:/served"] == 1
+        warned = [record for record in caplog.records if "not_offered" in record.getMessage()]
+        assert [record.levelname for record in warned if record.levelno >= logging.WARNING] == ["WARNING"]
         later = middleware.serve("/later", ADD, lambda *_: None)
         client = peer("pub", "", RELIABLE, names=ros_graph.dds_service("/later", ADD)[0])
         assert not client.matched
         node.close()
         wait_for(lambda: {"/served", "/later"} <= another_link.discover_services().keys(), "both, without that node")
     server.close()
+    other.close()
     later.close()
 
 
