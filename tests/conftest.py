@@ -18,8 +18,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from gr_ros2_lab.record.result import Result
 from tests import domains
+from tests.company import pytest_runtest_makereport, pytest_runtest_protocol  # noqa: F401
 from tests.lab.record.results import RESULT
-from tests.outcomes import pytest_addoption, pytest_configure, pytest_xdist_make_scheduler  # noqa: F401
+from tests.outcomes import (  # noqa: F401
+    pytest_addoption,
+    pytest_configure,
+    pytest_runtest_logreport,
+    pytest_xdist_make_scheduler,
+)
 
 # Helpers that assert say what they saw, as tests do.
 pytest.register_assert_rewrite("tests.e2e.support", "tests.middleware.support", "tests.waiting")

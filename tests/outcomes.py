@@ -1,18 +1,22 @@
 """Pytest plugin: what became of every test, in a file; and a worker that crashed has a successor that ends.
 
 Invariant: the file is written line by line, so it says as much as was known when a run is killed. A line is one word
-and a test, as it is named on the command line: `collected`, then `passed`, `skipped`, `failed` or `crashed`. A test
-that passes and cannot be cleaned up behind itself has two lines. `tools/repeat-failed` reads it.
+and a test, as it is named on the command line: `collected`, then `passed`, `skipped`, `late` (see `tests/company.py`),
+`failed` or `crashed`. A test that passes and cannot be cleaned up behind itself has two lines. `tools/repeat-failed`
+reads it.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.company import LATE
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -66,6 +70,8 @@ class Outcomes:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.when == "???":  # as xdist reports a worker that has ended
             self._write("crashed", report.nodeid)
+        elif LATE in dict(report.user_properties):
+            self._write("late", report.nodeid)
         elif report.when == "call" or report.outcome != "passed":
             self._write(report.outcome, report.nodeid)
 
@@ -80,5 +86,16 @@ class Outcomes:
                 self._write("collected", name)
 
     def _write(self, word: str, name: str) -> None:
-        name = re.sub(r"@\w+$", "", name)  # the group, which xdist appends
-        self._file.write(f"{word} {name}\n")
+        self._file.write(f"{word} {_pasted(name)}\n")
+
+
+def _pasted(name: str) -> str:
+    """The name of a test as pytest takes it, without the group that xdist appends."""
+    return re.sub(r"@\w+$", "", name)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """What the terminal shows can be pasted."""
+    if not os.environ.get("PYTEST_XDIST_WORKER"):
+        report.nodeid = _pasted(report.nodeid)

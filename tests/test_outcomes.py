@@ -13,13 +13,19 @@ from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parent.parent
 TOOL = ROOT / "tools" / "repeat-failed"
-PYTEST = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "xdist.plugin"]
+PYTEST = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "xdist.plugin", "-W", "ignore"]
 BARE = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
 """Runs of a few empty tests need no other plug-in, and each of five processes would load them all."""
 CONFTEST = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
-from tests.outcomes import pytest_addoption, pytest_configure, pytest_xdist_make_scheduler
+from tests.company import pytest_runtest_makereport, pytest_runtest_protocol
+from tests.outcomes import (
+    pytest_addoption,
+    pytest_configure,
+    pytest_runtest_logreport,
+    pytest_xdist_make_scheduler,
+)
 """
 BEGIN = """
 import os, signal
@@ -73,6 +79,35 @@ def test_three_are_too_many_though_each_would_pass_alone(tmp_path: Path) -> None
     assert status == 1
     assert said[:-1] == [f"failed: test_it.py::test_flaky_{n} failed" for n in range(3)]
     assert said[-1] == "20 passed, 3 failed"
+
+
+BESIDE = """
+import subprocess, sys, time
+def beside_others():
+    flag, other = (Path(__file__).with_name(name) for name in ("flag", "other.py"))
+    flag.touch()
+    text = "import os, time; end = time.time() + 30\\nwhile os.path.exists(%r) and time.time() < end: pass"
+    other.write_text(text % str(flag))
+    subprocess.run(["sh", "-c", f"setsid {sys.executable} {other} &"], check=True)  # nobody's child
+    time.sleep(1)
+    flag.unlink()
+"""
+LATE = """
+@pytest.mark.real_time
+def test_late_{0}():
+    if once('late_{0}'):
+        beside_others()
+        assert 0, "too late"
+"""
+
+
+@pytest.mark.slow
+def test_what_fails_in_real_time_beside_other_programs_is_late_and_repeated_alone(tmp_path: Path) -> None:
+    status, said = judged(tmp_path, BESIDE + GROUPED + LATE.format(0))
+    assert (status, said) == (
+        0,
+        ["repeated: test_it.py::test_late_0 was late beside other tests, and passed alone", "21 passed, 0 failed"],
+    )
 
 
 @pytest.mark.slow

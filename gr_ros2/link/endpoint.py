@@ -210,7 +210,7 @@ class HeardRobot:
     :param snr_db: SNR of its newest packets, dB; None if it is not measured packet by packet
     :param loss: share of its packets that were lost lately, 0..1
     :param lost: packets of it that were lost since it was first heard, repaired or not
-    :param topics: number of topics and services that it has announced
+    :param topics: number of topics that it has announced, without its services
     :param hops: robots that have sent its newest message on; 0 where it is heard itself
     :param over: where it is not heard: the neighbour over which it is reached, None if no way is known
     :param doubled: two robots send under its number, or a recording of an earlier start is on the air

@@ -229,7 +229,7 @@ class EndpointV1:
                 neighbour.inbox.reports.snr.snr_db,
                 neighbour.inbox.reports.loss,
                 self.received.missed[neighbour.src_id],
-                len(neighbour.inbox.announced.topics),
+                sum("/msg/" in row.type_name for row in neighbour.inbox.announced.topics.values()),
                 doubled=self.neighbours.doubled(neighbour.src_id, now),
                 no_table=self.neighbours.lacks_table(neighbour, now),
             )

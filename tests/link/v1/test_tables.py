@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from gr_ros2.link.events import Announced
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import Part
 from tests.link.v1.air import Air, Robot, registry
@@ -152,3 +153,16 @@ def test_fragments_join_however_they_are_cut_and_in_whatever_order(data: st.Data
     assert whole.payload() == message
     assert whole.order == whole.newest
     assert reassembly.held == 0
+
+
+def test_a_peer_has_as_many_topics_as_a_person_counts() -> None:
+    """Services and the row of their calls are in the table, too."""
+    kinds = ("odom", "std_msgs/msg/String"), ("add", "example_interfaces/srv/AddTwoInts"), ("calls", CALLS_TYPE)
+    one = Robot(1, Registry([Topic(n, *kind) for n, kind in enumerate(kinds)]))
+    two = Robot(2)
+    for topic_id in (1, 2):
+        one.end.messages.offer(topic_id, offered=True)
+    air = Air(one, two)
+    air.run(3.0, lambda: len(rows(two)) == 3)
+    (peer,) = two.end.peers(air.now)
+    assert (len(rows(two)), peer.topics) == (3, 1)
