@@ -170,7 +170,7 @@ def _verdict(forecast: Forecast) -> str:
         fits = "it fits"
     per_message = _number(forecast.air_bytes_per_message, 1, ".0f")
     air = "of the air" if forecast.allowed == 1 else f"of the {forecast.allowed:.0%} of the air that may be used"
-    alone = f"New messages alone need {forecast.load:.0%} {air}: {fits}"
+    alone = f"New messages in packets of their own need {forecast.load:.0%} {air}: {fits}"
     return f"{alone}. {per_message} bytes on the air per message delivered."
 
 
