@@ -121,8 +121,8 @@ def test_who_sends_alone_is_heard_and_who_send_together_collide(medium: Start, t
         wait_for(lambda: one.silent, "silence")
 
         def collide() -> bool:
-            """Both say 20 messages; whether fewer than half of the packets come. A busy computer may let one speak
-            first."""
+            """Both say 20 messages; whether many packets do not come, though nothing but the other's is in their way. A
+            busy computer may let one speak first, and what is lost is repaired."""
             before, taken = packets(), one.taken() + two.taken()
             for number in range(20):
                 one._chat.publish(message(number, 400))
@@ -130,14 +130,14 @@ def test_who_sends_alone_is_heard_and_who_send_together_collide(medium: Start, t
             wait_for(lambda: one.taken() + two.taken() == taken + 40, "the links to take all")
             wait_for(lambda: one.silent and two.silent, "all to be sent")
             sent, came = (now - then for now, then in zip(packets(), before, strict=True))
-            return came < sent / 2
+            return sent - came > 10
 
         def packets() -> tuple[int, int]:
             """Sent and received by both."""
             counts = [robot.link.stats()["packets"] for robot in (one, two)]
             return sum(each["out"] for each in counts), sum(each["in"] for each in counts)
 
-        wait_for(collide, "most packets to collide")
+        wait_for(collide, "packets to collide")
     process.send_signal(signal.SIGINT)
     assert process.wait() == 0
     assert process.stdout is not None
@@ -198,9 +198,8 @@ def test_nobody_waits_for_a_robot_that_sends_and_never_answers_the_time(
     assert named.startswith("medium: robot 2: ")
 
 
-def test_a_medium_that_was_frozen_itself_goes_on_waiting_for_its_robots(
-    process: MediumProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_medium_that_was_frozen_itself_goes_on_waiting_for_its_robots(process: MediumProcess, tmp_path: Path) -> None:
+    """Its clock does not go back at the end, as it would if it was patched for the test alone."""
     left, slept = [5], [0.0]
     clock, take = process._clock, process._take
 
@@ -210,8 +209,7 @@ def test_a_medium_that_was_frozen_itself_goes_on_waiting_for_its_robots(
 
     with Robot(1, front_end(tmp_path, 1), hears=(2,)), Robot(2, front_end(tmp_path, 2), hears=(1,)):
         wait_for(lambda: process.robots == 2, "both robots")
-        monkeypatch.setattr(process, "_clock", lambda: clock() + slept[0])
-        monkeypatch.setattr(process, "_take", freeze)
+        vars(process).update(_clock=lambda: clock() + slept[0], _take=freeze)
         wait_for(lambda: not left[0], "the jumps")
         after = process.now
         wait_for(lambda: process.now > after + 0.2, "the time to go on")
