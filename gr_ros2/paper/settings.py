@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
@@ -39,7 +39,7 @@ _WITHOUT = (
 _WHY = "the paper's blocks have no such setting; leave it out"
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, use_attribute_docstrings=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class PaperConfig:
     """What the paper's blocks have, ROS Source and ROS Sink, which speak version 0 (sections 4.3 and 4.4)."""
 

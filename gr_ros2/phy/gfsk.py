@@ -32,12 +32,10 @@ _DESIGN_NOISE = 0.1
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class GfskOptions(LinearOptions):
-    """Settings of this PHY beside packet length and sample rate, and those of every burst PHY.
-
-    :param bt: bandwidth-time product of the Gaussian filter, 0.3..1; smaller is narrower and needs more SNR
-    """
+    """Settings of this PHY beside packet length and sample rate, and those of every burst PHY."""
 
     bt: Annotated[float, Field(ge=0.3, le=1, title="Bandwidth-time product")] = 0.5
+    """bandwidth-time product of the Gaussian filter, 0.3..1; smaller is narrower and needs more SNR"""
 
 
 class GfskModem(LinearModem):

@@ -214,12 +214,10 @@ class LinearModem(BurstModem):
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class LinearOptions(BurstOptions):
-    """Settings that every single-carrier PHY has.
-
-    :param sps: samples per symbol, with one bit per symbol samples per bit
-    """
+    """Settings that every single-carrier PHY has."""
 
     sps: Annotated[int, Field(ge=2, le=64, title="Samples per symbol")] = 4
+    """samples per symbol, with one bit per symbol samples per bit"""
 
 
 class LinearPhy(BurstPhy):

@@ -60,32 +60,27 @@ _SDR_GAP, _SDR_LEAST_GAP = 32, 24
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class LoraOptions(BurstOptions):
-    """Settings of this PHY beside packet length and sample rate, and those of every burst PHY.
-
-    :param spreading_factor: bits per symbol of 2^this samples, 7..12; each step more takes about twice the time and
-        2.5 dB less SNR
-    :param coding_rate: check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word, 1 and 2 none
-    :param implementation: ``own``, or ``lora_sdr`` = the frames of LoRa modems, by the GNU Radio module gr-lora_sdr,
-        which has to be installed. Neither understands the other, so it is chosen by name, the same at both ends, and
-        never by what is installed
-    :param gap: zero samples after each packet, up to 100000; auto = 32, with ``lora_sdr`` 32 chips. Below 16, with
-        ``lora_sdr`` 24 chips, the receiver would keep the last packet waiting for the next
-    :param oversampling: ``lora_sdr`` only: samples per chip, 2, 4 or 8; auto = 2. With 1 the module loses packets that
-        come half a sample late; symbols of more than 2048 samples (factor 11 with 2) make it crash and are refused
-    :param sync_word: ``lora_sdr`` only: of the network, 0x11..0xff, no nibble 0; auto = 0x12, private networks
-    :param ldro: ``lora_sdr`` only: low data rate optimisation, two bits fewer per symbol; LoRa modems turn it on where
-        a symbol takes more than 16 ms; auto = off
-    :param carrier_hz: ``lora_sdr`` only: the radio's carrier frequency, 1e6..4.2e9 Hz, by which the module tells how
-        much the clocks differ; null = it takes them to be alike
-    """
+    """Settings of this PHY beside packet length and sample rate, and those of every burst PHY."""
 
     spreading_factor: Annotated[int, Field(ge=7, le=12, title="Spreading factor (bits/symbol)")] = 7
+    """bits per symbol of 2^this samples, 7..12; each step more takes about twice the time and 2.5 dB less SNR"""
     coding_rate: Annotated[int, Field(ge=1, le=4, title="Coding rate (check bits per 4 bits)")] = 4
+    """check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word, 1 and 2 none"""
     implementation: Literal["own", "lora_sdr"] = "own"
+    """``own``, or ``lora_sdr`` = the frames of LoRa modems, by the GNU Radio module gr-lora_sdr, which has to be
+    installed. Neither understands the other, so it is chosen by name, the same at both ends, and never by what is
+    installed"""
     oversampling: Annotated[Literal[2, 4, 8] | Auto, Field(title="Oversampling (samples/chip)")] = AUTO
+    """``lora_sdr`` only: samples per chip, 2, 4 or 8; auto = 2. With 1 the module loses packets that come half a sample
+    late; symbols of more than 2048 samples (factor 11 with 2) make it crash and are refused"""
     sync_word: Annotated[int, Field(ge=0x11, le=0xFF)] | Auto = AUTO
+    """``lora_sdr`` only: of the network, 0x11..0xff, no nibble 0; auto = 0x12, private networks"""
     ldro: Annotated[bool | Auto, Field(title="Low data rate optimisation")] = AUTO
+    """``lora_sdr`` only: low data rate optimisation, two bits fewer per symbol; LoRa modems turn it on where a symbol
+    takes more than 16 ms; auto = off"""
     carrier_hz: Annotated[float, Field(ge=1e6, le=4.2e9, title="Carrier frequency (Hz)")] | None = None
+    """``lora_sdr`` only: the radio's carrier frequency, 1e6..4.2e9 Hz, by which the module tells how much the clocks
+    differ; null = it takes them to be alike"""
 
 
 class _ChirpPlace(NamedTuple):

@@ -18,17 +18,14 @@ BITS = 8
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
 class ModemOptions:
-    """Settings of this PHY beside packet length.
-
-    :param bit_rate: bits/s that the modem sends on the air
-    :param overhead_bytes: bytes that framing and the modem add to each packet, 0..4096
-    :param overhead_s: s that the modem needs for each packet beside its bits: switching the transmitter on, preamble,
-        gap
-    """
+    """Settings of this PHY beside packet length."""
 
     bit_rate: Annotated[float, Field(gt=0, allow_inf_nan=False, title="Bit rate (bits/s)")] = 9600.0
+    """bits/s that the modem sends on the air"""
     overhead_bytes: Annotated[int, Field(ge=0, le=4096, title="Bytes added to a packet")] = 0
+    """bytes that framing and the modem add to each packet, 0..4096"""
     overhead_s: Annotated[Seconds, Field(title="Time added to a packet (s)")] = 0.0
+    """s that the modem needs for each packet beside its bits: switching the transmitter on, preamble, gap"""
 
 
 class ModemPhy(PacketPhy):

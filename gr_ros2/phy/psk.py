@@ -22,14 +22,12 @@ _PULSE_SYMBOLS = 10
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class PskOptions(LinearOptions):
-    """Settings of this PHY beside packet length and sample rate, and those of every burst PHY.
-
-    :param modulation: of the payload; the preamble is BPSK always
-    :param rolloff: of the root-raised-cosine pulse, 0.2..1
-    """
+    """Settings of this PHY beside packet length and sample rate, and those of every burst PHY."""
 
     modulation: Literal["bpsk", "qpsk", "8psk"] = "qpsk"
+    """of the payload; the preamble is BPSK always"""
     rolloff: Annotated[float, Field(ge=0.2, le=1, title="Roll-off factor")] = 0.35
+    """of the root-raised-cosine pulse, 0.2..1"""
 
 
 class PskModem(LinearModem):

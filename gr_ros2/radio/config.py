@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
@@ -24,7 +24,7 @@ from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire import FORMATS
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, use_attribute_docstrings=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class LinkConfig(AirConfig, RobotConfig):
     """One robot's end of a link: its ROS graph -> PHY -> front end, and back the same way."""
 

@@ -27,32 +27,30 @@ Decibels = Annotated[float, Field(ge=-200, le=200)]
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class DeviceOptions(BurstDeviceOptions):
-    """Settings of every radio.
-
-    :param args: which device, in the words of its driver; auto takes the first found
-    :param frequency: Hz, to send at, and to receive at unless ``frequency_rx`` says otherwise
-    :param frequency_rx: Hz, to receive at; auto = ``frequency``
-    :param gain_tx: dB, of the transmitter; 0 unless set, so that nothing loud happens unasked
-    :param gain_rx: dB, of the receiver
-    :param antenna_tx: port to send from, auto = the device's default
-    :param antenna_rx: port to receive from, auto = the device's default
-    :param bandwidth: Hz, of the analogue filters, auto = the device's choice
-    :param lead: zero samples before each burst, while the amplifier settles
-    :param tail: zero samples behind each burst at least
-    :param multiple: samples a burst is filled up to a multiple of, for drivers that send whole transfers only
-    """
+    """Settings of every radio."""
 
     frequency: Annotated[float, Field(gt=0, le=300e9, title="Frequency (Hz)")]
+    """Hz, to send at, and to receive at unless ``frequency_rx`` says otherwise"""
     args: Annotated[Text, Field(title="Device arguments")] = AUTO
+    """which device, in the words of its driver; auto takes the first found"""
     frequency_rx: Annotated[float, Field(gt=0, le=300e9, title="Receive frequency (Hz)")] | Auto = AUTO
+    """Hz, to receive at; auto = ``frequency``"""
     gain_tx: Annotated[Decibels, Field(title="Transmit gain (dB)")] = 0.0
+    """dB, of the transmitter; 0 unless set, so that nothing loud happens unasked"""
     gain_rx: Annotated[Decibels, Field(title="Receive gain (dB)")] = 30.0
+    """dB, of the receiver"""
     antenna_tx: Annotated[Text, Field(title="Transmit antenna")] = AUTO
+    """port to send from, auto = the device's default"""
     antenna_rx: Annotated[Text, Field(title="Receive antenna")] = AUTO
+    """port to receive from, auto = the device's default"""
     bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
+    """Hz, of the analogue filters, auto = the device's choice"""
     lead: Annotated[int, Field(ge=0, le=_MOST_ZEROS, title="Zeros before a burst (samples)")] = 32
+    """zero samples before each burst, while the amplifier settles"""
     tail: Annotated[int, Field(ge=0, le=_MOST_ZEROS, title="Zeros behind a burst (samples)")] = 64
+    """zero samples behind each burst at least"""
     multiple: Annotated[int, Field(ge=1, le=1 << 22, title="Burst length in steps of (samples)")] = 1
+    """samples a burst is filled up to a multiple of, for drivers that send whole transfers only"""
 
     @property
     def receive_frequency(self) -> float:

@@ -34,18 +34,16 @@ _BEHIND = 2
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class FileOptions(FrontEndOptions):
-    """Settings of this front end; at least one of the two paths. Paths are relative to the current directory.
-
-    :param write: recording to make of what is sent, '' = send nothing
-    :param read: recording to receive, '' = receive nothing
-    :param speed: of the replay, 1 = as recorded, 0 = as fast as the receiver takes it
-    :param repeat: begin again at its end
-    """
+    """Settings of this front end; at least one of the two paths. Paths are relative to the current directory."""
 
     write: Annotated[str, Field(title="Recording of what is sent")] = ""
+    """recording to make of what is sent, '' = send nothing"""
     read: Annotated[str, Field(title="Recording to replay")] = ""
+    """recording to receive, '' = receive nothing"""
     speed: Annotated[float, Field(ge=0, le=1000, title="Replay speed (times real time)")] = 1.0
+    """of the replay, 1 = as recorded, 0 = as fast as the receiver takes it"""
     repeat: Annotated[bool, Field(title="Repeat the replay")] = False
+    """begin again at its end"""
 
     @model_validator(mode="after")
     def _something(self) -> FileOptions:

@@ -27,22 +27,18 @@ Hertz = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class FrontEndOptions:
-    """What every front end takes.
-
-    :param guard_s: s of silence after each packet
-    """
+    """What every front end takes."""
 
     guard_s: Annotated[Seconds, Field(title="Silence after a packet (s)")] = 0.0
+    """s of silence after each packet"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SharedAir(FrontEndOptions):
-    """What a front end takes that may have one channel for both directions.
-
-    :param half_duplex: nothing can be received while something is sent
-    """
+    """What a front end takes that may have one channel for both directions."""
 
     half_duplex: bool = False
+    """nothing can be received while something is sent"""
 
 
 class FrontEndCounters(NamedTuple):

@@ -22,17 +22,15 @@ _MAX_PORT = 15
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class KissOptions(StreamOptions):
-    """Settings of this front end.
-
-    :param tnc_port: which radio of the TNC, 0..15
-    :param callsign: own callsign, with which packets are sent as AX.25 UI frames, as direwolf needs it; '' = packets as
-        they are, for modems that do not look into a frame
-    :param destination: callsign of the group of robots; frames for others are not taken
-    """
+    """Settings of this front end."""
 
     tnc_port: Annotated[int, Field(ge=0, le=_MAX_PORT, title="Port of the TNC")] = 0
+    """which radio of the TNC, 0..15"""
     callsign: Annotated[Callsign, Field(title="Own callsign")] = ""
+    """own callsign, with which packets are sent as AX.25 UI frames, as direwolf needs it; '' = packets as they are, for
+    modems that do not look into a frame"""
     destination: Annotated[Callsign, Field(title="Callsign of the group")] = "GRROS2"
+    """callsign of the group of robots; frames for others are not taken"""
 
     @model_validator(mode="after")
     def _addressed(self) -> KissOptions:

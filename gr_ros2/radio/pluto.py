@@ -55,17 +55,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class PlutoOptions(DeviceOptions):
-    """Settings of this front end.
-
-    :param gain_tx: dB, 0 = full power, down to -89.75; -40 unless set
-    :param bandwidth: Hz, of the transmitter's analogue filter, auto = ``sample_rate``; the receiver's stays as it is
-    :param buffer_rx: samples the receiver hands over at a time, auto = 5 ms of them
-    """
+    """Settings of this front end."""
 
     gain_tx: Annotated[float, Field(ge=-_LARGEST_ATTENUATION, le=0, title="Transmit gain (dB)")] = -40.0
+    """dB, 0 = full power, down to -89.75; -40 unless set"""
     gain_rx: Annotated[float, Field(ge=-3, le=76, title="Receive gain (dB)")] = 30.0
     bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
+    """Hz, of the transmitter's analogue filter, auto = ``sample_rate``; the receiver's stays as it is"""
     buffer_rx: Annotated[int, Field(ge=1, le=1 << 22, title="Receive buffer (samples)")] | Auto = AUTO
+    """samples the receiver hands over at a time, auto = 5 ms of them"""
 
 
 class PlutoFrontEnd(DeviceFrontEnd):

@@ -41,17 +41,15 @@ Device = Annotated[str, Field(min_length=1), AfterValidator(_valid)]
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class StreamOptions(SharedAir):
-    """What every front end on a stream of bytes takes.
-
-    :param device: ``/dev/ttyUSB0``; or ``tcp://HOST:PORT``, for instance of direwolf or of a serial server
-    :param baud: speed of a serial line, the same as in the modem's settings
-    :param backoff_s: s of further silence after each packet, at random from 0 to this, where modems share a frequency
-        and do not listen before they send: without it, two can send at the same moments for ever
-    """
+    """What every front end on a stream of bytes takes."""
 
     device: Annotated[Device, Field(title="Device")]
+    """``/dev/ttyUSB0``; or ``tcp://HOST:PORT``, for instance of direwolf or of a serial server"""
     baud: Annotated[int, Field(ge=50, le=4_000_000, title="Speed of the serial line (baud)")] = 57_600
+    """speed of a serial line, the same as in the modem's settings"""
     backoff_s: Annotated[Seconds, Field(title="Random silence after a packet (s)")] = 0.0
+    """s of further silence after each packet, at random from 0 to this, where modems share a frequency and do not
+    listen before they send: without it, two can send at the same moments for ever"""
     half_duplex: bool = True
 
 

@@ -48,14 +48,12 @@ Address = Annotated[str, Field(min_length=1), AfterValidator(_other)]
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class UdpOptions(SharedAir):
-    """Settings of this front end.
-
-    :param listen: own address: ``5555`` (all interfaces) or ``10.0.0.1:5555``
-    :param send_to: addresses to which every packet is sent, ``10.0.0.2:5555``; a broadcast address is one for all
-    """
+    """Settings of this front end."""
 
     listen: Annotated[OwnAddress, Field(title="Own address")]
+    """own address: ``5555`` (all interfaces) or ``10.0.0.1:5555``"""
     send_to: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses to send to")]
+    """addresses to which every packet is sent, ``10.0.0.2:5555``; a broadcast address is one for all"""
 
 
 class UdpFrontEnd(PacketFrontEnd):

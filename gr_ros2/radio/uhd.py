@@ -25,16 +25,14 @@ _CHANNEL = 0
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class UhdOptions(DeviceOptions):
-    """Settings of this front end.
-
-    :param clock_source: auto = the device's default, or internal, external, mimo, gpsdo
-    :param subdev_tx: frontend to send with, as in ``A:A``, auto = the device's default
-    :param subdev_rx: frontend to receive with, auto = the device's default
-    """
+    """Settings of this front end."""
 
     clock_source: Annotated[str, Field(examples=[AUTO, "internal", "external", "mimo", "gpsdo"], min_length=1)] = AUTO
+    """auto = the device's default, or internal, external, mimo, gpsdo"""
     subdev_tx: Annotated[Text, Field(title="Transmit subdevice")] = AUTO
+    """frontend to send with, as in ``A:A``, auto = the device's default"""
     subdev_rx: Annotated[Text, Field(title="Receive subdevice")] = AUTO
+    """frontend to receive with, auto = the device's default"""
 
 
 class UhdFrontEnd(DeviceFrontEnd):

@@ -84,31 +84,29 @@ _STRICT = ConfigDict(extra="forbid", str_strip_whitespace=True)
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class AirtimeConfig:
-    """How much a robot may send, whatever waits (docs/how-to/radios.md).
-
-    :param band: rules of a band by name, which hold beside the other settings: `eu433`, `eu863`, `eu865`, `eu868`,
-        `eu868.7`, `eu869.4`, `eu869.7`, `us915`, `amateur`; '' = none
-    :param duty_cycle: largest share of any ``window_s`` during which this robot sends, above 0 to 1; auto = the band's,
-        without one no limit
-    :param window_s: s over which ``duty_cycle`` holds; auto = the band's, without one an hour
-    :param max_burst_s: most s without a pause of 0.1 s, 0 = no limit; auto = the band's, without one no limit
-    :param listen_before_send: a packet waits while the receiver hears a signal, 6 dB above the noise; for front ends of
-        SDRs with ``half_duplex``
-    """
+    """How much a robot may send, whatever waits (docs/how-to/radios.md)."""
 
     band: str = ""
+    """rules of a band by name, which hold beside the other settings: `eu433`, `eu863`, `eu865`, `eu868`, `eu868.7`,
+    `eu869.4`, `eu869.7`, `us915`, `amateur`; '' = none"""
     duty_cycle: Annotated[
         Annotated[float, Field(gt=0, le=1)] | Auto,
         BeforeValidator(_sends),
         Field(title="Largest share of the time that it sends"),
     ] = AUTO
+    """largest share of any ``window_s`` during which this robot sends, above 0 to 1; auto = the band's, without one no
+    limit"""
     window_s: Annotated[
         Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)] | Auto, Field(title="Time of that share (s)")
     ] = AUTO
+    """s over which ``duty_cycle`` holds; auto = the band's, without one an hour"""
     max_burst_s: Annotated[
         Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Longest time without a pause (s)")
     ] = AUTO
+    """most s without a pause of 0.1 s, 0 = no limit; auto = the band's, without one no limit"""
     listen_before_send: bool = False
+    """a packet waits while the receiver hears a signal, 6 dB above the noise; for front ends of SDRs with
+    ``half_duplex``"""
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("window_s",),

@@ -77,16 +77,14 @@ DEFAULT_MIDDLEWARE = "dds"
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Traffic:
-    """What a link is given to carry.
-
-    :param source: where messages come from: `sim`, the simulated robots, or `bag:PATH`, a recording
-    :param duration_s: s during which messages are submitted; 0 = no limit: as long as the recording
-    :param seed: of everything random in it; the same seed draws the same numbers
-    """
+    """What a link is given to carry."""
 
     source: str = "sim"
+    """where messages come from: `sim`, the simulated robots, or `bag:PATH`, a recording"""
     duration_s: Seconds = 15.0
+    """s during which messages are submitted; 0 = no limit: as long as the recording"""
     seed: Seed = 0
+    """of everything random in it; the same seed draws the same numbers"""
 
     @model_validator(mode="after")
     def _sim_or_bag(self) -> Traffic:
@@ -104,18 +102,15 @@ class Traffic:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class CloudOptions:
-    """What leaves of a point cloud.
-
-    :param voxel: m, edge of the cells that the points of a cloud become, each a point at its middle; 0 = every point,
-        exactly
-    :param range: m from the origin of the cloud's frame, beyond which points are left out where they become cells;
-        auto = none are
-    :param keep: what of a cell's points is sent beside their place, as a mean: intensity, rgb, or '' for neither
-    """
+    """What leaves of a point cloud."""
 
     voxel: Annotated[Literal[0] | Annotated[float, Field(ge=0.001, le=1000)], Field(title="Cell (m)")] = 0
+    """m, edge of the cells that the points of a cloud become, each a point at its middle; 0 = every point, exactly"""
     range: Annotated[float, Field(gt=0, le=1e6)] | Auto = AUTO
+    """m from the origin of the cloud's frame, beyond which points are left out where they become cells; auto = none
+    are"""
     keep: Literal["", "intensity", "rgb"] = ""
+    """what of a cell's points is sent beside their place, as a mean: intensity, rgb, or '' for neither"""
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("range", "keep"), lambda cloud: cloud.voxel > 0, "an exact cloud has every point; set voxel above 0"
@@ -143,19 +138,17 @@ def _off(given: object) -> object:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class CameraOptions:
-    """What leaves of pictures.
-
-    :param off: pictures pass exactly
-    :param size: pixels at most, such as 320x240; full = as they come, auto = halved while the air has too few bytes
-    :param fps: pictures/s at most; auto = as many as the air carries, and as max_rate allows
-    :param output: what comes out: same, CompressedImage, CompressedVideo (foxglove_msgs) or FFMPEGPacket
-        (ffmpeg_image_transport_msgs)
-    """
+    """What leaves of pictures."""
 
     off: bool = False
+    """pictures pass exactly"""
     size: Annotated[str, Field(pattern=r"^(auto|full|[1-9]\d{0,4}x[1-9]\d{0,4})$")] = AUTO
+    """pixels at most, such as 320x240; full = as they come, auto = halved while the air has too few bytes"""
     fps: Annotated[float, Field(gt=0, le=1000)] | Auto = AUTO
+    """pictures/s at most; auto = as many as the air carries, and as max_rate allows"""
     output: Literal["same", "CompressedImage", "CompressedVideo", "FFMPEGPacket"] = "same"
+    """what comes out: same, CompressedImage, CompressedVideo (foxglove_msgs) or FFMPEGPacket
+    (ffmpeg_image_transport_msgs)"""
     conditions: ClassVar[Any] = (
         ActsWhere(("size", "fps", "output"), lambda camera: not camera.off, "it is off; leave off out"),
     )
@@ -168,18 +161,16 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class DepthOptions:
-    """What leaves of depth images (16UC1, 32FC1, compressedDepth).
-
-    :param off: they pass exactly
-    :param mode: auto = video of inverse distances within what the air has; 8, 10 or 12 bits; exact
-    :param near: m, the nearest distance; 0 = found from the images
-    :param far: m, the farthest distance; 0 = found from the images
-    """
+    """What leaves of depth images (16UC1, 32FC1, compressedDepth)."""
 
     off: bool = False
+    """they pass exactly"""
     mode: Literal["auto", "8", "10", "12", "exact"] = AUTO
+    """auto = video of inverse distances within what the air has; 8, 10 or 12 bits; exact"""
     near: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Nearest (m)")] = 0.0
+    """m, the nearest distance; 0 = found from the images"""
     far: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Farthest (m)")] = 0.0
+    """m, the farthest distance; 0 = found from the images"""
     conditions: ClassVar[Any] = (
         ActsWhere(("mode", "near", "far"), lambda depth: not depth.off, "it is off; leave off out"),
     )
@@ -194,57 +185,55 @@ class DepthOptions:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SendOptions:
-    """Options of one topic that a robot sends.
-
-    :param qos: class of its packets, the two QoS bits of the header; auto = latency for ``commands``, else default
-    :param reliability: auto adapts the subscription to the publishers found
-    :param durability: auto adapts likewise; the sink publishes volatile unless this says transient_local
-    :param depth: QoS depth of subscription and publisher, auto takes that of ``graph`` or ``publish``; of a
-        transient-local topic also how many messages late robots and late subscribers get, auto 1
-    :param queue: what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
-        ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the
-        publishers' QoS (docs/explanation/scheduling.md)
-    :param queue_depth: messages waiting, the oldest dropped and counted; 0 unbounded, auto takes the source's
-    :param deadline_s: s after submission until which a message must be across, or it is dropped; 0 none, auto the
-        publishers' lifespan where ``queue`` is auto too, otherwise 0.3 for ``commands`` and none for others. Of a
-        service: s that a call waits for its reply, auto 30
-    :param weight: what a second of this topic's age counts beside other topics, 0.001..1000
-    :param max_rate: messages/s sent at most, the newest at each turn unless `queue` is set; 0 unlimited
-    :param max_age_s: s for which a sealed message of it may have been withheld (with a key and both ways), or it is not
-        taken; 0 = any time, auto takes the sink's. A number above 0 at the source has every sink take its own bound
-    :param keep_s: s for which its newest message is sent again to robots that lack it, although nothing follows and it
-        is not transient-local: an e-stop, a mode; 0 = as the publishers' durability has it. Commands are never kept
-    :param to: robot for which its messages are, 0..254; other robots do not deliver them; auto = all robots
-    :param codec: auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)
-    :param quantize: bounded loss per field, '' lossless (docs/explanation/compression.md)
-    :param instance: fields that tell apart the things of which messages speak, so that max_rate and queue latest work
-        for each of them, such as robots[].id; '' = those known of its type (/tf, /diagnostics, JointState, markers),
-        none = they are not told apart
-    :param cloud: what leaves of a PointCloud2: exact, or cells of so many m, such as {voxel: 0.1, range: 30}
-        (docs/explanation/codecs.md)
-    :param camera: what leaves of an Image or CompressedImage: video that fits the air, such as {size: 320x240, fps:
-        10}; off = exactly (docs/how-to/cameras.md)
-    :param depth_image: the same of depth images, such as {mode: 10}
-    """
+    """Options of one topic that a robot sends."""
 
     qos: QosClass | Auto = AUTO
+    """class of its packets, the two QoS bits of the header; auto = latency for ``commands``, else default"""
     reliability: Literal["reliable", "best_effort"] | Auto = AUTO
+    """auto adapts the subscription to the publishers found"""
     durability: Literal["volatile", "transient_local"] | Auto = AUTO
+    """auto adapts likewise; the sink publishes volatile unless this says transient_local"""
     depth: Count | Auto = AUTO
+    """QoS depth of subscription and publisher, auto takes that of ``graph`` or ``publish``; of a transient-local topic
+    also how many messages late robots and late subscribers get, auto 1"""
     queue_depth: Annotated[Count | Auto, Field(title="Queue depth (messages per topic)")] = AUTO
+    """messages waiting, the oldest dropped and counted; 0 unbounded, auto takes the source's"""
     queue: QueuePolicy | Auto = AUTO
+    """what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
+    ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the publishers' QoS
+    (docs/explanation/scheduling.md)"""
     deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
+    """s after submission until which a message must be across, or it is dropped; 0 none, auto the publishers' lifespan
+    where ``queue`` is auto too, otherwise 0.3 for ``commands`` and none for others. Of a service: s that a call waits
+    for its reply, auto 30"""
     weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
+    """what a second of this topic's age counts beside other topics, 0.001..1000"""
     max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
+    """messages/s sent at most, the newest at each turn unless `queue` is set; 0 unlimited"""
     max_age_s: Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")] = AUTO
+    """s for which a sealed message of it may have been withheld (with a key and both ways), or it is not taken; 0 = any
+    time, auto takes the sink's. A number above 0 at the source has every sink take its own bound"""
     keep_s: Seconds = 0.0
+    """s for which its newest message is sent again to robots that lack it, although nothing follows and it is not
+    transient-local: an e-stop, a mode; 0 = as the publishers' durability has it. Commands are never kept"""
     to: RobotId | Auto = AUTO
+    """robot for which its messages are, 0..254; other robots do not deliver them; auto = all robots"""
     codec: str = AUTO
+    """auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)"""
     quantize: str = ""
+    """bounded loss per field, '' lossless (docs/explanation/compression.md)"""
     instance: str = ""
+    """fields that tell apart the things of which messages speak, so that max_rate and queue latest work for each of
+    them, such as robots[].id; '' = those known of its type (/tf, /diagnostics, JointState, markers), none = they are
+    not told apart"""
     cloud: CloudOptions = Field(default_factory=CloudOptions)
+    """what leaves of a PointCloud2: exact, or cells of so many m, such as {voxel: 0.1, range: 30}
+    (docs/explanation/codecs.md)"""
     camera: Annotated[CameraOptions, BeforeValidator(_off)] = Field(default_factory=CameraOptions)
+    """what leaves of an Image or CompressedImage: video that fits the air, such as {size: 320x240, fps: 10}; off =
+    exactly (docs/how-to/cameras.md)"""
     depth_image: Annotated[DepthOptions, BeforeValidator(_off)] = Field(default_factory=DepthOptions)
+    """the same of depth images, such as {mode: 10}"""
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("queue_depth",),
@@ -268,17 +257,16 @@ class BurstLoss:
 
     The mean share of lost packets and the mean length of a stay in the bad state are :attr:`mean_loss` and
     ``1 / p_bad_to_good`` packets.
-
-    :param p_good_to_bad: probability that the packet after one in the good state finds the bad one, 0..1
-    :param p_bad_to_good: the other way round, above 0..1
-    :param loss_good: probability that a packet is lost in the good state, 0..1
-    :param loss_bad: the same in the bad state, 0..1
     """
 
     p_good_to_bad: Probability
+    """probability that the packet after one in the good state finds the bad one, 0..1"""
     p_bad_to_good: Annotated[float, Field(gt=0, le=1)]
+    """the other way round, above 0..1"""
     loss_good: Probability = 0.0
+    """probability that a packet is lost in the good state, 0..1"""
     loss_bad: Probability = 1.0
+    """the same in the bad state, 0..1"""
 
     @property
     def share_bad(self) -> float:
@@ -297,31 +285,30 @@ class ChannelConfig:
 
     ``snr_db`` to ``doppler_hz`` act on samples, and a PHY without samples refuses them; ``packet_loss`` to ``outages``
     act on packets, whatever the PHY.
-
-    :param snr_db: mean burst power over noise power in the sampled band, dB, -50..100; null = no noise
-    :param frequency_offset: carrier frequency offset, fraction of the sample rate, -0.5..0.5
-    :param epsilon: sample clock ratio, 1.0 = none, 0.99..1.01
-    :param taps: complex impulse response at the sample rate
-    :param doppler_hz: Rayleigh fading with this maximum Doppler shift, Hz; every tap fades by itself; 0 = none
-    :param packet_loss: probability that a packet is dropped between PHY and sink, 0..1
-    :param burst_loss: losses in bursts; null = none
-    :param outages: [from_s, to_s) during which nothing passes, s since the run began, in order of time
-    :param seed: of noise, fading and losses; in a scenario that of the scenario unless it is set
     """
 
     snr_db: Annotated[
         Annotated[float, Field(ge=-50, le=100, allow_inf_nan=False)] | None, Field(title="Signal-to-noise ratio (dB)")
     ] = None
+    """mean burst power over noise power in the sampled band, dB, -50..100; null = no noise"""
     frequency_offset: Annotated[float, Field(ge=-0.5, le=0.5, title="Frequency offset (share of the sample rate)")] = (
         0.0
     )
+    """carrier frequency offset, fraction of the sample rate, -0.5..0.5"""
     epsilon: Annotated[float, Field(ge=0.99, le=1.01)] = 1.0
+    """sample clock ratio, 1.0 = none, 0.99..1.01"""
     taps: Annotated[tuple[complex, ...], Field(min_length=1)] = (1.0 + 0.0j,)
+    """complex impulse response at the sample rate"""
     doppler_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Rayleigh fading with this maximum Doppler shift, Hz; every tap fades by itself; 0 = none"""
     packet_loss: Annotated[Probability, Field(title="Packet loss (share of packets)")] = 0.0
+    """probability that a packet is dropped between PHY and sink, 0..1"""
     burst_loss: BurstLoss | None = None
+    """losses in bursts; null = none"""
     outages: tuple[tuple[Seconds, Seconds], ...] = ()
+    """[from_s, to_s) during which nothing passes, s since the run began, in order of time"""
     seed: Seed = 0
+    """of noise, fading and losses; in a scenario that of the scenario unless it is set"""
 
     @model_validator(mode="after")
     def _outages_in_order(self) -> ChannelConfig:
@@ -349,16 +336,14 @@ class ChannelConfig:
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, populate_by_name=True))
 class PathConfig(ChannelConfig):
-    """The channel from one robot to another, where it is not that of all.
-
-    :param from_: number of the robot that sends; null = whoever
-    :param to: number of the robot that hears it; null = whoever
-    :param delay_s: s that a packet takes beside its airtime
-    """
+    """The channel from one robot to another, where it is not that of all."""
 
     from_: Annotated[RobotId | None, Field(alias="from", title="From")] = None
+    """number of the robot that sends; null = whoever"""
     to: RobotId | None = None
+    """number of the robot that hears it; null = whoever"""
     delay_s: Seconds = 0.0
+    """s that a packet takes beside its airtime"""
 
     def between(self, sender: int, receiver: int) -> bool:
         """Whether it lies between two robots, by their numbers."""
@@ -367,43 +352,39 @@ class PathConfig(ChannelConfig):
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Transceiver:
-    """What levels at a receiver follow from.
-
-    :param tx_power_dbm: power that it transmits, dBm; auto = the channel's
-    :param noise_figure_db: of its receiver, dB; auto = the channel's
-    """
+    """What levels at a receiver follow from."""
 
     tx_power_dbm: Decibels | Auto = AUTO
+    """power that it transmits, dBm; auto = the channel's"""
     noise_figure_db: Decibels | Auto = AUTO
+    """of its receiver, dB; auto = the channel's"""
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, populate_by_name=True))
 class ScenarioChannel(Transceiver, ChannelConfig):
-    """The channel of a scenario, which may follow from where the robots are (docs/explanation/medium.md).
-
-    :param from_: what says the levels: settings = ``snr_db``; positions = where the robots are, in the simulator's
-        world or by a recording's odometry
-    :param model: of the path loss: free_space, two_ray (with the reflection from the ground) or log_distance
-    :param exponent: of log_distance: 2 as in free space, 1.6 to 1.8 in corridors, 2.7 to 4 among obstacles
-    :param height_m: of two_ray: height of all antennas, m
-    :param walls_db: loss in each obstacle of the simulated world on the straight line between two robots, dB
-    :param shadowing_db: standard deviation of the shadowing, dB; 0 = none
-    :param decorrelation_m: way of one robot after which its shadowing has 1/e of the correlation left, m
-    :param tx_power_dbm: power that a robot transmits, dBm
-    :param noise_figure_db: of a receiver, dB
-    :param carrier_hz: carrier frequency, Hz
-    """
+    """The channel of a scenario, which may follow from where the robots are (docs/explanation/medium.md)."""
 
     from_: Annotated[Literal["settings", "positions"], Field(alias="from", title="From")] = "settings"
+    """what says the levels: settings = ``snr_db``; positions = where the robots are, in the simulator's world or by a
+    recording's odometry"""
     model: Literal["log_distance", "two_ray", "free_space"] = "log_distance"
+    """of the path loss: free_space, two_ray (with the reflection from the ground) or log_distance"""
     exponent: Annotated[float, Field(ge=1, le=8)] = 3.0
+    """of log_distance: 2 as in free space, 1.6 to 1.8 in corridors, 2.7 to 4 among obstacles"""
     height_m: Annotated[float, Field(gt=0, le=1000)] = 0.5
+    """of two_ray: height of all antennas, m"""
     walls_db: Annotated[float, Field(ge=0, le=100)] = 0.0
+    """loss in each obstacle of the simulated world on the straight line between two robots, dB"""
     shadowing_db: Annotated[float, Field(ge=0, le=30)] = 0.0
+    """standard deviation of the shadowing, dB; 0 = none"""
     decorrelation_m: Annotated[float, Field(gt=0, le=10_000)] = 5.0
+    """way of one robot after which its shadowing has 1/e of the correlation left, m"""
     tx_power_dbm: Decibels = 20.0
+    """power that a robot transmits, dBm"""
     noise_figure_db: Decibels = 6.0
+    """of a receiver, dB"""
     carrier_hz: Annotated[float, Field(ge=1e3, le=1e12)] = 2.4e9
+    """carrier frequency, Hz"""
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("model", "exponent", "height_m", "walls_db", "shadowing_db", "decorrelation_m", "carrier_hz"),
@@ -470,22 +451,19 @@ LEVELS = (
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class PhyConfig:
-    """Which physical layer, and how fast.
-
-    :param name: a name of ``gr_ros2.phy.PHY``
-    :param sample_rate: samples/s; auto = an experiment chooses it by what it offers. A link of radios has to be told
-    :param headroom: capacity over offered load where sample_rate is auto; a recording counts with one message per
-        second at least
-    :param kernels: what works on the samples of this end: auto = compiled kernels where they were built, else numpy;
-        numpy = the reference, several times slower
-    :param options: settings of that PHY
-    """
+    """Which physical layer, and how fast."""
 
     name: str = "ofdm"
+    """a name of ``gr_ros2.phy.PHY``"""
     sample_rate: Annotated[SampleRate | Auto, Field(title="Sample rate (samples/s)")] = AUTO
+    """samples/s; auto = an experiment chooses it by what it offers. A link of radios has to be told"""
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
+    """capacity over offered load where sample_rate is auto; a recording counts with one message per second at least"""
     kernels: Kernels = AUTO
+    """what works on the samples of this end: auto = compiled kernels where they were built, else numpy; numpy = the
+    reference, several times slower"""
     options: dict[str, Any] = Field(default_factory=dict)
+    """settings of that PHY"""
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("headroom",),
@@ -507,21 +485,19 @@ class PhyConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class AirConfig:
-    """How robots send, which is the same for all that share a channel.
-
-    :param name: what results, tables and errors call it; the file's name unless it is set
-    :param phy: which physical layer, and how fast; the same at every robot
-    :param airtime: how much a robot may send, whatever waits: settings, or the name of a band alone
-    :param medium: when a robot sends on a channel that others use too: slots that it derives from the packets heard,
-        aloha (at random, as rarely as the robots heard call for), or exclusive = whenever it has something
-    :param relay: gain = a robot sends on the messages of others that make those who hear it youngest; medium: slots
-    """
+    """How robots send, which is the same for all that share a channel."""
 
     name: Text
+    """what results, tables and errors call it; the file's name unless it is set"""
     phy: PhyConfig = Field(default_factory=PhyConfig)
+    """which physical layer, and how fast; the same at every robot"""
     medium: Medium = "exclusive"
+    """when a robot sends on a channel that others use too: slots that it derives from the packets heard, aloha (at
+    random, as rarely as the robots heard call for), or exclusive = whenever it has something"""
     relay: Literal["off", "gain"] = "off"
+    """gain = a robot sends on the messages of others that make those who hear it youngest; medium: slots"""
     airtime: Airtime = Field(default_factory=AirtimeConfig)
+    """how much a robot may send, whatever waits: settings, or the name of a band alone"""
 
     @model_validator(mode="after")
     def _medium_fits(self) -> AirConfig:
@@ -538,36 +514,34 @@ class AirConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class DiagnosticsConfig:
-    """What a live link says about itself on ``/diagnostics``, and when it calls that a warning or an error.
-
-    :param period_s: s between two messages, 0 = none at all
-    :param window_s: s over which rates and losses are taken, 1 or more
-    :param packet_loss_warn: share of packets lost, 0..1; 0 = never, as for all limits
-    :param packet_loss_error: the same for an error
-    :param message_loss_warn: share of messages lost, 0..1
-    :param message_loss_error: the same for an error
-    :param latency_warn_s: s from a message's stamp to its publication here, median of the newest
-    :param latency_error_s: the same for an error
-    :param age_warn_s: s since the stamp of a topic's newest message (where it has none, since its publication)
-    :param age_error_s: the same for an error
-    :param silence_warn_s: s without any packet, once there was one
-    :param silence_error_s: the same for an error
-    :param queue_warn: share of ``queue_depth`` that waits to be sent, 0..1
-    """
+    """What a live link says about itself on ``/diagnostics``, and when it calls that a warning or an error."""
 
     period_s: Seconds = 1.0
+    """s between two messages, 0 = none at all"""
     window_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
+    """s over which rates and losses are taken, 1 or more"""
     packet_loss_warn: Probability = 0.1
+    """share of packets lost, 0..1; 0 = never, as for all limits"""
     packet_loss_error: Probability = 0.5
+    """the same for an error"""
     message_loss_warn: Probability = 0.1
+    """share of messages lost, 0..1"""
     message_loss_error: Probability = 0.5
+    """the same for an error"""
     latency_warn_s: Seconds = 1.0
+    """s from a message's stamp to its publication here, median of the newest"""
     latency_error_s: Seconds = 5.0
+    """the same for an error"""
     age_warn_s: Seconds = 0.0
+    """s since the stamp of a topic's newest message (where it has none, since its publication)"""
     age_error_s: Seconds = 0.0
+    """the same for an error"""
     silence_warn_s: Seconds = 3.0
+    """s without any packet, once there was one"""
     silence_error_s: Seconds = 10.0
+    """the same for an error"""
     queue_warn: Probability = 0.8
+    """share of ``queue_depth`` that waits to be sent, 0..1"""
 
 
 def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:

@@ -1,14 +1,19 @@
 """Describes each field of a settings class: meaning, default, range, choices, label.
 
 Invariant: everything that shows settings (error messages, docs/reference/parameters.md, GRC, ROS parameters) reads them
-here. A new setting is therefore one field of a dataclass and its line in the docstring.
+here. A new setting is therefore one field of a dataclass and the docstring behind it. Docstrings are read from the
+source when somebody asks. pydantic reads them when a class is made, so that a link starts 5 ms later for each class.
 """
 
 from __future__ import annotations
 
-import re
+import ast
+import inspect
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
+from itertools import pairwise
+from textwrap import dedent
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -35,7 +40,7 @@ class Setting:
     :param attribute: name of the field, which may be a name that Python keeps for itself, with ``_``
     :param hint: its type, with annotations
     :param default: ``REQUIRED`` if it has none
-    :param meaning: text from the docstrings of its class and the base classes
+    :param owner: its class
     :param title: label in plain words, with the unit of a number in brackets
     :param choices: all texts and numbers that are allowed, or the words allowed besides its range, such as ``auto``
     :param suggested: suggested values; other values are allowed too
@@ -49,7 +54,7 @@ class Setting:
     attribute: str
     hint: Any
     default: Any
-    meaning: str
+    owner: type[Any]
     title: str
     choices: tuple[Any, ...] = ()
     suggested: tuple[Any, ...] = ()
@@ -57,6 +62,11 @@ class Setting:
     most: float | None = None
     above: float | None = None
     below: float | None = None
+
+    @property
+    def meaning(self) -> str:
+        """Text of its docstring, in its class or a base class."""
+        return meanings(self.owner).get(self.attribute, "")
 
     @property
     def explained(self) -> str:
@@ -94,12 +104,12 @@ _FOUND: dict[type[Any], list[Setting]] = {}
 def settings_of(cls: type[Any]) -> Sequence[Setting]:
     """Every field of a settings class, in their order."""
     if cls not in _FOUND:
-        described, called, hints = meanings(cls), titles(cls), get_type_hints(cls, include_extras=True)
-        _FOUND[cls] = [_setting(item, hints[item.name], described.get(item.name, ""), called) for item in fields(cls)]
+        called, hints = titles(cls), get_type_hints(cls, include_extras=True)
+        _FOUND[cls] = [_setting(item, hints[item.name], cls, called) for item in fields(cls)]
     return _FOUND[cls]
 
 
-def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> Setting:
+def _setting(item: Any, hint: Any, owner: type[Any], called: Mapping[str, str]) -> Setting:
     marks = list(_marks(hint))
     bounds = [bound for mark in marks for bound in getattr(mark, "metadata", [mark])]
     about = [mark for mark in marks if isinstance(mark, FieldInfo)]
@@ -113,7 +123,7 @@ def _setting(item: Any, hint: Any, meaning: str, called: Mapping[str, str]) -> S
         item.name,
         hint,
         default,
-        meaning,
+        owner,
         called.get(item.name) or label(item.name),
         tuple(value for kind in members(hint) if get_origin(kind) is Literal for value in get_args(kind)),
         tuple(value for mark in about for value in mark.examples or ()),
@@ -133,16 +143,21 @@ def label(name: str) -> str:
 
 
 def meanings(cls: type[Any]) -> dict[str, str]:
-    """The text for each setting in the docstrings of a settings class and its bases, one line each."""
-    described: dict[str, str] = {}
-    for part in reversed(cls.__mro__):  # the text of a class replaces that of its base
-        text = re.sub(r"\s*\n\s+(?!:param)", " ", part.__doc__ or "")
-        described |= {
-            name: line.strip() for name, line in re.findall(r":param (\w+): (.*?)(?=\s*:param|\s*$)", text, re.S)
-        }
-        own = vars(part).get("__pydantic_fields__", {})
-        described |= {name: " ".join(info.description.split()) for name, info in own.items() if info.description}
-    return described
+    """The docstring of each setting of a class and its bases, one line each, the one nearest to the class."""
+    return {name: text for part in reversed(cls.__mro__) if is_dataclass(part) for name, text in _own(part).items()}
+
+
+@cache
+def _own(cls: type[Any]) -> dict[str, str]:
+    """The docstrings behind the fields of a class alone."""
+    (body,) = ast.parse(dedent(inspect.getsource(cls))).body
+    assert isinstance(body, ast.ClassDef)
+    found = {}
+    for field, behind in pairwise(body.body):
+        if isinstance(field, ast.AnnAssign) and isinstance(behind, ast.Expr) and isinstance(field.target, ast.Name):
+            text = ast.literal_eval(behind.value)
+            found[field.target.id] = " ".join(text.split())
+    return found
 
 
 def titles(cls: type[Any]) -> dict[str, str]:

@@ -39,8 +39,7 @@ from gr_ros2.settings.topic_choice import LEAVES_OUT, checked_words, topics_of
 from gr_ros2.state.keys import checked_key_file
 from gr_ros2.wire import BROADCAST
 
-_DESCRIBED = ConfigDict(**STRICT, use_attribute_docstrings=True)
-_ALIASED = ConfigDict(**_DESCRIBED, populate_by_name=True)
+_ALIASED = ConfigDict(**STRICT, populate_by_name=True)
 Age = Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")]
 
 
@@ -57,7 +56,7 @@ def _named(topics: dict[str, Any]) -> dict[str, Any]:
     return topics
 
 
-@dataclass(frozen=True, kw_only=True, config=_DESCRIBED)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class GraphConfig:
     """The ROS graph of a robot."""
 
@@ -119,7 +118,7 @@ class PublishConfig:
         return (self.merge_tf, f"{self.merge_tf}_static") if self.merge_tf else ()
 
 
-@dataclass(frozen=True, kw_only=True, config=_DESCRIBED)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RobotConfig:
     """One robot: what it sends, what it takes, and how it joins its graph and the link."""
 

@@ -72,41 +72,37 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class MediumRobot(Transceiver):
-    """A robot whose link uses the medium.
-
-    :param connect: address at which the link publishes: ``bind`` of its front end
-    :param bind: address at which the link hears: ``connect`` of its front end
-    :param position: where it is, x and y in m; needed where levels follow from positions
-    """
+    """A robot whose link uses the medium."""
 
     connect: Address
+    """address at which the link publishes: ``bind`` of its front end"""
     bind: OwnAddress
+    """address at which the link hears: ``connect`` of its front end"""
     position: tuple[float, float] | None = None
+    """where it is, x and y in m; needed where levels follow from positions"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class MediumConfig:
-    """A medium process and its robots.
-
-    :param name: what errors and the first line call it
-    :param phy: physical layer and sample rate, those of the links
-    :param packet_len: bytes, that of the links
-    :param robots: those that share the channel
-    :param gains_db: gain from one robot to another, dB: one number for all, or a row for each robot with a number for
-        each other, null where nothing arrives; null = ``channel.snr_db`` between all
-    :param channel: of all pairs; with ``from: positions`` levels follow from where the robots are
-    :param time: lockstep = links take the medium's clock, and it waits for them; real = nobody waits
-    :param seed: of noise and phases
-    """
+    """A medium process and its robots."""
 
     name: Text = "medium"
+    """what errors and the first line call it"""
     phy: PhyConfig
+    """physical layer and sample rate, those of the links"""
     packet_len: PacketLen = 64
+    """bytes, that of the links"""
     robots: Annotated[tuple[MediumRobot, ...], Field(min_length=2, max_length=BROADCAST)]
+    """those that share the channel"""
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
+    """gain from one robot to another, dB: one number for all, or a row for each robot with a number for each other,
+    null where nothing arrives; null = ``channel.snr_db`` between all"""
     channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
+    """of all pairs; with ``from: positions`` levels follow from where the robots are"""
     time: Literal["lockstep", "real"] = "lockstep"
+    """lockstep = links take the medium's clock, and it waits for them; real = nobody waits"""
     seed: Seed = 0
+    """of noise and phases"""
     conditions: ClassVar[Any] = LEVELS
 
     @model_validator(mode="after")

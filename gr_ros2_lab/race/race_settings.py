@@ -49,29 +49,25 @@ Load = Annotated[float, Field(gt=0, le=100)]
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
 class RaceSettings(Traffic):
-    """One race: every contender at every load and every loss.
-
-    :param robots: all of them send to all others on one channel, each a recording of its own; of a bag all the same,
-        one after the other; null = one robot sends to another one
-    :param source: `sim`, the odometry of a simulated robot at 35 Hz, or `bag:PATH`
-    :param bag_topic: the topic of the bag that is carried; auto where it has only one
-    :param peers: names of ``CONTENDERS``; [] = all
-    :param loss: probability that a frame is lost, 0..1, in each direction
-    :param load: of the link by the recording as it is, 1 = all of its capacity
-    :param sample_rate: samples/s instead of ``load``; auto = chosen by it
-    :param duration_s: s of the recording
-    :param packet_len: bytes of gr-ros2's longest packets; of `gr-ros2-plain` they are as long as a message needs
-    :param seed: of the simulator, the losses and gr-ros2's sender
-    """
+    """One race: every contender at every load and every loss."""
 
     robots: Annotated[int, Field(ge=2, le=MOST_ROBOTS)] | None = None
+    """all of them send to all others on one channel, each a recording of its own; of a bag all the same, one after the
+    other; null = one robot sends to another one"""
     bag_topic: Text = AUTO
+    """the topic of the bag that is carried; auto where it has only one"""
     peers: tuple[str, ...] = ()
+    """names of ``CONTENDERS``; [] = all"""
     loss: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.0, 0.05, 0.2, 0.4)
+    """probability that a frame is lost, 0..1, in each direction"""
     sample_rate: SampleRate | Auto = AUTO
+    """samples/s instead of ``load``; auto = chosen by it"""
     load: Annotated[tuple[Load, ...], Field(min_length=1)] = (0.5, 2.0)
+    """of the link by the recording as it is, 1 = all of its capacity"""
     duration_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    """s of the recording"""
     packet_len: PacketLen = 64
+    """bytes of gr-ros2's longest packets; of `gr-ros2-plain` they are as long as a message needs"""
 
 
 @plain_dataclass(frozen=True)

@@ -18,50 +18,48 @@ Noise = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
 class SimSettings:
-    """Robots, world, rates and noise.
-
-    :param seed: of the world, the routes and all noise; in a scenario that of the scenario unless it is set
-    :param robots: number of robots; they are called robot_1, robot_2, ...
-    :param size_m: side of the square room, m
-    :param obstacles: boxes and pillars in it; fewer where the room has no place for all
-    :param max_speed: m/s
-    :param scan_rate: laser scans, Hz
-    :param odom_rate: odometry, Hz
-    :param imu_rate: Hz
-    :param cmd_vel_rate: velocity commands, Hz
-    :param clock_rate: Hz
-    :param map_rate: maps, Hz; 0 = once at the start
-    :param rtcm_rate: RTK corrections of a base station, Hz; 0 = there are none
-    :param camera_rate: pictures of 320 × 240, Hz; 0 = there is no camera
-    :param beams: of a laser scan, over the full turn
-    :param map_cells: cells along each side of the map
-    :param odom_linear_noise: of the measured forward speed, m/s; the odometry pose integrates it, so it drifts
-    :param odom_angular_noise: of the measured turn rate, rad/s; integrated likewise
-    :param start_time_s: s, what the stamps begin at
-    :param prefix_frames: frame ids carry the robot's name (robot_1/odom), for robots that share one graph
-    :param transforms: robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries
-    """
+    """Robots, world, rates and noise."""
 
     seed: Seed = 0
+    """of the world, the routes and all noise; in a scenario that of the scenario unless it is set"""
     robots: Annotated[int, Field(ge=1, le=255)] = 2
+    """number of robots; they are called robot_1, robot_2, ..."""
     size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
+    """side of the square room, m"""
     obstacles: Annotated[int, Field(ge=0, le=100)] = 12
+    """boxes and pillars in it; fewer where the room has no place for all"""
     max_speed: Annotated[float, Field(ge=0.1, le=2)] = 1.0
+    """m/s"""
     scan_rate: Rate = 5.0
+    """laser scans, Hz"""
     odom_rate: Rate = 30.0
+    """odometry, Hz"""
     imu_rate: Rate = 50.0
+    """Hz"""
     cmd_vel_rate: Rate = 10.0
+    """velocity commands, Hz"""
     clock_rate: Rate = 10.0
+    """Hz"""
     map_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    """maps, Hz; 0 = once at the start"""
     rtcm_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    """RTK corrections of a base station, Hz; 0 = there are none"""
     camera_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    """pictures of 320 × 240, Hz; 0 = there is no camera"""
     beams: Annotated[int, Field(ge=1, le=10_000)] = 360
+    """of a laser scan, over the full turn"""
     map_cells: Annotated[int, Field(ge=10, le=2000)] = 100
+    """cells along each side of the map"""
     odom_linear_noise: Noise = 0.02
+    """of the measured forward speed, m/s; the odometry pose integrates it, so it drifts"""
     odom_angular_noise: Noise = 0.01
+    """of the measured turn rate, rad/s; integrated likewise"""
     start_time_s: Annotated[float, Field(ge=0, le=2**31 - 1)] = 0.0
+    """s, what the stamps begin at"""
     prefix_frames: bool = False
+    """frame ids carry the robot's name (robot_1/odom), for robots that share one graph"""
     transforms: bool = False
+    """robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries"""
 
     def frame_prefix(self, robot_id: int) -> str:
         """The prefix of the names of a robot's frames; '' if they have none."""

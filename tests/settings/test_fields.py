@@ -31,25 +31,22 @@ ANOTHER_TIME = {"max_rate", "packet_rate", "speed", "bag_speed", "clock_rate", "
 
 @dataclass(frozen=True)
 class Base:
-    """:param low: how low"""
-
     low: Annotated[int, Field(ge=0, lt=9, title="Lowest")] = 0
+    """how low"""
 
 
 @dataclass(frozen=True)
 class Example(Base):
-    """Something.
-
-    :param wait_s: how long it waits; auto = as long as it likes
-    :param kind: of which
-        kind
-    :param name: its name
-    """
+    """Something."""
 
     low: int = 3
     wait_s: Annotated[float, Field(gt=0)] | Auto = AUTO
+    """how long it waits; auto = as long as it likes"""
     kind: Literal["a", "b"] = "a"
+    """of which
+    kind"""
     name: str = field(kw_only=True)
+    """its name"""
     maybe: bool | None = None
 
 

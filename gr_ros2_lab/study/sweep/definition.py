@@ -61,30 +61,27 @@ Keys = Annotated[tuple[str, ...], BeforeValidator(lambda keys: (keys,) if isinst
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", str_strip_whitespace=True))
 class Sweep(Experiment):
-    """One scenario at many settings. The cells are every entry of ``list`` at every point of ``grid``.
-
-    :param scenario: a built-in name, or the path of a file seen from the sweep's
-    :param set: settings of all cells, over the scenario's
-    :param grid: dotted key -> the values it takes; all combinations are run
-    :param list: mappings of settings that belong together, each run in turn
-    :param repetitions: runs of every cell, with seeds one apart
-    :param x: key along the horizontal axis; auto chooses channel.snr_db or else the first that has numbers
-    :param y: key up the vertical axis of the heat map; auto chooses the next one that has numbers
-    :param by: keys that make a curve each; auto chooses those that are no numbers, or else the next one
-    :param value: what the figures show, a name of ``VALUES``
-    :param topic: of which topic, an absolute name; '' all together
-    """
+    """One scenario at many settings. The cells are every entry of ``list`` at every point of ``grid``."""
 
     scenario: Annotated[str, Field(min_length=1)]
+    """a built-in name, or the path of a file seen from the sweep's"""
     set: dict[str, Any] = Field(default_factory=dict)
+    """settings of all cells, over the scenario's"""
     grid: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(default_factory=dict)
+    """dotted key -> the values it takes; all combinations are run"""
     list: tuple[dict[str, Any], ...] = ()
+    """mappings of settings that belong together, each run in turn"""
     time: Time = "samples"
     x: Text = AUTO
+    """key along the horizontal axis; auto chooses channel.snr_db or else the first that has numbers"""
     y: Text = AUTO
+    """key up the vertical axis of the heat map; auto chooses the next one that has numbers"""
     by: Keys = (AUTO,)
+    """keys that make a curve each; auto chooses those that are no numbers, or else the next one"""
     value: str = PDR
+    """what the figures show, a name of ``VALUES``"""
     topic: str = ""
+    """of which topic, an absolute name; '' all together"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Sweep:
