@@ -38,10 +38,10 @@ pulse.connect(pulse.properties.old.change, show);
 pulse.connect(pulse.properties.said.change, say);
 pause.connect(pause.properties.active.change, name);
 dark.addEventListener("change", paint);
+show();
+say();
+paint();
 for (const fold of document.querySelectorAll("details")) {  // as this viewer has left it, also when the next run is shown
     fold.open = localStorage.getItem(fold.id) === "open";
     fold.addEventListener("toggle", () => localStorage.setItem(fold.id, fold.open ? "open" : ""));
 }
-show();
-say();
-paint();
