@@ -84,7 +84,7 @@ class RunMonitor:
             duration_s=run.duration_s,
             ledger=run.fates,
             tick_s=TICK_S,
-            airtime=run.links[0].phy.airtime if run.links and run.links[0].phy.has_airtime else None,
+            airtime=run.airtime,
             received_as=run.received_as,
             senders=run.heard,
         )

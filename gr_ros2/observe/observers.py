@@ -109,6 +109,7 @@ class LiveRun:
     :param fates: messages by their fate now, by source id and topic id; None where only one end of the link is in
         this process
     :param clock: s, the clock of the run's events
+    :param airtime: s that a packet of so many bytes takes at an MCS; None where packets take no air
     :param team: robots that share a channel, None where none do
     :param received_as: absolute name under which a topic of a sender, by its name in a registry, comes out here; ''
         where the names of ``topics`` are shown
@@ -127,6 +128,7 @@ class LiveRun:
     links: Sequence[LiveLink]
     fates: Callable[[], Mapping[tuple[int, int], Mapping[str, int]]] | None
     clock: Callable[[], float] = time.monotonic
+    airtime: Callable[[int, int], float] | None = None
     team: Callable[[], TeamView] | None = None
     received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
     announced: Callable[[], Sequence[tuple[int, str, Topic]]] = tuple

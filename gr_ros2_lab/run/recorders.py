@@ -173,6 +173,7 @@ class RunRecords:
             links=links,
             fates=self.recorder.ledger.fates,
             clock=clock,
+            airtime=self._phy.airtime if self._phy.has_airtime else None,
             team=None if self.team is None else self.team.view,
             heard=None
             if len(self._scenario.all_robots) == 2  # which share a recorder

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import RunError
 from gr_ros2.dashboard.monitor import RunMonitor
-from gr_ros2.link.events import Delivered
+from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.observe.observers import LiveRun
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2_lab.run.runner import run_scenario
@@ -100,6 +101,29 @@ def test_a_page_that_is_opened_late_knows_what_others_have_announced() -> None:
         ("/robot_1/odom", "nav_msgs/msg/Odometry"),
         ("/rx_robot_9/cmd_vel", "geometry_msgs/msg/Twist"),
     ]
+
+
+class Ticking(RunMonitor):
+    """Looks often in simulated time, whose seconds are none of the computer's."""
+
+    seen = 0
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        super().receiver_event(event, now)
+        self.seen += 1
+        if self.seen % 20 == 0:
+            self.tick()
+
+
+def test_simulated_time_has_its_share_of_the_air() -> None:
+    monitor = Ticking()
+    scenario = load_scenario("team", ["robots=4", "time=packets"], duration_s=10.0)
+    phy = run_scenario(scenario, observers=[monitor]).result.phy
+    air = monitor.snapshot.air
+    assert air is not None
+    spans = np.diff(air.t, prepend=0.0)
+    for kind, seconds in phy["airtime_of_kinds_s"].items():
+        assert float(air.busy[kind] @ spans) == pytest.approx(seconds, rel=0.05), kind  # the last tick is earlier
 
 
 def test_a_phy_without_samples_says_so_and_can_still_lose() -> None:
