@@ -58,6 +58,9 @@ class FrameSide(Protocol):
         :param output: type of the messages that receivers make of them; '' = the topic's
         """
 
+    def end(self, topic_id: int) -> None:
+        """No frame of a topic follows, and those that have left are of no more use."""
+
     def progress(self, topic_id: int, now: float) -> FrameState:
         """How it stands."""
 

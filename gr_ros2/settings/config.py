@@ -243,6 +243,12 @@ class SendOptions:
         ActsWhere(BY_TYPE, lambda topic: topic.codec == AUTO, "codec has to be auto for it; leave codec out"),
     )
 
+    @property
+    def passes_pictures(self) -> bool:
+        """Whether pictures pass as any message does."""
+        depth_off = self.depth_image in (DepthOptions(), DepthOptions(off=True))
+        return self.codec != AUTO or self.keep_s > 0 or (self.camera.off and depth_off)
+
     @model_validator(mode="after")
     def _deadline(self) -> SendOptions:
         refuse_without_effect(self)

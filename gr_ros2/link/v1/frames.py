@@ -92,6 +92,12 @@ class SentFrames:
         self._ages.setdefault(topic_id, 0.0)
         self._outlet.tabulate()
 
+    def end(self, topic_id: int) -> None:
+        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        sent = self.sent[topic_id]
+        while sent:
+            sent.popleft().lifetime.end()
+
     def progress(self, topic_id: int, now: float) -> FrameState:
         """How it stands."""
         queue = self._topics[topic_id].queue
