@@ -95,8 +95,7 @@ class MediumConfig:
     robots: Annotated[tuple[MediumRobot, ...], Field(min_length=2, max_length=BROADCAST)]
     """those that share the channel"""
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
-    """gain from one robot to another, dB: one number for all, or a row for each robot with a number for each other,
-    null where nothing arrives; null = ``channel.snr_db`` between all"""
+    """gain from one robot to another, dB: one number, or a row for each robot; null = `channel.snr_db` between all"""
     channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
     """of all pairs; with ``from: positions`` levels follow from where the robots are"""
     time: Literal["lockstep", "real"] = "lockstep"
