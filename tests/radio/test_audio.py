@@ -59,8 +59,8 @@ def serve(*robots: Robot) -> bool:
 
 
 def says_until(alone: Robot, number: int, condition: Callable[[], object]) -> None:
-    """Wait until what a robot says has come back. A computer that is late loses packets, which nobody repairs here: once
-    all have sounded, the robot says it again."""
+    """Wait until what a robot says has come back. A computer that is late loses packets, which nobody repairs here:
+    once all have sounded, the robot says it again."""
     alone.say(number)
 
     def look() -> object:
