@@ -68,6 +68,8 @@ _USUAL_PER_BLOCK = 8
 """Bytes where no budget is given."""
 _SLOWLY, _CLEARLY = 8, 1.5
 """The size follows the mean of about so many budgets, once it would be wrong by this factor."""
+_OUTER = 1024
+"""Bytes of an image beside its pixels, at most, but for the longest names of frames."""
 _SMALLEST = 64
 """Pixels of the shorter side, below which no image is halved."""
 _FORM = 1
@@ -130,7 +132,8 @@ class CameraEncoder:
         width, height = picture.width, picture.height
         if budget is None:
             budget = _USUAL_PER_BLOCK * _blocks(width, height)
-        halved = self._halvings(width, height, budget, key)
+        bytes_each = ENCODINGS[picture.label][1] if self._options.output == IMAGE else 0
+        halved = self._halvings(width, height, bytes_each, budget, key)
         shown = _shown(width, height, halved)
         frame = picture.frame
         if frame.format.name.startswith(_BAYER):
@@ -144,13 +147,18 @@ class CameraEncoder:
     def confirmed(self, name: int) -> None:
         """Do nothing: no frame needs a confirmed one."""
 
-    def _halvings(self, width: int, height: int, budget: int, key: bool) -> int:
-        """How often each side is halved."""
+    def _halvings(self, width: int, height: int, bytes_each: int, budget: int, key: bool) -> int:
+        """How often each side is halved.
+
+        :param bytes_each: of a pixel where it comes out; 0 where the picture comes out packed
+        """
         sizes = [0]
+        while not _makes(*_shown(width, height, sizes[0]), bytes_each):
+            sizes[0] += 1
         while min(_shown(width, height, sizes[-1] + 1)) >= _SMALLEST:
             sizes.append(sizes[-1] + 1)
         if self._options.size == FULL:
-            return 0
+            return sizes[0]
         if self._options.size != AUTO:
             most = tuple(map(int, self._options.size.split("x")))
             fitting = [n for n in sizes if all(a <= b for a, b in zip(_shown(width, height, n), most, strict=True))]
@@ -227,6 +235,11 @@ class CameraDecoder:
         if len(message) > self._max_size:
             raise DamagedError(f"damaged video: a message of {len(message)} bytes, at most {self._max_size}")
         return message
+
+
+def _makes(width: int, height: int, bytes_each: int) -> bool:
+    """Whether a receiver makes a picture of this size."""
+    return width * height <= MAX_PIXELS and width * height * bytes_each + _OUTER <= MAX_SIZE
 
 
 def scaled_camera_info(message: bytes, width: int, height: int) -> bytes:

@@ -66,8 +66,7 @@ class _Sent:
 
     def __init__(self, topic: Topic, coded: CodedTopic) -> None:
         self.name = topic.name
-        self.encoder = coded.encoder()
-        self.options = _coding(topic)
+        self.use(topic, coded)
         self.is_map = topic.type_name == GRID
         self.pull: FramePull | StatePull = (StatePull if self.is_map else FramePull)(coding_s=CODING_S)
         self.limit(topic)
@@ -76,6 +75,11 @@ class _Sent:
         self._lately: deque[tuple[float, int, int]] = deque()
         """When, bytes that came, and bytes of a frame that was sent."""
         self.what = ""
+
+    def use(self, topic: Topic, coded: CodedTopic) -> None:
+        """Code from now on so, with a key frame first."""
+        self.options, self.coded = _coding(topic), coded
+        self.encoder = coded.encoder()
 
     def note(self, now: float, came: int = 0, frame: int = 0) -> None:
         """So many bytes came, or were sent."""
@@ -125,7 +129,7 @@ class FrameSender:
         if known is not None:
             known.limit(topic)
             if known.options != _coding(topic) and (changed := coded_topic(topic)) is not None:
-                known.options, known.encoder = _coding(topic), changed.encoder()
+                known.use(topic, changed)
                 self._begin(topic)
             return True
         coded = coded_topic(topic, latched=(latched or topic.latched) and not self._frames.relayed)
@@ -180,22 +184,41 @@ class FrameSender:
     def done(self, job: Job, made: Coded | CodecError, now: float) -> None:
         """What has become of a message."""
         sent = job.sent
-        sent.pull.done(job.pull if isinstance(made, CodecError) else None)
         if job.encoder is not sent.encoder or self._sent.get(job.topic_id) is not sent:
+            taken = False
             self._frames.refuse(job.topic_id, Fate.SUPERSEDED, "the topic's options changed while it was coded")
-            return
-        if isinstance(made, CodecError):
+        elif isinstance(made, CodecError):
+            taken = False
             sent.failed += 1
             self._frames.refuse(job.topic_id, Fate.DAMAGED, str(made))
-            return
-        if made.data[0] == 0 and not sent.is_map and made.said not in sent.said:
-            sent.said.add(made.said)
-            _log.warning("topic %s: passes exactly, not as pictures: %s", sent.name, made.said)
+        elif not (taken := self._taken(job, made, now)) and not sent.is_map:
+            sent.encoder = sent.coded.encoder()  # no frame may follow one that is not sent
+        sent.pull.done(None if taken else job.pull)
+
+    def _taken(self, job: Job, made: Coded, now: float) -> bool:
+        """Whether a frame is sent. One of which no receiver makes a message is not."""
+        sent, size = job.sent, len(job.pull.message)
+        makes = size <= MAX_SIZE or not (sent.is_map or made.data[0] == 0)
+        if not makes:
+            self._frames.refuse(job.topic_id, Fate.TOO_LARGE, f"{size} bytes; at most {MAX_SIZE}")
+        elif self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=made.before is None):
+            self._sent_off(sent, made, now)
+            return True
+        sent.failed += 1
+        if Fate.TOO_LARGE not in sent.said:
+            sent.said.add(Fate.TOO_LARGE)
+            _log.warning("topic %s: a message of %d bytes is too large to be sent", sent.name, size)
+        return False
+
+    def _sent_off(self, sent: _Sent, made: Coded, now: float) -> None:
+        """A frame is sent."""
         sent.frames, sent.what = sent.frames + 1, made.said
         sent.note(now, frame=len(made.data))
-        self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=made.before is None)
         if sent.is_map:
             sent.encoder.confirmed(made.name)  # frames arrive in order
+        elif made.data[0] == 0 and made.said not in sent.said:
+            sent.said.add(made.said)
+            _log.warning("topic %s: passes exactly, not as pictures: %s", sent.name, made.said)
 
     def end(self) -> None:
         """Code nothing more: messages that wait are not sent."""

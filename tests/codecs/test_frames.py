@@ -511,3 +511,37 @@ def test_a_picture_that_is_coded_while_the_camera_is_turned_off_has_a_fate() -> 
     refused = [event for event in sender.events if isinstance(event, Refused)]
     assert [event.reason for event in refused] == [Fate.SUPERSEDED] * 2
     assert len([event for event in sender.events if isinstance(event, Accepted)]) == 1
+
+
+def test_a_frame_that_is_too_long_is_counted_and_named_and_the_next_passes(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    air = link()
+    sender, receiver = air.robots
+    air.run(2.0)
+    monkeypatch.setattr("gr_ros2.link.v1.outbox.MAX_MESSAGE", 100)
+    air.run(3.0)
+    monkeypatch.undo()
+    seen = len(receiver.of(1))
+    air.run(5.0)
+    refused = [event for event in sender.events if isinstance(event, Refused) and event.reason == Fate.TOO_LARGE]
+    assert len(refused) >= 4, "each is counted"
+    assert len([record for record in caplog.records if "too large" in record.message]) == 1
+    assert len(receiver.of(1)) - seen > 20
+    assert not receiver.failed, "no frame came without the one before it"
+    said = sender.sender.stats(CAMERA, air.now)
+    assert said is not None and said["not_coded"] == len(refused)
+
+
+def test_a_picture_that_no_receiver_would_make_is_not_sent(caplog: pytest.LogCaptureFixture) -> None:
+    air = link(kbit_s=4000)
+    sender, receiver = air.robots
+    huge = scenes.image(np.zeros((2000, 2100, 6), np.uint8), "rgb16", 5)
+    air._feeds[0] = sender, CAMERA, 5, lambda n: huge if n == 5 else picture(n), 0
+    air.run(3.0)
+    refused = [event for event in sender.events if isinstance(event, Refused) and event.reason == Fate.TOO_LARGE]
+    assert len(refused) == 1
+    assert str(len(huge)) in refused[0].detail
+    assert len([record for record in caplog.records if "too large" in record.message]) == 1
+    assert [number_of(message) for _, message in receiver.of(1)][-1] > 12
+    assert not receiver.failed
