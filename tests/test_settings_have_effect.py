@@ -30,7 +30,7 @@ from gr_ros2.gr.factory import Start, make_endpoint
 from gr_ros2.link.air import Air as RadioFacts
 from gr_ros2.link.endpoint import LIVE_OPTIONS, Endpoint, OpenEndpoint
 from gr_ros2.link.v1.endpoint import EndpointV1
-from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
+from gr_ros2.link.v1.endpoint_settings import end_settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
 from gr_ros2.paper.endpoint import EndpointV0
 from gr_ros2.paper.factory import make_paper_endpoint

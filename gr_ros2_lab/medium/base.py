@@ -20,16 +20,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.link.events import AirPacket
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.settings.config import ChannelConfig
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int_]
 
 
 @dataclass(frozen=True)
-class Path:
+class RadioPath:
     """What lies between a sender and one robot that can hear it, whatever the level.
 
     :param receiver: place of that robot among the robots of the medium
@@ -105,7 +105,7 @@ class Surroundings(ABC):
         """Those who hear a robot at a time in s: the same object as long as nothing has changed for this robot."""
 
     @abstractmethod
-    def path(self, sender: int, receiver: int) -> Path:
+    def path(self, sender: int, receiver: int) -> RadioPath:
         """What lies between two robots."""
 
     @abstractmethod
@@ -125,7 +125,7 @@ class FixedPaths(Surroundings):
 
     moves = False
 
-    def __init__(self, paths: Sequence[Sequence[Path]]) -> None:
+    def __init__(self, paths: Sequence[Sequence[RadioPath]]) -> None:
         self.robots = len(paths)
         self._paths = [{path.receiver: path for path in heard} for heard in paths]
         self._hearers = [self._of(heard) for heard in paths]
@@ -136,7 +136,7 @@ class FixedPaths(Surroundings):
         # Robots that reach a common one, and robots of which one reaches the other.
         self._near = (hears.astype(np.float32) @ hears.T.astype(np.float32) > 0) | hears | hears.T
 
-    def _of(self, heard: Sequence[Path]) -> Hearers:
+    def _of(self, heard: Sequence[RadioPath]) -> Hearers:
         snrs = [inf if path.channel.snr_db is None else path.channel.snr_db for path in heard]
         ids = np.array([path.receiver for path in heard], int)
         return Hearers(ids, np.array(snrs), np.zeros(len(heard)), self.robots)
@@ -144,7 +144,7 @@ class FixedPaths(Surroundings):
     def hearers(self, sender: int, now: float) -> Hearers:  # noqa: ARG002
         return self._hearers[sender]
 
-    def path(self, sender: int, receiver: int) -> Path:
+    def path(self, sender: int, receiver: int) -> RadioPath:
         return self._paths[sender][receiver]
 
     def reached(self, sender: int) -> list[int]:

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.settings.config import ScenarioChannel
-from gr_ros2_lab.medium.base import Floats, Hearers, Ints, Path, Surroundings
+from gr_ros2_lab.medium.base import Hearers, Ints, RadioPath, Surroundings
 from gr_ros2_lab.medium.propagation import Shadowing, doppler_hz, path_loss_db, snr_over_db
 from gr_ros2_lab.sim.world import World
 
@@ -52,7 +53,7 @@ class Positions(Surroundings):
         tx_power_dbm: Sequence[float],
         noise_figure_db: Sequence[float],
         *,
-        paths: Sequence[Sequence[Path]],
+        paths: Sequence[Sequence[RadioPath]],
         world: World | None = None,
     ) -> None:
         self.robots = len(tx_power_dbm)
@@ -76,7 +77,7 @@ class Positions(Surroundings):
     def begin(self, now: float) -> None:
         self._begin_s = now
 
-    def path(self, sender: int, receiver: int) -> Path:
+    def path(self, sender: int, receiver: int) -> RadioPath:
         return self._paths[sender][receiver]
 
     def reached(self, sender: int) -> list[int]:

@@ -11,10 +11,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.lateness import Lateness
 from gr_ros2_lab.record.result import LatenessResult
-from gr_ros2_lab.record.trace import Floats, Trace
+from gr_ros2_lab.record.trace import Trace
 
 AFTER_S = 1.0
 """s. After this time, queues that became full in a late moment are empty again, and incomplete messages have been given

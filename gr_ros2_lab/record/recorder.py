@@ -12,6 +12,7 @@ from dataclasses import asdict
 from math import inf
 from typing import Any
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.link.events import Accepted, AirKind, Delivered, Received, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.observe.positions import PositionReader, position_reader
 from gr_ros2.observe.result import AgeResult, LatencyResult, TopicResult
@@ -19,7 +20,7 @@ from gr_ros2.settings.registry import MAX_TOPICS, Registry, Topic
 from gr_ros2_lab.record.ledger import Ledger, TopicLedger
 from gr_ros2_lab.record.metrics import TopicMetrics, topic_metrics
 from gr_ros2_lab.record.path_error import path_error, rms_error
-from gr_ros2_lab.record.trace import Floats, PacketLog, Trace, Track, make_trace
+from gr_ros2_lab.record.trace import PacketLog, Trace, Track, make_trace
 
 
 class Recorder:

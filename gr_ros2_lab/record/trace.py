@@ -24,12 +24,12 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.files import write_whole
 from gr_ros2.link.events import SentPacket
 from gr_ros2_lab.record.ledger import TopicLedger
 
-Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Texts = npt.NDArray[Any]
 
