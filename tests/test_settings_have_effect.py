@@ -252,6 +252,7 @@ effects(
     voxel=Elsewhere("codecs/test_whole.py::test_cells_come_out_as_they_were_said_to"),
     range=Elsewhere("codecs/test_whole.py::test_range_and_keep_say_what_of_a_cloud_leaves"),
     keep=Elsewhere("codecs/test_whole.py::test_range_and_keep_say_what_of_a_cloud_leaves"),
+    fit=Elsewhere("codecs/test_cloud_frames.py::test_cells_are_as_small_as_the_air_allows"),
 )
 effects(
     "Simulator",

@@ -1,4 +1,4 @@
-"""Topics as chains of frames on a link: cameras, depth and maps.
+"""Topics as chains of frames on a link: cameras, depth, maps, and clouds that fit the air.
 
 :class:`FrameSender` decides when the newest message of each topic is coded and keeps the encoders, whoever runs them:
 a thread of a link, or a simulation at once. :class:`FrameReceiver` keeps one decoder for each topic of each robot.
@@ -17,14 +17,14 @@ from math import inf
 from typing import Any, NamedTuple
 
 from gr_ros2.codecs.base import MAX_SIZE, Coded
-from gr_ros2.codecs.messages import CAMERA_INFO, GRID
+from gr_ros2.codecs.messages import CAMERA_INFO, CLOUD, GRID
 from gr_ros2.codecs.pull import FramePull, Pull, StatePull
 from gr_ros2.codecs.topic import OFF, CodedTopic, TopicDecoder, TopicEncoder
 from gr_ros2.core.errors import BackendMissingError, CodecError
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.frames import MARK, FrameSide
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Topic
+from gr_ros2.settings.registry import PICTURES, Topic
 from gr_ros2.wire import AnnouncedTopic
 
 CODING_S = 0.008
@@ -67,7 +67,7 @@ class _Sent:
     def __init__(self, topic: Topic, coded: CodedTopic) -> None:
         self.name = topic.name
         self.use(topic, coded)
-        self.is_map = topic.type_name == GRID
+        self.is_map, self.is_cloud = topic.type_name == GRID, topic.type_name == CLOUD
         self.pull: FramePull | StatePull = (StatePull if self.is_map else FramePull)(coding_s=CODING_S)
         self.limit(topic)
         self.said: set[str] = set()
@@ -120,7 +120,8 @@ class FrameSender:
         self._sent: dict[int, _Sent] = {}
 
     def add(self, topic: Topic, *, latched: bool = False) -> bool:
-        """Send a topic as frames if it is a camera, depth or a latched map, and its options do not say otherwise.
+        """Send a topic as frames if it is a camera, depth, a latched map or a cloud that is to fit the air, and its
+        options do not say otherwise.
         Returns whether it is sent so. For one that is, its options may have changed.
 
         :param latched: whether its one publisher keeps its message for late joiners
@@ -145,7 +146,7 @@ class FrameSender:
 
     def change(self, before: Topic, after: Topic) -> None:
         """A topic has other options, and may have another topic id with them."""
-        if not before.as_video or after.as_video:
+        if not before.as_frames or after.as_frames:
             if before.topic_id in self._sent or before.topic_id != after.topic_id:
                 self.add(after)
         elif (sent := self._sent.pop(before.topic_id, None)) is not None:
@@ -201,7 +202,7 @@ class FrameSender:
         makes = size <= MAX_SIZE or not (sent.is_map or made.data[0] == 0)
         if not makes:
             self._frames.refuse(job.topic_id, Fate.TOO_LARGE, f"{size} bytes; at most {MAX_SIZE}")
-        elif self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=made.before is None):
+        elif self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=self._is_key(job, made)):
             self._sent_off(sent, made, now)
             return True
         sent.failed += 1
@@ -209,6 +210,11 @@ class FrameSender:
             sent.said.add(Fate.TOO_LARGE)
             _log.warning("topic %s: a message of %d bytes is too large to be sent", sent.name, size)
         return False
+
+    def _is_key(self, job: Job, made: Coded) -> bool:
+        """Whether what was sent before is of no more use once a frame has left. Of clouds, each of which stands alone,
+        all are repaired as long as somebody follows."""
+        return job.pull.key if job.sent.is_cloud else made.before is None
 
     def _sent_off(self, sent: _Sent, made: Coded, now: float) -> None:
         """A frame is sent."""
@@ -218,7 +224,8 @@ class FrameSender:
             sent.encoder.confirmed(made.name)  # frames arrive in order
         elif made.data[0] == 0 and made.said not in sent.said:
             sent.said.add(made.said)
-            _log.warning("topic %s: passes exactly, not as pictures: %s", sent.name, made.said)
+            what = "cells" if sent.is_cloud else "pictures"
+            _log.warning("topic %s: passes exactly, not as %s: %s", sent.name, what, made.said)
 
     def end(self) -> None:
         """Code nothing more: messages that wait are not sent."""
@@ -273,9 +280,12 @@ def coded_topic(topic: Topic, *, latched: bool = False) -> CodedTopic | None:
     """
     if topic.type_name == GRID and topic.options.codec == AUTO and latched:
         return CodedTopic(GRID)
-    if not topic.as_video:
+    if not topic.as_frames:
         return None
     options, depth = topic.options, topic.options.depth_image
+    if topic.type_name == CLOUD:
+        cloud = {"voxel": options.cloud.voxel, "range": options.cloud.range, "keep": options.cloud.keep}
+        return CodedTopic(CLOUD, {"cloud": {name: value for name, value in cloud.items() if value != AUTO}})
     chosen: dict[str, Mapping[str, Any] | str] = {
         "camera": OFF if options.camera.off else {"size": options.camera.size},
         "depth": OFF if depth.off else {"mode": depth.mode, "near": depth.near, "far": depth.far},
@@ -344,7 +354,8 @@ class FrameReceiver:
             self._decoders.popitem(last=False)
         message = decoder.decode(payload)
         self._sizes.pop(camera, None)
-        self._sizes[camera] = decoder.size
+        if self._topics[key][0] in PICTURES:
+            self._sizes[camera] = decoder.size
         if len(self._sizes) > MOST_DECODERS:
             del self._sizes[next(iter(self._sizes))]
         return message

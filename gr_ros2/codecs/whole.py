@@ -24,7 +24,8 @@ class WholeCodec:
 
     def __init__(self, name: str, topic: Topic) -> None:
         chosen = getattr(topic.options, name, None)
-        options = {} if chosen is None else {key: value for key, value in asdict(chosen).items() if value != AUTO}
+        given = {} if chosen is None else asdict(chosen)
+        options = {key: value for key, value in given.items() if value != AUTO and key != "fit"}
         self._wanted = chosen is not None and chosen != type(chosen)()
         self._name, self._topic_name, self._said = name, topic.name, False
         self._mark = bytes([CODECS[name].number])

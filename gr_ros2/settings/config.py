@@ -110,9 +110,12 @@ class CloudOptions:
     """m from the origin of the cloud's frame, beyond which cells are left out; auto = none are"""
     keep: Literal["", "intensity", "rgb"] = ""
     """what of a cell's points is sent beside their place, as a mean"""
+    fit: bool = False
+    """cells become larger where the air is short: clouds leave as pictures of a camera do, the newest alone, coded into
+    what other topics leave"""
     conditions: ClassVar[Any] = (
         ActsWhere(
-            ("range", "keep"), lambda cloud: cloud.voxel > 0, "an exact cloud has every point; set voxel above 0"
+            ("range", "keep", "fit"), lambda cloud: cloud.voxel > 0, "an exact cloud has every point; set voxel above 0"
         ),
     )
 
@@ -240,8 +243,7 @@ class SendOptions:
     @property
     def passes_pictures(self) -> bool:
         """Whether pictures pass as any message does."""
-        depth_off = self.depth_image in (DepthOptions(), DepthOptions(off=True))
-        return self.codec != AUTO or self.keep_s > 0 or (self.camera.off and depth_off)
+        return self.camera.off and self.depth_image in (DepthOptions(), DepthOptions(off=True))
 
     @model_validator(mode="after")
     def _deadline(self) -> SendOptions:

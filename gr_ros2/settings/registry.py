@@ -33,6 +33,7 @@ _D = TypeVar("_D")
 
 PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 """Types whose messages may leave as video."""
+CLOUD = "sensor_msgs/msg/PointCloud2"
 CALLS_TYPE = "gr_ros2/calls/Frame"
 """Type of the row in which requests and replies are sent (see :mod:`gr_ros2.calls`); no topic has this type."""
 
@@ -96,8 +97,8 @@ class Topic:
 
     @property
     def stream(self) -> tuple[str, str, int | Auto, bool]:
-        """What has a topic id of its own: name, type, the robot that it is for, and whether it is video."""
-        return self.name.lstrip("/"), self.type_name, self.options.to, self.as_video
+        """What has a topic id of its own: name, type, the robot that it is for, and whether it leaves as frames."""
+        return self.name.lstrip("/"), self.type_name, self.options.to, self.as_frames
 
     @property
     def latched(self) -> bool:
@@ -107,9 +108,17 @@ class Topic:
         return self.name.rsplit("/", 1)[-1] in _LATCHED or self.name.endswith(f"/{STATUS}")
 
     @property
-    def as_video(self) -> bool:
-        """Whether its messages leave as video, where the robot can code it."""
-        return self.type_name in PICTURES and not (self.latched or self.options.passes_pictures)
+    def as_frames(self) -> bool:
+        """Whether its messages leave as frames that fit the air (:mod:`gr_ros2.link.frames`), where the robot can code
+        them. Those of latched maps do, too, which depends on their publishers."""
+        options = self.options
+        if self.latched or options.keep_s > 0 or options.codec != AUTO:
+            return False
+        return options.cloud.fit if self.type_name == CLOUD else self._is_video
+
+    @property
+    def _is_video(self) -> bool:
+        return self.type_name in PICTURES and not self.options.passes_pictures
 
     @property
     def is_service(self) -> bool:
@@ -196,7 +205,7 @@ class Registry(Sequence[Topic]):
 
     def extended(self, topics: Sequence[NewTopic]) -> Registry:
         """These topics too, with the next numbers. A name may come again with another type, for another robot, or as
-        video.
+        frames.
 
         :raises RegistryError: too many, or a topic that is there already
         """

@@ -162,7 +162,7 @@ class Outbox:
         meant = replace(before.topic, options=options)
         known = [one for one in self.sent.named() if one.topic.stream == meant.stream]
         after = known[0] if known else self.sent[self.add([(name, type_name, options)])[-1].topic_id]
-        if before.topic.as_video != meant.as_video:
+        if before.topic.as_frames != meant.as_frames:
             self.drop([Dropped(message, *_changed(message)) for message in before.queue])
             before.queue.clear()
         after.publishers = before.publishers
