@@ -71,7 +71,7 @@ class _Sent:
         self.pull: FramePull | StatePull = (StatePull if self.is_map else FramePull)(coding_s=CODING_S)
         self.limit(topic)
         self.said: set[str] = set()
-        self.frames = self.failed = 0
+        self.frames = self.failed = self.bytes = 0
         self._lately: deque[tuple[float, int, int]] = deque()
         """When, bytes that came, and bytes of a frame that was sent."""
         self.what = ""
@@ -218,7 +218,7 @@ class FrameSender:
 
     def _sent_off(self, sent: _Sent, made: Coded, now: float) -> None:
         """A frame is sent."""
-        sent.frames, sent.what = sent.frames + 1, made.said
+        sent.frames, sent.what, sent.bytes = sent.frames + 1, made.said, sent.bytes + len(made.data)
         sent.note(now, frame=len(made.data))
         if sent.is_map:
             sent.encoder.confirmed(made.name)  # frames arrive in order
@@ -234,13 +234,14 @@ class FrameSender:
                 self._frames.refuse(topic_id, Fate.SUPERSEDED, "sending ended before the air was free for it")
 
     def stats(self, topic_id: int, now: float) -> dict[str, Any] | None:
-        """What is made of a topic: frames so far, messages that could not be coded, and in words what the newest frame
-        leaves out and what the topic has become lately; None for one that is not sent as frames."""
+        """What is made of a topic: frames so far and their bytes, messages that could not be coded, and in words what
+        the newest frame leaves out and what the topic has become lately; None for one that is not sent as frames."""
         sent = self._sent.get(topic_id)
         if sent is None:
             return None
         state = self._frames.progress(topic_id, now)
-        return {"frames": sent.frames, "not_coded": sent.failed, "made": sent.what, "words": sent.words(now, state.age)}
+        words = {"made": sent.what, "words": sent.words(now, state.age)}
+        return {"frames": sent.frames, "bytes": sent.bytes, "not_coded": sent.failed, **words}
 
 
 class TimedCoder:
