@@ -24,6 +24,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.facts import Early
 from gr_ros2.link.v1.frames import SentFrames
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
@@ -120,7 +121,15 @@ class EndpointV1:
         )
         self.sent = messages.stats
         self._receiving = ReceivingSide(
-            settings, boot, keys, decoder_for=decoder_for, access=access, heard=heard or {}, save=save
+            settings,
+            boot,
+            keys,
+            window.packets,
+            decoder_for=decoder_for,
+            access=access,
+            tells_snr=rate is not None,
+            heard=heard or {},
+            save=save,
         )
         self.received = self._receiving.stats
         self.neighbours = neighbours = self._receiving.neighbours
@@ -144,6 +153,7 @@ class EndpointV1:
             hellos=hellos,
             writer=writer,
             hold=hold,
+            rate=rate,
             relaying=self._receiving.relaying,
         )
         relaying = self._receiving.relaying
@@ -161,7 +171,6 @@ class EndpointV1:
                 ended=messages.ended,
             )
             messages.relayed_left, relaying.found = relaying.left, messages.found
-        self._receiving.tell(self._sending, messages, window, rate)
         self.pace, self.pings = self._sending.pace, self._sending.pings
         self.frames = SentFrames(
             messages.sent,
@@ -292,11 +301,25 @@ class EndpointV1:
 
     def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         self._now = now if now > self._now else self._now
-        return self._receiving.receive(arrival, now)
+        return self._take(arrival, now)
+
+    def _take(self, arrival: AirPacket, now: float, came: float | None = None) -> list[ReceiverEvent]:
+        """Take a packet, and what can be opened since it came; the sending half learns what matters there."""
+        events = self._receiving.receive(arrival, now, came)
+        for fact in self._receiving.take_facts():
+            if isinstance(fact, Early):
+                for at, data in fact.packets:
+                    events += self._take(AirPacket(data), now, at)
+            else:
+                self._sending.learn(fact, now)
+        return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         self._now = max(self._now, now)
-        return self._receiving.handle_timeout(now)
+        events = self._receiving.handle_timeout(now)
+        for fact in self._receiving.take_facts():
+            self._sending.learn(fact, now)
+        return events
 
     def next_timeout(self) -> float | None:
         return self._receiving.next_timeout()

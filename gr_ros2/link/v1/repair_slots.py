@@ -27,17 +27,15 @@ for 40 s after an outage of 300 s at 10 Hz, and those that their queue had no ro
 
 
 class RepairSlots:
-    """The slots of one sender that carry repairs.
-
-    :ivar waits_until: time in s up to which repairs wait, because a new message is about to come; -inf to look anew
-    """
+    """The slots of one sender that carry repairs."""
 
     def __init__(
         self, settings: Settings, pace: Pace, window: RepairWindow, *, writer: PacketWriter, hold: Hold
     ) -> None:
         self._settings = settings
         self._pace, self._window, self._writer, self._hold = pace, window, writer, hold
-        self.waits_until = -inf
+        self._waits_until = -inf
+        """Time in s up to which repairs wait, because a new message is about to come; -inf to look anew."""
         self._calm_since = -inf
         """Time in s at which no repair was wanted, if no report has come since; otherwise -inf."""
         self._calm_number = 0
@@ -54,6 +52,10 @@ class RepairSlots:
         if mode != AUTO:
             return mode
         return "thrifty" if reported else "idle"
+
+    def look_anew(self) -> None:
+        """A robot was heard: what repairs wait for may be another message now."""
+        self._waits_until = -inf
 
     def reported(self) -> None:
         """A report has come."""
@@ -84,9 +86,9 @@ class RepairSlots:
         self._window.mode = self.mode
         if self._window.peers.in_vain and (over := self._window.peers.over(now)) >= 0:
             return self._tell(over, now)
-        self.waits_until = -inf
+        self._waits_until = -inf
         chosen = self._window.next(now, self.held)
-        held = self.waits_until > now
+        held = self._waits_until > now
         self._calm_since = now if chosen is None and not held else -inf
         self._calm_number = self._window.packets.newest
         if chosen is not None:
@@ -101,10 +103,10 @@ class RepairSlots:
         :param waiting: something else waits for such a slot
         """
         if waiting:
-            return max(self.waits_until, now)
+            return max(self._waits_until, now)
         if self.mode == "off" or not self._window.packets.wanted(now):
             return inf
-        return max(self.waits_until, now if self.mode == "idle" else self._next_look(now))
+        return max(self._waits_until, now if self.mode == "idle" else self._next_look(now))
 
     def _tell(self, number: int, now: float) -> SentPacket | None:
         """Say that a packet is not repaired any more."""
@@ -125,5 +127,5 @@ class RepairSlots:
     def held(self, now: float, *, repairs: bool = True) -> bool:
         """Whether what could leave now, a repair or something else, waits for a new message."""
         airtime = self._pace.interval
-        self.waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime, repairs=repairs)
-        return self.waits_until > now
+        self._waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime, repairs=repairs)
+        return self._waits_until > now
