@@ -545,3 +545,26 @@ def test_a_picture_that_no_receiver_would_make_is_not_sent(caplog: pytest.LogCap
     assert len([record for record in caplog.records if "too large" in record.message]) == 1
     assert [number_of(message) for _, message in receiver.of(1)][-1] > 12
     assert not receiver.failed
+
+
+def test_a_robot_in_between_shows_a_camera_on_as_one_of_its_own() -> None:
+    """What a program of its graph publishes again is coded anew, within what that robot's air has left."""
+    camera, between, far = Robot(1, registry(), 256), Robot(2, registry(), 128), Robot(3, None, 128)
+    air = Air(camera, between, far)
+    air.lost = lambda sender, receiver: {sender, receiver} == {camera, far}
+    air.feed(camera, CAMERA, FPS, picture)
+    take = between.take
+
+    def taken(events: Any, now: float) -> None:
+        before = len(between.seen)
+        take(events, now)
+        for _, key, message in between.seen[before:]:
+            if key == (1, CAMERA):
+                between.submit(CAMERA, message, now)
+
+    between.take = taken  # type: ignore[method-assign]
+    air.run(6.0)
+    seen = [(now, number_of(message) / FPS) for now, message in far.of(2) if now > 2]
+    assert len(seen) > 4 * 12
+    assert np.mean([now - made for now, made in seen]) < 0.3
+    assert not far.of(1)
