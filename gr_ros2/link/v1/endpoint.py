@@ -21,6 +21,7 @@ from gr_ros2.link.endpoint import LIVE_OPTIONS, HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.instances import InstancesOf, no_instances
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
@@ -37,7 +38,6 @@ from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.link.v1.writer import PacketWriter, room_of
-from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import TAG_LEN
@@ -65,6 +65,7 @@ class EndpointV1:
     :param instances: tells the instances of a topic that it sends
     :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
     :ivar answers: whether what it receives can change what it sends
+    :ivar pace: when packets may leave
     :ivar window: the packets that are worth repairing
     :ivar frames: its coded topics
     :ivar neighbours: the robots that are heard
@@ -98,15 +99,17 @@ class EndpointV1:
         self.answers = bool(topics) or settings.hears
         self._now = -inf
         rate = RateController(mcs_table) if mcs_table else None
+        self.pace = pace = Pace(settings.packet_rate)
         self._hold = hold = Hold()
         room = room_of(settings, keys, block=access is not None)
         self.window = window = RepairWindow(
-            "idle" if settings.repair == AUTO else settings.repair,
+            settings.repair,
             room,
             settings.expected_loss,
             shares=settings.shares,
             proves=keys.sealed and settings.hears and settings.idle_is_free,
             slower=settings.slower,
+            limited=lambda: pace.known,
         )
         self.messages = messages = Outbox(
             topics,
@@ -153,6 +156,7 @@ class EndpointV1:
             hellos=hellos,
             writer=writer,
             hold=hold,
+            pace=pace,
             rate=rate,
             relaying=self._receiving.relaying,
         )
@@ -171,13 +175,13 @@ class EndpointV1:
                 ended=messages.ended,
             )
             messages.relayed_left, relaying.found = relaying.left, messages.found
-        self.pace, self.pings = self._sending.pace, self._sending.pings
+        self.pings = self._sending.pings
         self.frames = SentFrames(
             messages.sent,
             messages,
             window.packets,
             window.peers,
-            self.pace,
+            pace,
             room=room,
             turn_s=settings.turn_s,
             any_length=settings.any_length,
@@ -203,7 +207,7 @@ class EndpointV1:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self._sending.repairs.mode != "off" and self.window.packets.wanted(self._now)
+        mending = self.window.mode != "off" and self.window.packets.wanted(self._now)
         return self.messages.idle and not mending
 
     @property

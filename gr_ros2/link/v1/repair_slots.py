@@ -11,9 +11,8 @@ from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hold import Hold
-from gr_ros2.link.v1.repair import RepairMode, RepairWindow
+from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.writer import PacketWriter
-from gr_ros2.settings.fields import AUTO
 
 PATIENCE_S = 0.2
 """s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
@@ -43,16 +42,6 @@ class RepairSlots:
         self._ahead, self._number = 0, 0
         """Repairs that may go before new messages, and the newest packet when that was counted."""
 
-    @property
-    def mode(self) -> RepairMode:
-        """What idle slots carry."""
-        mode, reported = self._settings.repair, bool(self._window.peers.all)
-        if not self._pace.known:  # nothing limits how many packets leave: repair only what reports call for
-            return "thrifty" if mode != "off" and reported else "off"
-        if mode != AUTO:
-            return mode
-        return "thrifty" if reported else "idle"
-
     def look_anew(self) -> None:
         """A robot was heard: what repairs wait for may be another message now."""
         self._waits_until = -inf
@@ -72,7 +61,6 @@ class RepairSlots:
             self._number = newest
             if not self._ahead:
                 return None
-        self._window.mode = self.mode
         over = self._window.peers.over(now, PATIENCE_S * self._settings.slower)
         if over < 0 or not self._window.may_tell(waiting=waiting):
             again = self._window.urgent(now)
@@ -83,7 +71,6 @@ class RepairSlots:
 
     def spare(self, now: float) -> SentPacket | None:
         """What a slot carries that nothing else needs."""
-        self._window.mode = self.mode
         if self._window.peers.in_vain and (over := self._window.peers.over(now)) >= 0:
             return self._tell(over, now)
         self._waits_until = -inf
@@ -104,9 +91,10 @@ class RepairSlots:
         """
         if waiting:
             return max(self._waits_until, now)
-        if self.mode == "off" or not self._window.packets.wanted(now):
+        mode = self._window.mode
+        if mode == "off" or not self._window.packets.wanted(now):
             return inf
-        return max(self._waits_until, now if self.mode == "idle" else self._next_look(now))
+        return max(self._waits_until, now if mode == "idle" else self._next_look(now))
 
     def _tell(self, number: int, now: float) -> SentPacket | None:
         """Say that a packet is not repaired any more."""

@@ -42,9 +42,9 @@ every ``repeat_s`` in any case."""
 class SendingSide:
     """The choice of what leaves next.
 
+    :param pace: says when packets may leave
     :param rate: chooses the MCS of each packet; None for a fixed rate
     :param relaying: what is sent on of what others make; None where nothing is
-    :ivar pace: when packets may leave
     :ivar hellos: when this robot announces itself
     :ivar pings: its questions and answers
     :ivar repairs: its repairs
@@ -62,16 +62,17 @@ class SendingSide:
         hellos: Hellos,
         writer: PacketWriter,
         hold: Hold,
+        pace: Pace,
         rate: RateController | None = None,
         relaying: Relaying | None = None,
     ) -> None:
         self.settings = settings
         self._rate, self._relaying = rate, relaying
-        self.pace = Pace(settings.packet_rate)
-        self._slowness = Slowness(self.pace)
+        self._pace = pace
+        self._slowness = Slowness(pace)
         self.hellos = hellos
         self.pings = Pings(turn_s=settings.turn_s)
-        self.repairs = RepairSlots(settings, self.pace, window, writer=writer, hold=hold)
+        self.repairs = RepairSlots(settings, self._pace, window, writer=writer, hold=hold)
         self.reports = ReportSlots(settings, neighbours.all.values(), writer)
         self.urged = False
         self._heard_at = inf
@@ -103,7 +104,7 @@ class SendingSide:
         if now >= self._repeat_at:
             self._repeat(now)
         if messages.sent.deadlines:
-            messages.expire(now, self.pace.sure_interval(now))
+            messages.expire(now, self._pace.sure_interval(now))
         due = reports.due(now)
         if due and reports.overdue:
             return reports.packet(due, now)
@@ -163,13 +164,13 @@ class SendingSide:
     def next_departure(self, now: float) -> float:
         """When ``packet`` may have something, s; without regard to credits."""
         if self._alone(now):
-            return max(self._beacon_at, self.pace.slot)
+            return max(self._beacon_at, self._pace.slot)
         leaving = self._messages.packing.next_timeout(now)
         if leaving > now:
             leaving = min(leaving, self.hellos.due, self.pings.due, self._repeat_at, self.reports.next(now))
         if leaving > now:
             leaving = min(leaving, self.repairs.next(now, waiting=self._messages.packing.fills))
-        return max(leaving, self.pace.slot)
+        return max(leaving, self._pace.slot)
 
     def learn(self, fact: Fact, now: float) -> None:
         """Something that matters here has arrived."""
@@ -240,7 +241,7 @@ class SendingSide:
         if settings.repeat_s != before.repeat_s and self._started and self._messages.kept.digest:
             self._plan_repeat(now)
         if settings.packet_rate != before.packet_rate:
-            self.pace.change(settings.packet_rate)
+            self._pace.change(settings.packet_rate)
 
     def topics_changed(self, now: float) -> None:
         self.hellos.hurry(now)
@@ -255,7 +256,7 @@ class SendingSide:
 
     def _beacon(self, now: float) -> SentPacket | None:
         """What leaves while nobody is heard for long."""
-        self._messages.expire(now, self.pace.sure_interval(now))
+        self._messages.expire(now, self._pace.sure_interval(now))
         if now < self._beacon_at:
             return None
         self._beacon_at = now + self.settings.beacon_s
@@ -293,7 +294,7 @@ class SendingSide:
         starting = self.hellos.starting
         often = starting or (now >= self._table_at and not self.hellos.lone)
         if often and not window.peers and kept.digest:  # no report says whether it has arrived
-            self._table_at = now + kept.table_packets * self.pace.interval / TABLE_SHARE
+            self._table_at = now + kept.table_packets * self._pace.interval / TABLE_SHARE
             kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
         sent = self._writer.control(entries, "hello", now, clear=isinstance(entries[0], Hello))
