@@ -8,8 +8,7 @@ what is said names the reason; frames of different senders never meet, since eac
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -23,14 +22,12 @@ from gr_ros2.core.errors import BackendMissingError, ConfigError, DamagedError, 
 class CodecRow(Backend):
     """One codec.
 
-    :param number: of its frames, 1..255; those of other packages have 128 and more
+    :param number: of its frames, 1..255
     :param types: that it takes; of two that take a type, the first codec of the table that codes a message does
-    :param alone: whether each of its frames stands alone, so that a link codes every message of these types with it
     """
 
     number: int = 0
     types: tuple[str, ...] = ()
-    alone: bool = False
 
 
 _VIDEO = "PyAV (pip install 'gr-ros2[video]')"
@@ -57,7 +54,7 @@ CODECS = BackendTable(
             number=2,
             types=(IMAGE, COMPRESSED_IMAGE),
         ),
-        "cloud": CodecRow("gr_ros2.codecs.cloud", "CloudCodec", "point clouds", number=3, types=(CLOUD,), alone=True),
+        "cloud": CodecRow("gr_ros2.codecs.cloud", "CloudCodec", "point clouds", number=3, types=(CLOUD,)),
         "grid": CodecRow("gr_ros2.codecs.grid", "GridCodec", "what changes of a map", number=4, types=(GRID,)),
     },
     CodecRow,
@@ -84,8 +81,8 @@ class CodedTopic:
         options = options or {}
         if unknown := [name for name in options if name not in CODECS]:
             raise ConfigError(f"no codec {unknown[0]!r}; known are {', '.join(CODECS)}")
-        for name, row in rows_of(type_name):
-            if options.get(name) != OFF:
+        for name, row in CODECS.items():
+            if type_name in row.types and options.get(name) != OFF:
                 try:
                     CODECS.modules(name)
                     self.codecs[row.number] = configured(name, type_name, options.get(name, {}))
@@ -103,15 +100,6 @@ class CodedTopic:
         :param max_size: bytes of the largest message that it makes
         """
         return TopicDecoder(self, max_size)
-
-
-def rows_of(type_name: str) -> Iterator[tuple[str, CodecRow]]:
-    """The codecs that take a type, by name, without those of other packages that cannot be loaded."""
-    for name in CODECS:
-        with suppress(BackendMissingError):
-            row = CODECS[name]
-            if type_name in row.types:
-                yield name, row
 
 
 def configured(name: str, type_name: str, options: Mapping[str, Any] | str) -> Codec:

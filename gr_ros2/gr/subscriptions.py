@@ -323,11 +323,10 @@ class OpenSubscriptions(Subscriptions):
         return any(LOOP_GUARD.returns(self._graph, name) for name in names)
 
     def _change(self, topic_id: int, options: SendOptions) -> None:
-        before = self.registry[self._now(topic_id)]
-        self.registry, after = self._messages.change(before.topic_id, options)
+        self.registry, after = self._messages.change(self._now(topic_id), options)
         self._moved[topic_id] = after.topic_id
-        if self.frames is not None and topic_id not in self._static:
-            self.frames.change(before, after)
+        if self.frames is not None and topic_id in self.frames:
+            self._code(after)
 
     def _unsubscribe(self, topic: Topic) -> None:
         """Take no further messages of a topic id, and keep none for robots that join late."""

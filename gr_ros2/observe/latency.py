@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from gr_ros2.core.arrays import Floats
+Floats = npt.NDArray[np.float64]
 
 CDF_POINTS = 101
 """Number of quantiles in a stored CDF: 0 %, 1 %, … 100 %."""
