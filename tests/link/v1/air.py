@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable
+from math import inf
 from typing import Any
 
 from gr_ros2.link import AirPacket
@@ -128,7 +129,20 @@ class Air:
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
         """So long, or until something is so; the time it took."""
-        begin = self.now
+        begin = rests = self.now
         while self.now - begin < seconds and not until():
-            self.step()
+            if self.now < rests:
+                self.now += SLOT_S
+            else:
+                self.step()
+                rests = self._rests()
         return self.now - begin
+
+    def _rests(self) -> float:
+        """Until when robots have nothing to do if nothing is said: the threads of a live link sleep so long, too."""
+        if any(self.under_way) or any(robot.end.pace.out_of_credit for robot in self.robots):
+            return self.now
+        departures = [robot.end.next_departure() for robot in self.robots]
+        timeouts = [robot.end.next_timeout() for robot in self.robots]
+        soonest = min((at for at in departures if at is not None), default=inf)
+        return min(soonest, *(at - SLOT_S for at in timeouts if at is not None), inf)
