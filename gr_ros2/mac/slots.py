@@ -183,9 +183,9 @@ class Slots:
         """When the next own slot begins, s. A host that is too late for a slot takes the next one."""
         if self._since is None:
             self._since = now
-        ready, listened = now + self.lead_s, self._listened
+        ready = now + self.lead_s
         if not self.clock.runs:
-            if ready < listened:
+            if ready < (listened := self._listened):
                 return listened
             self.clock.start(ready)
         while self._mine:
@@ -193,7 +193,7 @@ class Slots:
             if begin >= ready - min(self.clock.slot_s, LATE_S):
                 return begin
             self._mine.pop(0)
-        self._mine.append(self._entry(self.clock.slot(max(ready, listened)) + 1))
+        self._mine.append(self._entry(self.clock.slot(max(ready, self._listened)) + 1))
         return self.clock.begin(self._mine[0])
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from math import inf
 from typing import Any
 
 import pytest
@@ -37,6 +38,7 @@ class Line:
         self.now, self._rng, self._loss = 0.0, random.Random(1), loss
         self._messages = self._steps = 0
         self.said: list[tuple[int, bytes]] = []
+        self._departures: dict[int, float] = {}
         self.invariant = PacketsEnd(self.robots)
 
     def near(self, one: int) -> list[int]:
@@ -45,9 +47,11 @@ class Line:
     def run(self, seconds: float) -> None:
         """So long; every robot has a new message every 0.3 s."""
         end = self.now + seconds
+        self._departures.clear()  # somebody may have said something meanwhile
         while self.now < end:
             if self.now >= 0.3 * self._messages:
                 self._messages += 1
+                self._departures.clear()
                 for one in self.robots:
                     self.said.append((one.src_id, b"%d says %d" % (one.src_id, self._messages)))
                     one.end.messages.submit(0, self.said[-1][1], self.now)
@@ -56,18 +60,23 @@ class Line:
                 heard = [left[near] for near in self.near(n) if near in left]
                 if len(heard) == 1 and n not in left and self._rng.random() >= self._loss:
                     one.receive(heard[0], self.now + SLOT_S, self.now)
+                    self._departures.pop(n, None)
             self._steps += 1
             self.now += SLOT_S / STEPS
             if self._steps % STEPS == 0:
                 for one in self.robots:
                     one.events += one.end.handle_timeout(self.now)
+                self._departures.clear()
                 self.invariant.step()
 
     def _leaving(self) -> Iterator[int]:
-        """The robots whose next packet may leave by now."""
+        """The robots whose next packet may leave by now. When one may leave changes only with what happens."""
         for n, one in enumerate(self.robots):
-            departure = one.end.next_departure(credited=True)
-            if departure is not None and departure <= self.now + 1e-9:
+            if n not in self._departures:
+                departure = one.end.next_departure(credited=True)
+                self._departures[n] = inf if departure is None else departure
+            if self._departures[n] <= self.now + 1e-9:
+                del self._departures[n]
                 yield n
 
 
