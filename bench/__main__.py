@@ -46,6 +46,7 @@ BENCHMARKS = {
     "compression": "bench.compression",
     "codecs": "bench.codecs",
     "cameras": "bench.cameras",
+    "clouds": "bench.clouds",
     "maps": "bench.maps",
     "sweep": "bench.sweep",
     "mac": "bench.mac",
@@ -63,7 +64,7 @@ BENCHMARKS = {
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
-    *("gate", "rate_rules", "cells", "hidden", "changes", "scale", "crowd", "energy", "cameras"),
+    *("gate", "rate_rules", "cells", "hidden", "changes", "scale", "crowd", "energy", "cameras", "clouds"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

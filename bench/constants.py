@@ -91,9 +91,9 @@ RULES: dict[str, list[Patch]] = {
 CONSTANTS = (
     ("lifetime", "WORTH"), ("thrift", "_ENOUGH"), ("order", "_SMOOTHING"),
     ("peers", "_DELAYS"), ("peers", "_SOON"), ("peers", "PROMPT"), ("freshness", "TURN"),
-    ("packing", "SHARE"), ("packing", "LONG"),
+    ("packing", "FULL_PART"), ("packing", "LONG"),
     ("reports", "_EVERY"), ("reports", "_SMOOTHING"), ("reports", "_PAUSE_S"), ("reports", "_CALM_S"),
-    ("reports", "CALM"), ("reports", "_SLOWER"), ("reports", "_AGAIN_S"), ("reports", "SHARE"),
+    ("reports", "CALM"), ("reports", "_SLOWER"), ("reports", "_AGAIN_S"), ("reports", "PER_ARRIVED"),
     ("reports", "PER_LOSS"), ("reports", "PER_VAIN"), ("reports", "_MOST"),
     ("hold", "OVERLAP"), ("hold", "SURPLUS"), ("hold", "_MOST_OWED"), ("hold", "_SMOOTHING"),
     ("hold", "_LATE"), ("hold", "_MOST_IN_VAIN"), ("hold", "_GAIN"),

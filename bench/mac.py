@@ -36,7 +36,7 @@ Graph = list[set[int]]
 
 
 def slots(number: int, rng: random.Random) -> Slots:
-    return Slots(number, SLOT_S, rng)
+    return Slots(number, SLOT_S, rng, period_s=0.1)
 
 
 def aloha(number: int, rng: random.Random) -> Aloha:

@@ -23,7 +23,7 @@ from gr_ros2.mac import read_block
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.wire.mac_block import Block
-from gr_ros2_lab.medium.base import Hearers, Medium, Path, Reception, Surroundings, Transmission
+from gr_ros2_lab.medium.base import Hearers, Medium, RadioPath, Reception, Surroundings, Transmission
 from gr_ros2_lab.medium.packets import PacketMedium
 from gr_ros2_lab.record.team_numbers import jain
 from gr_ros2_lab.run.simulate import EventLoop
@@ -79,7 +79,7 @@ class HearingGraph(Surroundings):
         self._now: Sequence[set[int]] = ()
         self._hearers: list[Hearers] = []
         self._near = np.zeros((0, 0), bool)
-        self._paths: dict[tuple[int, int], Path] = {}
+        self._paths: dict[tuple[int, int], RadioPath] = {}
         self._look(0.0)
         self.robots = len(self._now)
 
@@ -100,12 +100,12 @@ class HearingGraph(Surroundings):
         self._look(now)
         return self._hearers[sender]
 
-    def path(self, sender: int, receiver: int) -> Path:
+    def path(self, sender: int, receiver: int) -> RadioPath:
         path = self._paths.get((sender, receiver))
         if path is None:
             seed = self._config.seed * 65536 + sender * 256 + receiver
             channel = ChannelConfig(packet_loss=self._config.loss, seed=seed)
-            path = self._paths[sender, receiver] = Path(receiver, channel, self._config.latency_s)
+            path = self._paths[sender, receiver] = RadioPath(receiver, channel, self._config.latency_s)
         return path
 
     def reached(self, sender: int) -> list[int]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -27,7 +27,7 @@ _STARTED = pytest.StashKey[tuple[float, float]]()
 
 def busy_s() -> float:
     """Processor time of all programs since the computer started, s, and what other machines took from it."""
-    user, nice, system, _, _, irq, soft_irq, steal, *_ = map(int, _STAT.read_text().split("\n")[0].split()[1:])
+    user, nice, system, _, _, irq, soft_irq, steal, *_ = map(int, _STAT.read_text().splitlines()[0].split()[1:])
     return (user + nice + system + irq + soft_irq + steal) / os.sysconf("SC_CLK_TCK")
 
 
@@ -78,8 +78,5 @@ def pytest_runtest_makereport(
 
 def _first(report: pytest.TestReport) -> str:
     """What failed, in a line."""
-    return next(_errors(report.longreprtext), "") or report.longreprtext[-200:]
-
-
-def _errors(text: str) -> Iterator[str]:
-    return (line[1:].strip() for line in text.splitlines() if line.startswith("E "))
+    text = report.longreprtext
+    return next((line[1:].strip() for line in text.splitlines() if line.startswith("E ")), text[-200:])

@@ -1,9 +1,9 @@
 """Pytest plugin: what became of every test, in a file; and a worker that crashed has a successor that ends.
 
 Invariant: the file is written line by line, so it says as much as was known when a run is killed. A line is one word
-and a test, as it is named on the command line: `collected`, then `passed`, `skipped`, `late` (see `tests/company.py`),
-`failed` or `crashed`. A test that passes and cannot be cleaned up behind itself has two lines. `tools/repeat-failed`
-reads it.
+and a test, as it is named on the command line: `collected`, `began`, then `passed`, `skipped`, `late` (see
+`tests/company.py`), `failed` or `crashed`. A test that passes and cannot be cleaned up behind itself has two lines.
+`tools/repeat-failed` reads it.
 """
 
 from __future__ import annotations
@@ -66,6 +66,9 @@ class Outcomes:
     @pytest.hookimpl(optionalhook=True)
     def pytest_xdist_node_collection_finished(self, ids: Sequence[str]) -> None:
         self._collect(ids)
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        self._write("began", nodeid)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.when == "???":  # as xdist reports a worker that has ended

@@ -56,6 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("spool", ("tests/middleware/test_contract.py",), 30),
         ("halfsine", ("tests/phy/test_contract.py", "tests/phy/test_loopback.py"), 15),
+        ("scan", ("tests/codecs/test_contract.py",), 10),
     ],
 )
 def test_a_worked_example_keeps_the_contract(
@@ -63,6 +64,8 @@ def test_a_worked_example_keeps_the_contract(
 ) -> None:
     if name == "halfsine":
         pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    if name == "scan":
+        pytest.importorskip("av", reason="needs PyAV: pip install 'gr-ros2[video]'")
     done = run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", *suite, "-k", name, SPOOL=str(tmp_path))
     passed = re.search(r"(\d+) passed", done.stdout)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr
@@ -85,6 +88,26 @@ def test_the_worked_examples_carry_a_run_together(folder: Path, tmp_path: Path) 
     assert '"name": "halfsine"' in next((tmp_path / "out").glob("*.json")).read_text()
 
 
+CODE_SCANS = """
+from gr_ros2.compression.link_codec import WHOLE
+from gr_ros2.gr.factory import message_codec
+from gr_ros2.settings.registry import Topic
+from tests.codecs.scenes import scan
+
+topic = Topic(0, "scan", "sensor_msgs/msg/LaserScan")
+message, codec = scan(), message_codec([topic])
+coded = codec.encode(0, message)
+print(coded[0] == WHOLE, message_codec([topic]).decode(0, coded) == message, len(coded) < 0.5 * len(message))
+"""
+"""What a link makes of a laser scan."""
+
+
+def test_a_link_codes_with_the_codec_of_another_package(folder: Path) -> None:
+    pytest.importorskip("av", reason="needs PyAV, for the scenes of other codecs")
+    done = run(folder, "-c", CODE_SCANS)
+    assert done.stdout.split() == ["True"] * 3, done.stderr
+
+
 @pytest.mark.parametrize("name", sorted(FILES))
 def test_the_worked_examples_are_written_like_the_rest(folder: Path, name: str) -> None:
     pytest.importorskip("ruff", reason="ruff is not installed")
@@ -97,7 +120,7 @@ def test_the_worked_examples_are_written_like_the_rest(folder: Path, name: str) 
 
 
 def test_the_page_has_an_example_of_each() -> None:
-    assert sorted(FILES) == ["halfsine", "spool"]
+    assert sorted(FILES) == ["halfsine", "scan", "spool"]
     assert len(DIFFS) == 1
 
 
@@ -131,7 +154,7 @@ def test_a_setting_is_one_field(tmp_path: Path) -> None:
         "True",
     ]
     page = (tmp_path / "docs" / "reference" / "parameters.md").read_text(encoding="utf-8")
-    assert page.count("| `warm_up_s` | `0` | 0 or more | s after the start in which nothing is sent |") == 1
+    assert page.count("| `warm_up_s` | `0`, ≥\N{NO-BREAK SPACE}0 | s after the start in which nothing is sent |") == 1
     block = (tmp_path / "gr_ros2" / "grc" / "ros2_link.block.yml").read_text(encoding="utf-8")
     for part in ("label: Warm up (s)", "${ 0 <= warm_up_s }", "warm_up_s=${warm_up_s}", "Warm up: s after the start"):
         assert part in block

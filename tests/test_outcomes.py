@@ -13,7 +13,18 @@ from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parent.parent
 TOOL = ROOT / "tools" / "repeat-failed"
-PYTEST = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "xdist.plugin", "-W", "ignore"]
+PYTEST = [
+    sys.executable,
+    "-m",
+    "pytest",
+    "-q",
+    "-p",
+    "no:cacheprovider",
+    "-p",
+    "xdist.plugin",
+    "-o",
+    "markers=real_time",
+]
 BARE = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
 """Runs of a few empty tests need no other plug-in, and each of five processes would load them all."""
 CONFTEST = f"""
@@ -44,6 +55,7 @@ def test_skipped(): pass
 """
 FLAKY = "def test_flaky_{0}(): assert not once('flaky_{0}')\n"
 CRASH = "def test_crash():\n    if once('crash'): os.kill(os.getpid(), signal.SIGKILL)\n"
+HANGING = "def test_hanging():\n    if once('hanging'): signal.pause()\n"
 GROUPED = "@pytest.mark.xdist_group('radio')\n"
 
 
@@ -56,7 +68,9 @@ def judged(folder: Path, text: str, *options: str) -> tuple[int, list[str]]:
     subprocess.run(command, cwd=folder, env=BARE, capture_output=True, timeout=PATIENCE_S, check=False)
     again = [TOOL, outcomes, *PYTEST, "-n", "0"]
     done = subprocess.run(again, cwd=folder, env=BARE, capture_output=True, text=True, check=False)
-    said = [line for line in done.stdout.splitlines() if line.startswith(("repeated", "failed", "the run"))]
+    said = [
+        line for line in done.stdout.splitlines() if line.startswith(("repeated", "failed", "the run", "had begun"))
+    ]
     said.sort()
     return done.returncode, [*said, done.stdout.splitlines()[-1]]
 
@@ -69,6 +83,18 @@ def test_what_failed_or_crashed_once_is_named_and_counted_and_everything_else_ru
             "repeated: test_it.py::test_crash took its worker down beside other tests, and passed alone",
             "repeated: test_it.py::test_flaky_1 failed beside other tests, and passed alone",
             "22 passed, 0 failed",
+        ],
+    )
+
+
+@pytest.mark.slow
+def test_what_hangs_takes_its_worker_down_and_everything_else_runs(tmp_path: Path) -> None:
+    at_once = ("-o", "faulthandler_timeout=1", "-o", "faulthandler_exit_on_timeout=true")
+    assert judged(tmp_path, HANGING, *at_once) == (
+        0,
+        [
+            "repeated: test_it.py::test_hanging took its worker down beside other tests, and passed alone",
+            "21 passed, 0 failed",
         ],
     )
 
@@ -120,7 +146,10 @@ def test_what_fails_alone_too_fails(tmp_path: Path) -> None:
 def test_a_run_that_did_not_come_to_its_end_fails(tmp_path: Path) -> None:
     status, said = judged(tmp_path, "def test_end(): pytest.exit('the end')\n", "-n", "0")
     assert status == 1
-    assert said[0].startswith("the run did not come to its end: 1 of 22")
+    assert said[:-1] == [
+        "had begun and not ended: test_it.py::test_end",
+        "the run did not come to its end: 1 of 22 tests have no result",
+    ]
     status, said = judged(tmp_path, "import nothing_of_that_name\n")
     assert status == 1
     assert said == ["the run did not come to its end: 0 of 0 tests have no result", "0 passed, 0 failed"]

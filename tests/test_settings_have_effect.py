@@ -30,7 +30,7 @@ from gr_ros2.gr.factory import Start, make_endpoint
 from gr_ros2.link.air import Air as RadioFacts
 from gr_ros2.link.endpoint import LIVE_OPTIONS, Endpoint, OpenEndpoint
 from gr_ros2.link.v1.endpoint import EndpointV1
-from gr_ros2.link.v1.endpoint_settings import settings_of as end_settings
+from gr_ros2.link.v1.endpoint_settings import end_settings
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode
 from gr_ros2.paper.endpoint import EndpointV0
 from gr_ros2.paper.factory import make_paper_endpoint
@@ -45,7 +45,7 @@ from gr_ros2.settings.config import (
     build,
 )
 from gr_ros2.settings.fields import AUTO, Setting, settings_of
-from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.registry import PICTURES, Registry, Topic
 from gr_ros2.settings.robot import PublishOptions, RobotConfig, robot_from
 from gr_ros2_lab.cli.medium import medium
 from gr_ros2_lab.race.contenders import chosen
@@ -252,6 +252,7 @@ effects(
     voxel=Elsewhere("codecs/test_whole.py::test_cells_come_out_as_they_were_said_to"),
     range=Elsewhere("codecs/test_whole.py::test_range_and_keep_say_what_of_a_cloud_leaves"),
     keep=Elsewhere("codecs/test_whole.py::test_range_and_keep_say_what_of_a_cloud_leaves"),
+    fit=Elsewhere("codecs/test_cloud_frames.py::test_cells_are_as_small_as_the_air_allows"),
 )
 effects(
     "Simulator",
@@ -842,6 +843,8 @@ CHANGED: dict[str, tuple[dict[str, Any], Any]] = {
     "weight": ({"queue": "latest"}, 50.0),
     "max_rate": ({"queue": "latest"}, 2.0),
     "keep_s": ({}, 5.0),
+    "camera": ({}, CameraOptions(off=True)),
+    "depth_image": ({"camera": CameraOptions(off=True), "depth_image": DepthOptions(mode="10")}, DepthOptions()),
 }
 """Options of a topic that runs, and the value that one takes."""
 
@@ -849,7 +852,7 @@ CHANGED: dict[str, tuple[dict[str, Any], Any]] = {
 def optioned(base: Mapping[str, Any], **changed: Any) -> list[bytes]:
     """What an end sends of two topics that want more than there is, of which the options of one change."""
     options = SendOptions(**{"queue": "fifo", **base})
-    rows = Registry([Topic(n, name, "a_msgs/msg/B", options) for n, name in enumerate(("goal", "scan"))])
+    rows = Registry([Topic(n, name, PICTURES[0], options) for n, name in enumerate(("goal", "scan"))])
     end = link_end(rows, packet_rate=20.0, repeat_s=0.5, compression=False)
     sent, topic_id = [], 0
     for step in range(300):

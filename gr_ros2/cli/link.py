@@ -229,6 +229,7 @@ def _live(running: RobotLink) -> LiveRun:
         sources={source.src_id: source},
         links=(running.radio,),
         fates=None,
+        airtime=running.phy.airtime if running.phy.has_airtime else None,
         received_as=running.sink.outputs.heard.name_of,
         announced=running.sink.outputs.heard.announced,
         alarms=running.same_numbers,

@@ -68,6 +68,10 @@ _USUAL_PER_BLOCK = 8
 """Bytes where no budget is given."""
 _SLOWLY, _CLEARLY = 8, 1.5
 """The size follows the mean of about so many budgets, once it would be wrong by this factor."""
+_MOST_SEEN = 1 << 25
+"""Pixels of a picture of this robot's camera; those that leave are fewer."""
+_OUTER = 1024
+"""Bytes of an image beside its pixels, at most, but for the longest names of frames."""
 _SMALLEST = 64
 """Pixels of the shorter side, below which no image is halved."""
 _FORM = 1
@@ -130,7 +134,8 @@ class CameraEncoder:
         width, height = picture.width, picture.height
         if budget is None:
             budget = _USUAL_PER_BLOCK * _blocks(width, height)
-        halved = self._halvings(width, height, budget, key)
+        bytes_each = ENCODINGS[picture.label][1] if self._options.output == IMAGE else 0
+        halved = self._halvings(width, height, bytes_each, budget, key)
         shown = _shown(width, height, halved)
         frame = picture.frame
         if frame.format.name.startswith(_BAYER):
@@ -144,13 +149,18 @@ class CameraEncoder:
     def confirmed(self, name: int) -> None:
         """Do nothing: no frame needs a confirmed one."""
 
-    def _halvings(self, width: int, height: int, budget: int, key: bool) -> int:
-        """How often each side is halved."""
+    def _halvings(self, width: int, height: int, bytes_each: int, budget: int, key: bool) -> int:
+        """How often each side is halved.
+
+        :param bytes_each: of a pixel where it comes out; 0 where the picture comes out packed
+        """
         sizes = [0]
+        while not _makes(*_shown(width, height, sizes[0]), bytes_each):
+            sizes[0] += 1
         while min(_shown(width, height, sizes[-1] + 1)) >= _SMALLEST:
             sizes.append(sizes[-1] + 1)
         if self._options.size == FULL:
-            return 0
+            return sizes[0]
         if self._options.size != AUTO:
             most = tuple(map(int, self._options.size.split("x")))
             fitting = [n for n in sizes if all(a <= b for a, b in zip(_shown(width, height, n), most, strict=True))]
@@ -229,6 +239,11 @@ class CameraDecoder:
         return message
 
 
+def _makes(width: int, height: int, bytes_each: int) -> bool:
+    """Whether a receiver makes a picture of this size."""
+    return width * height <= MAX_PIXELS and width * height * bytes_each + _OUTER <= MAX_SIZE
+
+
 def scaled_camera_info(message: bytes, width: int, height: int) -> bytes:
     """A CameraInfo for the image after resizing; the same bytes where it has that size already.
 
@@ -256,19 +271,20 @@ def _image(message: bytes) -> _Picture:
     if image.encoding not in ENCODINGS:
         raise UnfitError(f"image: encoding {image.encoding!r} is not one of pictures: {', '.join(ENCODINGS)}")
     kind, size = ENCODINGS[image.encoding]
-    rows, width = rows_of(image, size), image.width
+    rows, width = rows_of(image, size, _MOST_SEEN), image.width
     if kind.startswith(_BAYER):
         rows, width = _whole_patterns(rows[:, :width]), _even(width)
     picture = video.from_rows(rows, width, kind)
     return _Picture(Origin(image.header), picture, image.width, image.height, str(image.encoding))
 
 
-def rows_of(image: Any, size: int) -> Pixels:
+def rows_of(image: Any, size: int, most: int = MAX_PIXELS) -> Pixels:
     """The bytes of an image, shape (height, step).
 
     :param size: bytes of a pixel
+    :param most: pixels
     :raises DamagedError: when they do not fit its size
-    :raises UnfitError: for more than ``MAX_PIXELS``
+    :raises UnfitError: for more pixels
     """
     fits = image.width and image.height and image.step >= image.width * size
     if not fits or len(image.data) < image.step * image.height:
@@ -276,8 +292,8 @@ def rows_of(image: Any, size: int) -> Pixels:
             f"damaged image: {image.width} × {image.height} pixels {image.encoding}, rows of {image.step} bytes, do "
             f"not fit its {len(image.data)} bytes"
         )
-    if image.width * image.height > MAX_PIXELS:
-        raise UnfitError(f"image: {image.width} × {image.height} pixels are more than {MAX_PIXELS}")
+    if image.width * image.height > most:
+        raise UnfitError(f"image: {image.width} × {image.height} pixels are more than {most}")
     rows: Pixels = image.data[: image.step * image.height].reshape(image.height, image.step)
     return rows
 
@@ -288,7 +304,7 @@ def _compressed(message: bytes) -> _Picture:
     codec = {b"\xff\xd8": "mjpeg", b"\x89P": "png"}.get(data[:2])
     if codec is None or "compressedDepth" in image.format:
         raise UnfitError(f"image: format {image.format!r} is not JPEG or PNG")
-    picture = video.still(codec, data)
+    picture = video.still(codec, data, _MOST_SEEN)
     if "16" in picture.format.name or "48" in picture.format.name or "64" in picture.format.name:
         raise UnfitError(f"image: a picture of 16 bits for each colour ({picture.format.name})")
     return _Picture(Origin(image.header), picture, picture.width, picture.height, str(image.format))

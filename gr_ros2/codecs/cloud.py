@@ -12,6 +12,7 @@ says what is; each frame stands alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from struct import Struct
 from typing import Any, Literal, NamedTuple
@@ -37,6 +38,11 @@ _META = Struct("<f3iBBBff")
 """Edge of a voxel (m), the lowest cell, how often the edge was doubled since, levels of the octree, what is kept, and
 its least and greatest value."""
 _MOST_CELLS = (1 << 31) - 1
+STEPS = 4
+"""Sizes of voxels from one to twice as large: a fourth of the budget is left over at most, of factors of two alone a
+half in the mean."""
+_STEEP, _TRIES = 1.7, 4
+"""Bytes of a cloud fall with this power of the edge, by a scanner's recordings; so many edges are tried for a cloud."""
 _FAST = 1
 """Level of zstd with which transforms are compared."""
 
@@ -92,15 +98,27 @@ class _Voxels(NamedTuple):
     greatest: float
 
 
+class _Tree(NamedTuple):
+    """:param step: by which its voxels are larger than asked for"""
+
+    step: int
+    voxels: _Voxels
+    depth: int
+    body: bytes
+
+
 class CloudEncoder:
     """Clouds to frames."""
 
     def __init__(self, options: CloudCodec) -> None:
         self._options = options
         self._packer, self._fast = Packer(), Packer(_FAST)
+        self._step = 0
+        """By how many steps the voxels of the newest cloud were larger than asked for."""
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:  # noqa: ARG002
-        """The frame of a cloud. Voxels become larger, by factors of two, until the frame is within the budget."""
+        """The frame of a cloud. Voxels become larger until the frame is within the budget, in steps of ``STEPS`` for
+        each factor of two, from those of the cloud before: steps that are small waste little of it."""
         cloud = read(CLOUD, message)
         _check(cloud)
         if not self._options.voxel:
@@ -109,39 +127,63 @@ class CloudEncoder:
         kept, without = self._kept(cloud, inside)
         count, out = points.shape[1], len(inside) - points.shape[1]
         left_out = f"without {out} of {len(inside)} points, which are not finite or beyond {self._options.range:g} m"
-        said = "; ".join([f"voxels of {self._options.voxel:g} m"] + [left_out] * bool(out) + without)
+        parts = [left_out] * bool(out) + without
+        said = "; ".join([f"voxels of {self._options.voxel:g} m", *parts])
         if not count:
             nothing = _Voxels(self._options.voxel, np.zeros(3), 0, np.zeros(0, np.uint64), *_NO_VALUES)
             return frame(_VOXELS, self._body(cloud, nothing, 0), said=said)
-        voxels = self._voxels(points, kept)
-        depth = int(octree.cells(voxels.codes).max()).bit_length()
-        body = self._body(cloud, voxels, depth)
+        tree = self._tree(cloud, points, kept, 0 if budget is None else self._step)
+        if budget is not None:
+            tree = self._within(budget - 1, tree, lambda step: self._tree(cloud, points, kept, step))
+            self._step = tree.step
+        voxels, depth, body = tree.voxels, tree.depth, tree.body
         while budget is not None and len(body) + 1 > budget and depth:
             voxels, depth = _coarser(voxels), depth - 1
             body = self._body(cloud, voxels, depth)
-        if voxels.doubled:
-            said = f"{said}; coarser for the budget: voxels of {voxels.edge * 2**voxels.doubled:g} m"
+        edge = voxels.edge * 2**voxels.doubled
+        if tree.step or voxels.doubled:
+            said = "; ".join([f"voxels of {edge:.3g} m instead of {self._options.voxel:g} m", *parts])
         return frame(_VOXELS, body, said=said)
+
+    def _tree(self, cloud: Any, points: Whole, kept: Whole | None, step: int) -> _Tree:
+        """A cloud whose voxels are so many steps larger than asked for."""
+        voxels = self._voxels(points, kept, self._options.voxel * 2 ** (step / STEPS))
+        depth = int(octree.cells(voxels.codes).max()).bit_length()
+        return _Tree(step, voxels, depth, self._body(cloud, voxels, depth))
+
+    def _within(self, most: int, tree: _Tree, made: Callable[[int], _Tree]) -> _Tree:
+        """The finest of a few trees that is within a budget, or the coarsest."""
+        tried = {tree.step: tree}
+        while len(tried) < _TRIES:
+            size = max(len(tree.body), 1)
+            far = STEPS * math.log2(size / max(most, 1)) / _STEEP
+            step = max(0, tree.step + (math.ceil(far) if far > 0 else -math.floor(-far)))
+            if step in tried or not tree.voxels.codes.size:
+                break
+            tree = tried[step] = made(step)
+        fitting = [step for step, tree in tried.items() if len(tree.body) <= most]
+        return tried[min(fitting) if fitting else max(tried)]
 
     def confirmed(self, name: int) -> None:
         """Do nothing: no frame needs a confirmed one."""
 
-    def _voxels(self, points: Whole, kept: Whole | None) -> _Voxels:
-        places = np.floor(points / self._options.voxel)
+    def _voxels(self, points: Whole, kept: Whole | None, edge: float) -> _Voxels:
+        edge = float(np.float32(edge))  # as it leaves
+        places = np.floor(points / edge)
         lowest = places.min(1)
         if np.abs(places).max() > _MOST_CELLS or (places.max(1) - lowest).max() >= 1 << octree.MAX_LEVELS:
             raise UnfitError(
-                f"cloud: more than {1 << octree.MAX_LEVELS} voxels of {self._options.voxel:g} m side by side; "
+                f"cloud: more than {1 << octree.MAX_LEVELS} voxels of {edge:g} m side by side; "
                 "give a range, or larger voxels"
             )
         codes = octree.numbers((places - lowest[:, None]).astype(np.uint64))
         if kept is None:
-            return _Voxels(self._options.voxel, lowest, 0, np.unique(codes), *_NO_VALUES)
+            return _Voxels(edge, lowest, 0, np.unique(codes), *_NO_VALUES)
         codes, which, count = np.unique(codes, return_inverse=True, return_counts=True)
         means = np.stack([np.bincount(which, channel) / count for channel in kept.T], 1)
         least, greatest = (0.0, 255.0) if self._options.keep == "rgb" else (float(means.min()), float(means.max()))
         scaled = (means - least) * (255 / (greatest - least) if greatest > least else 0)
-        return _Voxels(self._options.voxel, lowest, 0, codes, np.rint(scaled).astype(np.uint8), least, greatest)
+        return _Voxels(edge, lowest, 0, codes, np.rint(scaled).astype(np.uint8), least, greatest)
 
     def _kept(self, cloud: Any, inside: Whole) -> tuple[Whole | None, list[str]]:
         """The values that are kept, shape (points, channels), and what is left out of each point."""

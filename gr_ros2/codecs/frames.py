@@ -1,4 +1,4 @@
-"""Topics as chains of frames on a link: cameras, depth and maps.
+"""Topics as chains of frames on a link: cameras, depth, maps, and clouds that fit the air.
 
 :class:`FrameSender` decides when the newest message of each topic is coded and keeps the encoders, whoever runs them:
 a thread of a link, or a simulation at once. :class:`FrameReceiver` keeps one decoder for each topic of each robot.
@@ -17,15 +17,14 @@ from math import inf
 from typing import Any, NamedTuple
 
 from gr_ros2.codecs.base import MAX_SIZE, Coded
-from gr_ros2.codecs.messages import CAMERA_INFO, GRID
+from gr_ros2.codecs.messages import CAMERA_INFO, CLOUD, GRID
 from gr_ros2.codecs.pull import FramePull, Pull, StatePull
-from gr_ros2.codecs.topic import CODECS, OFF, CodedTopic, TopicDecoder, TopicEncoder
+from gr_ros2.codecs.topic import OFF, CodedTopic, TopicDecoder, TopicEncoder
 from gr_ros2.core.errors import BackendMissingError, CodecError
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.frames import MARK, FrameSide
-from gr_ros2.settings.config import DepthOptions
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Topic
+from gr_ros2.settings.registry import PICTURES, Topic
 from gr_ros2.wire import AnnouncedTopic
 
 CODING_S = 0.008
@@ -33,6 +32,8 @@ CODING_S = 0.008
 MOST_DECODERS = 32
 """Topics of others that are decoded at a time; each may hold some pictures. The one that was used longest ago begins
 anew with a key frame."""
+_BESIDE = ("image_raw", "image", "image_color", "image_mono")
+"""Ends of the names of pictures that a CameraInfo beside them is of, the likeliest first."""
 _SECONDS = 2.0
 """s over which what is said of a topic is a mean."""
 _log = logging.getLogger(__name__)
@@ -42,11 +43,13 @@ class Job(NamedTuple):
     """A message to be encoded.
 
     :param encoder: whose ``encode`` it is for, without a lock
+    :param sent: the topic
     """
 
     topic_id: int
     pull: Pull
     encoder: TopicEncoder
+    sent: _Sent
 
     def run(self) -> Coded | CodecError:
         """The frame, or why there is none."""
@@ -63,15 +66,20 @@ class _Sent:
 
     def __init__(self, topic: Topic, coded: CodedTopic) -> None:
         self.name = topic.name
-        self.encoder = coded.encoder()
-        self.is_map = topic.type_name == GRID
+        self.use(topic, coded)
+        self.is_map, self.is_cloud = topic.type_name == GRID, topic.type_name == CLOUD
         self.pull: FramePull | StatePull = (StatePull if self.is_map else FramePull)(coding_s=CODING_S)
         self.limit(topic)
         self.said: set[str] = set()
-        self.frames = self.failed = 0
+        self.frames = self.failed = self.bytes = 0
         self._lately: deque[tuple[float, int, int]] = deque()
         """When, bytes that came, and bytes of a frame that was sent."""
         self.what = ""
+
+    def use(self, topic: Topic, coded: CodedTopic) -> None:
+        """Code from now on so, with a key frame first."""
+        self.options, self.coded = _coding(topic), coded
+        self.encoder = coded.encoder()
 
     def note(self, now: float, came: int = 0, frame: int = 0) -> None:
         """So many bytes came, or were sent."""
@@ -112,22 +120,40 @@ class FrameSender:
         self._sent: dict[int, _Sent] = {}
 
     def add(self, topic: Topic, *, latched: bool = False) -> bool:
-        """Send a topic as frames if it is a camera, depth or a latched map, and its options do not say otherwise.
-        Returns whether it is sent so.
+        """Send a topic as frames if it is a camera, depth, a latched map or a cloud that is to fit the air, and its
+        options do not say otherwise.
+        Returns whether it is sent so. For one that is, its options may have changed.
 
         :param latched: whether its one publisher keeps its message for late joiners
         """
         known = self._sent.get(topic.topic_id)
         if known is not None:
             known.limit(topic)
+            if known.options != _coding(topic) and (changed := coded_topic(topic)) is not None:
+                known.use(topic, changed)
+                self._begin(topic)
             return True
         coded = coded_topic(topic, latched=(latched or topic.latched) and not self._frames.relayed)
         if coded is None:
             return False
         self._sent[topic.topic_id] = _Sent(topic, coded)
+        self._begin(topic)
+        return True
+
+    def _begin(self, topic: Topic) -> None:
         output = topic.options.camera.output
         self._frames.begin(topic.topic_id, "" if output == "same" else output)
-        return True
+
+    def change(self, before: Topic, after: Topic) -> None:
+        """A topic has other options, and may have another topic id with them."""
+        if not before.as_frames or after.as_frames:
+            if before.topic_id in self._sent or before.topic_id != after.topic_id:
+                self.add(after)
+        elif (sent := self._sent.pop(before.topic_id, None)) is not None:
+            if sent.pull.end():
+                why = "the topic's options changed before the air was free for it"
+                self._frames.refuse(before.topic_id, Fate.SUPERSEDED, why)
+            self._frames.end(before.topic_id)
 
     def forget(self, topic_id: int) -> None:
         """Send no message of a topic so far to those who come."""
@@ -153,25 +179,53 @@ class FrameSender:
                 )
                 pull = sent.pull.pull(now, self._frames.progress(topic_id, now), share)
                 if pull is not None:
-                    return Job(topic_id, pull, sent.encoder)
+                    return Job(topic_id, pull, sent.encoder, sent)
         return None
 
     def done(self, job: Job, made: Coded | CodecError, now: float) -> None:
         """What has become of a message."""
-        sent = self._sent[job.topic_id]
-        sent.pull.done(job.pull if isinstance(made, CodecError) else None)
-        if isinstance(made, CodecError):
+        sent = job.sent
+        if job.encoder is not sent.encoder or self._sent.get(job.topic_id) is not sent:
+            taken = False
+            self._frames.refuse(job.topic_id, Fate.SUPERSEDED, "the topic's options changed while it was coded")
+        elif isinstance(made, CodecError):
+            taken = False
             sent.failed += 1
             self._frames.refuse(job.topic_id, Fate.DAMAGED, str(made))
-            return
-        if made.data[0] == 0 and not sent.is_map and made.said not in sent.said:
-            sent.said.add(made.said)
-            _log.warning("topic %s: passes exactly, not as pictures: %s", sent.name, made.said)
-        sent.frames, sent.what = sent.frames + 1, made.said
+        elif not (taken := self._taken(job, made, now)) and not sent.is_map:
+            sent.encoder = sent.coded.encoder()  # no frame may follow one that is not sent
+        sent.pull.done(None if taken else job.pull)
+
+    def _taken(self, job: Job, made: Coded, now: float) -> bool:
+        """Whether a frame is sent. One of which no receiver makes a message is not."""
+        sent, size = job.sent, len(job.pull.message)
+        makes = size <= MAX_SIZE or not (sent.is_map or made.data[0] == 0)
+        if not makes:
+            self._frames.refuse(job.topic_id, Fate.TOO_LARGE, f"{size} bytes; at most {MAX_SIZE}")
+        elif self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=self._is_key(job, made)):
+            self._sent_off(sent, made, now)
+            return True
+        sent.failed += 1
+        if Fate.TOO_LARGE not in sent.said:
+            sent.said.add(Fate.TOO_LARGE)
+            _log.warning("topic %s: a message of %d bytes is too large to be sent", sent.name, size)
+        return False
+
+    def _is_key(self, job: Job, made: Coded) -> bool:
+        """Whether what was sent before is of no more use once a frame has left. Of clouds, each of which stands alone,
+        all are repaired as long as somebody follows."""
+        return job.pull.key if job.sent.is_cloud else made.before is None
+
+    def _sent_off(self, sent: _Sent, made: Coded, now: float) -> None:
+        """A frame is sent."""
+        sent.frames, sent.what, sent.bytes = sent.frames + 1, made.said, sent.bytes + len(made.data)
         sent.note(now, frame=len(made.data))
-        self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=made.before is None)
         if sent.is_map:
             sent.encoder.confirmed(made.name)  # frames arrive in order
+        elif made.data[0] == 0 and made.said not in sent.said:
+            sent.said.add(made.said)
+            what = "cells" if sent.is_cloud else "pictures"
+            _log.warning("topic %s: passes exactly, not as %s: %s", sent.name, what, made.said)
 
     def end(self) -> None:
         """Code nothing more: messages that wait are not sent."""
@@ -180,13 +234,14 @@ class FrameSender:
                 self._frames.refuse(topic_id, Fate.SUPERSEDED, "sending ended before the air was free for it")
 
     def stats(self, topic_id: int, now: float) -> dict[str, Any] | None:
-        """What is made of a topic: frames so far, messages that could not be coded, and in words what the newest frame
-        leaves out and what the topic has become lately; None for one that is not sent as frames."""
+        """What is made of a topic: frames so far and their bytes, messages that could not be coded, and in words what
+        the newest frame leaves out and what the topic has become lately; None for one that is not sent as frames."""
         sent = self._sent.get(topic_id)
         if sent is None:
             return None
         state = self._frames.progress(topic_id, now)
-        return {"frames": sent.frames, "not_coded": sent.failed, "made": sent.what, "words": sent.words(now, state.age)}
+        words = {"made": sent.what, "words": sent.words(now, state.age)}
+        return {"frames": sent.frames, "bytes": sent.bytes, "not_coded": sent.failed, **words}
 
 
 class TimedCoder:
@@ -213,6 +268,12 @@ class TimedCoder:
             self._jobs.append((now + CODING_S, following, following.run()))
 
 
+def _coding(topic: Topic) -> tuple[Any, ...]:
+    """Options with which another encoder is made."""
+    camera = topic.options.camera
+    return camera.off, camera.size, camera.output, topic.options.depth_image
+
+
 def coded_topic(topic: Topic, *, latched: bool = False) -> CodedTopic | None:
     """How a topic is coded as frames; None if it is not. What has to be installed for it is said.
 
@@ -220,12 +281,12 @@ def coded_topic(topic: Topic, *, latched: bool = False) -> CodedTopic | None:
     """
     if topic.type_name == GRID and topic.options.codec == AUTO and latched:
         return CodedTopic(GRID)
+    if not topic.as_frames:
+        return None
     options, depth = topic.options, topic.options.depth_image
-    kept = topic.latched or options.keep_s > 0
-    if topic.type_name not in CODECS["camera"].types or options.codec != AUTO or kept:
-        return None
-    if options.camera.off and depth in (DepthOptions(), DepthOptions(off=True)):
-        return None
+    if topic.type_name == CLOUD:
+        cloud = {"voxel": options.cloud.voxel, "range": options.cloud.range, "keep": options.cloud.keep}
+        return CodedTopic(CLOUD, {"cloud": {name: value for name, value in cloud.items() if value != AUTO}})
     chosen: dict[str, Mapping[str, Any] | str] = {
         "camera": OFF if options.camera.off else {"size": options.camera.size},
         "depth": OFF if depth.off else {"mode": depth.mode, "near": depth.near, "far": depth.far},
@@ -255,8 +316,8 @@ class FrameReceiver:
         self._decoders: OrderedDict[tuple[int, int], TopicDecoder] = OrderedDict()
         """Those that were used last, the newest last."""
         self._sizes: dict[tuple[int, str], tuple[int, int] | None] = {}
-        """Width and height of the newest picture in a namespace of a robot; None for one that has its own size. Only of
-        the namespaces that were used last, the newest last."""
+        """Width and height of the newest picture of each camera of a robot; None for one that has its own size. Only of
+        the cameras that were used last, the newest last."""
 
     def announce(self, key: tuple[int, int], told: AnnouncedTopic) -> str:
         """A robot has announced a topic. Returns the type of the messages that come out.
@@ -268,7 +329,7 @@ class FrameReceiver:
         output = frames_output(told)
         if output is None:
             if self._topics.pop(key, None):
-                self._sizes.pop(_place(key, told.name), None)
+                self._sizes.pop((key[0], _camera(told.name)), None)
             return told.type_name
         if key not in self._topics or self._topics[key][:2] != (told.type_name, output):
             coded = CodedTopic(told.type_name, {"camera": {"output_type": output}})
@@ -284,23 +345,37 @@ class FrameReceiver:
         :param name: of its topic
         :raises CodecError: the frame before is missing, or it is damaged
         """
+        camera = key[0], _camera(name)
         if key not in self._topics:
+            self._sizes.pop(camera, None)  # of the same camera as video
             return payload
         decoder = self._decoders.setdefault(key, self._topics[key][2].decoder(self._max_size))
         self._decoders.move_to_end(key)
         if len(self._decoders) > MOST_DECODERS:
             self._decoders.popitem(last=False)
         message = decoder.decode(payload)
-        place = _place(key, name)
-        self._sizes.pop(place, None)
-        self._sizes[place] = decoder.size
+        self._sizes.pop(camera, None)
+        if self._topics[key][0] in PICTURES:
+            self._sizes[camera] = decoder.size
         if len(self._sizes) > MOST_DECODERS:
             del self._sizes[next(iter(self._sizes))]
         return message
 
     def scaled(self, src_id: int, name: str, type_name: str, message: bytes) -> bytes:
-        """A CameraInfo for the picture beside it, as large as that came out; any other message as it is."""
-        size = self._sizes.get((src_id, name.rpartition("/")[0])) if type_name == CAMERA_INFO else None
+        """A CameraInfo for the picture beside it, as large as that came out; any other message as it is.
+
+        Of several pictures beside it, it fits the first of ``_BESIDE``, or else the first by name.
+        """
+        if type_name != CAMERA_INFO:
+            return message
+        place, _, own = name.rpartition("/")
+        begin = f"{place}/{own.removesuffix('camera_info')}".lstrip("/")
+        beside = {
+            camera.rpartition("/")[2]: size
+            for (robot, camera), size in self._sizes.items()
+            if robot == src_id and camera.startswith(begin) and camera.rpartition("/")[0] == place
+        }
+        size = beside[min(beside, key=_rank)] if beside else None
         if size is None:
             return message
         from gr_ros2.codecs.camera import scaled_camera_info
@@ -308,8 +383,12 @@ class FrameReceiver:
         return scaled_camera_info(message, *size)
 
 
-def _place(key: tuple[int, int], name: str) -> tuple[int, str]:
-    """The robot and the namespace of a topic."""
-    # Plug-ins of image_transport publish camera/image/compressed beside camera/camera_info.
-    base = name.removesuffix("/compressed").removesuffix("/compressedDepth")
-    return key[0], base.rpartition("/")[0]
+def _camera(name: str) -> str:
+    """The name of a camera, without that of its transport: its CameraInfo is beside it."""
+    return name.removesuffix("/compressed").removesuffix("/compressedDepth")
+
+
+def _rank(name: str) -> tuple[int, str]:
+    """The place of a picture among those beside a CameraInfo."""
+    known = [place for place, end in enumerate(_BESIDE) if name.endswith(end)]
+    return min(known, default=len(_BESIDE)), name

@@ -8,7 +8,8 @@ what is said names the reason; frames of different senders never meet, since eac
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -22,12 +23,14 @@ from gr_ros2.core.errors import BackendMissingError, ConfigError, DamagedError, 
 class CodecRow(Backend):
     """One codec.
 
-    :param number: of its frames, 1..255
+    :param number: of its frames, 1..255; those of other packages have 128 and more
     :param types: that it takes; of two that take a type, the first codec of the table that codes a message does
+    :param alone: whether each of its frames stands alone, so that a link codes every message of these types with it
     """
 
     number: int = 0
     types: tuple[str, ...] = ()
+    alone: bool = False
 
 
 _VIDEO = "PyAV (pip install 'gr-ros2[video]')"
@@ -54,7 +57,7 @@ CODECS = BackendTable(
             number=2,
             types=(IMAGE, COMPRESSED_IMAGE),
         ),
-        "cloud": CodecRow("gr_ros2.codecs.cloud", "CloudCodec", "point clouds", number=3, types=(CLOUD,)),
+        "cloud": CodecRow("gr_ros2.codecs.cloud", "CloudCodec", "point clouds", number=3, types=(CLOUD,), alone=True),
         "grid": CodecRow("gr_ros2.codecs.grid", "GridCodec", "what changes of a map", number=4, types=(GRID,)),
     },
     CodecRow,
@@ -81,8 +84,8 @@ class CodedTopic:
         options = options or {}
         if unknown := [name for name in options if name not in CODECS]:
             raise ConfigError(f"no codec {unknown[0]!r}; known are {', '.join(CODECS)}")
-        for name, row in CODECS.items():
-            if type_name in row.types and options.get(name) != OFF:
+        for name, row in rows_of(type_name):
+            if options.get(name) != OFF:
                 try:
                     CODECS.modules(name)
                     self.codecs[row.number] = configured(name, type_name, options.get(name, {}))
@@ -100,6 +103,15 @@ class CodedTopic:
         :param max_size: bytes of the largest message that it makes
         """
         return TopicDecoder(self, max_size)
+
+
+def rows_of(type_name: str) -> Iterator[tuple[str, CodecRow]]:
+    """The codecs that take a type, by name, without those of other packages that cannot be loaded."""
+    for name in CODECS:
+        with suppress(BackendMissingError):
+            row = CODECS[name]
+            if type_name in row.types:
+                yield name, row
 
 
 def configured(name: str, type_name: str, options: Mapping[str, Any] | str) -> Codec:

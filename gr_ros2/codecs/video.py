@@ -111,15 +111,16 @@ class H264Decoder:
         return pictures[0]
 
 
-def still(codec: str, data: bytes) -> av.VideoFrame:
+def still(codec: str, data: bytes, most: int = MAX_PIXELS) -> av.VideoFrame:
     """A picture that stands alone.
 
     :param codec: 'mjpeg' or 'png'
-    :raises DamagedError: not such a picture, cut short, or of more than ``MAX_PIXELS``
+    :param most: pixels
+    :raises DamagedError: not such a picture, cut short, or of more pixels
     """
     # FFmpeg takes a JPEG whose last bytes are missing: the end of the picture stands behind its last scan.
     cut = codec == "mjpeg" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    pictures = [] if cut else _decoded(_reader(codec, MAX_PIXELS), data)
+    pictures = [] if cut else _decoded(_reader(codec, most), data)
     if len(pictures) != 1 or pictures[0].is_corrupt:
         raise DamagedError(f"damaged image: not one whole {codec} picture")
     return pictures[0]

@@ -13,11 +13,12 @@ from threading import Lock
 import numpy as np
 import numpy.typing as npt
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.dashboard.spectrum import Spectrum
 from gr_ros2.dashboard.state import DashboardState
 from gr_ros2.dashboard.views import Snapshot
-from gr_ros2.dashboard.windows import RATE_S, Floats
+from gr_ros2.dashboard.windows import RATE_S
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.observe.observers import Change, LiveLink, LiveRun
@@ -84,7 +85,7 @@ class RunMonitor:
             duration_s=run.duration_s,
             ledger=run.fates,
             tick_s=TICK_S,
-            airtime=run.links[0].phy.airtime if run.links and run.links[0].phy.has_airtime else None,
+            airtime=run.airtime,
             received_as=run.received_as,
             senders=run.heard,
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gr_ros2.dashboard.windows import Floats
+from gr_ros2.core.arrays import Floats
 
 BINS = 256
 _SMOOTHING = 0.25

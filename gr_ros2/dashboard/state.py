@@ -115,7 +115,7 @@ class DashboardState:
     :param duration_s: s during which messages will be submitted, 0 = unknown
     :param ledger: gives the messages per fate, as an observer of both ends knows them; None uses the events alone
     :param tick_s: s between two calls of :meth:`tick`, for the length of the history
-    :param airtime: s that a packet of so many bytes takes; None where packets take no air, or it is not known
+    :param airtime: s that a packet of so many bytes takes at an MCS; None where packets take no air, or it is not known
     :param received_as: absolute name under which a sender's topic comes out here, '' where it is not known
     :param senders: source ids of those that the receiver can hear; what others send is left out. None = all
     """
@@ -130,7 +130,7 @@ class DashboardState:
         duration_s: float = 0.0,
         ledger: Callable[[], Mapping[Key, Mapping[str, int]]] | None = None,
         tick_s: float = 0.5,
-        airtime: Callable[[int], float] | None = None,
+        airtime: Callable[[int, int], float] | None = None,
         received_as: Callable[[int, str], str] = lambda _src_id, _name: "",
         senders: Collection[int] | None = None,
     ) -> None:
@@ -154,9 +154,9 @@ class DashboardState:
         self._changes: deque[float] = deque(maxlen=_CHANGES)
         self._phase = "waiting"
         self._airtime, self._received_as = airtime, received_as
-        self._tick_s, self._silence = tick_s, Watch(2 * tick_s)
+        self._silence = Watch(2 * tick_s)
         self._spent: Counter[str] = Counter()
-        """s of air since the last tick, by what the packets were for."""
+        """s of air since the last point of the history, by what the packets were for."""
         self._air: deque[tuple[float, ...]] = deque(maxlen=self._history)
         self._robots: dict[int, tuple[float, int]] = {}
         """When each robot was heard last, itself or over others, and packets received of it."""
@@ -179,7 +179,7 @@ class DashboardState:
                 self._packets["sent"] += 1
                 self._packets[f"air_{event.kind}"] += 1
                 if self._airtime is not None:
-                    self._spent[event.kind] += self._airtime(len(event.data))  # type: ignore[assignment]
+                    self._spent[event.kind] += self._airtime(len(event.data), event.mcs)  # type: ignore[assignment]
                 self._packets_sent.add(event.now)
                 for entry in event.entries:
                     source.messages.left(entry)
@@ -267,10 +267,7 @@ class DashboardState:
             if not over and self._start is not None:
                 for key in keys:
                     self._remember(key, now, elapsed, (queued or {}).get(key))
-                spent = (self._spent[kind] / self._tick_s for kind in get_args(AirKind))
-                known = (nan if value is None or not here else value for value in (snr_db, lost_now))
-                self._air.append((elapsed, *known, *spent))
-                self._spent.clear()
+                self._remember_air(elapsed, snr_db if here else None, lost_now)
             views = tuple(
                 self._view(place, key, now, elapsed=elapsed, queued=queued or {}, ledger=ledger)
                 for place, key in enumerate(keys)
@@ -368,6 +365,15 @@ class DashboardState:
                 nan if queued is None else queued,
             )
         )
+
+    def _remember_air(self, elapsed: float, snr_db: float | None, lost: float | None) -> None:
+        """Add what the air was used for to its history. A clock that stands still, as simulated time does, adds
+        nothing."""
+        span = elapsed - (self._air[-1][0] if self._air else 0.0)
+        if span > 0:
+            spent = (self._spent[kind] / span for kind in get_args(AirKind))
+            self._air.append((elapsed, *(nan if value is None else value for value in (snr_db, lost)), *spent))
+            self._spent.clear()
 
     def _view(
         self,

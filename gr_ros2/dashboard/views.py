@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from gr_ros2.dashboard.windows import Floats, Point
+from gr_ros2.core.arrays import Floats
+from gr_ros2.dashboard.windows import Point
 from gr_ros2.observe.latency import Latency
 from gr_ros2.observe.team import TeamView
 

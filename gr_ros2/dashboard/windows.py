@@ -10,9 +10,9 @@ from collections import deque
 from math import hypot
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from gr_ros2.core.arrays import Floats
+
 Point = tuple[float, float]
 RATE_S = 5.0
 """The window of all numbers called "now", s."""

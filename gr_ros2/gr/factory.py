@@ -18,7 +18,7 @@ from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.link.events import SenderEvent
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.endpoint import EndpointV1
-from gr_ros2.link.v1.endpoint_settings import settings_of
+from gr_ros2.link.v1.endpoint_settings import end_settings
 from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.settings.registry import Registry, Topic
@@ -103,7 +103,7 @@ def make_endpoint(
     :param registry: the topics that it may send
     :param codec: codec of all messages; None: made here
     :param calls: whether services cross the link: the last topic of the endpoint's registry is for requests and replies
-    :param loops_back: see :func:`settings_of`
+    :param loops_back: see :func:`end_settings`
     :raises ConfigError: for settings that contradict each other
     """
     if registry.services and not calls:
@@ -119,7 +119,7 @@ def make_endpoint(
     known = message_codec()
     return EndpointV1(
         topics or None,
-        settings_of(robot, air, loops_back=loops_back),
+        end_settings(robot, air, loops_back=loops_back),
         boot=start.boot,
         keys=start.keys,
         codec=(codec or message_codec(topics)) if robot.compression and (robot.sends or calls) else None,

@@ -323,10 +323,11 @@ class OpenSubscriptions(Subscriptions):
         return any(LOOP_GUARD.returns(self._graph, name) for name in names)
 
     def _change(self, topic_id: int, options: SendOptions) -> None:
-        self.registry, after = self._messages.change(self._now(topic_id), options)
+        before = self.registry[self._now(topic_id)]
+        self.registry, after = self._messages.change(before.topic_id, options)
         self._moved[topic_id] = after.topic_id
-        if self.frames is not None and topic_id in self.frames:
-            self._code(after)
+        if self.frames is not None and topic_id not in self._static:
+            self.frames.change(before, after)
 
     def _unsubscribe(self, topic: Topic) -> None:
         """Take no further messages of a topic id, and keep none for robots that join late."""

@@ -39,7 +39,10 @@ def check_live(changes: Mapping[str, Any], live: Sequence[str]) -> None:
             raise ConfigError(f"{name} cannot change while running; these can: {', '.join(live)}")
 
 
-LIVE_OPTIONS = ("to", "qos", "queue", "queue_depth", "deadline_s", "weight", "max_rate", "keep_s")
+LIVE_OPTIONS = (
+    *("to", "qos", "queue", "queue_depth", "deadline_s", "weight", "max_rate", "keep_s"),
+    *("camera", "depth_image"),
+)
 """Options of a topic that may change at run time in a version that allows it. The others are those of its subscription
 and of its codec, or of a sink."""
 
@@ -141,7 +144,9 @@ class OpenMessages(MessageSide, Protocol):
         """Give a topic other options from now on, in ``LIVE_OPTIONS``.
 
         With another robot in ``to``, its messages leave under another topic id, which is the same again for the same
-        robot. What was submitted before stays with the robot for which it was, and is sent on and repaired.
+        robot. What was submitted before stays with the robot for which it was, and is sent on and repaired. Pictures
+        leave under another topic id, too, where they are not video any more, or are from now on; then what waits or is
+        partly sent is not sent on.
 
         :return: everything that is sent, and the topic as which its messages are to be submitted from now on
         :raises ConfigError: too many topics, or another option

@@ -58,11 +58,14 @@ class FrameSide(Protocol):
         :param output: type of the messages that receivers make of them; '' = the topic's
         """
 
+    def end(self, topic_id: int) -> None:
+        """No frame of a topic follows, and those that have left are of no more use."""
+
     def progress(self, topic_id: int, now: float) -> FrameState:
         """How it stands."""
 
-    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
-        """Send a frame.
+    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> bool:
+        """Send a frame. Returns whether it is sent: one that is longer than a message may be is not.
 
         :param came: when its message came, s
         :param key: it needs no other frame: all before it are of no more use when it has left, and those that somebody

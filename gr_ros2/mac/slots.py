@@ -122,9 +122,7 @@ class Slots:
     :ivar reserved: whether the block before had announced the slot of the newest one
     """
 
-    def __init__(
-        self, src_id: int, slot_s: float, rng: random.Random, *, period_s: float = 0.1, lead_s: float = 0.0
-    ) -> None:
+    def __init__(self, src_id: int, slot_s: float, rng: random.Random, *, period_s: float, lead_s: float = 0.0) -> None:
         self.src_id, self.lead_s = src_id, lead_s
         self._ahead = math.ceil(lead_s / slot_s)
         """Whole slots by which packets are composed ahead."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from gr_ros2.core.arrays import Floats
 
 CDF_POINTS = 101
 """Number of quantiles in a stored CDF: 0 %, 1 %, … 100 %."""

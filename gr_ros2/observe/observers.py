@@ -38,7 +38,7 @@ _PATIENCE_S = 5.0
 
 
 class LiveLink(Protocol):
-    """What an observer can read and change of one direction of a link: ``radio.radio.Radio``, or the channel of a run.
+    """What an observer can read and change in a flowgraph: ``phy.loopback.LoopbackLink``, ``radio.radio.Radio``.
 
     The setters raise a GrRos2Error where the setting cannot be changed.
 
@@ -109,11 +109,12 @@ class LiveRun:
     :param fates: messages by their fate now, by source id and topic id; None where only one end of the link is in
         this process
     :param clock: s, the clock of the run's events
+    :param airtime: s that a packet of so many bytes takes at an MCS; None where packets take no air
     :param team: robots that share a channel, None where none do
     :param received_as: absolute name under which a topic of a sender, by its name in a registry, comes out here; ''
         where the names of ``topics`` are shown
     :param announced: source id, absolute name here and meaning of each topic that other robots have announced so far
-    :param alarms: what is wrong with the robots that are heard, or with what lies between them, one line each
+    :param alarms: what is wrong with the robots that are heard, one line each
     :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
     :param changed: told of each change that somebody makes while it runs
     """
@@ -127,6 +128,7 @@ class LiveRun:
     links: Sequence[LiveLink]
     fates: Callable[[], Mapping[tuple[int, int], Mapping[str, int]]] | None
     clock: Callable[[], float] = time.monotonic
+    airtime: Callable[[int, int], float] | None = None
     team: Callable[[], TeamView] | None = None
     received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
     announced: Callable[[], Sequence[tuple[int, str, Topic]]] = tuple

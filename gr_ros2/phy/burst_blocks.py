@@ -50,12 +50,10 @@ class AirOptions:
     """Settings that every PHY with samples has."""
 
     gap: Annotated[int, Field(ge=16, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
-    """zero samples after each packet, 16..100000; fewer would keep the last packet waiting for the next. auto = 32, or
-    as many as another receiver needs: two symbols with ``stock``, 32 chips with ``lora_sdr``"""
+    """zero samples after each packet, 16..100000; auto = 32, or two symbols with `stock`, 32 chips with `lora_sdr`"""
     lengths: Annotated[Literal["any", "fixed"], Field(title="Packet lengths on the air")] = "any"
-    """``any`` = a packet is as long on the air as its bytes need, and says so; ``fixed`` = as long as the longest, as
-    the blocks of others send (``detection_threshold: stock``, ``lora_sdr``) whatever is set here. The same at both
-    ends"""
+    """`any` = a packet is as long on the air as its bytes need; `fixed` = as the longest, which the blocks of others
+    always send. The same at both ends"""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -63,7 +61,7 @@ class BurstOptions(AirOptions):
     """Settings that every burst PHY has."""
 
     fec: Annotated[CodeName, Field(title="Forward error correction")] = "none"
-    """forward error correction: none, cc (convolutional, constraint length 7, rate 1/2), ldpc or polar"""
+    """forward error correction; cc is convolutional, constraint length 7, rate 1/2"""
 
 
 class BurstPhy(Phy):

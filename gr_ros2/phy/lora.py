@@ -67,20 +67,17 @@ class LoraOptions(BurstOptions):
     coding_rate: Annotated[int, Field(ge=1, le=4, title="Coding rate (check bits per 4 bits)")] = 4
     """check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word, 1 and 2 none"""
     implementation: Literal["own", "lora_sdr"] = "own"
-    """``own``, or ``lora_sdr`` = the frames of LoRa modems, by the GNU Radio module gr-lora_sdr, which has to be
-    installed. Neither understands the other, so it is chosen by name, the same at both ends, and never by what is
-    installed"""
+    """`lora_sdr` = the frames of LoRa modems, by the GNU Radio module gr-lora_sdr. Neither understands the other: the
+    same at both ends"""
     oversampling: Annotated[Literal[2, 4, 8] | Auto, Field(title="Oversampling (samples/chip)")] = AUTO
-    """``lora_sdr`` only: samples per chip, 2, 4 or 8; auto = 2. With 1 the module loses packets that come half a sample
-    late; symbols of more than 2048 samples (factor 11 with 2) make it crash and are refused"""
+    """`lora_sdr` only: samples per chip; auto = 2. Symbols of more than 2048 samples (factor 11 with 2) are refused"""
     sync_word: Annotated[int, Field(ge=0x11, le=0xFF)] | Auto = AUTO
     """``lora_sdr`` only: of the network, 0x11..0xff, no nibble 0; auto = 0x12, private networks"""
     ldro: Annotated[bool | Auto, Field(title="Low data rate optimisation")] = AUTO
-    """``lora_sdr`` only: low data rate optimisation, two bits fewer per symbol; LoRa modems turn it on where a symbol
-    takes more than 16 ms; auto = off"""
+    """`lora_sdr` only: low data rate optimisation, two bits fewer per symbol; auto = off"""
     carrier_hz: Annotated[float, Field(ge=1e6, le=4.2e9, title="Carrier frequency (Hz)")] | None = None
-    """``lora_sdr`` only: the radio's carrier frequency, 1e6..4.2e9 Hz, by which the module tells how much the clocks
-    differ; null = it takes them to be alike"""
+    """`lora_sdr` only: carrier frequency, 1e6..4.2e9 Hz, by which the module tells how much the clocks differ; null =
+    not at all"""
 
 
 class _ChirpPlace(NamedTuple):

@@ -25,7 +25,7 @@ class ModemOptions:
     overhead_bytes: Annotated[int, Field(ge=0, le=4096, title="Bytes added to a packet")] = 0
     """bytes that framing and the modem add to each packet, 0..4096"""
     overhead_s: Annotated[Seconds, Field(title="Time added to a packet (s)")] = 0.0
-    """s that the modem needs for each packet beside its bits: switching the transmitter on, preamble, gap"""
+    """s for each packet beside its bits: switching the transmitter on, preamble, gap"""
 
 
 class ModemPhy(PacketPhy):

@@ -46,28 +46,24 @@ class OfdmOptions(BurstOptions):
     fft_len: Annotated[Literal[64, 128, 256, 512], Field(title="FFT length (carriers)")] = 64
     """carriers, used or not; about 13 of 16 are used"""
     cp_len: Annotated[int, Field(ge=16, le=256, title="Cyclic prefix (samples)")] | Auto = AUTO
-    """samples of the cyclic prefix, a quarter to a half of ``fft_len``; auto = a quarter. With a shorter one the stock
-    synchroniser loses packets even without noise"""
+    """samples of the cyclic prefix, a quarter to a half of `fft_len`; auto = a quarter"""
     carriers: Annotated[int, Field(ge=17, le=255, title="Carriers to either side")] | Auto = AUTO
-    """how far either side of the middle carrier data and pilots go, below half of ``fft_len``; auto = 26 of 64. Fewer
-    make room for the analogue filters, more carry more"""
+    """how far either side of the middle carrier data and pilots go, below half of `fft_len`; auto = 26 of 64"""
     pilots: Annotated[tuple[int, ...] | Auto, Field(title="Pilot carriers")] = AUTO
-    """carriers that carry no data but a known sign, by which phase is followed, such as (-21, -7, 7, 21); auto = these,
-    spread over a larger ``fft_len``"""
+    """carriers by which phase is followed; auto = (-21, -7, 7, 21), spread over a larger `fft_len`"""
     scramble: Annotated[bool, Field(title="Scrambling")] = False
-    """scramble header and payload bits. Without, data of many zeros makes high peaks, and the stock receiver loses
+    """scramble header and payload bits: without, data of many zeros makes high peaks, and the stock receiver loses
     packets at a clock offset of 0.1 %"""
     detection_threshold: Annotated[float, Field(ge=0.05, le=0.95)] | Literal["stock"] | Auto = AUTO
     """of the preamble's metric (Schmidl and Cox), 0.05..0.95, from which on samples are looked at closely; auto = what
     noise alone passes once in 1000 samples. ``stock`` = GNU Radio's own blocks and their 0.9, which need 5 to 7 dB more
     SNR; at a lower one these lose packets without any noise"""
     rate: Literal["fixed", "adaptive"] = "fixed"
-    """``adaptive`` = the sender chooses modulation and code of each packet by what its receivers report (version 1,
-    with reports), and the header of each burst says which; ``payload_modulation`` and ``fec`` are then left out. The
-    same at both ends"""
+    """`adaptive` = the sender chooses modulation and code of each packet by what its receivers report;
+    `payload_modulation` and `fec` are then left out. The same at both ends"""
     rates: Annotated[tuple[RateName, ...], Field(min_length=1)] | Auto = AUTO
-    """names of the modulations and codes that ``adaptive`` may choose from, the most robust one first; auto = all:
-    bpsk-cc, qpsk-cc, 8psk-cc, 16qam-cc, 64qam-cc, 16qam, 64qam"""
+    """what `adaptive` may choose from, the most robust first; auto = bpsk-cc, qpsk-cc, 8psk-cc, 16qam-cc, 64qam-cc,
+    16qam, 64qam"""
 
 
 class OfdmPhy(BurstPhy):

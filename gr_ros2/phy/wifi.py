@@ -89,24 +89,22 @@ class WifiOptions(AirOptions):
     encoding: Literal[
         "bpsk-1/2", "bpsk-3/4", "qpsk-1/2", "qpsk-3/4", "16qam-1/2", "16qam-3/4", "64qam-2/3", "64qam-3/4"
     ] = "bpsk-1/2"
-    """modulation and code rate; at 10 MS/s 3, 4.5, 6, 9, 12, 18, 24 and 27 Mbit/s, at 20 MS/s twice as much. The
-    receiver reads it in each frame"""
+    """modulation and code rate; at 10 MS/s 3, 4.5, 6, 9, 12, 18, 24 and 27 Mbit/s. A receiver hears all"""
     equalizer: Literal["ls", "lms", "comb", "sta"] = "ls"
-    """how the receiver estimates the channel: ``ls`` = from the preamble, ``lms`` = follows it by the decided symbols,
-    ``comb`` = from the pilots, ``sta`` = averages over time and carriers. ``comb`` reports no SNR"""
+    """how the receiver estimates the channel: from the preamble; `lms` also by the decided symbols; `comb` from the
+    pilots, without an SNR; `sta` averages over time and carriers"""
     gap: Annotated[int, Field(ge=360, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
-    """zero samples after each packet, 360..100000; fewer would keep the last packet in the receiver. auto = 400"""
+    """zero samples after each packet, 360..100000; auto = 400"""
     sensitivity: Annotated[float, Field(ge=0.3, le=0.9)] = 0.5
     """part of the preamble's autocorrelation from which on a frame is looked at, 0.3..0.9; the module's default is
     0.56, which hears frames from 5 dB on"""
     network: Annotated[Address, Field(title="Network (BSSID)")] = "02:67:72:2d:72:32"
-    """address 3 (BSSID) of the frames, six octets in hexadecimal. Frames of others are counted as ``foreign`` and
-    dropped"""
+    """address 3 (BSSID) of the frames; those of others are counted as `foreign` and dropped"""
     address: Annotated[Address, Field(title="Own address")] = "02:67:72:00:00:01"
-    """address 2 of the frames sent, of this radio, for those who listen with other programs"""
+    """address 2 of the frames sent"""
     channel_hz: Annotated[float, Field(ge=1e6, le=1e11, title="Channel frequency (Hz)")] | None = None
-    """the centre frequency of the radio's channel, 1e6..1e11 Hz, by which the module tells how much the clocks differ;
-    null = it takes them to be alike"""
+    """centre frequency of the channel, 1e6..1e11 Hz, by which the module tells how much the clocks differ; null = not
+    at all"""
 
 
 class WifiPhy(Phy):

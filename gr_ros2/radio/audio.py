@@ -47,8 +47,8 @@ class AudioOptions(BurstDeviceOptions):
     ptt: Annotated[Literal["none", "vox", "rts", "dtr", "rigctld", "cm108"], Field(title="What keys the radio")] = (
         "none"
     )
-    """what keys a transmitter: none; vox, which hears a tone before each packet; a serial line's rts or dtr; rigctld;
-    or cm108, a sound chip's own pin"""
+    """what keys a transmitter: a tone before each packet (vox), a serial line's rts or dtr, rigctld, or a sound chip's
+    pin (cm108)"""
     ptt_device: Annotated[Text | Literal[""], Field(title="Device of the key")] = ""
     """``/dev/ttyUSB0`` for rts and dtr, ``HOST:PORT`` for rigctld, ``/dev/hidraw0`` for cm108"""
     lead_s: Annotated[_KeyedS | Auto, Field(title="Silence before a packet (s)")] = AUTO

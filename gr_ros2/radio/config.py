@@ -33,10 +33,9 @@ class LinkConfig(AirConfig, RobotConfig):
     front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
     """``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings (docs/how-to/radios.md)"""
     transmit: bool | Auto = AUTO
-    """whether it sends: auto = yes, where no radio is connected; a radio needs true, the word of the person who answers
-    for it; false = it only receives"""
+    """whether it sends: a radio needs true, the word of the person who answers for it; auto = yes without a radio"""
     open: Annotated[bool, Field(title="Without a key")] = False
-    """a radio may send without a key, so that anybody can read and forge what crosses"""
+    """a radio may send without a key"""
     channel: ChannelConfig = Field(default_factory=ChannelConfig)
     """impairments of what is received, for front ends without a radio"""
     record: Annotated[str, Field(title="Recording of what is received")] = ""

@@ -30,13 +30,13 @@ class DeviceOptions(BurstDeviceOptions):
     """Settings of every radio."""
 
     frequency: Annotated[float, Field(gt=0, le=300e9, title="Frequency (Hz)")]
-    """Hz, to send at, and to receive at unless ``frequency_rx`` says otherwise"""
+    """Hz, to send at, and to receive at without `frequency_rx`"""
     args: Annotated[Text, Field(title="Device arguments")] = AUTO
     """which device, in the words of its driver; auto takes the first found"""
     frequency_rx: Annotated[float, Field(gt=0, le=300e9, title="Receive frequency (Hz)")] | Auto = AUTO
     """Hz, to receive at; auto = ``frequency``"""
     gain_tx: Annotated[Decibels, Field(title="Transmit gain (dB)")] = 0.0
-    """dB, of the transmitter; 0 unless set, so that nothing loud happens unasked"""
+    """dB, of the transmitter"""
     gain_rx: Annotated[Decibels, Field(title="Receive gain (dB)")] = 30.0
     """dB, of the receiver"""
     antenna_tx: Annotated[Text, Field(title="Transmit antenna")] = AUTO
@@ -50,7 +50,7 @@ class DeviceOptions(BurstDeviceOptions):
     tail: Annotated[int, Field(ge=0, le=_MOST_ZEROS, title="Zeros behind a burst (samples)")] = 64
     """zero samples behind each burst at least"""
     multiple: Annotated[int, Field(ge=1, le=1 << 22, title="Burst length in steps of (samples)")] = 1
-    """samples a burst is filled up to a multiple of, for drivers that send whole transfers only"""
+    """a burst is filled up to a multiple of so many samples, for drivers that send whole transfers only"""
 
     @property
     def receive_frequency(self) -> float:

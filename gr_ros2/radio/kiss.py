@@ -27,8 +27,7 @@ class KissOptions(StreamOptions):
     tnc_port: Annotated[int, Field(ge=0, le=_MAX_PORT, title="Port of the TNC")] = 0
     """which radio of the TNC, 0..15"""
     callsign: Annotated[Callsign, Field(title="Own callsign")] = ""
-    """own callsign, with which packets are sent as AX.25 UI frames, as direwolf needs it; '' = packets as they are, for
-    modems that do not look into a frame"""
+    """own callsign, for packets as AX.25 UI frames, as direwolf needs them; '' = packets as they are"""
     destination: Annotated[Callsign, Field(title="Callsign of the group")] = "GRROS2"
     """callsign of the group of robots; frames for others are not taken"""
 

@@ -58,7 +58,7 @@ class PlutoOptions(DeviceOptions):
     """Settings of this front end."""
 
     gain_tx: Annotated[float, Field(ge=-_LARGEST_ATTENUATION, le=0, title="Transmit gain (dB)")] = -40.0
-    """dB, 0 = full power, down to -89.75; -40 unless set"""
+    """dB, 0 = full power"""
     gain_rx: Annotated[float, Field(ge=-3, le=76, title="Receive gain (dB)")] = 30.0
     bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
     """Hz, of the transmitter's analogue filter, auto = ``sample_rate``; the receiver's stays as it is"""

@@ -20,8 +20,7 @@ class SerialOptions(StreamOptions):
     """Settings of this front end."""
 
     framing: Literal["cobs", "slip"] = "cobs"
-    """how packets are told apart in the stream, the same at every robot: ``cobs`` adds one byte in 254, ``slip`` is RFC
-    1055"""
+    """how packets are told apart, the same at every robot: `cobs` adds one byte in 254, `slip` is RFC 1055"""
     rssi: Annotated[bool, Field(title="Byte of signal strength")] = False
     """the radio adds a byte of signal strength behind each packet (E22 modules: bit 7 of REG3)"""
 

@@ -49,7 +49,7 @@ class StreamOptions(SharedAir):
     """speed of a serial line, the same as in the modem's settings"""
     backoff_s: Annotated[Seconds, Field(title="Random silence after a packet (s)")] = 0.0
     """s of further silence after each packet, at random from 0 to this, where modems share a frequency and do not
-    listen before they send: without it, two can send at the same moments for ever"""
+    listen before they send"""
     half_duplex: bool = True
 
 

@@ -28,7 +28,7 @@ class UhdOptions(DeviceOptions):
     """Settings of this front end."""
 
     clock_source: Annotated[str, Field(examples=[AUTO, "internal", "external", "mimo", "gpsdo"], min_length=1)] = AUTO
-    """auto = the device's default, or internal, external, mimo, gpsdo"""
+    """auto = the device's default"""
     subdev_tx: Annotated[Text, Field(title="Transmit subdevice")] = AUTO
     """frontend to send with, as in ``A:A``, auto = the device's default"""
     subdev_rx: Annotated[Text, Field(title="Receive subdevice")] = AUTO

@@ -102,8 +102,8 @@ class ZmqOptions(FrontEndOptions):
     """Settings of this front end."""
 
     bind: Annotated[OwnAddress, Field(title="Own address")]
-    """address to publish at: ``5555`` or ``tcp://*:5555`` (all interfaces), ``10.0.0.1:5555``, ``ipc:///tmp/a``.
-    Whoever can reach it can listen; there is no encryption"""
+    """address to publish at: `5555` (all interfaces), `10.0.0.1:5555`, `ipc:///tmp/a`. Whoever can reach it can
+    listen"""
     connect: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses of other robots")]
     """addresses of the other robots, ``10.0.0.2:5555``"""
     burst_queue: Annotated[int, Field(ge=1, le=10_000, title="Queue (bursts)")] = 300

@@ -107,13 +107,15 @@ class CloudOptions:
     voxel: Annotated[Literal[0] | Annotated[float, Field(ge=0.001, le=1000)], Field(title="Cell (m)")] = 0
     """m, edge of the cells that the points of a cloud become, each a point at its middle; 0 = every point, exactly"""
     range: Annotated[float, Field(gt=0, le=1e6)] | Auto = AUTO
-    """m from the origin of the cloud's frame, beyond which points are left out where they become cells; auto = none
-    are"""
+    """m from the origin of the cloud's frame, beyond which cells are left out; auto = none are"""
     keep: Literal["", "intensity", "rgb"] = ""
-    """what of a cell's points is sent beside their place, as a mean: intensity, rgb, or '' for neither"""
+    """what of a cell's points is sent beside their place, as a mean"""
+    fit: bool = False
+    """cells become larger where the air is short: clouds leave as pictures of a camera do, the newest alone, coded into
+    what other topics leave"""
     conditions: ClassVar[Any] = (
         ActsWhere(
-            ("range", "keep"), lambda cloud: cloud.voxel > 0, "an exact cloud has every point; set voxel above 0"
+            ("range", "keep", "fit"), lambda cloud: cloud.voxel > 0, "an exact cloud has every point; set voxel above 0"
         ),
     )
 
@@ -147,8 +149,7 @@ class CameraOptions:
     fps: Annotated[float, Field(gt=0, le=1000)] | Auto = AUTO
     """pictures/s at most; auto = as many as the air carries, and as max_rate allows"""
     output: Literal["same", "CompressedImage", "CompressedVideo", "FFMPEGPacket"] = "same"
-    """what comes out: same, CompressedImage, CompressedVideo (foxglove_msgs) or FFMPEGPacket
-    (ffmpeg_image_transport_msgs)"""
+    """type that comes out; CompressedVideo is of foxglove_msgs, FFMPEGPacket of ffmpeg_image_transport_msgs"""
     conditions: ClassVar[Any] = (
         ActsWhere(("size", "fps", "output"), lambda camera: not camera.off, "it is off; leave off out"),
     )
@@ -166,7 +167,7 @@ class DepthOptions:
     off: bool = False
     """they pass exactly"""
     mode: Literal["auto", "8", "10", "12", "exact"] = AUTO
-    """auto = video of inverse distances within what the air has; 8, 10 or 12 bits; exact"""
+    """auto = video of inverse distances within what the air has; or so many bits"""
     near: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Nearest (m)")] = 0.0
     """m, the nearest distance; 0 = found from the images"""
     far: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Farthest (m)")] = 0.0
@@ -194,44 +195,40 @@ class SendOptions:
     durability: Literal["volatile", "transient_local"] | Auto = AUTO
     """auto adapts likewise; the sink publishes volatile unless this says transient_local"""
     depth: Count | Auto = AUTO
-    """QoS depth of subscription and publisher, auto takes that of ``graph`` or ``publish``; of a transient-local topic
-    also how many messages late robots and late subscribers get, auto 1"""
+    """QoS depth of subscription and publisher, auto takes that of `graph` or `publish`; of a transient-local topic also
+    how many messages late robots get, auto 1"""
     queue_depth: Annotated[Count | Auto, Field(title="Queue depth (messages per topic)")] = AUTO
     """messages waiting, the oldest dropped and counted; 0 unbounded, auto takes the source's"""
     queue: QueuePolicy | Auto = AUTO
-    """what waits at the source: latest (a new message replaces what has not started), fifo (all, up to
-    ``queue_depth``), deadline (fifo, and stale after ``deadline_s``); auto follows ``depth`` and the publishers' QoS
-    (docs/explanation/scheduling.md)"""
+    """what waits: latest (a new message replaces what has not started), fifo (all, up to `queue_depth`), deadline
+    (fifo, stale after `deadline_s`); auto follows `depth` and the publishers' QoS (docs/explanation/scheduling.md)"""
     deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
-    """s after submission until which a message must be across, or it is dropped; 0 none, auto the publishers' lifespan
-    where ``queue`` is auto too, otherwise 0.3 for ``commands`` and none for others. Of a service: s that a call waits
-    for its reply, auto 30"""
+    """s until which a message must be across, or it is dropped; 0 none, auto the publishers' lifespan where `queue` is
+    auto too, otherwise 0.3 for `commands` and none for others. Of a service: s that a call waits, auto 30"""
     weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
     """what a second of this topic's age counts beside other topics, 0.001..1000"""
     max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
     """messages/s sent at most, the newest at each turn unless `queue` is set; 0 unlimited"""
     max_age_s: Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")] = AUTO
-    """s for which a sealed message of it may have been withheld (with a key and both ways), or it is not taken; 0 = any
-    time, auto takes the sink's. A number above 0 at the source has every sink take its own bound"""
+    """as of the robot, 0 = any time, auto takes the receiver's; a number above 0 at the sender has every receiver take
+    its own"""
     keep_s: Seconds = 0.0
-    """s for which its newest message is sent again to robots that lack it, although nothing follows and it is not
-    transient-local: an e-stop, a mode; 0 = as the publishers' durability has it. Commands are never kept"""
+    """s for which its newest message is sent again to robots that lack it, though not transient-local: an e-stop, a
+    mode; 0 = as the publishers' durability has it. Commands are never kept"""
     to: RobotId | Auto = AUTO
-    """robot for which its messages are, 0..254; other robots do not deliver them; auto = all robots"""
+    """robot for which its messages are, 0..254; auto = all robots"""
     codec: str = AUTO
     """auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)"""
     quantize: str = ""
     """bounded loss per field, '' lossless (docs/explanation/compression.md)"""
     instance: str = ""
-    """fields that tell apart the things of which messages speak, so that max_rate and queue latest work for each of
-    them, such as robots[].id; '' = those known of its type (/tf, /diagnostics, JointState, markers), none = they are
-    not told apart"""
+    """fields that tell apart the things of which messages speak, so that max_rate and queue latest work for each, such
+    as robots[].id; '' = those known of its type (/tf, /diagnostics, JointState, markers), none = not told apart"""
     cloud: CloudOptions = Field(default_factory=CloudOptions)
-    """what leaves of a PointCloud2: exact, or cells of so many m, such as {voxel: 0.1, range: 30}
-    (docs/explanation/codecs.md)"""
+    """what leaves of a PointCloud2, such as {voxel: 0.1, range: 30} (docs/explanation/codecs.md)"""
     camera: Annotated[CameraOptions, BeforeValidator(_off)] = Field(default_factory=CameraOptions)
-    """what leaves of an Image or CompressedImage: video that fits the air, such as {size: 320x240, fps: 10}; off =
-    exactly (docs/how-to/cameras.md)"""
+    """what leaves of an Image or CompressedImage, such as {size: 320x240, fps: 10}; off = exactly
+    (docs/how-to/cameras.md)"""
     depth_image: Annotated[DepthOptions, BeforeValidator(_off)] = Field(default_factory=DepthOptions)
     """the same of depth images, such as {mode: 10}"""
     conditions: ClassVar[Any] = (
@@ -242,6 +239,11 @@ class SendOptions:
         ),
         ActsWhere(BY_TYPE, lambda topic: topic.codec == AUTO, "codec has to be auto for it; leave codec out"),
     )
+
+    @property
+    def passes_pictures(self) -> bool:
+        """Whether pictures pass as any message does."""
+        return self.camera.off and self.depth_image in (DepthOptions(), DepthOptions(off=True))
 
     @model_validator(mode="after")
     def _deadline(self) -> SendOptions:
@@ -458,10 +460,9 @@ class PhyConfig:
     sample_rate: Annotated[SampleRate | Auto, Field(title="Sample rate (samples/s)")] = AUTO
     """samples/s; auto = an experiment chooses it by what it offers. A link of radios has to be told"""
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
-    """capacity over offered load where sample_rate is auto; a recording counts with one message per second at least"""
+    """capacity over offered load where sample_rate is auto"""
     kernels: Kernels = AUTO
-    """what works on the samples of this end: auto = compiled kernels where they were built, else numpy; numpy = the
-    reference, several times slower"""
+    """auto = compiled kernels where they were built; numpy = the reference, several times slower"""
     options: dict[str, Any] = Field(default_factory=dict)
     """settings of that PHY"""
     conditions: ClassVar[Any] = (
@@ -492,10 +493,10 @@ class AirConfig:
     phy: PhyConfig = Field(default_factory=PhyConfig)
     """which physical layer, and how fast; the same at every robot"""
     medium: Medium = "exclusive"
-    """when a robot sends on a channel that others use too: slots that it derives from the packets heard, aloha (at
-    random, as rarely as the robots heard call for), or exclusive = whenever it has something"""
+    """when a robot sends: in slots that it derives from the packets heard, by aloha (at random, as rarely as the robots
+    heard call for), or exclusive = whenever it has something"""
     relay: Literal["off", "gain"] = "off"
-    """gain = a robot sends on the messages of others that make those who hear it youngest; medium: slots"""
+    """gain = a robot sends messages of others on; medium: slots"""
     airtime: Airtime = Field(default_factory=AirtimeConfig)
     """how much a robot may send, whatever waits: settings, or the name of a band alone"""
 

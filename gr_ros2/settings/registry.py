@@ -20,7 +20,7 @@ from typing import TypeVar, overload
 from gr_ros2.core.errors import ConfigError, RegistryError
 from gr_ros2.core.names import checked_topic_form, filled, topic_fault
 from gr_ros2.settings.config import SendOptions, build
-from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.robot import PublishConfig, PublishOptions
 from gr_ros2.settings.service_rows import OF_ACTION, STATUS, is_of_node, is_service, parts
 from gr_ros2.settings.topic_choice import TopicChoice, is_wild
@@ -31,6 +31,9 @@ DEFAULT_OPTIONS = SendOptions()
 _O = TypeVar("_O")
 _D = TypeVar("_D")
 
+PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+"""Types whose messages may leave as video."""
+CLOUD = "sensor_msgs/msg/PointCloud2"
 CALLS_TYPE = "gr_ros2/calls/Frame"
 """Type of the row in which requests and replies are sent (see :mod:`gr_ros2.calls`); no topic has this type."""
 
@@ -93,11 +96,29 @@ class Topic:
         return name if name.startswith("/") else f"/{name}"
 
     @property
+    def stream(self) -> tuple[str, str, int | Auto, bool]:
+        """What has a topic id of its own: name, type, the robot that it is for, and whether it leaves as frames."""
+        return self.name.lstrip("/"), self.type_name, self.options.to, self.as_frames
+
+    @property
     def latched(self) -> bool:
         """Whether late joiners get the last message: because the registry says so, or by ROS convention."""
         if self.options.durability != AUTO:
             return self.options.durability == "transient_local"
         return self.name.rsplit("/", 1)[-1] in _LATCHED or self.name.endswith(f"/{STATUS}")
+
+    @property
+    def as_frames(self) -> bool:
+        """Whether its messages leave as frames that fit the air (:mod:`gr_ros2.link.frames`), where the robot can code
+        them. Those of latched maps do, too, which depends on their publishers."""
+        options = self.options
+        if self.latched or options.keep_s > 0 or options.codec != AUTO:
+            return False
+        return options.cloud.fit if self.type_name == CLOUD else self._is_video
+
+    @property
+    def _is_video(self) -> bool:
+        return self.type_name in PICTURES and not self.options.passes_pictures
 
     @property
     def is_service(self) -> bool:
@@ -183,16 +204,17 @@ class Registry(Sequence[Topic]):
         return cls(list(_topics(rows, path)), path)
 
     def extended(self, topics: Sequence[NewTopic]) -> Registry:
-        """These topics too, with the next numbers. A name may come again with another type or for another robot.
+        """These topics too, with the next numbers. A name may come again with another type, for another robot, or as
+        frames.
 
         :raises RegistryError: too many, or a topic that is there already
         """
         added = [Topic(number, *topic) for number, topic in enumerate(topics, len(self))]
         if len(self) + len(added) > MAX_TOPICS:
             raise RegistryError(f"{len(self) + len(added)} topics; a link carries at most {MAX_TOPICS}")
-        known = {(topic.name.lstrip("/"), topic.type_name, topic.options.to) for topic in self}
+        known = {topic.stream for topic in self}
         for topic in added:
-            key = topic.name.lstrip("/"), topic.type_name, topic.options.to
+            key = topic.stream
             if key in known:
                 raise RegistryError(f"duplicate topic {topic.name!r}")
             known.add(key)

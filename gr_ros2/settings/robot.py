@@ -65,7 +65,7 @@ class GraphConfig:
     domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
     """ROS domain, 0..232; auto takes ROS_DOMAIN_ID"""
     localhost_only: bool | Auto = AUTO
-    """DDS stays on the loopback interface; auto takes what the environment of ROS says, in a scenario true"""
+    """DDS stays on the loopback interface; auto takes what ROS's environment says, in a scenario true"""
     namespace: Namespace | Auto = AUTO
     """namespace of the robot's topics there; '' is the root, auto the name of the robot"""
     depth: Annotated[Count, Field(title="Depth of subscriptions (messages)")] = 10
@@ -88,10 +88,9 @@ class PublishOptions:
     """QoS depth of its publisher; auto = ``publish.depth``, of a transient-local topic 1"""
     deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
     """s after which a message is not delivered any more; 0 = any time, auto takes that of its sender. Of a service: s
-    that a call waits for its reply, auto 30"""
+    that a call waits, auto 30"""
     max_age_s: Age = AUTO
-    """s for which a sealed message of it may have been withheld (with a key), or it is not taken; 0 = any time, auto
-    takes ``max_age_s`` of the robot"""
+    """as of the robot, which auto takes; 0 = any time"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_ALIASED)
@@ -105,8 +104,8 @@ class PublishConfig:
     frame_prefix: FrameForm = ""
     """before every frame name of a message, ``{robot}`` is the sender; '' leaves messages as sent"""
     merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
-    """topic on which the transforms of all senders come out too, and their static ones, latched, on this + ``_static``;
-    needs ``frame_prefix``; '' off"""
+    """topic on which the transforms of all senders come out too, static ones on this + `_static`; needs `frame_prefix`;
+    '' off"""
     topics: Annotated[dict[str, PublishOptions], AfterValidator(_named), Field(title="Topics that come out")] = Field(
         default_factory=dict
     )
@@ -125,7 +124,7 @@ class RobotConfig:
     robot: Annotated[int, Field(ge=0, le=BROADCAST - 1)] | str
     """its number on the air, 0..254, or its name: the number then is the last digits, /robot_1 is robot 1"""
     direction: Literal["both", "send", "receive"] = "both"
-    """whether it sends and receives; with one of them alone nobody gets reports from it, or it gets none"""
+    """with send or receive alone it gets no reports, or gives none"""
     topics: Annotated[dict[str, SendOptions], BeforeValidator(topics_of), AfterValidator(_checked_topics)] = Field(
         default_factory=lambda: {AUTO: SendOptions()}
     )
@@ -136,49 +135,46 @@ class RobotConfig:
     graph: GraphConfig = Field(default_factory=GraphConfig)
     """its ROS graph"""
     registry: Annotated[str, Field(title="Registry CSV")] = ""
-    """file of topics and their types, or the name of a built-in one such as ``table4``; '' = ``topics`` are looked for
-    on the graph"""
+    """file of topics and their types, or a built-in one such as `table4`; '' = `topics` are looked for on the graph"""
     services: Annotated[bool, Field(title="Services and actions too")] = True
     """whether ``topics`` choose services and actions of the graph too, which other robots may then call"""
     commands: Annotated[tuple[str, ...], AfterValidator(checked_commands)] = COMMAND_TYPES
     """types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before others, unless
-    the topic's options say otherwise"""
+    their options say otherwise"""
     packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
     """bytes of the longest packet, 40..4095 (14 or more of the paper's blocks), the same at all robots"""
     key: Annotated[str, Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
-    """file of the fleet's keys (gr-ros2 key new); '' sends packets that anybody can read and forge; with one, sealed
-    packets alone are taken"""
+    """file of the fleet's keys (gr-ros2 key new), with which sealed packets alone are taken; '' = anybody can read and
+    forge packets"""
     seal: Literal["encrypt", "authenticate"] = "encrypt"
-    """with a key: encrypt packets, or authenticate them alone, where a radio's licence forbids encryption"""
+    """with a key: authenticate alone, where a radio's licence forbids encryption"""
     state: Annotated[str, Field(title="State file")] = ""
-    """file that counts this robot's starts and says what was heard before a restart; '' keeps it in the user's state
-    folder"""
+    """file that counts starts and says what was heard before; '' = in the user's state folder"""
     packet_rate: Annotated[
         Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Packet rate (packets/s)")
     ] = AUTO
-    """packets/s at most. auto = as the PHY grants credits, each packet composed just before; a number is a limit beside
-    that; 0 = every packet at once, whatever the PHY grants, as the paper has it"""
+    """packets/s at most, beside what the PHY grants, which is the limit of auto; 0 = every packet at once, as the paper
+    has it"""
     queue_depth: Annotated[Count, Field(title="Queue depth (messages per topic)")] = 100
     """messages waiting per topic, the oldest dropped and counted; 0 unbounded"""
     compression: bool = True
     """code every message, which a receiver sees by itself"""
     repair: Repairs | Auto = AUTO
-    """what idle air is spent on: idle = all of it on what may have been lost, thrifty = as much as losses are known or
-    expected, off; auto = thrifty where receivers report, idle where none does"""
+    """idle = all idle air for what may have been lost, thrifty = as much as losses are known or expected; auto =
+    thrifty where receivers report, else idle"""
     expected_loss: Annotated[float, Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
     """share of packets lost, 0..1, as long as no report tells (thrifty)"""
     repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
-    """s between repeats of a transient-local topic such as /map while no robot reports, and up to 32 times as long
-    while none is heard that could be; 0 off"""
+    """s between repeats of a transient-local topic while no robot reports, and up to 32 times as long while none is
+    heard; 0 off"""
     beacon_s: Annotated[Seconds, Field(title="Time until only beacons are sent (s)")] = 0.0
-    """s without hearing any robot after which nothing is sent but one hello every so many s, until one is heard; 0 =
-    never"""
+    """s without hearing any robot after which only one hello every so many s is sent, until one is heard; 0 = never"""
     hold_s: Annotated[Seconds, Field(title="Wait for repair (s)")] = 1.0
-    """s that a message of a reliable topic waits for an earlier one where the sender gets no reports; where it does,
-    until that one is repaired or given up by its sender"""
+    """s that a reliable message waits for an earlier one where the sender gets no reports; where it does, until that
+    one is repaired or given up"""
     max_age_s: Age = AUTO
-    """s for which a sealed message may have been withheld on its way (with a key), or it is not taken; auto: 15 for
-    calls and topics with a deadline or lifespan, any time for others; 0 = any time"""
+    """s for which a sealed message may have been withheld, or it is not taken; auto: 15 for calls and topics with a
+    deadline or lifespan, any time for others; 0 = any time"""
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
     """robots heard at a time; packets of further ones are counted and dropped"""
     max_source_bytes: Annotated[Bytes, Field(title="Memory per sender (bytes)")] = 72_000_000

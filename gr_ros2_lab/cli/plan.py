@@ -93,6 +93,8 @@ def _tell(planner: Planner, advise: bool) -> None:
         soft_wrap=True,
     )
     console.print(_table(forecast))
+    if (fitting := _fitting(forecast)) is not None:
+        console.print(fitting)
     console.print(_verdict(forecast), soft_wrap=True)
     console.print(forecast.in_use, soft_wrap=True)
     if task := planner.task:
@@ -152,9 +154,23 @@ def _table(forecast: Forecast) -> Table:
     return table
 
 
+def _fitting(forecast: Forecast) -> Table | None:
+    """What cameras and clouds become that fit what is left; None where there is none."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    table.add_column("Fits what is left", no_wrap=True)
+    table.add_column("sent as")
+    for heading in ("frames [1/s]", "kbit/s", "age [ms]"):
+        table.add_column(escape(heading.replace(" ", "\n")), justify="right", no_wrap=True)
+    for topic in forecast.topics:
+        if (frames := topic.frames) is not None:
+            age = _number(topic.result.age_s.mean, 1e3, ".0f")
+            table.add_row(topic.topic, frames.made or "–", f"{frames.rate_hz:.1f}", f"{frames.kbit_s:.0f}", age)
+    return table if table.row_count else None
+
+
 def _verdict(forecast: Forecast) -> str:
     if forecast.load > 1:
-        heaviest = max(forecast.topics, key=lambda topic: topic.load)
+        heaviest = max((topic for topic in forecast.topics if topic.frames is None), key=lambda topic: topic.load)
         what = "most of it" if heaviest.load > forecast.load / 2 else "the heaviest topic"
         fits = f"it does not fit, {what} is {heaviest.topic}"
     elif (arrives := _arrives(forecast)) < _GOOD:
@@ -182,8 +198,9 @@ def _arrives(forecast: Forecast) -> float:
 
 def _replaced(forecast: Forecast) -> float:
     """Share of the messages that are to be sent which newer ones replace for want of air, 0..1."""
-    wanted = sum(topic.wanted_hz for topic in forecast.topics)
-    return sum(max(topic.wanted_hz - topic.rate_hz, 0.0) for topic in forecast.topics) / wanted if wanted else 0.0
+    topics = [topic for topic in forecast.topics if topic.frames is None]
+    wanted = sum(topic.wanted_hz for topic in topics)
+    return sum(max(topic.wanted_hz - topic.rate_hz, 0.0) for topic in topics) / wanted if wanted else 0.0
 
 
 def _share(forecast: Forecast, *fates: Fate) -> float:

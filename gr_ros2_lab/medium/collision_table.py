@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import RunError
 from gr_ros2.core.files import replacing
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import ChannelConfig, replaced
-from gr_ros2_lab.medium.base import FixedPaths, Floats
-from gr_ros2_lab.medium.base import Path as Way
+from gr_ros2_lab.medium.base import FixedPaths, RadioPath
 from gr_ros2_lab.medium.loss_table import BUILTIN_DIR, alone, cache_dir, named, program, setting_of
 from gr_ros2_lab.medium.samples import SampleMedium
 
@@ -145,7 +145,7 @@ def measure(phy: Phy, channel: ChannelConfig, setting: dict[str, Any]) -> Collis
 
 def edge(phy: Phy, channel: ChannelConfig, side: int) -> float:
     """Share of a burst at its beginning (-1) or its end (1) that can be missed, without noise; found by bisection."""
-    around = FixedPaths([[Way(1, replaced(channel, snr_db=None))], [Way(0, channel)]])
+    around = FixedPaths([[RadioPath(1, replaced(channel, snr_db=None))], [RadioPath(0, channel)]])
     draw, airtime, burst = random.Random(1), phy.airtime(), burst_s(phy)
     spare, lost = 0.0, 0.25
     while lost - spare > _EDGE:
@@ -175,7 +175,7 @@ def _by_sir(count: Callable[[float], int]) -> list[int]:
 def delivered_at(phy: Phy, channel: ChannelConfig, snr_db: float, offset: float, sir_db: float) -> int:
     """How many of ``PACKETS`` packets arrive beside another one each."""
     levels = [replaced(channel, snr_db=snr_db), replaced(channel, snr_db=max(snr_db - sir_db, -50.0))]
-    around = FixedPaths([[Way(2, level)] for level in levels] + [[]])
+    around = FixedPaths([[RadioPath(2, level)] for level in levels] + [[]])
     medium = SampleMedium(around, [phy] * 3, shared=True)
     draw, airtime, burst = random.Random(0), phy.airtime(), burst_s(phy)
     count = 0

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.wire import BROADCAST
-from gr_ros2_lab.medium.base import Path
+from gr_ros2_lab.medium.base import RadioPath
 from gr_ros2_lab.medium.positions import LEAST_DB, MOST_DB
 from gr_ros2_lab.medium.propagation import snr_over_db
 
@@ -16,7 +16,7 @@ Gains = float | Sequence[Sequence[float | None]] | None
 _SEEDS_APART = 7919
 
 
-def all_paths(channel: ChannelConfig, robots: int, *, leveled: bool) -> list[list[Path]]:
+def all_paths(channel: ChannelConfig, robots: int, *, leveled: bool) -> list[list[RadioPath]]:
     """The paths between robots that all send and receive. Where they draw random numbers, each has its own seed.
 
     :param channel: what all paths have in common
@@ -28,14 +28,14 @@ def all_paths(channel: ChannelConfig, robots: int, *, leveled: bool) -> list[lis
         return replace(channel, seed=channel.seed + _SEEDS_APART * (1 + number * BROADCAST + other))
 
     return [
-        [Path(other, between(number, other) if apart else channel) for other in range(robots) if other != number]
+        [RadioPath(other, between(number, other) if apart else channel) for other in range(robots) if other != number]
         for number in range(robots)
     ]
 
 
 def at_gains(
-    paths: Sequence[Sequence[Path]], gains_db: Gains, levels: Sequence[tuple[float, float]], bandwidth: float
-) -> list[list[Path]]:
+    paths: Sequence[Sequence[RadioPath]], gains_db: Gains, levels: Sequence[tuple[float, float]], bandwidth: float
+) -> list[list[RadioPath]]:
     """The paths of robots at the levels that follow from gains, without those on which nothing is heard.
 
     :param levels: power that each robot transmits, dBm, and noise figure of its receiver, dB
@@ -43,7 +43,7 @@ def at_gains(
     """
     if gains_db is None:
         return [list(heard) for heard in paths]
-    found: list[list[Path]] = []
+    found: list[list[RadioPath]] = []
     for number, (heard, (power, _)) in enumerate(zip(paths, levels, strict=True)):
         found.append([])
         for path in heard:

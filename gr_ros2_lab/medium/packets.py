@@ -21,13 +21,14 @@ from typing import Any
 
 import numpy as np
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import AirPacket
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.link.rate import Mcs
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import ChannelConfig, replaced
-from gr_ros2_lab.medium.base import Floats, Hearers, Ints, Medium, Reception, Surroundings, Transmission
+from gr_ros2_lab.medium.base import Hearers, Ints, Medium, Reception, Surroundings, Transmission
 from gr_ros2_lab.medium.collision_table import SIRS_DB, CollisionTable, burst_s, collision_table
 from gr_ros2_lab.medium.fading import RayleighFading
 from gr_ros2_lab.medium.loss_table import LossCurve, packet_losses

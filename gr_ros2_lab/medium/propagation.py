@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.settings.config import ScenarioChannel
-from gr_ros2_lab.medium.base import Floats
 
 LIGHT_M_S = 299_792_458.0
 THERMAL_DBM_HZ = -174.0

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from gr_ros2.compression import LinkCodec
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.observe.latency import latency
 from gr_ros2.settings.registry import Registry
@@ -22,8 +22,6 @@ from gr_ros2_lab.race.contenders import Races
 from gr_ros2_lab.race.links import LinkLog, LinkReport
 from gr_ros2_lab.race.race_settings import RaceRecording
 from gr_ros2_lab.record.metrics import Age, age
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

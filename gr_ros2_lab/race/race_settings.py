@@ -52,8 +52,8 @@ class RaceSettings(Traffic):
     """One race: every contender at every load and every loss."""
 
     robots: Annotated[int, Field(ge=2, le=MOST_ROBOTS)] | None = None
-    """all of them send to all others on one channel, each a recording of its own; of a bag all the same, one after the
-    other; null = one robot sends to another one"""
+    """all send to all others on one channel, of a bag the same topic one after the other; null = one robot sends to
+    another one"""
     bag_topic: Text = AUTO
     """the topic of the bag that is carried; auto where it has only one"""
     peers: tuple[str, ...] = ()

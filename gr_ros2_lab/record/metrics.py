@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.link.fates import arrived
-from gr_ros2.observe.latency import Floats, Latency, latency, latency_cdf
+from gr_ros2.observe.latency import Latency, latency, latency_cdf
 from gr_ros2_lab.record.ledger import TopicLedger
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from gr_ros2.core.arrays import Floats
 
 GRID_POINTS = 1000
 """Points of the common grid, ends included."""

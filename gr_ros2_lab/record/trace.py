@@ -24,12 +24,12 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.files import write_whole
 from gr_ros2.link.events import SentPacket
 from gr_ros2_lab.record.ledger import TopicLedger
 
-Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Texts = npt.NDArray[Any]
 
@@ -125,6 +125,10 @@ class PacketLog:
     def received(self, number: int, now: float) -> None:
         """The packet of this number, from 0, reached the sink."""
         self._t_received[number] = now
+
+    def received_at(self) -> Floats:
+        """s on the run's clock, when each packet reached the sink; NaN for packets that did not."""
+        return _copied(self._t_received, len(self._t_received))
 
     def columns(self, src_id: int, name_of: Callable[[int], str], t0: float) -> dict[str, Any]:
         """The columns of table `packets`, with topic names.

@@ -17,9 +17,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.observe.colours import COLOURS
 from gr_ros2_lab.record.metrics import age_sawtooth
-from gr_ros2_lab.record.trace import Floats, Ints, Messages, Packets
+from gr_ros2_lab.record.trace import Ints, Messages, Packets
 
 _BINS = 40
 """Approximate number of intervals into which a run is divided."""

@@ -21,7 +21,7 @@ from gr_ros2.settings.config import (
 )
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire import BROADCAST
-from gr_ros2_lab.medium.base import Path
+from gr_ros2_lab.medium.base import RadioPath
 
 STARTED_S = 1.0
 """s within which the robots of a run begin to send. Hellos of robots that begin together would collide for ever."""
@@ -47,7 +47,7 @@ class RobotSettings:
 
     config: RobotConfig
     takes: bool
-    paths: tuple[Path, ...]
+    paths: tuple[RadioPath, ...]
     levels: tuple[float, float]
     start_s: float = 0.0
 
@@ -114,7 +114,7 @@ def _path(
     *,
     shared: bool,
     leveled: bool,
-) -> Path:
+) -> RadioPath:
     """What lies between two robots, by their places. Where it draws random numbers, it has a seed of its own."""
     own = [one for one in differing if one.between(robots[number].robot_id, robots[other].robot_id)]
     found: ChannelConfig = own[-1] if own else channel
@@ -122,7 +122,7 @@ def _path(
         found = replace(found, seed=found.seed + _seed_of(number, other))
     elif leveled or found.loses_packets or found.doppler_hz:
         found = replace(found, seed=found.seed + _APART * (1 + number * BROADCAST + other))
-    return Path(other, found, own[-1].delay_s if own else 0.0)
+    return RadioPath(other, found, own[-1].delay_s if own else 0.0)
 
 
 def _seed_of(number: int, other: int) -> int:

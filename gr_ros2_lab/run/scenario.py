@@ -61,10 +61,9 @@ class Experiment:
     repetitions: Annotated[int, Field(ge=1, le=10_000)] = 1
     """runs, with seeds seed, seed + 1, ...; in a sweep of every cell"""
     time: Time = "real"
-    """what the clock of a run follows. `real`: the wall clock, or as slowly as the computer needs; `samples`:
-    simulated time, as the samples of the flowgraph tell it, as fast as it can be computed; `packets`: simulated time of
-    the packets alone, which are lost as measured on the flowgraph (docs/explanation/simulated-time.md). Simulated time
-    has no ROS graphs, so `graph`, but for its namespace, and `publish.depth` have no effect there"""
+    """what the clock of a run follows: the wall clock; or simulated time, of samples, or of packets alone, which are
+    lost as measured (docs/explanation/simulated-time.md). Simulated time has no ROS graphs, so `graph`, but for its
+    namespace, and `publish.depth` have no effect there"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -72,28 +71,25 @@ class Scenario(Experiment, Traffic, AirConfig):
     """One experiment: robots, the medium between them, what they send, and for how long."""
 
     robots: Annotated[tuple[ScenarioRobot, ...], Field(max_length=BROADCAST)]
-    """the robots, those that send first; a number stands for as many that differ in their names alone. What they have
-    in common may stand above them"""
+    """the robots, those that send first; a number stands for as many that differ in their names alone"""
     channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
     """what lies between all of them"""
     paths: tuple[PathConfig, ...] = ()
     """the channels that differ: what is not set in one is as in ``channel``"""
     duplex: Literal["full", "half"] = "full"
-    """full = each robot sends on a channel of its own, and hears while it sends; half = all use one channel: who sends
-    hears nothing meanwhile, and packets that overlap at a receiver disturb each other"""
+    """full = each robot sends on a channel of its own; half = all use one: who sends hears nothing meanwhile, and
+    packets that overlap disturb each other"""
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
-    """gain from one robot to another, dB: one number for all, or a row for each robot with a number for each other,
-    null where nothing arrives. Level and noise then follow from transmit power, noise figure and ``phy.sample_rate``;
-    null = ``channel.snr_db`` between all"""
+    """gain from one robot to another, dB: one number, or a row for each robot, null where nothing arrives. The SNR then
+    follows from transmit power, noise figure and `phy.sample_rate`; null = `channel.snr_db` between all"""
     paper: PaperConfig | None = None
-    """the robots are the paper's blocks, ROS Source and ROS Sink, which speak version 0, with these settings; null =
-    they are ROS Links"""
+    """the robots are the paper's blocks, with these settings; null = they are ROS Links"""
     drain_s: Seconds = 2.0
     """s the link may go on delivering after ``duration_s``"""
     bag_speed: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
     """playback speed of a bag, 1 as recorded, 0 as fast as the link takes it"""
     sim: SimSettings = Field(default_factory=SimSettings)
-    """settings of the simulator, which a recording does not need; its seed is the scenario's unless given"""
+    """settings of the simulator"""
     task: str = ""
     """what the robots do on what they hear of each other: `formation`, `rendezvous`, or `module:Class`, a subclass of
     :class:`gr_ros2_lab.sim.tasks.Task`; '' = each drives its own ways"""
@@ -101,8 +97,7 @@ class Scenario(Experiment, Traffic, AirConfig):
     """who drives the robots of a task. `task`: the task itself; `ros`: a node on the graph of each robot, by
     ``cmd_vel`` (in real time)"""
     own_domains: bool = True
-    """robots whose ``graph.domain_id`` is auto are on ROS domains that no other program of this computer uses; false =
-    they are on ROS_DOMAIN_ID"""
+    """robots without `graph.domain_id` are on ROS domains that no other program here uses; false = on ROS_DOMAIN_ID"""
     also: ClassVar[Any] = {RobotConfig: ("robot",)}
     """Settings of these may stand here too, but for some."""
     conditions: ClassVar[Any] = (
@@ -208,10 +203,16 @@ class Scenario(Experiment, Traffic, AirConfig):
                     f"robots: what robot {sender.robot_id} sends comes out twice on one ROS graph; set own_domains: "
                     "true, or another graph.domain_id for each"
                 )
-        if self.duplex == "half" and not PHY.load(self.phy.name).has_samples:
+        if self.duplex == "full":
+            return
+        if not PHY.load(self.phy.name).has_samples:
             raise ValueError(
                 f"robots: phy {self.phy.name} has no samples, which they share in real time; choose another"
             )
+        if self.paper is not None:
+            raise ValueError("paper: on one channel in real time robots need version 1; leave it out")
+        if self.channel.loses_packets or any(path.loses_packets for path in self.paths):
+            raise ValueError("channel: bursts cross as samples, so none is dropped whole; leave these settings out")
 
     @cached_property
     def all_robots(self) -> tuple[RobotSettings, ...]:

@@ -97,6 +97,7 @@ class Simulated:
     :param airtime_s: of the longest packet, s; 0 for a PHY without airtime
     :param packets: as in ``result.json``
     :param stats: by source id
+    :param frames: what was made of topics that are sent as frames, by source and topic id
     """
 
     duration_s: float
@@ -105,6 +106,7 @@ class Simulated:
     packets: dict[str, Any]
     stats: Mapping[int, SenderStats]
     recorder: Recorder
+    frames: Mapping[tuple[int, int], dict[str, Any]]
 
 
 def offered(scenario: Scenario, registry: Registry) -> Iterator[Offered]:
@@ -210,6 +212,7 @@ def simulate(
         packets=recorder.ledger.packets(),
         stats={src_id: robot.endpoint.sent for src_id, robot in zip(ids, run.robots, strict=False)},
         recorder=recorder,
+        frames={(robot.src_id, topic_id): made for robot in run.robots for topic_id, made in robot.made().items()},
     )
 
 
@@ -472,6 +475,14 @@ class Robot:
             self._frames.end()
             yield from ((now, self, event) for event in self._events)
             self._events.clear()
+
+    def made(self) -> dict[int, dict[str, Any]]:
+        """What was made of its topics that are sent as frames, by topic id."""
+        frames = self._frames
+        if frames is None:
+            return {}
+        found = {topic_id: frames.stats(topic_id, self.duration_s) for topic_id in self.endpoint.messages.queued()}
+        return {topic_id: made for topic_id, made in found.items() if made is not None}
 
     def _code(self, now: float) -> None:
         """Encode the pictures that are due."""

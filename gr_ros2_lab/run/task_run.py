@@ -16,6 +16,7 @@ from functools import partial
 from heapq import merge
 from operator import attrgetter
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import Delivered
 from gr_ros2.middleware import Middleware, Qos
@@ -26,7 +27,7 @@ from gr_ros2_lab.run.robot_settings import senders_of
 from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.sim.sensors import TYPES, read_command
 from gr_ros2_lab.sim.tasks import TaskRobots, make_task
-from gr_ros2_lab.sim.world import Floats, World
+from gr_ros2_lab.sim.world import World
 
 
 @dataclass(frozen=True)

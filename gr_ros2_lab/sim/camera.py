@@ -12,8 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2_lab.sim.motion import RADIUS, State
-from gr_ros2_lab.sim.world import Floats, World
+from gr_ros2_lab.sim.world import World
 
 WIDTH: Final = 320
 HEIGHT: Final = 240

@@ -13,9 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2_lab.sim.motion import ACCELERATION, MAX_TURN, RADIUS, TICK, State, stopping_paths
 from gr_ros2_lab.sim.roadmap import Roadmap
-from gr_ros2_lab.sim.world import Floats, World
+from gr_ros2_lab.sim.world import World
 
 _LOOKAHEAD_M = 1.2
 _ARRIVED_M = 0.5

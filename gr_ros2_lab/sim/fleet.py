@@ -15,13 +15,14 @@ from functools import lru_cache
 
 import numpy as np
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.sim.driver import Driver
 from gr_ros2_lab.sim.motion import RADIUS, TICK, State, places_and_velocities
 from gr_ros2_lab.sim.roadmap import Roadmap
 from gr_ros2_lab.sim.sensors import ALL_TYPES, CAMERA, TYPES, Sensors
 from gr_ros2_lab.sim.sim_settings import SimSettings
-from gr_ros2_lab.sim.world import Floats, World
+from gr_ros2_lab.sim.world import World
 
 _START_GAP_M = 3.0
 _DRIVEN_S = 30.0

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gr_ros2_lab.sim.world import Floats
+from gr_ros2.core.arrays import Floats
 
 TICK = 0.1
 """Time between two commands, s."""

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
-from gr_ros2_lab.sim.world import Floats
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 _STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gr_ros2_lab.sim.world import Floats, World
+from gr_ros2.core.arrays import Floats
+from gr_ros2_lab.sim.world import World
 
 Places = NDArray[np.int_]
 """Indices of places."""

@@ -16,10 +16,11 @@ from typing import Any, Final
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2_lab.sim.camera import HEIGHT, WIDTH, picture
 from gr_ros2_lab.sim.motion import MAX_TURN, RADIUS, State
 from gr_ros2_lab.sim.sim_settings import SimSettings
-from gr_ros2_lab.sim.world import Floats, World
+from gr_ros2_lab.sim.world import World
 
 TYPES: Final = {
     "scan": "sensor_msgs/msg/LaserScan",

@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.sim.motion import MAX_TURN, TICK, State, places_and_velocities
 from gr_ros2_lab.sim.sensors import Sensors, read_odometry
 from gr_ros2_lab.sim.sim_settings import SimSettings
-from gr_ros2_lab.sim.world import Floats, World
+from gr_ros2_lab.sim.world import World
 
 Command = tuple[float, float]
 """Speed in m/s and turn rate in rad/s."""

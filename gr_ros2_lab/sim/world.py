@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gr_ros2.core.arrays import Floats
 
 GAP = 1.7
 """Smallest gap between obstacles, m. A robot of 0.7 m passes with half a metre on each side."""

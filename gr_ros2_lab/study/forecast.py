@@ -22,6 +22,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from gr_ros2.codecs.frames import coded_topic
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import SentPacket
@@ -67,6 +68,20 @@ _LIGHTER = 0.95
 
 
 @dataclass(frozen=True)
+class FrameForecast:
+    """What a topic becomes that is sent as frames, in what others leave of the air.
+
+    :param made: what the newest frame is, in words
+    :param rate_hz: frames/s sent
+    :param kbit_s: of the frames, without headers
+    """
+
+    made: str
+    rate_hz: float
+    kbit_s: float
+
+
+@dataclass(frozen=True)
 class TopicForecast:
     """One topic.
 
@@ -92,6 +107,8 @@ class TopicForecast:
     share: float
     rate_hz: float
     result: TopicResult
+    frames: FrameForecast | None = None
+    """None for a topic whose messages all leave; the load of any other is its share."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +140,12 @@ class Forecast:
 
     @property
     def load(self) -> float:
-        """Part of the airtime allowed that all messages would take, on the busiest channel; above 1 they do not fit."""
+        """Part of the airtime allowed that all messages would take, on the busiest channel; above 1 they do not fit.
+        Topics that are sent as frames always fit: they take what is left."""
         channels: Counter[int] = Counter()
         for topic in self.topics:
+            if topic.frames is not None:
+                continue
             channels[0 if self.shared else topic.src_id] += topic.load  # type: ignore[assignment]
         return max(channels.values(), default=0.0)
 
@@ -254,10 +274,15 @@ class Planner:
             raise ConfigError(f"source = {scenario.source!r}: has nothing on the registered topics; set other topics")
         self._rows: dict[str, str] = {}
         self._weights: dict[str, float] = {}
+        self._framed: set[int] = set()
+        """Topics of pictures and clouds that are sent as frames."""
         for robot in senders_of(self.scenario.all_robots):
             options = self.registry.with_options(robot.options)
             for name, topic_id in source_names(robot, self.registry).items():
-                self._rows[name], self._weights[name] = self.registry[topic_id].name, options[topic_id].options.weight
+                topic = options[topic_id]
+                self._rows[name], self._weights[name] = topic.name, topic.options.weight
+                if robot.compression and coded_topic(topic) is not None:
+                    self._framed.add(topic_id)
         self._remembering: _Remembering | None = None
         self._now: Forecast | None = None
         self._begun: Generator[Forecast, None, None] | None = None
@@ -350,8 +375,10 @@ class Planner:
         wire = self.scenario.wire_format
         sizes: dict[int, list[int]] = {}
         for message in chain(*self._messages):
+            if message.topic_id in self._framed:
+                continue  # cut to what there is
             sizes.setdefault(message.topic_id, []).append(self._size(message.topic_id, message.payload))
-        largest = max(max(values) for values in sizes.values())
+        largest = max((max(values) for values in sizes.values()), default=0)
         lens = set()
         for values in sizes.values():
             most = sorted(values)[int(0.99 * (len(values) - 1))]
@@ -397,7 +424,7 @@ class Planner:
         """Messages/s that a robot offers, and the load of its channel, by rows of the registry."""
         rows: dict[str, list[TopicForecast]] = {}
         for topic in forecast.topics:
-            if topic.load:
+            if topic.load and topic.frames is None:
                 rows.setdefault(self._rows[topic.topic], []).append(topic)
         offered = {row: fmean(topic.offered_hz for topic in topics) for row, topics in rows.items()}
         together = sum if forecast.shared else max
@@ -514,7 +541,12 @@ class Planner:
             key = result.src_id, topic_id
             mine = payloads[key]
             cost = shares[key] / max(run.stats[result.src_id].sent[topic_id], 1)
-            sizes = [len(payload) if codec is None else len(codec.encode(topic_id, payload)) for payload in mine]
+            made = run.frames.get(key)
+            fits = made is not None and topic_id in self._framed
+            if made is not None:
+                sizes = [made["bytes"] / max(made["frames"], 1)]
+            else:
+                sizes = [len(payload) if codec is None else len(codec.encode(topic_id, payload)) for payload in mine]
             topics.append(
                 TopicForecast(
                     topic=result.topic,
@@ -523,10 +555,13 @@ class Planner:
                     wanted_hz=(wanted_hz := min(len(mine) / duration, rates_hz[key])),
                     message_bytes=float(np.mean([len(payload) for payload in mine])) if mine else 0.0,
                     air_bytes=float(np.mean(sizes)) if mine else 0.0,
-                    load=cost * wanted_hz / allowed,
+                    load=(shares[key] / duration if fits else cost * wanted_hz) / allowed,
                     share=shares[key] / duration,
                     rate_hz=result.delivered / duration,
                     result=result,
+                    frames=FrameForecast(made["made"], made["frames"] / duration, 8e-3 * made["bytes"] / duration)
+                    if made is not None and fits
+                    else None,
                 )
             )
         delivered = sum(topic.result.delivered for topic in topics)

@@ -37,6 +37,7 @@ class Robot:
     name: str = "camera/image"
     seen: list[tuple[float, tuple[int, int], bytes]] = field(default_factory=list)
     types: dict[tuple[int, int], str] = field(default_factory=dict)
+    names: dict[tuple[int, int], str] = field(default_factory=dict)
     failed: list[tuple[float, CodecError]] = field(default_factory=list)
     events: list[Any] = field(default_factory=list)
     on: bool = True
@@ -70,15 +71,23 @@ class Robot:
         self.sender, self.receiver = FrameSender(self.end.frames), FrameReceiver()
         for topic in self.topics or ():
             self.sender.add(topic)
+        self.camera = self.topics[CAMERA] if self.topics else Topic(CAMERA, "", "")
         self.boot += 1
         self.coder = TimedCoder(self.sender)
 
     def submit(self, topic_id: int, message: bytes, now: float) -> None:
+        topic_id = self.camera.topic_id if topic_id == CAMERA else topic_id
         if topic_id in self.sender:
             self.sender.offer(topic_id, message, now)
             self.coder.look(now)
         else:
             self.end.messages.submit(topic_id, message, now)
+
+    def change(self, options: SendOptions) -> None:
+        """Give the camera other options."""
+        before = self.camera
+        _, self.camera = self.end.messages.change(before.topic_id, options)
+        self.sender.change(before, self.camera)
 
     def receive(self, data: bytes, now: float) -> None:
         self.take(self.end.receive(AirPacket(data), now), now)
@@ -87,11 +96,12 @@ class Robot:
         for event in events:
             if isinstance(event, Announced):
                 for row in event.topics:
+                    self.names[event.src_id, row.topic_id] = self.name if "camera" in row.name else row.name
                     self.types[event.src_id, row.topic_id] = self.receiver.announce((event.src_id, row.topic_id), row)
             elif isinstance(event, Delivered):
                 key = event.src_id, event.topic_id
                 try:
-                    self.seen.append((now, key, self.receiver.decode(key, self.name, event.payload)))
+                    self.seen.append((now, key, self.receiver.decode(key, self.names.get(key, ""), event.payload)))
                 except CodecError as error:
                     self.failed.append((now, error))
                     self.end.frames.lost(*key)

@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gr_ros2.codecs import CodedTopic, video
+from gr_ros2.codecs import CODECS, CodedTopic, video
 from gr_ros2.codecs.messages import CLOUD, COMPRESSED_IMAGE, GRID, IMAGE
 from tests.codecs import scenes
+
+SCAN = "sensor_msgs/msg/LaserScan"
 
 
 class Sample(NamedTuple):
@@ -62,6 +64,10 @@ def _metres() -> list[bytes]:
     return [scenes.image(scenes.room(n, 160, 120), "32FC1", n) for n in range(3)]
 
 
+def _scans() -> list[bytes]:
+    return [scenes.scan(n) for n in range(3)]
+
+
 SAMPLES = {
     "exact": Sample("exact", "std_msgs/msg/String", {}, cache(_texts), exact=True),
     "camera": Sample("camera", IMAGE, {"size": "full"}, cache(_colours), budget=1200),
@@ -78,3 +84,5 @@ SAMPLES = {
     "cloud in a budget": Sample("cloud", CLOUD, {"voxel": 0.05}, cache(_clouds), budget=900),
     "grid": Sample("grid", GRID, {}, cache(_maps), exact=True),
 }
+if "scan" in CODECS:  # the worked example of docs/how-to/extend.md, where a test has installed it
+    SAMPLES["scan"] = Sample("scan", SCAN, {}, cache(_scans), exact=True)

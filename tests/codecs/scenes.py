@@ -264,3 +264,16 @@ def camera_info(width: int = 640, height: int = 480, number: int = 4) -> bytes:
         binning_y=0,
         roi=roi,
     )
+
+
+def scan(number: int = 0, beams: int = 360) -> bytes:
+    """A LaserScan in whole millimetres; a tenth of its beams meet nothing."""
+    rng = np.random.default_rng([3, number])
+    far = np.rint(4000 + 2000 * np.sin(np.linspace(0, 20, beams)) + rng.normal(0, 5, beams))
+    ranges = np.where(rng.random(beams) < 0.1, np.inf, far / 1000).astype(np.float32)
+    limits = {"angle_min": -3.14, "angle_max": 3.14, "range_min": 0.1, "range_max": 12.0}
+    times = {"angle_increment": 6.28 / beams, "time_increment": 0.0, "scan_time": 0.1}
+    nothing = np.zeros(0, np.float32)
+    return write(
+        "sensor_msgs/msg/LaserScan", header=header(number), ranges=ranges, intensities=nothing, **limits, **times
+    )

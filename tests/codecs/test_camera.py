@@ -356,3 +356,13 @@ def test_any_bytes_of_video_end_in_an_image_or_an_error(data: bytes, width: int,
         assert key
         assert shown is None or shown.width * shown.height <= 1 << 14
     assert read_varint(varint(width))[0] == width
+
+
+@pytest.mark.parametrize(("width", "height", "encoding"), [(3840, 2160, "rgb8"), (4200, 2400, "mono8")])
+def test_a_picture_that_no_receiver_would_make_is_halved(width: int, height: int, encoding: str) -> None:
+    """More bytes than a message may have, more pixels than a decoder takes."""
+    pixels = np.zeros((height, width, 3)[: 3 if encoding == "rgb8" else 2], np.uint8)
+    topic = CodedTopic(IMAGE, {"camera": {"size": "full"}})
+    coded = topic.encoder().encode(image(pixels, encoding), 100_000)
+    out = read(IMAGE, topic.decoder().decode(coded.data))
+    assert (out.width, out.height) == (width // 2, height // 2)

@@ -85,14 +85,23 @@ def test_clouds_without_a_point_come_out_empty(shape: tuple[int, ...]) -> None:
     assert topic.decoder().decode(topic.encoder().encode(message).data) == message
 
 
-def test_a_budget_makes_voxels_coarser_by_factors_of_two() -> None:
+def test_a_budget_makes_voxels_coarser_in_small_steps() -> None:
     points = street(0, 8, 150)
     message = cloud(points)
     for budget in (1500, 500, 100):
         out, _, said = through(message, budget, voxel=0.05)
-        edge = float(said.rsplit("voxels of ", 1)[1].removesuffix(" m"))
-        assert np.log2(edge / 0.05) == pytest.approx(round(np.log2(edge / 0.05)), abs=1e-4)
-        assert in_voxels(finite(points), out, edge)
+        steps = 4 * np.log2(float(said.split()[2]) / 0.05)
+        assert steps == pytest.approx(round(steps), abs=0.03)
+        assert in_voxels(finite(points), out, 0.05 * 2 ** (round(steps) / 4))
+
+
+def test_a_chain_of_clouds_keeps_within_its_budget_and_wastes_little_of_it() -> None:
+    messages = [cloud(street(number, 16, 900)) for number in range(4)]
+    for budget in (400, 1500, 5000):
+        encoder = CodedTopic(CLOUD, {"cloud": {"voxel": 0.05, "range": 30.0}}).encoder()
+        sizes = [len(encoder.encode(messages[n % 4], budget * (1 + n // 8)).data) / (1 + n // 8) for n in range(16)]
+        assert max(sizes) <= budget
+        assert np.median(sizes) > 0.7 * budget
 
 
 def test_intensity_is_the_mean_of_a_voxel() -> None:

@@ -22,7 +22,7 @@ from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
 from tests.codecs import scenes
-from tests.codecs.camera_link import CAMERA, ODOMETRY, Air, Robot, registry
+from tests.codecs.camera_link import CAMERA, ODOMETRY, SCAN, Air, Robot, registry
 
 FPS = 15
 ZERO = {"header": scenes.header(), "height": 0, "width": 0, "encoding": "rgb8", "is_bigendian": 0, "step": 0} | {
@@ -267,6 +267,28 @@ def test_camera_info_is_as_it_came_once_the_camera_passes_exactly() -> None:
     assert receiver.scaled(1, "camera/camera_info", CAMERA_INFO, info) == info
 
 
+def test_of_several_cameras_in_one_namespace_each_has_its_camera_info() -> None:
+    receiver, info = FrameReceiver(), scenes.camera_info(320, 240)
+    sizes = {"left_image_raw": 160, "left_image_rect": 320, "right_image": 320, "image_color": 320, "image": 160}
+    encoders = {}
+    for number, (name, width) in enumerate(sizes.items()):
+        receiver.announce((1, number), AnnouncedTopic(number, f"eye/{name}", IMAGE, codec="frames"))
+        options = {"camera": {"size": f"{width}x{width * 3 // 4}"}}
+        encoders[number] = CodedTopic(IMAGE, options).encoder()
+
+    def widths() -> list[int]:
+        of = ("left_camera_info", "right_camera_info", "camera_info")
+        return [read(CAMERA_INFO, receiver.scaled(1, f"eye/{name}", CAMERA_INFO, info)).width for name in of]
+
+    for round in range(2):
+        for number, name in enumerate(sizes):
+            receiver.decode((1, number), f"eye/{name}", encoders[number].encode(picture(round), 900).data)
+            if round:
+                assert widths() == [160, 320, 160], "whatever came last"
+    receiver.decode((1, 7), "eye/left_image_raw", b"a picture that passes exactly")
+    assert widths() == [320, 320, 160]
+
+
 def test_a_longest_rate_of_the_topic_is_heeded() -> None:
     air = link(options={"max_rate": 5.0})
     air.run(4.0)
@@ -431,3 +453,118 @@ def test_a_picture_that_waits_at_the_end_has_a_fate() -> None:
     assert last.reason == Fate.SUPERSEDED
     assert "ended" in last.detail
     assert sender.sender.next(air.now) is None
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_a_camera_is_turned_off_and_on_while_it_is_seen(loss: float) -> None:
+    """Exact pictures from then on; then video again."""
+    air = link(loss=loss, kbit_s=1000)
+    sender, receiver = air.robots
+    small = [scenes.image(scenes.view(number, 160, 120), "rgb8", number) for number in range(181)]
+    air._feeds[0] = sender, CAMERA, FPS, small.__getitem__, 0
+    air.run(2.0)
+
+    def changed(until: float, off: bool) -> list[bytes]:
+        sender.change(SendOptions(camera={"off": off}, queue="fifo", queue_depth=2))
+        before = len(receiver.seen)
+        air.run(until)
+        pictures = [message for _, key, message in receiver.seen[before:] if key[1] not in (ODOMETRY, SCAN)]
+        numbers = [number_of(message) for message in pictures]
+        assert numbers == sorted(set(numbers))
+        exact = [message == small[number] for message, number in zip(pictures, numbers, strict=True)]
+        assert exact == sorted(exact, reverse=not off), "what has left before comes before"
+        return [message for message, passes in zip(pictures, exact, strict=True) if passes == off]
+
+    for begin in (2.0, 7.0):
+        assert len(changed(begin + 3, off=True)) >= 2
+        assert len(changed(begin + 5, off=False)) > 20
+    assert not receiver.failed
+    assert len(receiver.end.topics_of(1)) == 4, "the same topic id each time"
+
+
+def test_an_output_changes_while_it_is_seen() -> None:
+    air = link()
+    sender, receiver = air.robots
+    air.run(3.0)
+    sender.change(SendOptions(camera={"output": "CompressedVideo", "size": "160x120"}))
+    before = len(receiver.of(1))
+    air.run(6.0)
+    assert receiver.types[1, CAMERA] == VIDEO
+    assert {read(VIDEO, message).format for _, message in receiver.of(1)[before + 3 :]} == {"h264"}
+    assert len(receiver.of(1)) - before > 30
+    assert receiver.receiver._decoders[1, CAMERA].size == (160, 120)
+
+
+def test_a_picture_that_is_coded_while_the_camera_is_turned_off_has_a_fate() -> None:
+    sender = Robot(1, registry(), 128)
+    sender.sender.offer(CAMERA, picture(0), 0.0)
+    job = sender.sender.next(0.0)
+    assert job is not None
+    sender.sender.offer(CAMERA, picture(1), 0.01)
+    sender.change(SendOptions(camera={"off": True}))
+    sender.sender.done(job, job.run(), 0.02)
+    sender.change(SendOptions())
+    sender.sender.offer(CAMERA, picture(2), 0.03)
+    again = sender.sender.next(0.03)
+    assert again is not None
+    sender.sender.done(again, again.run(), 0.04)
+    refused = [event for event in sender.events if isinstance(event, Refused)]
+    assert [event.reason for event in refused] == [Fate.SUPERSEDED] * 2
+    assert len([event for event in sender.events if isinstance(event, Accepted)]) == 1
+
+
+def test_a_frame_that_is_too_long_is_counted_and_named_and_the_next_passes(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    air = link()
+    sender, receiver = air.robots
+    air.run(2.0)
+    monkeypatch.setattr("gr_ros2.link.v1.outbox.MAX_MESSAGE", 100)
+    air.run(3.0)
+    monkeypatch.undo()
+    seen = len(receiver.of(1))
+    air.run(5.0)
+    refused = [event for event in sender.events if isinstance(event, Refused) and event.reason == Fate.TOO_LARGE]
+    assert len(refused) >= 4, "each is counted"
+    assert len([record for record in caplog.records if "too large" in record.message]) == 1
+    assert len(receiver.of(1)) - seen > 20
+    assert not receiver.failed, "no frame came without the one before it"
+    said = sender.sender.stats(CAMERA, air.now)
+    assert said is not None and said["not_coded"] == len(refused)
+
+
+def test_a_picture_that_no_receiver_would_make_is_not_sent(caplog: pytest.LogCaptureFixture) -> None:
+    air = link(kbit_s=4000)
+    sender, receiver = air.robots
+    huge = scenes.image(np.zeros((2000, 2100, 6), np.uint8), "rgb16", 5)
+    air._feeds[0] = sender, CAMERA, 5, lambda n: huge if n == 5 else picture(n), 0
+    air.run(3.0)
+    refused = [event for event in sender.events if isinstance(event, Refused) and event.reason == Fate.TOO_LARGE]
+    assert len(refused) == 1
+    assert str(len(huge)) in refused[0].detail
+    assert len([record for record in caplog.records if "too large" in record.message]) == 1
+    assert [number_of(message) for _, message in receiver.of(1)][-1] > 12
+    assert not receiver.failed
+
+
+def test_a_robot_in_between_shows_a_camera_on_as_one_of_its_own() -> None:
+    """What a program of its graph publishes again is coded anew, within what that robot's air has left."""
+    camera, between, far = Robot(1, registry(), 256), Robot(2, registry(), 128), Robot(3, None, 128)
+    air = Air(camera, between, far)
+    air.lost = lambda sender, receiver: {sender, receiver} == {camera, far}
+    air.feed(camera, CAMERA, FPS, picture)
+    take = between.take
+
+    def taken(events: Any, now: float) -> None:
+        before = len(between.seen)
+        take(events, now)
+        for _, key, message in between.seen[before:]:
+            if key == (1, CAMERA):
+                between.submit(CAMERA, message, now)
+
+    between.take = taken  # type: ignore[method-assign]
+    air.run(6.0)
+    seen = [(now, number_of(message) / FPS) for now, message in far.of(2) if now > 2]
+    assert len(seen) > 4 * 12
+    assert np.mean([now - made for now, made in seen]) < 0.3
+    assert not far.of(1)

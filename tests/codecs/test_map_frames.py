@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from gr_ros2.codecs.messages import GRID
@@ -109,3 +110,16 @@ def test_where_nobody_reports_every_map_is_whole_and_comes_again() -> None:
     air._feeds.clear()
     air.run(30.0)
     assert distinct(late) == [MAPS[-1]]
+
+
+@pytest.mark.parametrize("large", [0, 3])
+def test_a_map_that_is_too_large_is_counted_and_the_next_passes(large: int) -> None:
+    mapper, follower = Robot(1, Registry([MAP]), 128), Robot(2, None, 128)
+    air = Air(mapper, follower)
+    huge = scenes.grid(np.zeros((4100, 4100), np.int8))
+    air.feed(mapper, 0, 1, lambda number: huge if number == large else MAPS[number])
+    air.run(6.9)
+    refused = [event for event in mapper.events if isinstance(event, Refused) and event.reason == Fate.TOO_LARGE]
+    assert len(refused) == 1
+    assert distinct(follower) == [MAPS[number] for number in range(7) if number != large]
+    assert not follower.failed

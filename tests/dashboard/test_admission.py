@@ -17,7 +17,7 @@ from urllib.request import Request, urlopen
 import pytest
 
 pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
-pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from bokeh.document import Document
 from tornado.httpclient import HTTPRequest

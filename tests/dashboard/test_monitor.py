@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
 
+import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU RadioView 3.10")
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import RunError
 from gr_ros2.dashboard.monitor import RunMonitor
-from gr_ros2.link.events import Delivered
+from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.observe.observers import LiveRun
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2_lab.run.runner import run_scenario
@@ -22,12 +22,29 @@ ENDS = ("graph.middleware=memory",)
 OFDM = ("phy.name=ofdm", "phy.sample_rate=2e6", "packet_len=220", "channel.snr_db=30")
 
 
-def run(monitor: RunMonitor, *overrides: str, duration_s: float) -> tuple[threading.Thread, list[Any]]:
-    scenario = load_scenario("paper-direct", [*ENDS, *overrides], duration_s=duration_s)
-    outcomes: list[Any] = []
-    thread = threading.Thread(target=lambda: outcomes.append(run_scenario(scenario, observers=[monitor])))
-    thread.start()
-    return thread, outcomes
+class MonitoredRun(threading.Thread):
+    """A run in a thread, which starts.
+
+    :param duration_s: without it, the run lasts until it is ended
+    """
+
+    def __init__(self, monitor: RunMonitor, *overrides: str, duration_s: float = 3600.0) -> None:
+        super().__init__()
+        self._scenario = load_scenario("paper-direct", [*ENDS, *overrides], duration_s=duration_s)
+        self._monitor, self._over = monitor, threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        self.outcome = run_scenario(self._scenario, on_progress=self._look, observers=[self._monitor])
+
+    def end(self) -> None:
+        """As Ctrl-C does, and wait for the end."""
+        self._over.set()
+        self.join()
+
+    def _look(self, _progress: object) -> None:
+        if self._over.is_set():
+            raise KeyboardInterrupt
 
 
 @pytest.mark.slow
@@ -35,7 +52,7 @@ def test_a_run_is_seen_changed_and_ends_with_its_result() -> None:
     monitor = RunMonitor()
     assert monitor.tick().phase == "waiting"
     monitor.set_packet_loss(0.5)  # nothing to set yet
-    thread, outcomes = run(monitor, *OFDM, duration_s=3.0)
+    running = MonitoredRun(monitor, *OFDM)
     wait_for(lambda: monitor.tick().delivered > 5, "deliveries")
     wait_for(lambda: [monitor.look(), monitor.tick(), monitor.radio.spectrum_db is not None][-1], "a spectrum")
     assert monitor.radio.has_samples
@@ -51,8 +68,10 @@ def test_a_run_is_seen_changed_and_ends_with_its_result() -> None:
     channel = monitor.radio.channel
     assert channel is not None
     assert (channel.snr_db, channel.frequency_offset, channel.packet_loss) == (-20.0, 0.001, 1.0)
-    thread.join()
-    (outcome,) = outcomes
+    lost = monitor.snapshot.sent - monitor.snapshot.delivered
+    wait_for(lambda: monitor.tick().sent - monitor.tick().delivered > lost + 3, "messages to be lost")
+    running.end()
+    outcome = running.outcome
     assert monitor.snapshot.phase == "ended"
     assert monitor.tick() is monitor.snapshot  # nothing moves any more
     (view,), (topic,) = monitor.snapshot.topics, outcome.result.topics
@@ -67,7 +86,7 @@ def test_a_run_is_seen_changed_and_ends_with_its_result() -> None:
     assert monitor.snapshot.air is not None
     assert len(monitor.snapshot.air.changes) == len(changes), "nor is it marked"
     times = [change.t for change in changes if change.t is not None]
-    assert 0 < times[0] <= times[1] <= times[2] < 4
+    assert 0 < times[0] <= times[1] <= times[2] < outcome.result.duration_s
 
 
 def test_a_page_that_is_opened_late_knows_what_others_have_announced() -> None:
@@ -84,15 +103,38 @@ def test_a_page_that_is_opened_late_knows_what_others_have_announced() -> None:
     ]
 
 
+class Ticking(RunMonitor):
+    """Looks often in simulated time, whose seconds are none of the computer's."""
+
+    seen = 0
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        super().receiver_event(event, now)
+        self.seen += 1
+        if self.seen % 20 == 0:
+            self.tick()
+
+
+def test_simulated_time_has_its_share_of_the_air() -> None:
+    monitor = Ticking()
+    scenario = load_scenario("team", ["robots=4", "time=packets"], duration_s=10.0)
+    phy = run_scenario(scenario, observers=[monitor]).result.phy
+    air = monitor.snapshot.air
+    assert air is not None
+    spans = np.diff(air.t, prepend=0.0)
+    for kind, seconds in phy["airtime_of_kinds_s"].items():
+        assert float(air.busy[kind] @ spans) == pytest.approx(seconds, rel=0.05), kind  # the last tick is earlier
+
+
 def test_a_phy_without_samples_says_so_and_can_still_lose() -> None:
     monitor = RunMonitor()
-    thread, _ = run(monitor, duration_s=1.0)
+    running = MonitoredRun(monitor)
     wait_for(lambda: monitor.tick().phase == "running", "the first message")
     monitor.set_snr_db(10.0)
     assert "direct" in monitor.refused
     monitor.set_packet_loss(0.25)
     assert monitor.refused == ""
-    thread.join()
+    running.end()
     assert not monitor.radio.has_samples
     assert monitor.radio.snr_db is None
     assert monitor.radio.channel is not None
@@ -101,12 +143,12 @@ def test_a_phy_without_samples_says_so_and_can_still_lose() -> None:
 
 def test_the_next_run_starts_from_nothing() -> None:
     monitor = RunMonitor()
-    run(monitor, duration_s=0.5)[0].join()
+    MonitoredRun(monitor, duration_s=0.5).join()
     sent = monitor.snapshot.sent
-    thread, outcomes = run(monitor, duration_s=0.5)
-    thread.join()
+    again = MonitoredRun(monitor, duration_s=0.5)
+    again.join()
     assert sent
-    assert monitor.snapshot.sent == outcomes[0].result.topics[0].sent
+    assert monitor.snapshot.sent == again.outcome.result.topics[0].sent
 
 
 def test_a_run_that_fails_is_said_to_have_failed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -207,8 +207,7 @@ def test_credit_paces(rig: Rig) -> None:
         wait_for(lambda number=number: rig.probe.handled == number)
     assert rig.source.stats()["packets"] == 3
     rig.probe.message_port_pub(pmt.intern("credit"), pmt.from_long(4))
-    wait_for(lambda: rig.probe.handled == 7, "as many packets as the integer says")
-    assert rig.source.emitted == 7
+    wait_for(lambda: rig.probe.handled == rig.source.emitted == 7, "as many packets as the integer says")
 
 
 @pytest.mark.parametrize("backpressure", [False, True])

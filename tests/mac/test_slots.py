@@ -18,7 +18,7 @@ SLOT = 0.0145
 
 
 def robot(src_id: int = 5, seed: int = 1, **kwargs: float) -> Slots:
-    made = Slots(src_id, SLOT, random.Random(seed), **kwargs)
+    made = Slots(src_id, SLOT, random.Random(seed), **{"period_s": 0.1, **kwargs})
     made.clock.start(0.0)
     return made
 
@@ -257,7 +257,7 @@ def test_who_is_heard_for_a_moment_only_need_not_have_named_this_robot(moves: bo
 
 
 def test_a_robot_that_asks_ahead_of_the_end_of_its_silence_gets_a_slot_after_it() -> None:
-    made = Slots(5, SLOT, random.Random(1))
+    made = Slots(5, SLOT, random.Random(1), period_s=0.1)
     at = made.departure(3.0)
     assert at == pytest.approx(3.0 + QUIET * SLOT)
     assert made.block() is None

@@ -25,7 +25,7 @@ SLOWEST = {10: (1, 2, 9, 49, 52), 50: (25, 35, 42)}
 
 
 def slots(number: int, rng: random.Random) -> Slots:
-    return Slots(number, SLOT, rng)
+    return Slots(number, SLOT, rng, period_s=0.1)
 
 
 def aloha(number: int, rng: random.Random) -> Aloha:

@@ -44,7 +44,8 @@ def test_a_server_of_another_program_answers_and_is_seen_to_come_and_go(graph: D
             for number in range(start, start + 50):
                 caller.call(number)
                 wait_for(lambda: number in caller.got, "the reply")  # noqa: B023 - called at once
-            assert server.heard("took") == [[number] for number in range(start, start + 50)]
+            requests = [[number] for number in range(start, start + 50)]
+            wait_for(lambda: server.heard("took") == requests, "what the program says")  # noqa: B023 - called at once
         wait_for(lambda: not caller.there, "the server to be missed")
     assert caller.got == {number: [number + 1000] for number in (*range(50), *range(100, 150))}
 

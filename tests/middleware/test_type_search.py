@@ -45,6 +45,7 @@ def test_a_type_is_learned_from_whoever_uses_it(graph: DdsMiddleware, domain: in
         assert described.store().deserialize_cdr(message(3), CUSTOM).mode == 3
         (witness,) = graph.witnesses(TOPIC, CUSTOM)
         assert witness == Witness(DIGEST, (f"/wheels/{DESCRIPTION}",))
+        wait_for(lambda: peer.asked, "what the node says")
         assert peer.asked == 1
     assert not graph.counters
 

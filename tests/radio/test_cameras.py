@@ -18,6 +18,7 @@ pytest.importorskip("av", reason="needs PyAV")
 from gr_ros2.codecs.messages import CAMERA_INFO, IMAGE, read
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.radio.live_settings import LiveSettings
 from gr_ros2.radio.robot_link import RobotLink
 from tests.codecs import scenes
 from tests.domains import domain
@@ -31,7 +32,8 @@ SENSED, SEEN = "/robot_1/camera/image", "/rx_robot_1/camera/image"
 class Camera:
     """A camera of a robot's graph: 15 pictures/s of a scene in motion, in a thread."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, width: int = 320) -> None:
+        self._size = width, width * 3 // 4
         self._graph = MemoryMiddleware(domain_id=domain(number))
         self._images = self._graph.advertise(SENSED, IMAGE, QOS)
         self._infos = self._graph.advertise(SENSED.replace("image", "camera_info"), CAMERA_INFO, QOS)
@@ -39,11 +41,11 @@ class Camera:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def _run(self) -> None:
-        pictures = [scenes.view(number, 320, 240) for number in range(30)]
+        pictures = [scenes.view(number, *self._size) for number in range(30)]
         number = 0
         while not self._stop.wait(1 / 15):
             self._images.publish(scenes.image(pictures[number % 30], "rgb8", number))
-            self._infos.publish(scenes.camera_info(320, 240, number))
+            self._infos.publish(scenes.camera_info(*self._size, number))
             number += 1
 
     def __enter__(self) -> Camera:
@@ -110,6 +112,21 @@ def test_pictures_cross_a_link_as_video(tmp_path: Path, watcher: Watcher) -> Non
         assert words.startswith("camera/image: 3."), words
         sizes = {(shown.width, shown.height) for shown in (read(IMAGE, data) for data in watcher.pictures[-30:])}
         wait_for(lambda: (read(CAMERA_INFO, watcher.infos[-1]).width, 0) in {(w, 0) for w, _ in sizes}, "its size")
+
+
+@pytest.mark.real_time
+def test_a_camera_is_turned_off_and_on_while_it_is_seen(tmp_path: Path, watcher: Watcher) -> None:
+    made = [read(IMAGE, scenes.image(scenes.view(number, 80, 60), "rgb8")).data.tobytes() for number in range(30)]
+    with Camera(1, 80), link(1, tmp_path) as one, link(2, tmp_path, topics=[]):
+        live = LiveSettings(one.source, one.sink)
+        for value in ("off", {}) * 2:
+            live.change("topics.camera/image.camera", value)
+            begin = len(watcher.pictures)
+
+            def comes(exact: bool = value == "off", begin: int = begin) -> bool:
+                return exact in [read(IMAGE, data).data.tobytes() in made for data in watcher.pictures[begin:]]
+
+            wait_for(comes, f"pictures with camera: {value}")
 
 
 @pytest.mark.real_time

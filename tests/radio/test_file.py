@@ -91,6 +91,7 @@ def test_a_link_that_is_stopped_at_once_has_recorded_what_has_passed(
     with Robot(1, {"name": "file", "write": str(tmp_path / "sent")}, phy=fixed, repair="off") as robot:
         robot.say(*range(10))
         wait_for(lambda: robot.silent, "all to pass")
+        robot.link.transmit(on=False)
         samples = robot.link.stats()["packets"]["out"] * robot.link.phy.airtime_samples()
     assert samples > 0
     assert len(read_recording(tmp_path / "sent")[1]) == samples

@@ -70,7 +70,8 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
         live.change("topics./goal.weight", 2.0)
         (counted,) = source.stats()["topics"].values()
         assert (counted["submitted"], counted["types"], counted["sent"]) == (5, 1, 5)
-        assert [sink.stats()["topics"]["/rx_robot_1/goal"]["delivered"] for sink in sinks] == [3, 3]
+        counts = lambda: [sink.stats()["topics"]["/rx_robot_1/goal"]["delivered"] for sink in sinks]  # noqa: E731
+        wait_for(lambda: counts() == [3, 3], "the counts of what was heard")
         assert source.config.topics["goal"].to == 2
         assert sorted(str(topic.options.to) for _, topic in source.subscriptions.named()) == ["2", "3", "auto"]
         assert {name for name, _ in source.subscriptions.named()} == {"/goal"}

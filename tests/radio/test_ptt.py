@@ -54,7 +54,7 @@ def rigctld() -> Iterator[Rigctld]:
 def test_the_key_is_pressed_from_the_begin_of_a_burst_to_its_end(rigctld: Rigctld) -> None:
     keyer = Keyer("rigctld", rigctld.where)
     now = time.monotonic()
-    played = Played(now + 0.2, now + 0.4)
+    played = Played(now + 0.2, now + 1.0)  # a busy computer is late, though not by so much
     keyer.key(played)
     wait_for(lambda: len(rigctld.told) == 2)
     keyer.close()
@@ -67,11 +67,11 @@ def test_the_key_is_pressed_from_the_begin_of_a_burst_to_its_end(rigctld: Rigctl
 def test_bursts_that_follow_each_other_are_keyed_once(rigctld: Rigctld) -> None:
     keyer = Keyer("rigctld", rigctld.where)
     now = time.monotonic()
-    keyer.key(Played(now, now + 0.1))
-    keyer.key(Played(now + 0.12, now + 0.3))
+    keyer.key(Played(now, now + 1.0))
+    keyer.key(Played(now + 1.02, now + 1.2))
     wait_for(lambda: len(rigctld.told) == 2)
     keyer.close()
-    assert rigctld.told[1][0] >= now + 0.3
+    assert rigctld.told[1][0] >= now + 1.2
 
 
 def test_the_key_is_let_go_when_the_link_stops_within_a_burst(rigctld: Rigctld) -> None:
@@ -125,7 +125,7 @@ def test_a_sound_chip_gets_reports_of_its_pin(tmp_path: Path) -> None:
     device = tmp_path / "hidraw0"
     keyer = Keyer("cm108", str(device))
     now = time.monotonic()
-    keyer.key(Played(now, now + 0.01))
+    keyer.key(Played(now, now + 0.5))
     wait_for(lambda: device.stat().st_size == 15)
     keyer.close()
     off = [0, 0, 0, 4, 0]

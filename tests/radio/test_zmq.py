@@ -71,7 +71,7 @@ def test_both_ways_at_once_and_nobody_takes_its_own(ends: list[dict[str, Any]]) 
         assert one.link.sink.config.robot_id == 1
         for robot in (one, two):
             assert robot.counters()["missed"] == robot.counters()["malformed"] == robot.counters()["restarts"] == 0
-            assert robot.counters()["bursts_out"] == robot.link.stats()["packets"]["out"]
+            wait_for(lambda: robot.counters()["bursts_out"] == robot.link.stats()["packets"]["out"])  # noqa: B023
 
 
 @pytest.mark.slow

@@ -125,7 +125,7 @@ for option, given in BY_TYPE.items():
 for cls, values in ((CameraOptions, CAMERA), (DepthOptions, DEPTH)):
     for name, value in values.items():
         IDLE[cls, name] = ({name: value}, {"off": True}, {}, "leave off out")
-for name, value in {"range": 30.0, "keep": "rgb"}.items():
+for name, value in {"range": 30.0, "keep": "rgb", "fit": True}.items():
     IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
 NEVER = {(Scenario, "robots.*.state")}
 """Nothing makes them act."""

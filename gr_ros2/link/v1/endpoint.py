@@ -21,9 +21,11 @@ from gr_ros2.link.endpoint import LIVE_OPTIONS, HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.instances import InstancesOf, no_instances
 from gr_ros2.link.message_codec import MessageCodec
+from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import Mcs, RateController
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.facts import Early
 from gr_ros2.link.v1.frames import SentFrames
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
@@ -36,7 +38,6 @@ from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.link.v1.writer import PacketWriter, room_of
-from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import TAG_LEN
@@ -64,6 +65,7 @@ class EndpointV1:
     :param instances: tells the instances of a topic that it sends
     :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
     :ivar answers: whether what it receives can change what it sends
+    :ivar pace: when packets may leave
     :ivar window: the packets that are worth repairing
     :ivar frames: its coded topics
     :ivar neighbours: the robots that are heard
@@ -97,15 +99,17 @@ class EndpointV1:
         self.answers = bool(topics) or settings.hears
         self._now = -inf
         rate = RateController(mcs_table) if mcs_table else None
+        self.pace = pace = Pace(settings.packet_rate)
         self._hold = hold = Hold()
         room = room_of(settings, keys, block=access is not None)
         self.window = window = RepairWindow(
-            "idle" if settings.repair == AUTO else settings.repair,
+            settings.repair,
             room,
             settings.expected_loss,
             shares=settings.shares,
             proves=keys.sealed and settings.hears and settings.idle_is_free,
             slower=settings.slower,
+            limited=lambda: pace.known,
         )
         self.messages = messages = Outbox(
             topics,
@@ -120,7 +124,15 @@ class EndpointV1:
         )
         self.sent = messages.stats
         self._receiving = ReceivingSide(
-            settings, boot, keys, decoder_for=decoder_for, access=access, heard=heard or {}, save=save
+            settings,
+            boot,
+            keys,
+            window.packets,
+            decoder_for=decoder_for,
+            access=access,
+            tells_snr=rate is not None,
+            heard=heard or {},
+            save=save,
         )
         self.received = self._receiving.stats
         self.neighbours = neighbours = self._receiving.neighbours
@@ -144,6 +156,8 @@ class EndpointV1:
             hellos=hellos,
             writer=writer,
             hold=hold,
+            pace=pace,
+            rate=rate,
             relaying=self._receiving.relaying,
         )
         relaying = self._receiving.relaying
@@ -161,14 +175,13 @@ class EndpointV1:
                 ended=messages.ended,
             )
             messages.relayed_left, relaying.found = relaying.left, messages.found
-        self._receiving.tell(self._sending, messages, window, rate)
-        self.pace, self.pings = self._sending.pace, self._sending.pings
+        self.pings = self._sending.pings
         self.frames = SentFrames(
             messages.sent,
             messages,
             window.packets,
             window.peers,
-            self.pace,
+            pace,
             room=room,
             turn_s=settings.turn_s,
             any_length=settings.any_length,
@@ -194,7 +207,7 @@ class EndpointV1:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self._sending.repairs.mode != "off" and self.window.packets.wanted(self._now)
+        mending = self.window.mode != "off" and self.window.packets.wanted(self._now)
         return self.messages.idle and not mending
 
     @property
@@ -292,11 +305,25 @@ class EndpointV1:
 
     def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         self._now = now if now > self._now else self._now
-        return self._receiving.receive(arrival, now)
+        return self._take(arrival, now)
+
+    def _take(self, arrival: AirPacket, now: float, came: float | None = None) -> list[ReceiverEvent]:
+        """Take a packet, and what can be opened since it came; the sending half learns what matters there."""
+        events = self._receiving.receive(arrival, now, came)
+        for fact in self._receiving.take_facts():
+            if isinstance(fact, Early):
+                for at, data in fact.packets:
+                    events += self._take(AirPacket(data), now, at)
+            else:
+                self._sending.learn(fact, now)
+        return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         self._now = max(self._now, now)
-        return self._receiving.handle_timeout(now)
+        events = self._receiving.handle_timeout(now)
+        for fact in self._receiving.take_facts():
+            self._sending.learn(fact, now)
+        return events
 
     def next_timeout(self) -> float | None:
         return self._receiving.next_timeout()

@@ -35,7 +35,7 @@ class Settings:
     :param expected_loss: share of packets that are lost, used until a report gives it
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
-    :param shares: whether others send on the same channel, as medium access lets them: reports are few then
+    :param shares: whether others send on the same channel: reports are few then. An endpoint with medium access sets it
     :param relay: whether messages of other robots are sent on
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
     :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
@@ -101,7 +101,7 @@ class Settings:
         return self.airtime_share == 1 and not (self.half_duplex or self.shares)
 
 
-def settings_of(robot: RobotConfig, air: Air, *, loops_back: bool = False) -> Settings:
+def end_settings(robot: RobotConfig, air: Air, *, loops_back: bool = False) -> Settings:
     """The settings of a robot's end.
 
     :param loops_back: whether it receives what it sends itself, and takes packets of and for any robot

@@ -92,6 +92,12 @@ class SentFrames:
         self._ages.setdefault(topic_id, 0.0)
         self._outlet.tabulate()
 
+    def end(self, topic_id: int) -> None:
+        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        sent = self.sent[topic_id]
+        while sent:
+            sent.popleft().lifetime.end()
+
     def progress(self, topic_id: int, now: float) -> FrameState:
         """How it stands."""
         queue = self._topics[topic_id].queue
@@ -103,14 +109,16 @@ class SentFrames:
         lacked, behind = min(lags, default=0.0), max(lags, default=0.0)
         return FrameState(self._free(now), waiting, lacked, behind, silent, age, joined, bool(self._peers), asks)
 
-    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> None:
-        """Send a frame."""
+    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> bool:
+        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        message = self._outlet.submit_frame(self._topics[topic_id], frame, came, now, key=key)
+        if message is None:
+            return False
         for before in self.sent[topic_id] if key else ():
             if now - before.left_at > LONG_S:
                 before.lifetime.end()
-        message = self._outlet.submit_frame(self._topics[topic_id], frame, came, now, key=key)
-        if message is not None:
-            self.sent[topic_id].append(message)
+        self.sent[topic_id].append(message)
+        return True
 
     def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
         """A message is not coded."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import replace
 from math import inf
 from typing import Any, Protocol
 
@@ -41,6 +42,13 @@ LARGE = 4096
 second, in which nothing else could leave."""
 
 Observer = Callable[[Accepted | Refused | Missed | Ended], None]
+
+
+def _changed(message: Message) -> tuple[Fate, str]:
+    """What becomes of a message that waits while its topic becomes video, or is that no longer."""
+    if message.started:
+        return Fate.ABANDONED, f"{message.remaining} bytes were left when the topic's options changed"
+    return Fate.SUPERSEDED, "the topic's options changed before it could start"
 
 
 class Owner(Protocol):
@@ -151,11 +159,12 @@ class Outbox:
         before = self.sent[topic_id]
         name, type_name = before.topic.name, before.topic.type_name
         check_live_options(name, before.topic.options, options)
-        meant = name, type_name, options.to
-        known = [
-            one for one in self.sent.named() if (one.topic.name, one.topic.type_name, one.topic.options.to) == meant
-        ]
+        meant = replace(before.topic, options=options)
+        known = [one for one in self.sent.named() if one.topic.stream == meant.stream]
         after = known[0] if known else self.sent[self.add([(name, type_name, options)])[-1].topic_id]
+        if before.topic.as_frames != meant.as_frames:
+            self.drop([Dropped(message, *_changed(message)) for message in before.queue])
+            before.queue.clear()
         after.publishers = before.publishers
         after.change(options)
         self.sent.find_deadlines()

@@ -1,4 +1,4 @@
-"""What arrives: packets are opened, taken, and reported as events.
+"""What arrives: packets are opened, taken, and reported as events; and as facts, where they matter to what is sent.
 
 Invariant: ``receive`` never raises, whatever the bytes.
 """
@@ -22,19 +22,28 @@ from gr_ros2.link.events import (
 )
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.rate import RateController
 from gr_ros2.link.v1.announced import ARRIVING_S
 from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.facts import (
+    Appeared,
+    Asked,
+    Early,
+    Fact,
+    PeerLeft,
+    PeerMet,
+    ProofWanted,
+    Questioned,
+    Reported,
+    Taken,
+)
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
-from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.peers import REACH
 from gr_ros2.link.v1.relaying import FORGET_S, Relaying
-from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys
-from gr_ros2.link.v1.sending import SendingSide
+from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.relay.gain import HEARD_S
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.wire.control import (
@@ -63,7 +72,9 @@ class ReceivingSide:
 
     :param decoder_for: makes the decoder for a robot's messages from its table of topics
     :param heard: what ``save`` stored before this start
+    :param sent: what has left, of which reports speak
     :param access: is told what is heard on a channel that others share
+    :param tells_snr: whether reports say how strong packets are
     :ivar stats: what arrived and what did not
     :ivar neighbours: the robots that are heard
     :ivar relaying: what is sent on of what others make; None where nothing is
@@ -74,15 +85,19 @@ class ReceivingSide:
         settings: Settings,
         boot: int,
         keys: Keys,
+        sent: SentPackets,
         *,
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
         access: Access | None = None,
+        tells_snr: bool = False,
         heard: Mapping[int, tuple[int, int]],
         save: Save | None,
     ) -> None:
         self._access = access
         self._takes = range(256) if settings.src_id == NOBODY else (BROADCAST, settings.src_id)
         """The destinations of packets that are for this robot."""
+        self._facts: list[Fact] = []
+        self._sent, self._tells_snr = sent, tells_snr
         self._outcomes = Outcomes()
         self.stats = self._outcomes.stats
         self._settings = settings
@@ -111,16 +126,24 @@ class ReceivingSide:
         self._sender: Neighbour | None = None
         """The sender of the packet that is processed."""
 
-    def tell(self, sending: SendingSide, messages: Outbox, window: RepairWindow, rate: RateController | None) -> None:
-        """Use the parts of the sending half that what arrives can change."""
-        self._sending, self._messages, self._window, self._rate = sending, messages, window, rate
+    def receive(self, arrival: AirPacket, now: float, came: float | None = None) -> list[ReceiverEvent]:
+        """Take one packet; the events it causes, in order.
 
-    def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
-        """Take one packet; the events it causes, in order."""
+        :param came: when it came, s, where it was kept since then
+        """
         self._now = now
         began = now if self._access is None or arrival.at is None else min(arrival.at, now)
-        self._receive(arrival, now, began)
+        try:
+            self._receive(arrival, now, began if came is None else came)
+        except WireError as error:
+            self.stats.rejected[error.kind] += 1
+            self._outcomes.events.append(Rejected(arrival.data, error))
         return self._outcomes.take()
+
+    def take_facts(self) -> list[Fact]:
+        """The facts of the packets since this was called last."""
+        facts, self._facts = self._facts, []
+        return facts
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         """Give up missing packets, and forget robots that are silent."""
@@ -129,7 +152,7 @@ class ReceivingSide:
             neighbour.inbox.handle_timeout(now)
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now, self._give_up_s):
-            self._end(gone.src_id, self._window.peers.leave)
+            self._facts.append(PeerLeft(gone.src_id, ended=False))
             if self.relaying is None or not self.relaying.reaches(gone.src_id, gone.boot, now):
                 self._outcomes.events.append(Gone(gone.src_id, gone.boot))
         if self.relaying is not None:
@@ -167,28 +190,22 @@ class ReceivingSide:
 
     def _receive(self, arrival: AirPacket, now: float, began: float) -> None:
         """Take a packet that began to arrive at a time, s."""
-        try:
-            header = read_header(arrival.data, self._settings.packet_len)
-            opened = self._open(arrival.data, header, now)
-            if self._access is not None and (opened is None or opened.new):  # what was here says nothing about now
-                self._note_slot(self._access, header, arrival, now, opened)
-            if opened is None or opened.kept:
-                return
-            opened.neighbour.timeout = None
-            if self._access is not None and header.dst_id not in self._takes:
-                self.stats.dropped["not_for_us"] += 1
-                return
-            if arrival.snr_db is not None and opened.new and opened.trusted:
-                opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
-            opened.neighbour.inbox.began = began
-            self._use(arrival, opened, now)
-        except WireError as error:
-            self.stats.rejected[error.kind] += 1
-            self._outcomes.events.append(Rejected(arrival.data, error))
+        header = read_header(arrival.data, self._settings.packet_len)
+        opened = self._open(arrival.data, header, now)
+        if self._access is not None and (opened is None or opened.new):  # what was here says nothing about now
+            self._note_slot(self._access, header, arrival, now, opened)
+        if opened is None or opened.kept:
             return
-        if opened.met:
-            for at, early in self.neighbours.early(opened.neighbour.src_id, now):
-                self._receive(AirPacket(early), now, at)
+        opened.neighbour.timeout = None
+        if self._access is not None and header.dst_id not in self._takes:
+            self.stats.dropped["not_for_us"] += 1
+            return
+        if arrival.snr_db is not None and opened.new and opened.trusted:
+            opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
+        opened.neighbour.inbox.began = began
+        self._use(arrival, opened, now)
+        if opened.met and (early := self.neighbours.early(opened.neighbour.src_id, now)):
+            self._facts.append(Early(early))
 
     def _note_slot(self, access: Access, header: Header, arrival: AirPacket, now: float, opened: Opened | None) -> None:
         """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
@@ -221,11 +238,8 @@ class ReceivingSide:
         """Take an opened packet."""
         self.stats.packets += 1
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
-        sending = self._sending
-        if opened.trusted or opened.appeared:
-            sending.heard_at = now
-            sending.repairs.waits_until = -inf
-        sending.urged = sending.urged or (repair is not None and not repair.mask) or sending.reports.requests.lacking
+        control = repair is not None and not repair.mask
+        self._facts.append(Taken(opened.trusted or opened.appeared, urges=control))
         if opened.appeared:
             self._appear(opened, now)
         if opened.met:
@@ -256,12 +270,12 @@ class ReceivingSide:
         self, arrival: AirPacket, opened: Opened, repair: RepairHeader, entries: Sequence[EntryV1], now: float
     ) -> None:
         """Take a packet of entries that are not messages. One that is not trusted moves nothing but the proofs."""
-        neighbour, number, sending = opened.neighbour, opened.number, self._sending
+        neighbour, number = opened.neighbour, opened.number
         inbox = neighbour.inbox
         if repair.clear:
-            neighbour.echo = arrival.data[-ECHO_LEN:], self._window.packets.newest
+            neighbour.echo = arrival.data[-ECHO_LEN:], self._sent.newest
             if neighbour.hello.capabilities & WANTS_PROOF:
-                sending.hellos.answer(now)
+                self._facts.append(ProofWanted())
         if not opened.trusted:
             if not repair.clear:
                 self.stats.dropped["unproven"] += 1
@@ -272,7 +286,7 @@ class ReceivingSide:
             elif isinstance(entry, (Ask, Report, Newest)):
                 self._entry(entry)
             elif isinstance(entry, (Ping, About)):
-                sending.pings.receive(neighbour.src_id, self._settings.src_id, entry, now)
+                self._facts.append(Questioned(neighbour.src_id, entry))
         inbox.heard(number, now, over=repair.oldest)
 
     def _appear(self, opened: Opened, now: float) -> None:
@@ -280,21 +294,17 @@ class ReceivingSide:
         this start."""
         if opened.replaced is not None:
             opened.replaced.inbox.ended(now)
-            self._end(opened.replaced.src_id, self._window.peers.forget)
+            self._facts.append(PeerLeft(opened.replaced.src_id, ended=True))
             if self.relaying is not None:
                 self.relaying.started(opened.replaced, now)
-        self._sending.met(now)
+        self._facts.append(Appeared())
 
     def _meet(self, neighbour: Neighbour, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
-            self._window.peers.meet(neighbour.src_id, now)
-            if neighbour.proves:
-                since, wanted = self.neighbours.since(neighbour.src_id)
-                self._window.peers.prove(neighbour.src_id, since, wanted=wanted)
-            if self._rate is not None:
-                self._rate.meet(neighbour.src_id)
+            proof = self.neighbours.since(neighbour.src_id) if neighbour.proves else ()
+            self._facts.append(PeerMet(neighbour.src_id, *proof))
         self._outcomes.events.append(Met(neighbour.src_id, neighbour.boot, hears))
         if self.relaying is not None:
             self.relaying.met(neighbour, now)
@@ -318,37 +328,17 @@ class ReceivingSide:
             if self.relaying is not None:
                 self.relaying.newest(self._sender.src_id, entry, self._now)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
-            for topic_id in dict.fromkeys(entry.topic_ids):
-                if self._messages.kept.asked(topic_id, self._now):
-                    self._messages.asks[topic_id] += 1
-                else:
-                    self.stats.dropped["asked_too_often"] += 1
+            self._facts.append(Asked(tuple(dict.fromkeys(entry.topic_ids))))
 
     def _reported(self, sender: int, report: Report) -> None:
         """A robot says which packets it has."""
         if report.src_id != self._settings.src_id or report.boot != self._boot & 0xFFFF:
             return
-        newest = self._window.packets.newest
+        newest = self._sent.newest
         number = newest - ((newest - report.number) & 0xFFFF)
         if number < 0:
             raise EntryKindError(f"a report of packet {report.number}, which was never sent")
-        loss, now = report.loss / 128, self._now
-        self._window.peers.report(sender, number, report.arrived, settled=report.settled, loss=loss, now=now)
-        self._sending.repairs.reported()
-        if self.relaying is not None:
-            self.relaying.custody.reported(sender, now)
-        if self._rate is not None and report.snr_db is not None:
-            self._rate.report(sender, report.snr_db, loss, now)
-
-    def _end(self, src_id: int, end: Callable[[int], None]) -> None:
-        """A receiver is out of range, or its start has ended."""
-        end(src_id)
-        if self.relaying is not None:
-            self.relaying.custody.gone(src_id)
-        if not self._window.peers:
-            self._sending.hellos.hurry(self._now)
-        if self._rate is not None:
-            self._rate.forget(src_id)
+        self._facts.append(Reported(sender, number, report))
 
     def _brings(self, since: float) -> bool:
         """Whether a robot that is heard still repairs something that was missing at this time, s."""
@@ -372,5 +362,5 @@ class ReceivingSide:
             patience_s=FORGET_S * self._settings.slower if far else inf,
             brings=self._brings,
         )
-        inbox.reports.tells_snr = self._rate is not None
+        inbox.reports.tells_snr = self._tells_snr
         return inbox

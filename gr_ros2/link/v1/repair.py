@@ -23,6 +23,7 @@ from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.shared import SharedRepairs
 from gr_ros2.link.v1.thrift import Thrift
 from gr_ros2.link.v1.unreported import Unreported
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.wire.v1 import SPAN
 
 RepairMode = Literal["idle", "thrifty", "off"]
@@ -35,12 +36,12 @@ def _never(_now: float) -> bool:
 class RepairWindow:
     """The choice of repairs of one sender.
 
-    :param mode: ``idle`` uses every slot it is offered; ``thrifty`` uses only as many as losses are known or expected;
-        ``off`` uses none
+    :param repair: the setting: a mode, or auto, which is thrifty where somebody reports and idle where nobody does
     :param room: bytes of the longest body
     :param expected_loss: share of packets lost, used until a report arrives
     :param shares: whether others send on the same channel
     :param proves, slower: see :class:`Unreported`
+    :param limited: whether anything limits how many packets leave
     :ivar packets: what has left and may be repaired
     :ivar peers: what reports tell of them
     :ivar thrift: when a report is overdue
@@ -48,7 +49,7 @@ class RepairWindow:
 
     def __init__(
         self,
-        mode: RepairMode,
+        repair: RepairMode | Auto,
         room: int,
         expected_loss: float = 0.0,
         span: int = SPAN,
@@ -56,8 +57,9 @@ class RepairWindow:
         shares: bool = False,
         proves: bool = False,
         slower: float = 1.0,
+        limited: Callable[[], bool] = lambda: True,
     ) -> None:
-        self.mode = mode
+        self._repair, self._limited = repair, limited
         self.packets = SentPackets(span)
         self._unreported = Unreported(expected_loss, proves=proves, slower=slower)
         self._shared = SharedRepairs(self.packets) if shares else None
@@ -79,15 +81,26 @@ class RepairWindow:
             self._shared.sent(number, lifetimes, self.peers.loss)
         self.packets.add(number, body, data, lifetimes, now)
 
+    @property
+    def mode(self) -> RepairMode:
+        """What idle slots carry now: ``idle``, as many repairs as there are slots; ``thrifty``, as many as losses are
+        known or expected; ``off``, none."""
+        if not self._limited():  # repair only what reports call for
+            return "thrifty" if self._repair != "off" and self.peers else "off"
+        if self._repair != AUTO:
+            return self._repair
+        return "thrifty" if self.peers else "idle"
+
     def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
         """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.
 
         :param held: whether a repair has to wait, at this time in s; only asked if there is one. A thrifty sender has
             few repairs under way: what a report names as lost does not wait then
         """
-        if self.mode == "off" or not self.packets.wanted(now):
+        mode = self.mode
+        if mode == "off" or not self.packets.wanted(now):
             return None
-        thrifty = self.mode == "thrifty"
+        thrifty = mode == "thrifty"
         if self._shared is not None and self.peers and (again := self._urgent_of_all(now, idle=True)) is not None:
             return again
         if thrifty and (again := self.peers.lost(now)) is not None:

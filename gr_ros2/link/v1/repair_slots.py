@@ -11,9 +11,8 @@ from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hold import Hold
-from gr_ros2.link.v1.repair import RepairMode, RepairWindow
+from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.writer import PacketWriter
-from gr_ros2.settings.fields import AUTO
 
 PATIENCE_S = 0.2
 """s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
@@ -27,17 +26,15 @@ for 40 s after an outage of 300 s at 10 Hz, and those that their queue had no ro
 
 
 class RepairSlots:
-    """The slots of one sender that carry repairs.
-
-    :ivar waits_until: time in s up to which repairs wait, because a new message is about to come; -inf to look anew
-    """
+    """The slots of one sender that carry repairs."""
 
     def __init__(
         self, settings: Settings, pace: Pace, window: RepairWindow, *, writer: PacketWriter, hold: Hold
     ) -> None:
         self._settings = settings
         self._pace, self._window, self._writer, self._hold = pace, window, writer, hold
-        self.waits_until = -inf
+        self._waits_until = -inf
+        """Time in s up to which repairs wait, because a new message is about to come; -inf to look anew."""
         self._calm_since = -inf
         """Time in s at which no repair was wanted, if no report has come since; otherwise -inf."""
         self._calm_number = 0
@@ -45,15 +42,9 @@ class RepairSlots:
         self._ahead, self._number = 0, 0
         """Repairs that may go before new messages, and the newest packet when that was counted."""
 
-    @property
-    def mode(self) -> RepairMode:
-        """What idle slots carry."""
-        mode, reported = self._settings.repair, bool(self._window.peers.all)
-        if not self._pace.known:  # nothing limits how many packets leave: repair only what reports call for
-            return "thrifty" if mode != "off" and reported else "off"
-        if mode != AUTO:
-            return mode
-        return "thrifty" if reported else "idle"
+    def look_anew(self) -> None:
+        """A robot was heard: what repairs wait for may be another message now."""
+        self._waits_until = -inf
 
     def reported(self) -> None:
         """A report has come."""
@@ -70,7 +61,6 @@ class RepairSlots:
             self._number = newest
             if not self._ahead:
                 return None
-        self._window.mode = self.mode
         over = self._window.peers.over(now, PATIENCE_S * self._settings.slower)
         if over < 0 or not self._window.may_tell(waiting=waiting):
             again = self._window.urgent(now)
@@ -81,12 +71,11 @@ class RepairSlots:
 
     def spare(self, now: float) -> SentPacket | None:
         """What a slot carries that nothing else needs."""
-        self._window.mode = self.mode
         if self._window.peers.in_vain and (over := self._window.peers.over(now)) >= 0:
             return self._tell(over, now)
-        self.waits_until = -inf
+        self._waits_until = -inf
         chosen = self._window.next(now, self.held)
-        held = self.waits_until > now
+        held = self._waits_until > now
         self._calm_since = now if chosen is None and not held else -inf
         self._calm_number = self._window.packets.newest
         if chosen is not None:
@@ -101,10 +90,11 @@ class RepairSlots:
         :param waiting: something else waits for such a slot
         """
         if waiting:
-            return max(self.waits_until, now)
-        if self.mode == "off" or not self._window.packets.wanted(now):
+            return max(self._waits_until, now)
+        mode = self._window.mode
+        if mode == "off" or not self._window.packets.wanted(now):
             return inf
-        return max(self.waits_until, now if self.mode == "idle" else self._next_look(now))
+        return max(self._waits_until, now if mode == "idle" else self._next_look(now))
 
     def _tell(self, number: int, now: float) -> SentPacket | None:
         """Say that a packet is not repaired any more."""
@@ -125,5 +115,5 @@ class RepairSlots:
     def held(self, now: float, *, repairs: bool = True) -> bool:
         """Whether what could leave now, a repair or something else, waits for a new message."""
         airtime = self._pace.interval
-        self.waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime, repairs=repairs)
-        return self.waits_until > now
+        self._waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime, repairs=repairs)
+        return self._waits_until > now

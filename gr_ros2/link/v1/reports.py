@@ -27,19 +27,25 @@ from gr_ros2.wire.control import MAP, REPORT_LEN, Report, reportable
 
 _EVERY = 5
 """Packets received from one report to the next; more while none is lost."""
-SHARE, PER_LOSS, PER_VAIN, _MOST = 16, 3, 1.5, 8.0
-"""A report before its time, because something was lost or a slot is free, is paid for by the packets that are lost
-(``PER_LOSS`` reports each), by repairs of what is here (``PER_VAIN``) and by packets that arrive (one in ``SHARE``);
-``_MOST`` are saved up. With none for a repair in vain, a sender without a pace sent 1,115 repairs of 70 lost packets,
-with 1.5 it sends 278. With a report for every packet where the reverse is free, 43 % of the demo's packets were
-reports, and a slow computer had no time for messages (``python -m bench slow_computer``); now 28 % are. With 1 for each
-loss and .5 for each repair in vain 24 % are, and the oldest topic is 1.06 s old instead of .91. With 2.5 for each loss,
-odometry beside a backlog at 20 % loss is 1.33 times as old as alone, with 3 it is 1.27 times (``python -m bench
-repair_backlog``)."""
+PER_ARRIVED = 16
+"""Packets that arrive for which one report before its time is allowed, because something was lost or a slot is free.
+With a report for every packet where the reverse is free, 43 % of the demo's packets were reports, and a slow computer
+had no time for messages (``python -m bench slow_computer``); now 28 % are."""
+PER_LOSS = 3
+"""Such reports for each packet that is lost. With 2.5, odometry beside a backlog at 20 % loss is 1.33 times as old as
+alone, with 3 it is 1.27 times (``python -m bench repair_backlog``)."""
+PER_VAIN = 1.5
+"""Such reports for each repair of what is here. With none, a sender without a pace sent 1,115 repairs of 70 lost
+packets, with 1.5 it sends 278. With .5, and 1 for each loss, 24 % of the demo's packets are reports, and the oldest
+topic is 1.06 s old instead of .91."""
+_MOST = 8.0
+"""Such reports that are saved up."""
 _SMOOTHING = 1 / 32
-_PAUSE_S, _CALM_S = 0.1, 1.0
-"""s after which a report is due, even about a single packet: at first and after a loss, and at most. With .5 at most,
-the reports of a link without losses cost as much again, and at .2 to 2 % loss messages of 2 to 35 Hz are no younger."""
+_PAUSE_S = 0.1
+"""s after which a report is due, even about a single packet, at first and after a loss."""
+_CALM_S = 1.0
+"""The same at most. With .5, the reports of a link without losses cost as much again, and at .2 to 2 % loss messages of
+2 to 35 Hz are no younger."""
 _AGAIN_S = 0.5
 """s after which a report is repeated while messages wait for an earlier one."""
 CALM = 1 / 128
@@ -106,7 +112,7 @@ class Reporter:
         self.unreported += 1
         self._arrived += 1
         if self._unspent < _MOST:
-            self._unspent = min(self._unspent + 1 / SHARE, _MOST)
+            self._unspent = min(self._unspent + 1 / PER_ARRIVED, _MOST)
         if not late:
             self.loss -= self.loss * _SMOOTHING
 

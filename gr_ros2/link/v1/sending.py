@@ -1,4 +1,4 @@
-"""What leaves next.
+"""What leaves next, and what received packets change of that.
 
 When the caller asks for a packet, it is, in this order: a hello that cannot wait; a question or an answer (``pings``);
 a packet that a receiver lacks and for which later messages wait (``repair_slots``); new messages (``packing``); control
@@ -11,7 +11,9 @@ from math import inf
 
 from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
+from gr_ros2.link.rate import RateController
 from gr_ros2.link.v1.endpoint_settings import Settings
+from gr_ros2.link.v1.facts import Appeared, Asked, Fact, PeerLeft, PeerMet, ProofWanted, Questioned, Reported, Taken
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.neighbours import Neighbours
@@ -25,7 +27,7 @@ from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.link.v1.writer import PacketWriter
 from gr_ros2.relay.gain import TOLD
-from gr_ros2.wire.control import NEWEST_LEN, Heard, Hello, Newest, length_of
+from gr_ros2.wire.control import NEWEST_LEN, Heard, Hello, Newest, Report, length_of
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
 MOST_REPEATS = 32
@@ -40,14 +42,14 @@ every ``repeat_s`` in any case."""
 class SendingSide:
     """The choice of what leaves next.
 
+    :param pace: says when packets may leave
+    :param rate: chooses the MCS of each packet; None for a fixed rate
     :param relaying: what is sent on of what others make; None where nothing is
-    :ivar pace: when packets may leave
     :ivar hellos: when this robot announces itself
     :ivar pings: its questions and answers
     :ivar repairs: its repairs
     :ivar reports: what it tells others of their packets
     :ivar urged: whether a received packet may let one leave at once, before ``next_departure``
-    :ivar heard_at: when any robot was heard last, or when this one began to send, s
     """
 
     def __init__(
@@ -60,18 +62,21 @@ class SendingSide:
         hellos: Hellos,
         writer: PacketWriter,
         hold: Hold,
+        pace: Pace,
+        rate: RateController | None = None,
         relaying: Relaying | None = None,
     ) -> None:
         self.settings = settings
-        self._relaying = relaying
-        self.pace = Pace(settings.packet_rate)
-        self._slowness = Slowness(self.pace)
+        self._rate, self._relaying = rate, relaying
+        self._pace = pace
+        self._slowness = Slowness(pace)
         self.hellos = hellos
         self.pings = Pings(turn_s=settings.turn_s)
-        self.repairs = RepairSlots(settings, self.pace, window, writer=writer, hold=hold)
+        self.repairs = RepairSlots(settings, self._pace, window, writer=writer, hold=hold)
         self.reports = ReportSlots(settings, neighbours.all.values(), writer)
         self.urged = False
-        self.heard_at = inf
+        self._heard_at = inf
+        """When any robot was heard last, or when this one began to send, s."""
         self._messages, self._window, self._neighbours = messages, window, neighbours
         self._writer = writer
         self._started = False
@@ -99,7 +104,7 @@ class SendingSide:
         if now >= self._repeat_at:
             self._repeat(now)
         if messages.sent.deadlines:
-            messages.expire(now, self.pace.sure_interval(now))
+            messages.expire(now, self._pace.sure_interval(now))
         due = reports.due(now)
         if due and reports.overdue:
             return reports.packet(due, now)
@@ -159,15 +164,68 @@ class SendingSide:
     def next_departure(self, now: float) -> float:
         """When ``packet`` may have something, s; without regard to credits."""
         if self._alone(now):
-            return max(self._beacon_at, self.pace.slot)
+            return max(self._beacon_at, self._pace.slot)
         leaving = self._messages.packing.next_timeout(now)
         if leaving > now:
             leaving = min(leaving, self.hellos.due, self.pings.due, self._repeat_at, self.reports.next(now))
         if leaving > now:
             leaving = min(leaving, self.repairs.next(now, waiting=self._messages.packing.fills))
-        return max(leaving, self.pace.slot)
+        return max(leaving, self._pace.slot)
 
-    def met(self, now: float) -> None:
+    def learn(self, fact: Fact, now: float) -> None:
+        """Something that matters here has arrived."""
+        match fact:
+            case Taken(trusted, urges):
+                if trusted:
+                    self._heard_at = now
+                    self.repairs.look_anew()
+                self.urged = self.urged or urges or self.reports.requests.lacking
+            case Reported(robot, number, report):
+                self._reported(robot, number, report, now)
+            case Appeared():
+                self._appeared(now)
+            case PeerMet(robot, proven, wanted):
+                self._window.peers.meet(robot, now)
+                if proven is not None:
+                    self._window.peers.prove(robot, proven, wanted=wanted)
+                if self._rate is not None:
+                    self._rate.meet(robot)
+            case PeerLeft(robot, ended):
+                self._left(robot, now, ended=ended)
+            case Asked(topic_ids):
+                for topic_id in topic_ids:
+                    if self._messages.kept.asked(topic_id, now):
+                        self._messages.asks[topic_id] += 1
+                    else:
+                        self._neighbours.dropped["asked_too_often"] += 1
+            case Questioned(robot, entry):
+                self.pings.receive(robot, self.settings.src_id, entry, now)
+            case ProofWanted():
+                self.hellos.answer(now)
+
+    def _reported(self, robot: int, number: int, report: Report, now: float) -> None:
+        loss = report.loss / 128
+        self._window.peers.report(robot, number, report.arrived, settled=report.settled, loss=loss, now=now)
+        self.repairs.reported()
+        if self._relaying is not None:
+            self._relaying.custody.reported(robot, now)
+        if self._rate is not None and report.snr_db is not None:
+            self._rate.report(robot, report.snr_db, loss, now)
+
+    def _left(self, robot: int, now: float, *, ended: bool) -> None:
+        peers = self._window.peers
+        if ended:
+            peers.forget(robot)
+        else:
+            peers.leave(robot)
+        if self._relaying is not None:
+            self._relaying.custody.gone(robot)
+        if not peers:
+            self.hellos.hurry(now)
+        if self._rate is not None:
+            self._rate.forget(robot)
+
+    def _appeared(self, now: float) -> None:
         """A robot is heard for the first time, or again: kept messages are repeated soon, and hellos sent."""
         if self._repeats > 1:
             self._repeats = 1
@@ -183,7 +241,7 @@ class SendingSide:
         if settings.repeat_s != before.repeat_s and self._started and self._messages.kept.digest:
             self._plan_repeat(now)
         if settings.packet_rate != before.packet_rate:
-            self.pace.change(settings.packet_rate)
+            self._pace.change(settings.packet_rate)
 
     def topics_changed(self, now: float) -> None:
         self.hellos.hurry(now)
@@ -194,11 +252,11 @@ class SendingSide:
 
     def _alone(self, now: float) -> bool:
         """Whether nobody has been heard for so long that only beacons leave."""
-        return 0 < self.settings.beacon_s <= now - self.heard_at
+        return 0 < self.settings.beacon_s <= now - self._heard_at
 
     def _beacon(self, now: float) -> SentPacket | None:
         """What leaves while nobody is heard for long."""
-        self._messages.expire(now, self.pace.sure_interval(now))
+        self._messages.expire(now, self._pace.sure_interval(now))
         if now < self._beacon_at:
             return None
         self._beacon_at = now + self.settings.beacon_s
@@ -206,7 +264,7 @@ class SendingSide:
 
     def _start(self, now: float) -> None:
         self._started = True
-        self.heard_at = now
+        self._heard_at = now
         self.hellos.start(now)
         if self._messages.kept.digest:
             self._messages.kept.ask(TABLE_TOPIC, now)
@@ -236,7 +294,7 @@ class SendingSide:
         starting = self.hellos.starting
         often = starting or (now >= self._table_at and not self.hellos.lone)
         if often and not window.peers and kept.digest:  # no report says whether it has arrived
-            self._table_at = now + kept.table_packets * self.pace.interval / TABLE_SHARE
+            self._table_at = now + kept.table_packets * self._pace.interval / TABLE_SHARE
             kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
         sent = self._writer.control(entries, "hello", now, clear=isinstance(entries[0], Hello))

@@ -16,7 +16,7 @@ from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.unreported import MOST_LOSS
 from gr_ros2.wire.v1 import MAX_WINDOW
 
-TOLD = 2
+TOLD_TIMES = 2
 """Mean times between two new packets for which reports may be older than what a repair has told all peers: that
 something is not repaired any more."""
 OWED = 0.5
@@ -110,7 +110,7 @@ class SharedRepairs:
 
         :param period: mean time between two new packets, s
         """
-        told = number in self._told and now < self._told_at + TOLD * period
+        told = number in self._told and now < self._told_at + TOLD_TIMES * period
         return not self.within and number < self._ordered and not told
 
 

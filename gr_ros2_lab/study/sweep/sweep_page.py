@@ -105,38 +105,37 @@ def _draw(plan: SweepPlan, found: Sequence[Summary], folder: Path) -> tuple[list
 class _Column:
     """How a number of ``VALUES`` is written: with the unit and the digits that its largest value needs.
 
-    :param unit: what it is divided by
+    :param form: format of one number, after it was divided by ``scale``
+    :param even: whether an interval is as long on both sides
     """
 
     heading: str
-    unit: float
+    scale: float
     form: str
-    around: bool = True
-    """Whether an interval is as long on both sides."""
+    even: bool = True
 
     @classmethod
     def of(cls, name: str, estimates: Sequence[Estimate | None]) -> _Column:
         label = VALUES[name]
         if name == PDR:
-            return cls(label, 1.0, "{:.3f}", around=False)
+            return cls(label, 1.0, "{:.3f}", even=False)
         largest = max((abs(one.value) for one in estimates if one is not None), default=0.0)
-        for unit, factor, fits in (("B/s", 1e3, largest >= 1e3), ("s", 1e-3, largest < 1)):
-            if fits and label.endswith(f" [{unit}]"):
-                prefix = "k" if factor > 1 else "m"
-                label, largest = label.replace(f"[{unit}]", f"[{prefix}{unit}]"), largest / factor
-                break
-        else:
-            factor = 1.0
-        digits = 0 if largest >= 1000 else 1 if largest >= 10 else 3
-        return cls(label, factor, f"{{:.{digits}f}}")
+        scale = 1.0
+        if largest >= 1e3 and "[B/s]" in label:
+            label, scale = label.replace("[B/s]", "[kB/s]"), 1e3
+        elif largest < 1 and "[s]" in label:
+            label, scale = label.replace("[s]", "[ms]"), 1e-3
+        digits = 0 if largest >= 1000 * scale else 1 if largest >= 10 * scale else 3
+        return cls(label, scale, f"{{:.{digits}f}}")
 
     def cell(self, estimate: Estimate | None) -> str:
         if estimate is None or estimate.low is None or estimate.high is None:
-            return number(None if estimate is None else estimate.value / self.unit, self.form)
-        value, low, high = (self.form.format(one / self.unit) for one in (estimate.value, estimate.low, estimate.high))
-        if not self.around:
-            return f"{value} [{low}, {high}]"
-        return f"{value} ± {self.form.format((estimate.high - estimate.low) / 2 / self.unit)}"
+            return number(None if estimate is None else estimate.value / self.scale, self.form)
+        value, low, high = (one / self.scale for one in (estimate.value, estimate.low, estimate.high))
+        write = self.form.format
+        if self.even:
+            return f"{write(value)} ± {write((high - low) / 2)}"
+        return f"{write(value)} [{write(low)}, {write(high)}]"
 
 
 def _plain(value: object) -> str:

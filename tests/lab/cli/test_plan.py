@@ -63,6 +63,20 @@ def test_it_says_what_gets_better_by_how_much_and_what_gets_worse(capsys: pytest
     assert re.search(r"younger: /robot_1/\w+ \d+ to \d+ ms \(-\d+%\)", lines[0])
 
 
+def test_it_says_what_a_camera_becomes(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("av", reason="needs PyAV")
+    assert run(["plan", "cameras", "--duration", "4", "--no-advice"]) == 0
+    out = capsys.readouterr().out
+    said = re.search(r"/robot_1/camera +H\.264 of (\d+) × (\d+) pixels.*? +([\d.]+) +(\d+) +(\d+) *\n", out)
+    assert said is not None, out
+    width, height, rate, kbit_s, age = map(float, said.groups())
+    assert width / height == 4 / 3
+    assert rate > 4
+    assert 5 < kbit_s < 500
+    assert age < 1000
+    assert ": it fits." in out
+
+
 def test_without_advice(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["plan", "paper-ofdm-paced", "--duration", "3", "--no-advice"]) == 0
     assert "Better" not in capsys.readouterr().out

@@ -17,8 +17,7 @@ from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.ofdm import RATES
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.settings.files import find_registry
-from gr_ros2_lab.medium import FixedPaths, make_medium
-from gr_ros2_lab.medium import Path as Way
+from gr_ros2_lab.medium import FixedPaths, RadioPath, make_medium
 from gr_ros2_lab.medium.fading import RayleighFading
 from gr_ros2_lab.medium.packets import PacketMedium, limits_of
 from gr_ros2_lab.run.load import make_phy
@@ -85,7 +84,7 @@ def test_each_rate_takes_less_air_and_needs_more_snr() -> None:
 
 def arrived(phy: Phy, snr_db: float, mcs: int, packets: int) -> int:
     """How many of some packets arrive."""
-    paths = [[Way(1, ChannelConfig(snr_db=snr_db))], []]
+    paths = [[RadioPath(1, ChannelConfig(snr_db=snr_db))], []]
     medium = PacketMedium(FixedPaths(paths), [phy, phy])
     for number in range(packets):
         medium.send(0, b"x", number, 0.5, mcs)
@@ -108,7 +107,7 @@ def test_half_of_the_packets_of_a_rate_arrive_where_its_model_says(mcs: int, nam
 
 def test_packets_may_pass_through_the_modem_of_their_rate() -> None:
     phy = adaptive_phy()
-    paths = [[Way(1, ChannelConfig(snr_db=9.0))], []]
+    paths = [[RadioPath(1, ChannelConfig(snr_db=9.0))], []]
     medium = make_medium(FixedPaths(paths), [phy, phy], samples=True)
     for number, mcs in enumerate((0, 2, 5)):
         medium.send(0, bytes(220), number, phy.airtime(220, mcs), mcs)

@@ -17,8 +17,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig
-from gr_ros2_lab.medium import FixedPaths, Medium, make_medium
-from gr_ros2_lab.medium import Path as Way
+from gr_ros2_lab.medium import FixedPaths, Medium, RadioPath, make_medium
 from gr_ros2_lab.medium import collision_table as collisions
 from gr_ros2_lab.medium.collision_table import (
     OFFSETS,
@@ -53,7 +52,7 @@ def paths(robots: int, seed: int) -> FixedPaths:
     return FixedPaths(
         [
             [
-                Way(other, ChannelConfig(snr_db=levels[max(one, other), min(one, other)], seed=9 * one + other))
+                RadioPath(other, ChannelConfig(snr_db=levels[max(one, other), min(one, other)], seed=9 * one + other))
                 for other in range(robots)
                 if other != one
             ]

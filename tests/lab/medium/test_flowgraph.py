@@ -11,7 +11,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.phy import Phy, measure
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.settings.config import ChannelConfig
-from gr_ros2_lab.medium import FixedPaths, Path, Reception, Transmission
+from gr_ros2_lab.medium import FixedPaths, RadioPath, Reception, Transmission
 from gr_ros2_lab.medium.flowgraph import FlowgraphMedium
 
 PACKETS = [bytes([number]) * 64 for number in (1, 2, 2, 3)]
@@ -29,7 +29,7 @@ def test_what_is_foreseen_passes_together_and_what_is_not_one_by_one(monkeypatch
     monkeypatch.setattr(measure, "modulated", counted)
 
     def heard(ahead: list[Transmission]) -> tuple[list[Transmission], list[Reception]]:
-        medium = FlowgraphMedium(FixedPaths([[Path(1, ChannelConfig())], []]), [phy, phy], ahead)
+        medium = FlowgraphMedium(FixedPaths([[RadioPath(1, ChannelConfig())], []]), [phy, phy], ahead)
         sent = [medium.send(0, data, float(number), phy.airtime()) for number, data in enumerate(PACKETS)]
         receptions = list(medium.receptions(len(PACKETS)))
         assert [reception.packet.data for reception in receptions] == PACKETS

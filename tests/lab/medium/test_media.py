@@ -13,7 +13,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig
-from gr_ros2_lab.medium import FixedPaths, Medium, Path, Reception, make_medium
+from gr_ros2_lab.medium import FixedPaths, Medium, RadioPath, Reception, make_medium
 from gr_ros2_lab.medium.packets import PacketMedium
 
 PACKET_LEN = 64
@@ -24,17 +24,17 @@ def phy(name: str = "ofdm", **options: object) -> Phy:
     return made
 
 
-def between(robots: int, snr_db: float | None, heard: int | None = None) -> list[list[Path]]:
+def between(robots: int, snr_db: float | None, heard: int | None = None) -> list[list[RadioPath]]:
     """Paths between all robots, or from each robot to the ``heard`` next ones in a circle."""
     steps = range(1, robots if heard is None else heard + 1)
     channels = [[ChannelConfig(snr_db=snr_db, seed=100 * one + step) for step in steps] for one in range(robots)]
     return [
-        [Path((one + step) % robots, channel) for step, channel in zip(steps, channels[one], strict=True)]
+        [RadioPath((one + step) % robots, channel) for step, channel in zip(steps, channels[one], strict=True)]
         for one in range(robots)
     ]
 
 
-def media(paths: list[list[Path]], of: Phy, *, shared: bool, seed: int = 0) -> dict[str, Medium]:
+def media(paths: list[list[RadioPath]], of: Phy, *, shared: bool, seed: int = 0) -> dict[str, Medium]:
     phys = [of] * len(paths)
     return {
         time: make_medium(FixedPaths(paths), phys, samples=time == "samples", shared=shared, seed=seed)
@@ -63,7 +63,7 @@ def test_both_levels_lose_the_same_share_of_a_schedule_of_bursts(name: str, snrs
         schedule = [(1.5 * number, 0) for number in range(packets)]
         counts = {
             time: len(received(medium, of, schedule))
-            for time, medium in media([[Path(1, ChannelConfig(snr_db=snr_db))], []], of, shared=False).items()
+            for time, medium in media([[RadioPath(1, ChannelConfig(snr_db=snr_db))], []], of, shared=False).items()
         }
         pdr = sum(counts.values()) / (2 * packets)
         spread = sqrt(max(pdr * (1 - pdr), 1 / packets) * (2 / packets + 1 / measured))
@@ -96,7 +96,7 @@ def test_on_channels_of_their_own_robots_do_not_disturb_each_other(time: str) ->
 @pytest.mark.parametrize("time", ["packets", "samples"])
 def test_the_stronger_of_two_bursts_may_survive(time: str) -> None:
     of = phy()
-    paths = [[Path(2, ChannelConfig(snr_db=30.0))], [Path(2, ChannelConfig(snr_db=8.0))], []]
+    paths = [[RadioPath(2, ChannelConfig(snr_db=30.0))], [RadioPath(2, ChannelConfig(snr_db=8.0))], []]
     heard = received(media(paths, of, shared=True)[time], of, [(0.0, 0), (0.3, 1)])
     assert [reception.sent.sender for reception in heard] == [0]
     if time == "packets":
@@ -109,7 +109,7 @@ def test_of_robots_that_send_equal_bytes_the_one_that_is_heard_is_named(stronger
     of = phy()
     snrs_db = [8.0, 8.0]
     snrs_db[stronger] = 32.0
-    paths = [[Path(2, ChannelConfig(snr_db=snr_db))] for snr_db in snrs_db]
+    paths = [[RadioPath(2, ChannelConfig(snr_db=snr_db))] for snr_db in snrs_db]
     medium = media([*paths, []], of, shared=True)["samples"]
     airtime = of.airtime()
     for sender in (0, 1):
@@ -122,7 +122,7 @@ def test_of_robots_that_send_equal_bytes_the_one_that_is_heard_is_named(stronger
 
 def test_a_path_with_a_delay_receives_later() -> None:
     of = phy()
-    paths = [[Path(1, ChannelConfig(), delay_s=0.25)], []]
+    paths = [[RadioPath(1, ChannelConfig(), delay_s=0.25)], []]
     medium = PacketMedium(FixedPaths(paths), [of] * 2)
     medium.send(0, bytes(PACKET_LEN), 0.0, 0.1)
     assert not list(medium.receptions(0.34))

@@ -14,7 +14,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import ChannelConfig, ScenarioChannel, build
 from gr_ros2_lab.medium import make_medium
-from gr_ros2_lab.medium.base import Path as Way
+from gr_ros2_lab.medium.base import RadioPath
 from gr_ros2_lab.medium.loss_table import LossCurve
 from gr_ros2_lab.medium.positions import LEAST_DB, STEP_S, Positions, snr_map
 from gr_ros2_lab.medium.propagation import path_loss_db, snr_over_db
@@ -39,7 +39,7 @@ def standing(places: Any, world: World | None = None, velocities: Any = None, **
     there = np.array(places, float)
     speeds = np.zeros_like(there) if velocities is None else np.array(velocities, float)
     base, count = channel(**settings), len(places)
-    paths = [[Way(other, base) for other in range(count) if other != one] for one in range(count)]
+    paths = [[RadioPath(other, base) for other in range(count) if other != one] for one in range(count)]
     return Positions(
         base, lambda now: (there + now * speeds, speeds), 1e6, [20.0] * count, [6.0] * count, paths=paths, world=world
     )
@@ -166,6 +166,10 @@ def test_a_recording_tells_places_by_its_odometry() -> None:
         (["channel={from: positions}", "gains_db=-100"], "gains_db: levels follow from positions"),
         (["channel={from: positions}", "phy={name: direct}"], "phy direct has no samples, so no level"),
         (["gains_db=-100", "phy={name: direct}"], "gains_db: phy direct has no samples, so no level"),
+        (
+            ["channel={from: positions}", "medium=exclusive", "time=real", "duplex=full"],
+            "channel.from: time = 'real' has that with duplex = 'half' alone",
+        ),
         (["channel={from: positions}", "sim.robots=1"], "/robot_2 is none of the 1 simulated robots, so nobody knows"),
     ],
 )
@@ -218,7 +222,7 @@ def test_a_report_has_the_map_and_a_plan_the_range() -> None:
     assert figure is not None
     middles, snr_db = snr_map(scenario.channel, Fleet.of(scenario.sim).world, np.array([20.0, 20.0]), 2e5)
     place = np.array([middles[80], middles[20]])
-    paths = [[Way(1, scenario.channel)], [Way(0, scenario.channel)]]
+    paths = [[RadioPath(1, scenario.channel)], [RadioPath(0, scenario.channel)]]
     places = np.array([[20.0, 20.0], place])
     there = Positions(
         scenario.channel,

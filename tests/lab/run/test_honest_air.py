@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.link.airtime import LEAD_S, OUTSTANDING
-from gr_ros2_lab.record.trace import Floats
 from gr_ros2_lab.run.outcome import Outcome
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import RunError
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import AirPacket, Delivered, ReceiverEvent, SenderEvent
@@ -16,10 +17,9 @@ from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.paper.endpoint import EndpointV0
 from gr_ros2.phy.direct import DirectPhy
 from gr_ros2.settings.config import ChannelConfig
-from gr_ros2_lab.medium import FixedPaths
-from gr_ros2_lab.medium import Path as Way
+from gr_ros2_lab.medium import FixedPaths, RadioPath
 from gr_ros2_lab.medium.packets import PacketMedium
-from gr_ros2_lab.record.trace import Floats, Trace
+from gr_ros2_lab.record.trace import Trace
 from gr_ros2_lab.run.load import make_phy
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
 from gr_ros2_lab.run.simulate import EventLoop, Offered, Robot, Simulated, simulate
@@ -210,7 +210,7 @@ def test_a_robot_may_answer_what_it_hears() -> None:
         messages = iter(() if number else coming)
         common: dict[str, Any] = {"src_id": one.robot_id, "airtime": lambda *_: 0.01}
         robots.append(Robot(settings, number, endpoint, events=told, messages=messages, **common))
-    paths = [[Way(1, ChannelConfig())], [Way(0, ChannelConfig())]]
+    paths = [[RadioPath(1, ChannelConfig())], [RadioPath(0, ChannelConfig())]]
     medium = PacketMedium(FixedPaths(paths), [DirectPhy(220)] * 2)
     heard = [(now, event) for now, _, event in EventLoop(robots, medium).run() if isinstance(event, Delivered)]
     times = [now for now, _ in heard]

@@ -63,6 +63,20 @@ def test_what_to_cut_is_known_where_a_topic_finds_no_place_at_all() -> None:
     assert cuts[-1].load <= 1
 
 
+def test_a_camera_fits_what_is_left_and_is_not_cut() -> None:
+    pytest.importorskip("av", reason="needs PyAV")
+    for rate in (5, 200):
+        plan = planner("cameras", f"sim.odom_rate={rate}", duration=4.0)
+        forecast = plan.forecast()
+        (camera,) = [topic for topic in forecast.topics if topic.frames is not None]
+        assert camera.topic == "/robot_1/camera"
+        assert camera.frames is not None
+        assert camera.air_bytes * camera.frames.rate_hz == pytest.approx(125 * camera.frames.kbit_s)
+        assert (forecast.load > 1) == (rate == 200)
+        assert {cut.topic for cut in plan.cuts()} <= {"odom of every robot"}
+        assert camera.frames.rate_hz > 2
+
+
 def test_what_fits_is_said_to_fit() -> None:
     fits = planner("paper-ofdm-paced", "repair='off'", duration=20.0).forecast()
     assert fits.load == pytest.approx(fits.used, rel=0.08)

@@ -67,7 +67,7 @@ class PacketsEnd:
     def _check(self, sender: Robot, receiver: Robot, known: Neighbour) -> None:
         packets, order, decoder = sender.end.window.packets, known.inbox.order, known.inbox.decoder
         peer = sender.end.window.peers.all.get(receiver.src_id)
-        if peer is None or sender.end._sending.repairs.mode == "off":
+        if peer is None or sender.end.window.mode == "off":
             return
         urgent = {number for _, number in peer.urges}
         for number in peer.lost - urgent if peer.newest >= 0 else ():

@@ -24,7 +24,7 @@ SHORT = 0.0006
 
 
 def robot(src_id: int, mode: SealMode, slot_s: float = SLOT, seed: int = 0) -> tuple[Robot, Slots]:
-    access = Slots(src_id, slot_s, random.Random(src_id + 1000 * seed))
+    access = Slots(src_id, slot_s, random.Random(src_id + 1000 * seed), period_s=0.1)
     return Robot(src_id, registry(), mode=mode, access=access), access
 
 
@@ -296,7 +296,7 @@ def test_recordings_of_a_robot_that_is_dead_neither_slow_others_nor_move_their_c
     for attacked in (False, True):
         alive = robots[:3]
         for one in alive:
-            one.access = Slots(one.src_id, SLOT, random.Random(one.src_id))
+            one.access = Slots(one.src_id, SLOT, random.Random(one.src_id), period_s=0.1)
             one.start()
         talk(alive, 100.0, 8.0)
         queue = iter(recorded)

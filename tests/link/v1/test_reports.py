@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.link.events import SentPacket
-from gr_ros2.link.v1.reports import PER_LOSS, SHARE
+from gr_ros2.link.v1.reports import PER_ARRIVED, PER_LOSS
 from gr_ros2.wire.control import MAP
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 
@@ -27,7 +27,7 @@ def test_reports_take_no_more_than_their_share(loss: float, share: float) -> Non
     heard = len(kinds(one)) - begun[0]
     reports = kinds(two).count("report") - begun[1]
     seconds = 1500 * SLOT_S
-    assert heard / (MAP / 2) < reports < heard * ((1 - loss) / SHARE + loss * PER_LOSS) + 10 * seconds
+    assert heard / (MAP / 2) < reports < heard * ((1 - loss) / PER_ARRIVED + loss * PER_LOSS) + 10 * seconds
     assert reports < share * (heard + reports)
 
 
