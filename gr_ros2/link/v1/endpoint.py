@@ -109,7 +109,7 @@ class EndpointV1:
             shares=settings.shares,
             proves=keys.sealed and settings.hears and settings.idle_is_free,
             slower=settings.slower,
-            limited=lambda: pace.known,
+            pace=pace,
         )
         self.messages = messages = Outbox(
             topics,
@@ -305,23 +305,21 @@ class EndpointV1:
 
     def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         self._now = now if now > self._now else self._now
-        return self._take(arrival, now)
-
-    def _take(self, arrival: AirPacket, now: float, came: float | None = None) -> list[ReceiverEvent]:
-        """Take a packet, and what can be opened since it came; the sending half learns what matters there."""
-        events = self._receiving.receive(arrival, now, came)
-        for fact in self._receiving.take_facts():
+        events, facts = self._receiving.receive(arrival, now)
+        for fact in facts:  # grows where packets that came before can be opened now
             if isinstance(fact, Early):
                 for at, data in fact.packets:
-                    events += self._take(AirPacket(data), now, at)
+                    further, of_it = self._receiving.receive(AirPacket(data), now, at)
+                    events += further
+                    facts += of_it
             else:
                 self._sending.learn(fact, now)
         return events
 
     def handle_timeout(self, now: float) -> list[ReceiverEvent]:
         self._now = max(self._now, now)
-        events = self._receiving.handle_timeout(now)
-        for fact in self._receiving.take_facts():
+        events, facts = self._receiving.handle_timeout(now)
+        for fact in facts:
             self._sending.learn(fact, now)
         return events
 

@@ -18,6 +18,10 @@ class Taken(NamedTuple):
     urges: bool
 
 
+TAKEN = {(trusted, urges): Taken(trusted, urges) for trusted in (False, True) for urges in (False, True)}
+"""All of them: there is one for every packet."""
+
+
 class Early(NamedTuple):
     """Packets that could not be opened before can be now.
 

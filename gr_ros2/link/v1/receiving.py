@@ -25,6 +25,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.announced import ARRIVING_S
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.facts import (
+    TAKEN,
     Appeared,
     Asked,
     Early,
@@ -34,7 +35,6 @@ from gr_ros2.link.v1.facts import (
     ProofWanted,
     Questioned,
     Reported,
-    Taken,
 )
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
@@ -96,9 +96,9 @@ class ReceivingSide:
         self._access = access
         self._takes = range(256) if settings.src_id == NOBODY else (BROADCAST, settings.src_id)
         """The destinations of packets that are for this robot."""
-        self._facts: list[Fact] = []
         self._sent, self._tells_snr = sent, tells_snr
         self._outcomes = Outcomes()
+        self._facts: list[Fact] = []
         self.stats = self._outcomes.stats
         self._settings = settings
         self._boot = boot
@@ -126,8 +126,10 @@ class ReceivingSide:
         self._sender: Neighbour | None = None
         """The sender of the packet that is processed."""
 
-    def receive(self, arrival: AirPacket, now: float, came: float | None = None) -> list[ReceiverEvent]:
-        """Take one packet; the events it causes, in order.
+    def receive(
+        self, arrival: AirPacket, now: float, came: float | None = None
+    ) -> tuple[list[ReceiverEvent], list[Fact]]:
+        """Take one packet; the events that it causes, and what matters to what is sent, each in order.
 
         :param came: when it came, s, where it was kept since then
         """
@@ -138,15 +140,11 @@ class ReceivingSide:
         except WireError as error:
             self.stats.rejected[error.kind] += 1
             self._outcomes.events.append(Rejected(arrival.data, error))
-        return self._outcomes.take()
-
-    def take_facts(self) -> list[Fact]:
-        """The facts of the packets since this was called last."""
         facts, self._facts = self._facts, []
-        return facts
+        return self._outcomes.take(), facts
 
-    def handle_timeout(self, now: float) -> list[ReceiverEvent]:
-        """Give up missing packets, and forget robots that are silent."""
+    def handle_timeout(self, now: float) -> tuple[list[ReceiverEvent], list[Fact]]:
+        """Give up missing packets, and forget robots that are silent; returns as ``receive`` does."""
         self._now = now
         for neighbour in self.neighbours.all.values():
             neighbour.inbox.handle_timeout(now)
@@ -159,7 +157,8 @@ class ReceivingSide:
             self.relaying.handle_timeout(now)
         for neighbour in self.neighbours.all.values():
             neighbour.timeout = None
-        return self._outcomes.take()
+        facts, self._facts = self._facts, []
+        return self._outcomes.take(), facts
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
@@ -238,8 +237,8 @@ class ReceivingSide:
         """Take an opened packet."""
         self.stats.packets += 1
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
-        control = repair is not None and not repair.mask
-        self._facts.append(Taken(opened.trusted or opened.appeared, urges=control))
+        urges = repair is not None and not repair.mask
+        self._facts.append(TAKEN[opened.trusted or opened.appeared, urges])
         if opened.appeared:
             self._appear(opened, now)
         if opened.met:

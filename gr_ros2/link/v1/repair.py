@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
+from gr_ros2.link.pace import Pace
 from gr_ros2.link.v1.combining import Combining, Repair
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.peers import Peers
@@ -41,7 +42,7 @@ class RepairWindow:
     :param expected_loss: share of packets lost, used until a report arrives
     :param shares: whether others send on the same channel
     :param proves, slower: see :class:`Unreported`
-    :param limited: whether anything limits how many packets leave
+    :param pace: says whether anything limits how many packets leave; None: something does
     :ivar packets: what has left and may be repaired
     :ivar peers: what reports tell of them
     :ivar thrift: when a report is overdue
@@ -57,9 +58,9 @@ class RepairWindow:
         shares: bool = False,
         proves: bool = False,
         slower: float = 1.0,
-        limited: Callable[[], bool] = lambda: True,
+        pace: Pace | None = None,
     ) -> None:
-        self._repair, self._limited = repair, limited
+        self._repair, self._pace = repair, pace
         self.packets = SentPackets(span)
         self._unreported = Unreported(expected_loss, proves=proves, slower=slower)
         self._shared = SharedRepairs(self.packets) if shares else None
@@ -85,11 +86,11 @@ class RepairWindow:
     def mode(self) -> RepairMode:
         """What idle slots carry now: ``idle``, as many repairs as there are slots; ``thrifty``, as many as losses are
         known or expected; ``off``, none."""
-        if not self._limited():  # repair only what reports call for
-            return "thrifty" if self._repair != "off" and self.peers else "off"
+        if self._pace is not None and not self._pace.known:  # repair only what reports call for
+            return "thrifty" if self._repair != "off" and self.peers.all else "off"
         if self._repair != AUTO:
             return self._repair
-        return "thrifty" if self.peers else "idle"
+        return "thrifty" if self.peers.all else "idle"
 
     def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
         """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.
