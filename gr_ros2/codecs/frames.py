@@ -192,15 +192,22 @@ class FrameSender:
             taken = False
             sent.failed += 1
             self._frames.refuse(job.topic_id, Fate.DAMAGED, str(made))
-        elif not (taken := self._taken(job, made, now)) and not sent.is_map:
+        elif not (taken := self._taken(job, made, now)) and made.data[0] and not sent.is_map:
             sent.encoder = sent.coded.encoder()  # no frame may follow one that is not sent
         sent.pull.done(None if taken else job.pull)
 
     def _taken(self, job: Job, made: Coded, now: float) -> bool:
         """Whether a frame is sent. One of which no receiver makes a message is not."""
         sent, size = job.sent, len(job.pull.message)
-        makes = size <= MAX_SIZE or not (sent.is_map or made.data[0] == 0)
-        if not makes:
+        if not sent.coded.makes(made.data[0]):
+            why = f"{made.said or 'it is no picture'}; it cannot come out as {sent.coded.output}"
+            self._frames.refuse(job.topic_id, Fate.UNSUPPORTED, why)
+            sent.failed += 1
+            if why not in sent.said:
+                sent.said.add(why)
+                _log.warning("topic %s: is not sent: %s", sent.name, why)
+            return False
+        if size > MAX_SIZE and (sent.is_map or made.data[0] == 0):
             self._frames.refuse(job.topic_id, Fate.TOO_LARGE, f"{size} bytes; at most {MAX_SIZE}")
         elif self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=self._is_key(job, made)):
             self._sent_off(sent, made, now)
@@ -288,7 +295,7 @@ def coded_topic(topic: Topic, *, latched: bool = False) -> CodedTopic | None:
         cloud = {"voxel": options.cloud.voxel, "range": options.cloud.range, "keep": options.cloud.keep}
         return CodedTopic(CLOUD, {"cloud": {name: value for name, value in cloud.items() if value != AUTO}})
     chosen: dict[str, Mapping[str, Any] | str] = {
-        "camera": OFF if options.camera.off else {"size": options.camera.size},
+        "camera": OFF if options.camera.off else {"size": options.camera.size, "output_type": options.camera.output},
         "depth": OFF if depth.off else {"mode": depth.mode, "near": depth.near, "far": depth.far},
     }
     coded = CodedTopic(topic.type_name, chosen)
@@ -337,7 +344,7 @@ class FrameReceiver:
                 raise BackendMissingError(f"topic {told.name} comes as video: {coded.missing}")
             self._topics[key] = told.type_name, output, coded
             self._decoders.pop(key, None)
-        return next(iter(self._topics[key][2].codecs.values())).output
+        return self._topics[key][2].output
 
     def decode(self, key: tuple[int, int], name: str, payload: bytes) -> bytes:
         """The message of a frame, and any other as it is.

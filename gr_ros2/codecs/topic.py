@@ -93,6 +93,15 @@ class CodedTopic:
                     self.missing = str(error)
         self.codecs[CODECS[_EXACT].number] = configured(_EXACT, type_name, {})
 
+    @property
+    def output(self) -> str:
+        """The type of the messages that come out."""
+        return next(iter(self.codecs.values())).output
+
+    def makes(self, number: int) -> bool:
+        """Whether a codec makes messages of this type."""
+        return self.codecs[number].output == self.output
+
     def encoder(self) -> TopicEncoder:
         """For the sender."""
         return TopicEncoder(self)
@@ -166,6 +175,8 @@ class TopicDecoder:
         number = data[0] if data else 0
         if not data or number not in self._topic.codecs:
             raise DamagedError(f"damaged frame: no codec {number} for {self._topic.type_name}")
+        if not self._topic.makes(number):
+            raise DamagedError(f"frame of a {self._topic.codecs[number].output} where {self._topic.output} comes out")
         if number not in self._made:
             self._made[number] = self._topic.codecs[number].decoder(self._max_size)
         decoder = self._made[number]

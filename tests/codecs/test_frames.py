@@ -15,7 +15,7 @@ pytest.importorskip("av", reason="needs PyAV")
 from gr_ros2.codecs import CodedTopic
 from gr_ros2.codecs.frames import MOST_DECODERS, FrameReceiver
 from gr_ros2.codecs.messages import CAMERA_INFO, GRID, IMAGE, VIDEO, read
-from gr_ros2.core.errors import BackendMissingError, MissingFrameError
+from gr_ros2.core.errors import BackendMissingError, DamagedError, MissingFrameError
 from gr_ros2.link.events import Accepted, Delivered, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import SendOptions
@@ -568,3 +568,24 @@ def test_a_robot_in_between_shows_a_camera_on_as_one_of_its_own() -> None:
     assert len(seen) > 4 * 12
     assert np.mean([now - made for now, made in seen]) < 0.3
     assert not far.of(1)
+
+
+def test_what_cannot_come_out_as_video_is_not_sent_where_video_comes_out(caplog: pytest.LogCaptureFixture) -> None:
+    """Depth, and an encoding that is unknown: a subscriber of CompressedVideo could not read them."""
+    air = link(output="CompressedVideo", kbit_s=1000)
+    sender, receiver = air.robots
+    others = {
+        20: scenes.image(np.full((24, 32, 6), 9, np.uint8), "rgb16", 20),
+        24: scenes.image((scenes.room(0, 64, 48) * 1000).astype(np.uint16), "16UC1", 24),
+    }
+    air._feeds[0] = sender, CAMERA, FPS, lambda n: others.get(n, picture(n)), 0
+    air.run(4.0)
+    assert {read(VIDEO, message).format for _, message in receiver.of(1)} == {"h264"}
+    refused = [event for event in sender.events if isinstance(event, Refused) and event.reason == Fate.UNSUPPORTED]
+    assert len(refused) == 2
+    assert len([record for record in caplog.records if "is not sent" in record.message]) == 2
+    assert not receiver.failed
+    assert receiver.of(1)[-1][0] > 3.8
+    forged = CodedTopic(IMAGE, {"camera": "off", "depth": "off"}).encoder().encode(others[20])
+    with pytest.raises(DamagedError, match="comes out"):
+        receiver.receiver.decode((1, CAMERA), "camera/image", forged.data)
