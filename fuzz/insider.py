@@ -38,7 +38,7 @@ _KEY = bytes(range(32))
 _MODES: tuple[SealMode, ...] = ("none", "authenticate", "encrypt")
 _WAITS_S = (0.0, 0.001, 0.001, *[0.02] * 20, 0.1, 0.1, 0.6, 2.0, 11.0)
 _ROBOTS = (1, 2, 3, 0, 254)
-_STARTS = (
+STARTS = (
     *[(1, 1 << 32 | 11)] * 10,
     *[(2, 1 << 32 | 12)] * 4,
     (1, 2 << 32 | 22),
@@ -85,8 +85,9 @@ class Script:
 class Robot:
     """One start of one robot that says anything."""
 
-    def __init__(self, src_id: int, boot: int, mode: SealMode, *, slots: bool) -> None:
+    def __init__(self, src_id: int, boot: int, mode: SealMode, *, slots: bool, packet_len: int = PACKET_LEN) -> None:
         self.src_id, self.boot, self.number = src_id, boot, 0
+        self._packet_len = packet_len
         self.repair_id = 0
         self._slots, self._encrypts, self._met = slots, mode == "encrypt", False
         keys = Keys((_KEY,) if mode != "none" else (), mode)
@@ -104,9 +105,9 @@ class Robot:
         if kind >= 8:
             self.number += script.pick(_STEPS)
         header = v1.Header(qos, self.sealed, self.src_id, self.number & 0xFFFF, to, script.byte() % 3, block)
-        clear, room = v1.write_header(header), header.room(PACKET_LEN)
+        clear, room = v1.write_header(header), header.room(self._packet_len)
         if kind >= 8:
-            body = self._fitting(_parts(script, self, room), room)
+            body = self._fitting(self.parts(script, room), room)
             self.bodies[self.number] = body
             return self._trailer.close(clear, body, self.number, NOT_A_REPAIR)
         self.repair_id = (self.repair_id + script.pick((*[1] * 6, 0, 7))) % v1.REPAIR_IDS
@@ -124,10 +125,14 @@ class Robot:
         elif kind < 6 and self.bodies:
             repair, body = self._combination(script, room, len(clear), oldest=oldest)
         else:
-            body = self._fitting([_control(script, echo) for _ in range(1 + script.byte() % 4)], room)
+            body = self._fitting([self.control(script, echo) for _ in range(1 + script.byte() % 4)], room)
             repair = v1.RepairHeader(self.repair_id, 0, oldest)
         clear += v1.write_repair_header(repair)
         return self._trailer.close(clear, body, self.number, repair.repair_id, plain=repair.clear)
+
+    def parts(self, script: Script, room: int) -> list[v1.EntryV1]:
+        """What its next packet of messages carries."""
+        return _parts(script, self, room)
 
     def _combination(self, script: Script, room: int, clear: int, *, oldest: bool) -> tuple[v1.RepairHeader, bytes]:
         """Of what it has sent, or of anything; also longer or shorter than its bodies.
@@ -142,9 +147,13 @@ class Robot:
         if script.byte() % 4 == 0:
             combined = script.bytes(room)
         repair = v1.RepairHeader(self.repair_id, mask, oldest)
-        most = PACKET_LEN - self._trailer_len - clear - len(v1.write_repair_header(repair))
+        most = self._packet_len - self._trailer_len - clear - len(v1.write_repair_header(repair))
         length = min(max(len(combined) + script.pick((0, 0, 0, 0, 1, 2, -1, most)), 0), most)
         return repair, combined[:length].ljust(length, b"\xff")
+
+    def control(self, script: Script, echo: bytes) -> Control:
+        """What it says of packets and of robots."""
+        return _control(script, echo)
 
     @staticmethod
     def _fitting(entries: Sequence[v1.EntryV1], room: int) -> bytes:
@@ -219,7 +228,7 @@ def _table(script: Script) -> bytes:
 
 def _of_another(script: Script, robot: Robot, *, carried: bool) -> bytes:
     origin = script.pick((robot.src_id, *_ROBOTS, _OWN))
-    boot = script.pick((robot.boot, robot.boot, *[boot for _, boot in _STARTS]))
+    boot = script.pick((robot.boot, robot.boot, *[boot for _, boot in STARTS]))
     topic_id = script.pick(_TOPICS[:6])
     payload = script.bytes(30)
     if topic_id == v1.TABLE_TOPIC:
@@ -263,7 +272,7 @@ def insider(data: bytes) -> None:
     for step in range(MOST_PACKETS):
         if script.over:
             break
-        name = script.pick(_STARTS)
+        name = script.pick(STARTS)
         robot = robots.setdefault(name, Robot(*name, mode, slots=access is not None))
         data = robot.packet(script, echo)
         now += script.pick(_WAITS_S)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections import Counter
 from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from runpy import run_module
+from typing import Any
 
 import pytest
 
@@ -68,6 +70,7 @@ COUNTS = {
     "calls": 1_500,
     "compression": 1_000,
     "codecs": 1_500,
+    "frames": 30,
     "structure": 400,
     "type_description": 500,
     "control_socket": 500,
@@ -82,7 +85,9 @@ COUNTS = {
 """Inputs of a short run; `python -m fuzz.NAME` goes on for as long as it is let."""
 if find_spec("av") is not None:
     import fuzz.codecs
+    import fuzz.frames
 
+    HARNESSES["frames"] = (fuzz.frames.frames, fuzz.frames.corpus)
     HARNESSES["codecs"] = (fuzz.codecs.codecs, fuzz.codecs.corpus)
 if find_spec("bokeh") is not None:
     import fuzz.dashboard
@@ -134,6 +139,30 @@ def test_scripts_of_an_insider_reach_delivery(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(fuzz.insider, "check", lambda _, events, __: found.update(type(e).__name__ for e in events))
     run(fuzz.insider.insider, fuzz.insider.corpus(), seed=1, count=60)
     assert {"Met", "Received", "Announced", "Delivered", "Lost", "Gone", "Rejected"} <= found
+
+
+def test_scripts_of_frames_reach_the_decoders(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some are decoded, some are not, and our own camera goes on."""
+    pytest.importorskip("av", reason="needs PyAV")
+    became: Counter[str] = Counter()
+    decode, check = fuzz.frames.FrameReceiver.decode, fuzz.frames.Victim.check
+
+    def decoded(self: fuzz.frames.FrameReceiver, key: tuple[int, int], *args: Any) -> bytes:
+        framed = key in self._topics
+        became["failed"] += framed
+        message = decode(self, key, *args)
+        became["decoded"] += framed
+        became["failed"] -= framed
+        return message
+
+    def checked(self: fuzz.frames.Victim, now: float) -> None:
+        check(self, now)
+        became["sent"] = max(became["sent"], len(self.events))
+
+    monkeypatch.setattr(fuzz.frames.FrameReceiver, "decode", decoded)
+    monkeypatch.setattr(fuzz.frames.Victim, "check", checked)
+    run(fuzz.frames.frames, fuzz.frames.corpus(), seed=1, count=20)
+    assert min(became["failed"], became["decoded"], became["sent"]) > 10, became
 
 
 def test_a_failing_input_is_named() -> None:

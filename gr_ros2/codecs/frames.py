@@ -20,7 +20,7 @@ from gr_ros2.codecs.base import MAX_SIZE, Coded
 from gr_ros2.codecs.messages import CAMERA_INFO, CLOUD, GRID
 from gr_ros2.codecs.pull import FramePull, Pull, StatePull
 from gr_ros2.codecs.topic import OFF, CodedTopic, TopicDecoder, TopicEncoder
-from gr_ros2.core.errors import BackendMissingError, CodecError
+from gr_ros2.core.errors import BackendMissingError, CodecError, MissingFrameError
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.frames import MARK, FrameSide
 from gr_ros2.settings.fields import AUTO
@@ -32,6 +32,12 @@ CODING_S = 0.008
 MOST_DECODERS = 32
 """Topics of others that are decoded at a time; each may hold some pictures. The one that was used longest ago begins
 anew with a key frame."""
+MOST_BYTES_S = 256e6
+"""Bytes of messages in a second that are made of one robot's frames, on average over a second: 250 bytes of video may
+say "the same as before" of 8 million pixels, which takes 18 ms. It is more than a camera of 1920 × 1080 pixels at 30/s,
+and keeps half a core busy."""
+_DAMAGED_BYTES = 1 << 23
+"""Bytes that a damaged frame counts: whatever was wrong with it may have been found at its end."""
 _BESIDE = ("image_raw", "image", "image_color", "image_mono")
 """Ends of the names of pictures that a CameraInfo beside them is of, the likeliest first."""
 _SECONDS = 2.0
@@ -320,6 +326,10 @@ class FrameReceiver:
     def __init__(self, max_size: int = MAX_SIZE) -> None:
         self._max_size = max_size
         self._topics: dict[tuple[int, int], tuple[str, str, CodedTopic]] = {}
+        self._shared: dict[tuple[str, str], CodedTopic] = {}
+        """Some of these, by type and output: topics share them, since others may announce many."""
+        self._left: dict[int, tuple[float, float]] = {}
+        """Bytes of messages that may be made of each robot's frames, at a time in s."""
         self._decoders: OrderedDict[tuple[int, int], TopicDecoder] = OrderedDict()
         """Those that were used last, the newest last."""
         self._sizes: dict[tuple[int, str], tuple[int, int] | None] = {}
@@ -339,28 +349,48 @@ class FrameReceiver:
                 self._sizes.pop((key[0], _camera(told.name)), None)
             return told.type_name
         if key not in self._topics or self._topics[key][:2] != (told.type_name, output):
-            coded = CodedTopic(told.type_name, {"camera": {"output_type": output}})
+            coded = self._shared.get((told.type_name, output))
+            if coded is None:
+                coded = CodedTopic(told.type_name, {"camera": {"output_type": output}})
+                if len(self._shared) == MOST_DECODERS:
+                    self._shared.clear()
+                self._shared[told.type_name, output] = coded
             if coded.missing:
                 raise BackendMissingError(f"topic {told.name} comes as video: {coded.missing}")
             self._topics[key] = told.type_name, output, coded
             self._decoders.pop(key, None)
         return self._topics[key][2].output
 
-    def decode(self, key: tuple[int, int], name: str, payload: bytes) -> bytes:
+    def decode(self, key: tuple[int, int], name: str, payload: bytes, now: float) -> bytes:
         """The message of a frame, and any other as it is.
 
         :param name: of its topic
-        :raises CodecError: the frame before is missing, or it is damaged
+        :raises CodecError: the frame before is missing, or it is damaged, or its robot's frames make more messages than
+            ``MOST_BYTES_S``
         """
         camera = key[0], _camera(name)
         if key not in self._topics:
             self._sizes.pop(camera, None)  # of the same camera as video
             return payload
+        left, at = self._left.get(key[0], (MOST_BYTES_S, now))
+        left = min(left + (now - at) * MOST_BYTES_S, MOST_BYTES_S)
+        if left < 0:
+            raise CodecError(
+                f"frames of robot {key[0]} make more than {MOST_BYTES_S / 1e6:.0f} MB of messages in a second"
+            )
         decoder = self._decoders.setdefault(key, self._topics[key][2].decoder(self._max_size))
         self._decoders.move_to_end(key)
         if len(self._decoders) > MOST_DECODERS:
             self._decoders.popitem(last=False)
-        message = decoder.decode(payload)
+        made = _DAMAGED_BYTES
+        try:
+            message = decoder.decode(payload)
+            made = len(message)
+        except MissingFrameError:
+            made = 0
+            raise
+        finally:
+            self._left[key[0]] = left - made, now
         self._sizes.pop(camera, None)
         if self._topics[key][0] in PICTURES:
             self._sizes[camera] = decoder.size

@@ -268,7 +268,7 @@ class Outputs:
         :raises CodecError: a frame that cannot be decoded; its robot is asked for a key frame
         """
         try:
-            message = self.frames.decode((event.src_id, event.topic_id), topic.name, event.payload)
+            message = self.frames.decode((event.src_id, event.topic_id), topic.name, event.payload, self._clock())
             return self.frames.scaled(event.src_id, topic.name, topic.type_name, message)
         except CodecError:
             with self._lock:

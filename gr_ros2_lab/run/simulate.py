@@ -460,14 +460,14 @@ class Robot:
     def receive(self, reception: Reception) -> Iterator[TimedEvent]:
         """Take what has come out of the receiver."""
         for event in self.endpoint.receive(reception.packet, reception.at):
-            yield reception.at, self, self._shown(event)
+            yield reception.at, self, self._shown(event, reception.at)
         self._code(reception.at)
 
     def expire(self, now: float) -> Iterator[TimedEvent]:
         """Do what is due by ``now`` other than to send."""
         at = self.endpoint.next_timeout()
         if at is not None and at <= now:
-            yield from ((now, self, self._shown(event)) for event in self.endpoint.handle_timeout(now))
+            yield from ((now, self, self._shown(event, now)) for event in self.endpoint.handle_timeout(now))
 
     def finish(self, now: float) -> Iterator[TimedEvent]:
         """Say what becomes of messages that still wait to be coded."""
@@ -489,14 +489,14 @@ class Robot:
         if self._coder is not None:
             self._coder.look(now)
 
-    def _shown(self, event: ReceiverEvent) -> ReceiverEvent:
+    def _shown(self, event: ReceiverEvent, now: float) -> ReceiverEvent:
         """An event with the message that a frame is. One that cannot be decoded stays a frame."""
         if isinstance(event, Announced):
             for told in event.topics:
                 self._received.announce((event.src_id, told.topic_id), told)
         elif isinstance(event, Delivered):
             try:
-                shown = self._received.decode((event.src_id, event.topic_id), "", event.payload)
+                shown = self._received.decode((event.src_id, event.topic_id), "", event.payload, now)
             except CodecError:
                 if self.endpoint.frames is not None:
                     self.endpoint.frames.lost(event.src_id, event.topic_id)

@@ -101,7 +101,7 @@ class Robot:
             elif isinstance(event, Delivered):
                 key = event.src_id, event.topic_id
                 try:
-                    self.seen.append((now, key, self.receiver.decode(key, self.names.get(key, ""), event.payload)))
+                    self.seen.append((now, key, self.receiver.decode(key, self.names.get(key, ""), event.payload, now)))
                 except CodecError as error:
                     self.failed.append((now, error))
                     self.end.frames.lost(*key)

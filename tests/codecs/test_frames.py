@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import re
 import sys
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ import pytest
 pytest.importorskip("av", reason="needs PyAV")
 
 from gr_ros2.codecs import CodedTopic
-from gr_ros2.codecs.frames import MOST_DECODERS, FrameReceiver
+from gr_ros2.codecs.frames import MOST_BYTES_S, MOST_DECODERS, FrameReceiver
 from gr_ros2.codecs.messages import CAMERA_INFO, GRID, IMAGE, VIDEO, read
-from gr_ros2.core.errors import BackendMissingError, DamagedError, MissingFrameError
+from gr_ros2.core.errors import BackendMissingError, CodecError, DamagedError, MissingFrameError
 from gr_ros2.link.events import Accepted, Delivered, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import SendOptions
@@ -261,7 +262,7 @@ def test_camera_info_is_as_it_came_once_the_camera_passes_exactly() -> None:
     receiver, told = FrameReceiver(), AnnouncedTopic(CAMERA, "camera/image", IMAGE, codec="frames")
     receiver.announce((1, CAMERA), told)
     info = scenes.camera_info(640, 480)
-    receiver.decode((1, CAMERA), told.name, CodedTopic(IMAGE).encoder().encode(picture(0), 900).data)
+    receiver.decode((1, CAMERA), told.name, CodedTopic(IMAGE).encoder().encode(picture(0), 900).data, 0.0)
     assert receiver.scaled(1, "camera/camera_info", CAMERA_INFO, info) != info
     receiver.announce((1, CAMERA), told._replace(codec=""))
     assert receiver.scaled(1, "camera/camera_info", CAMERA_INFO, info) == info
@@ -282,10 +283,10 @@ def test_of_several_cameras_in_one_namespace_each_has_its_camera_info() -> None:
 
     for round in range(2):
         for number, name in enumerate(sizes):
-            receiver.decode((1, number), f"eye/{name}", encoders[number].encode(picture(round), 900).data)
+            receiver.decode((1, number), f"eye/{name}", encoders[number].encode(picture(round), 900).data, 0.0)
             if round:
                 assert widths() == [160, 320, 160], "whatever came last"
-    receiver.decode((1, 7), "eye/left_image_raw", b"a picture that passes exactly")
+    receiver.decode((1, 7), "eye/left_image_raw", b"a picture that passes exactly", 0.0)
     assert widths() == [320, 320, 160]
 
 
@@ -370,11 +371,11 @@ def test_the_memory_for_topics_of_others_is_bounded() -> None:
     keys = [(robot, topic) for robot in range(1, 4) for topic in range(20)]
     for key in keys:
         assert receiver.announce(key, AnnouncedTopic(key[1], f"image_{key[1]}", IMAGE, codec="frames")) == IMAGE
-        receiver.decode(key, f"camera_{key[1]}/image", key_frame)
+        receiver.decode(key, f"camera_{key[1]}/image", key_frame, 0.0)
     assert len(receiver._decoders) == len(receiver._sizes) == MOST_DECODERS < len(keys)
-    receiver.decode(keys[-1], "camera/image", following)
+    receiver.decode(keys[-1], "camera/image", following, 0.0)
     with pytest.raises(MissingFrameError):
-        receiver.decode(keys[0], "camera/image", following)
+        receiver.decode(keys[0], "camera/image", following, 0.0)
 
 
 def test_maps_need_no_package_of_video(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -588,4 +589,24 @@ def test_what_cannot_come_out_as_video_is_not_sent_where_video_comes_out(caplog:
     assert receiver.of(1)[-1][0] > 3.8
     forged = CodedTopic(IMAGE, {"camera": "off", "depth": "off"}).encoder().encode(others[20])
     with pytest.raises(DamagedError, match="comes out"):
-        receiver.receiver.decode((1, CAMERA), "camera/image", forged.data)
+        receiver.receiver.decode((1, CAMERA), "camera/image", forged.data, air.now)
+
+
+def test_what_the_frames_of_one_robot_make_in_a_second_is_bounded() -> None:
+    """A few bytes may say "the same as before" of millions of pixels."""
+    receiver, pixels = FrameReceiver(), np.zeros((2160, 3840), np.uint8)
+    for robot in (1, 2):
+        receiver.announce((robot, 0), AnnouncedTopic(0, "image", IMAGE, codec="frames"))
+    encoder = CodedTopic(IMAGE, {"camera": {"size": "full"}}).encoder()
+    key, still = (encoder.encode(scenes.image(pixels, "mono8"), 90_000).data for _ in range(2))
+    assert len(still) < 300
+    made, now = 0, 0.0
+    for now in np.arange(0, 0.3, 0.002):
+        with suppress(CodecError):
+            made += len(receiver.decode((1, 0), "image", key, now))
+    assert MOST_BYTES_S <= made < 1.5 * MOST_BYTES_S
+    with pytest.raises(CodecError, match="more than 256 MB"):
+        receiver.decode((1, 0), "image", key, now)
+    assert receiver.decode((2, 0), "image", key, now), "another robot is decoded"
+    assert receiver.decode((1, 0), "image", key, now + 0.3)
+    assert receiver.decode((1, 0), "image", still, now + 0.4)
