@@ -262,7 +262,7 @@ def insider(data: bytes) -> None:
     settings = Settings(
         _OWN, packet_len=PACKET_LEN, any_length=True, max_sources=3, max_source_bytes=16_384, relay=relay
     )
-    access = Slots(_OWN, _SLOT_S, random.Random(1)) if relay or script.byte() & 1 else None
+    access = Slots(_OWN, _SLOT_S, random.Random(1), period_s=0.1) if relay or script.byte() & 1 else None
     keys = Keys((_KEY,) if mode != "none" else (), mode)
     end = EndpointV1(topics, settings, boot=_BOOT, keys=keys, access=access, save=lambda *_: None)
     end.pace.use_credit()

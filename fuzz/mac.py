@@ -19,7 +19,7 @@ _STEP = 15
 
 def mac(data: bytes) -> None:
     """Take the bytes as packets heard, and send in between."""
-    robot = Slots(1, _SLOT_S, random.Random(1))
+    robot = Slots(1, _SLOT_S, random.Random(1), period_s=0.1)
     now = 0.0
     for start in range(0, min(len(data), 40 * _STEP), _STEP):
         src_id, later, trusted = (data[start : start + 3] + bytes(3))[:3]
