@@ -1,4 +1,5 @@
-"""A computer that is too slow: the demo, in real time, with a third of the processor time that it needs.
+"""A computer that is too slow: the demo with a third of the processor time that it needs. Its packets are those of a
+modem as quick as its radio, and follow the wall clock; in lock step, as with a radio, everything would wait.
 
 First the demo runs free, and its processor time is measured while messages are sent. Then it runs with a third of that.
 Where the kernel does not give processor time by quota without rights, SIGSTOP and SIGCONT do, in periods of
@@ -32,6 +33,7 @@ from gr_ros2_lab.record.metrics import age
 from gr_ros2_lab.record.result import Result, read_result
 from gr_ros2_lab.run.runner import DELIVERED_BAG
 
+MODEM = "phy={name: modem, options: {bit_rate: 6e5}}"
 SHARE = 1 / 3
 DURATION_S = 20.0
 TICK_S, PERIOD_S = 0.005, 0.1
@@ -91,7 +93,8 @@ def _run(cores: float | None) -> _Run:
     with TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         command = [sys.executable, "-m", "gr_ros2.cli", "demo", "--no-report", "--out", str(out)]
-        process = subprocess.Popen([*command, "--duration", f"{DURATION_S}"], stdout=subprocess.PIPE, text=True)
+        command += ["--duration", f"{DURATION_S}", "--set", MODEM]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         try:
             assert process.stdout is not None
             while "ROS_DOMAIN_ID" not in process.stdout.readline():  # then the first messages leave

@@ -57,7 +57,10 @@ PURE_CODECS = {"backports", "cryptography"}
 """Small codecs and ciphers without IO that these may import beside the standard library."""
 
 CONFINED = {
-    "gnuradio": ("gr_ros2/gr/", "gr_ros2/phy/", "gr_ros2/radio/", "gr_ros2_lab/race/links.py"),
+    "gnuradio": (
+        *("gr_ros2/gr/", "gr_ros2/phy/", "gr_ros2/radio/"),
+        *("gr_ros2_lab/race/links.py", "gr_ros2_lab/run/passed_on.py"),
+    ),
     "pmt": ("gr_ros2/gr/", "gr_ros2/phy/", "gr_ros2/radio/", "gr_ros2_lab/race/links.py"),
     "rclpy": ("gr_ros2/middleware/rclpy.py", "gr_ros2/middleware/rclpy_executor.py", "gr_ros2/ros/"),
     "rcl_interfaces": ("gr_ros2/ros/",),

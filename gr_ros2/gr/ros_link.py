@@ -84,10 +84,43 @@ class LinkSendingBlock(SendingBlock):
             self._room.notify_all()
 
 
-class RosLink(gr.hier_block2):  # type: ignore[misc]
-    """One robot's end of a link.
+class LinkBlock(gr.hier_block2):  # type: ignore[misc]
+    """A block that sends and one that receives, as one. Message ports: `pdus` in and out, `credit` in, as in
+    :class:`SendingBlock` and :class:`ReceivingBlock`.
 
-    Message ports: `pdus` in and out, `credit` in, as in :class:`SendingBlock` and :class:`ReceivingBlock`.
+    :ivar end: its endpoint; of a robot that receives its own packets, the one that receives
+    :ivar calls: the services that cross the link; None where it goes one way, or topics leave no room for calls
+    """
+
+    source: SendingBlock
+    sink: ReceivingBlock
+    end: LiveEnd[Any]
+    calls: LiveCalls | None = None
+
+    def __init__(self, config: RobotConfig) -> None:
+        super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
+        self.config = config
+
+    def _connect(self) -> None:
+        """Connect the ports with the two blocks."""
+        for port in ("pdus", "credit"):
+            self.message_port_register_hier_in(port)
+        self.message_port_register_hier_out("pdus")
+        if self.config.receives:
+            self.msg_connect(self, "pdus", self.sink, "pdus")
+        self.msg_connect(self, "credit", self.source, "credit")
+        if self.config.direction != "receive":
+            self.msg_connect(self.source, "pdus", self, "pdus")
+
+    def close(self) -> None:
+        """Leave the ROS graph. Idempotent."""
+        for part in (self.calls, getattr(self, "source", None), getattr(self, "sink", None)):
+            if part is not None:
+                part.close()
+
+
+class RosLink(LinkBlock):
+    """One robot's end of a link.
 
     :param config: settings of the robot
     :param air: what is known of the radio
@@ -97,9 +130,9 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
     :param observer, clock, backpressure: see :class:`SendingBlock`
     :param registry: the topics that the robots know beforehand; None: as the settings say
     :raises ConfigError: for settings that contradict each other
-    :ivar end: its endpoint; of a robot that receives its own packets, the one that receives
-    :ivar calls: the services that cross the link; None where it goes one way, or topics leave no room for calls
     """
+
+    source: LinkSendingBlock
 
     def __init__(
         self,
@@ -114,8 +147,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         backpressure: bool = False,
         registry: Registry | None = None,
     ) -> None:
-        super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
-        self.config = config
+        super().__init__(config)
         known = registry if registry is not None else read_registry(config.registry)
         topics = known if config.sends else Registry.empty()
         calls = config.direction == "both" and not loops_back and (len(topics) < MAX_TOPICS or bool(topics.services))
@@ -133,7 +165,6 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         self._graph = middleware or join(config.graph, f"gr_ros2_link_{config.robot_id}")
         self._leave = weakref.finalize(self, self._graph.close if middleware is None else lambda: None)
         published = heard.with_options(config.publish.topics, announced=True)
-        self.calls: LiveCalls | None = None
         try:
             self.source = LinkSendingBlock(config, topics, sending, self._graph, backpressure=backpressure, **common)
             self.sink = ReceivingBlock(config, published, self.end, self._graph, **common)
@@ -142,14 +173,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
         except GrRos2Error:
             self.close()
             raise
-        for port in ("pdus", "credit"):
-            self.message_port_register_hier_in(port)
-        self.message_port_register_hier_out("pdus")
-        if config.receives:
-            self.msg_connect(self, "pdus", self.sink, "pdus")
-        self.msg_connect(self, "credit", self.source, "credit")
-        if config.direction != "receive":
-            self.msg_connect(self.source, "pdus", self, "pdus")
+        self._connect()
 
     def set_topics(self, topics: Any) -> None:
         """See :meth:`LinkSendingBlock.set_topics`."""
@@ -158,9 +182,7 @@ class RosLink(gr.hier_block2):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graph, and let another process use the state file. Idempotent."""
-        for part in (self.calls, getattr(self, "source", None), getattr(self, "sink", None)):
-            if part is not None:
-                part.close()
+        super().close()
         self._leave()
         self._start.close()
 

@@ -38,7 +38,7 @@ _PATIENCE_S = 5.0
 
 
 class LiveLink(Protocol):
-    """What an observer can read and change in a flowgraph: ``phy.loopback.LoopbackLink``, ``radio.radio.Radio``.
+    """What an observer can read and change of one direction of a link: ``radio.radio.Radio``, or the channel of a run.
 
     The setters raise a GrRos2Error where the setting cannot be changed.
 
@@ -114,7 +114,7 @@ class LiveRun:
     :param received_as: absolute name under which a topic of a sender, by its name in a registry, comes out here; ''
         where the names of ``topics`` are shown
     :param announced: source id, absolute name here and meaning of each topic that other robots have announced so far
-    :param alarms: what is wrong with the robots that are heard, one line each
+    :param alarms: what is wrong with the robots that are heard, or with what lies between them, one line each
     :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
     :param changed: told of each change that somebody makes while it runs
     """

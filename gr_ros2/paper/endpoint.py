@@ -9,13 +9,11 @@ from typing import Any
 from gr_ros2.link.endpoint import HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
-from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import Mcs
-from gr_ros2.link.stats import ReceiverStats, SenderStats
+from gr_ros2.link.stats import ReceiverStats
 from gr_ros2.paper.receiver import Receiver
 from gr_ros2.paper.sender import Sender
 from gr_ros2.paper.settings import PaperConfig
-from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 from gr_ros2.settings.robot import RobotConfig
 
@@ -47,23 +45,17 @@ class EndpointV0:
         observer: Callable[[SenderEvent], None] | None = None,
     ) -> None:
         to_air = codec if paper.compression else None
-        sends, receives = robot.sends, robot.receives
-        self._sender = Sender(registry, robot, paper, codec=to_air, rng=rng, observer=observer) if sends else None
-        self._receiver = Receiver(registry, robot, paper, codec=codec, own=own) if receives else None
-        self.sent = SenderStats() if self._sender is None else self._sender.stats
+        sent = registry if robot.sends else Registry.empty()
+        self.messages = Sender(sent, robot, paper, codec=to_air, rng=rng, observer=observer)
+        """Its message side."""
+        self._receiver = Receiver(registry, robot, paper, codec=codec, own=own) if robot.receives else None
+        self.sent, self.pace = self.messages.stats, self.messages.pace
         self.received = ReceiverStats() if self._receiver is None else self._receiver.stats
-        self.pace = Pace(AUTO) if self._sender is None else self._sender.pace
-
-    @property
-    def messages(self) -> Sender:
-        """Its message side; only an end that sends is asked for it."""
-        assert self._sender is not None
-        return self._sender
 
     @property
     def idle(self) -> bool:
         """Whether nothing waits to be sent."""
-        return self._sender is None or self._sender.idle
+        return self.messages.idle
 
     @property
     def held_bytes(self) -> int:
@@ -74,10 +66,10 @@ class EndpointV0:
         self.messages.reconfigure(**changes)
 
     def next_packet(self, now: float) -> SentPacket | None:
-        return None if self._sender is None else self._sender.next_packet(now)
+        return self.messages.next_packet(now)
 
     def next_departure(self, *, credited: bool = False) -> float | None:  # noqa: ARG002 - nothing is due by itself
-        return None if self._sender is None else self._sender.next_timeout()
+        return self.messages.next_timeout()
 
     def receive(self, arrival: AirPacket, now: float) -> list[ReceiverEvent]:
         return [] if self._receiver is None else self._receiver.receive(arrival, now)

@@ -7,7 +7,6 @@ time (`throttle` would let bursts through); the queue is unbounded and counted; 
 from __future__ import annotations
 
 import time
-from array import array
 from collections.abc import Callable
 from math import inf
 from typing import Any
@@ -18,7 +17,7 @@ from gnuradio import gr
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.phy.pdus import CREDIT, PDUS, credit_of, leave_at_of, mcs_of, octets, with_begin
+from gr_ros2.phy.pdus import CREDIT, PDUS, PduPort, credit_of, leave_at_of, mcs_of, octets, packets_of, with_begin
 from gr_ros2.phy.threads import WaitingBlock
 
 
@@ -32,9 +31,7 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
     :param timed, listens, ready: see :class:`AirtimeClock`
     :param admits: whether a packet with these bytes may be sent at all; others count as refused, `not_sealed`
     :param clock: s, monotonic
-    :param times: store when each packet passed; off by default, since a link that runs without end would store too many
     :ivar lateness: delays of packets after the time at which they should pass
-    :ivar passed_at: s, monotonic, of every packet; empty if ``times`` is off
     :raises ConfigError: for a value out of range
     """
 
@@ -49,7 +46,6 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         listens: Callable[[], float] | None = None,
         ready: Callable[[], bool] | None = None,
         admits: Callable[[bytes], bool] | None = None,
-        times: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("gr-ros2-airtime", "gr_ros2_airtime_gate", None, None)
@@ -63,16 +59,17 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         """Packets that have passed or are about to."""
         self.passed = 0
         self.lateness = Lateness()
-        self.passed_at = array("d")
-        self._times = times
         self._looks_at = inf
         """When its thread began with what it does, or looks again at the latest, s."""
         self.arrived = 0
         """Packets that have come."""
+        self._port = PduPort(self)
         self.message_port_register_in(PDUS)
-        self.message_port_register_out(PDUS)
         self.message_port_register_out(CREDIT)
-        self.set_msg_handler(PDUS, self._arrive)
+        self._at_once = airtime == 0 and limit is None and admits is None
+        if self._at_once:
+            PduPort.readable_by(self)
+        self.set_msg_handler(PDUS, self._pass if self._at_once else self._arrive)
 
     @property
     def backlog(self) -> int:
@@ -123,8 +120,26 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         return max(0.0, self._now() - self._looks_at) if self._thread.alive else inf
 
     def start(self) -> bool:
+        self._port.find_readers()
         self._looks_at = self._now()
         return super().start()
+
+    def _pass(self, message: Any) -> None:
+        """Let packets that take no time through, as many as come at once."""
+        packets, _ = packets_of(message)
+        with self._changed:
+            now = self._now()
+            for packet in packets:
+                self._clock.offer(packet, now)
+            passed = len(self._clock.due(now))
+            self.arrived += len(packets)
+            self._left += passed
+            self._changed.notify_all()
+        if len(packets) > 1:
+            self._port.send(packets[:passed])
+        elif passed:
+            self.message_port_pub(PDUS, message)
+        self.passed += passed
 
     def _arrive(self, pdu: Any) -> None:
         airtime = None
@@ -160,8 +175,6 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         self._left += len(pdus)
         if pdus and due is not None:
             self.lateness.happened(due, now)
-            if self._times:
-                self.passed_at.extend([now] * len(pdus))
         if not pdus and not credits:
             at = self._clock.next_timeout(now)
             self._looks_at = inf if at is None else max(at, now)

@@ -192,12 +192,14 @@ class WaitingBlock:
         """What the thread does. It is woken by ``_changed``, and returns when ``_running`` is False."""
 
     def start(self) -> bool:
+        """The flowgraph starts."""
         with self._changed:
             self._running = True
         self._thread.start(self.run, self._called)
         return True
 
     def stop(self) -> bool:
+        """The flowgraph stops."""
         with self._changed:
             self._running = False
             self._changed.notify_all()
@@ -213,10 +215,12 @@ class KeepsThreadState:
         return ThreadState()
 
     def start(self) -> bool:
+        """The flowgraph starts."""
         self._thread_state.keep()
         return True
 
     def stop(self) -> bool:
+        """The flowgraph stops."""
         self._thread_state.release()
         return True
 

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
-from functools import cached_property
+from functools import cached_property, partial
 from math import inf
 from typing import Any
 
 from gr_ros2.core.errors import RadioError
 from gr_ros2.core.watch import Watch
+from gr_ros2.gr.ros_link import LinkBlock, RosLink
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.endpoint import without_table
 from gr_ros2.link.observe import LinkObserver, Observers
@@ -54,6 +56,9 @@ class RobotLink(Flowgraph):
     :param observer: called with everything that is sent and received. If it raises, it is not called again, and the
         link continues
     :param instrumented: see :class:`gr_ros2.radio.radio.Radio`
+    :param front_end: opens the front end, given the PHY and ``transmits``; it has no radio. None: the one that the
+        configuration names
+    :param block: makes the block between the ROS graph and the radio, as :class:`RosLink` does
     :raises ConfigError: when the parts do not fit together
     :raises MiddlewareError: when the ROS graph cannot be joined
     :raises RadioError: when the front end cannot be opened
@@ -66,11 +71,14 @@ class RobotLink(Flowgraph):
         middleware: Middleware | None = None,
         observer: LinkObserver | None = None,
         instrumented: bool = False,
+        front_end: Callable[..., FrontEnd] | None = None,
+        block: Callable[..., LinkBlock] = RosLink,
     ) -> None:
         super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
         self._started: float | None = None
         self._instrumented = instrumented
+        self._made_front_end, self._block = front_end, block
         self._retry_at = inf
         """When a device that has vanished is tried again, s; infinite while there is one."""
         self._interruptions = self._passed_before = 0
@@ -90,11 +98,13 @@ class RobotLink(Flowgraph):
         config = self.config
         rate = config.phy.sample_rate
         self.phy = configured(config.phy, config.packet_len, 0.0 if rate == AUTO else rate)
-        self._front_end_class: type[FrontEnd] = FRONT_ENDS.load(config.front_end_name)
-        self.sends = config.direction != "receive" and permitted(
-            config.transmit, self._front_end_class, config.front_end_options, guarded=bool(config.key) or config.open
-        )
+        self.sends = config.direction != "receive"
         """Whether it may send at all."""
+        if self._made_front_end is None:
+            kind: type[FrontEnd] = FRONT_ENDS.load(config.front_end_name)
+            guarded = bool(config.key) or config.open
+            self.sends = self.sends and permitted(config.transmit, kind, config.front_end_options, guarded=guarded)
+            self._made_front_end = partial(kind, **config.front_end_options)
         self._open_radio()
         self._stack.callback(self._close_radio)
         self._clock = self.front_end.clock
@@ -106,15 +116,18 @@ class RobotLink(Flowgraph):
             middleware=middleware,
             observer=observer,
             clock=self._clock,
+            block=self._block,
             stack=self._stack,
         )
         self.node_name, graph = self._ros.node_name, self._ros.graph
         link = self._ros.link
         self.source, self.sink, self.end, self.calls = link.source, link.sink, link.end, link.calls
         self._connect_radio()
-        self.source.use_credit()
+        if self.phy.has_airtime:  # without, nothing sets a pace
+            self.source.use_credit()
         told = about(config, self.phy)
-        introduce(self.end, told, lambda: self.radio.snr_db, self._clock())
+        if hasattr(self.end.endpoint, "questions"):  # the paper's robots ask nothing
+            introduce(self.end, told, lambda: self.radio.snr_db, self._clock())
         self._mismatch = Mismatch(told, self.ping)
         if isinstance(graph, ServiceGraph):
             switch = TransmitSwitch(graph, self.node_name, lambda on: self.transmit(on=on))
@@ -129,7 +142,8 @@ class RobotLink(Flowgraph):
 
         :raises RadioError: when it cannot be opened
         """
-        self.front_end = self._front_end_class(self.phy, transmits=self.sends, **self.config.front_end_options)
+        assert self._made_front_end is not None
+        self.front_end = self._made_front_end(self.phy, transmits=self.sends)
         try:
             self.radio = Radio(
                 self.phy,
@@ -150,11 +164,11 @@ class RobotLink(Flowgraph):
     def _connect_radio(self) -> None:
         """Connect the radio with the blocks of ROS."""
         link = self._ros.link
-        if self.sends:  # without credit, nothing leaves
+        if self.sends:
             self.msg_connect(link, "pdus", self.radio, "pdus")
-            self.msg_connect(self.radio, "credit", link, "credit")
-            if self._ros.shares:
-                self.front_end.follow(self._at_rest)
+            if self.phy.has_airtime:
+                self.msg_connect(self.radio, "credit", link, "credit")
+            self.front_end.follow(self._at_rest)
         if self.config.receives:
             self.msg_connect(self.radio, "pdus", link, "pdus")
 

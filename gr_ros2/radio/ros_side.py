@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr import RosLink
+from gr_ros2.gr.ros_link import LinkBlock
 from gr_ros2.link.access import Access
 from gr_ros2.link.air import Air
 from gr_ros2.link.airtime import LEAD_S
@@ -30,6 +30,7 @@ class RosSide:
     :param sends: whether the robot may send
     :param middleware: an open Middleware for both directions, which the caller closes; None: opened here
     :param observer, clock: see :class:`gr_ros2.gr.ros_link.RosLink`
+    :param block: makes the block between the graph and the radio, as :class:`RosLink` does
     :param stack: closes what is opened here
     :raises ConfigError: when the parts do not fit together
     :raises MiddlewareError: when the ROS graph cannot be joined
@@ -47,6 +48,7 @@ class RosSide:
         middleware: Middleware | None,
         observer: LinkObserver | None,
         clock: Callable[[], float],
+        block: Callable[..., LinkBlock],
         stack: ExitStack,
     ) -> None:
         self._medium, self._front_end = config.medium, front_end
@@ -71,7 +73,7 @@ class RosSide:
             access=self._access if sends else lambda _: None,
             relay=config.relay == "gain",
         )
-        self.link = RosLink(
+        self.link = block(
             config if sends else replace(config, topics={}),
             air=air,
             loops_back=front_end.loops_back,

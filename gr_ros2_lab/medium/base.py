@@ -10,20 +10,21 @@ from __future__ import annotations
 import heapq
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
 from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gr_ros2.core.arrays import Floats
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import AirPacket
 from gr_ros2.link.losses import PduLosses
-from gr_ros2.settings.config import ChannelConfig
+from gr_ros2.settings.config import ChannelConfig, replaced
 
 Ints = NDArray[np.int_]
 
@@ -100,6 +101,13 @@ class Surroundings(ABC):
     def begin(self, now: float) -> None:  # noqa: B027 - most do not move
         """A run begins at a time in s, on a clock that went before: robots move from now on."""
 
+    def change(self, sender: int, **settings: Any) -> None:  # noqa: ARG002 - most do not change
+        """Give the channels from a robot to all who hear it other settings, from now on.
+
+        :raises ConfigError: for a value out of range, or a setting that nothing can change here
+        """
+        raise ConfigError(f"{', '.join(settings)}: nothing changes these channels")
+
     @abstractmethod
     def hearers(self, sender: int, now: float) -> Hearers:
         """Those who hear a robot at a time in s: the same object as long as nothing has changed for this robot."""
@@ -129,12 +137,17 @@ class FixedPaths(Surroundings):
         self.robots = len(paths)
         self._paths = [{path.receiver: path for path in heard} for heard in paths]
         self._hearers = [self._of(heard) for heard in paths]
-        self.passes = not any(path.channel.loses_packets or path.delay_s for heard in paths for path in heard)
+        self.passes = all_pass(self._paths)
         hears = np.zeros((self.robots, self.robots), bool)
         for sender, heard in enumerate(self._hearers):
             hears[sender, heard.ids] = True
         # Robots that reach a common one, and robots of which one reaches the other.
         self._near = (hears.astype(np.float32) @ hears.T.astype(np.float32) > 0) | hears | hears.T
+
+    def change(self, sender: int, **settings: Any) -> None:
+        self._paths[sender] = changed_paths(self._paths[sender], settings)
+        self._hearers[sender] = self._of(list(self._paths[sender].values()))
+        self.passes = all_pass(self._paths)
 
     def _of(self, heard: Sequence[RadioPath]) -> Hearers:
         snrs = [inf if path.channel.snr_db is None else path.channel.snr_db for path in heard]
@@ -152,6 +165,19 @@ class FixedPaths(Surroundings):
 
     def near(self, sender: int, now: float) -> NDArray[np.bool_]:  # noqa: ARG002
         return np.asarray(self._near[sender])
+
+
+def all_pass(paths: Iterable[Mapping[int, RadioPath]]) -> bool:
+    """Whether no path drops or delays whole packets."""
+    return not any(path.channel.loses_packets or path.delay_s for heard in paths for path in heard.values())
+
+
+def changed_paths(paths: Mapping[int, RadioPath], settings: Mapping[str, Any]) -> dict[int, RadioPath]:
+    """Paths whose channels have other settings.
+
+    :raises ConfigError: for a value out of range
+    """
+    return {receiver: replace(path, channel=replaced(path.channel, **settings)) for receiver, path in paths.items()}
 
 
 class Transmission(NamedTuple):
@@ -242,6 +268,17 @@ class Medium(ABC):
         self._longest = 0.0
         self._ways: dict[tuple[int, int], tuple[PduLosses | None, float]] = {}
         """What drops whole packets from a sender to a receiver, and by how many s it delays the others."""
+        self._begin_s = 0.0
+
+    def begin(self, now: float) -> None:
+        """A run begins at a time in s, on a clock that went before: robots move, and outages count, from now on."""
+        self._begin_s = now
+        self.around.begin(now)
+
+    def change(self, sender: int, **settings: Any) -> None:
+        """See :meth:`Surroundings.change`."""
+        self.around.change(sender, **settings)
+        self._ways.clear()
 
     def send(self, sender: int, data: bytes, start: float, airtime: float, mcs: int = 0) -> Transmission:
         """Take a packet that starts at ``start`` s and lasts for ``airtime`` s."""
@@ -295,8 +332,8 @@ class Medium(ABC):
         for reception in received:
             receiver, sent, at, packet, snr_db, sinr_db = reception
             pair = sent.sender, receiver
-            losses, delay_s = self._ways.get(pair) or self._way(pair)
-            if losses is not None and not losses.passes(at):
+            losses, delay_s = self.way(pair)
+            if losses is not None and not losses.passes(at - self._begin_s):
                 continue
             if delay_s:
                 at += delay_s
@@ -306,7 +343,10 @@ class Medium(ABC):
         for at, receptions in later.items():
             heapq.heappush(self._due, (at, next(self._order), receptions))
 
-    def _way(self, pair: tuple[int, int]) -> tuple[PduLosses | None, float]:
+    def way(self, pair: tuple[int, int]) -> tuple[PduLosses | None, float]:
+        """What drops whole packets from one robot to another, and by how many s it delays the others."""
+        if (known := self._ways.get(pair)) is not None:
+            return known
         path = self.around.path(*pair)
         losses = PduLosses(path.channel) if path.channel.loses_packets else None
         if losses is not None:

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gr_ros2.core.arrays import Floats
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import ScenarioChannel
-from gr_ros2_lab.medium.base import Hearers, Ints, RadioPath, Surroundings
+from gr_ros2_lab.medium.base import Hearers, Ints, RadioPath, Surroundings, all_pass, changed_paths
 from gr_ros2_lab.medium.propagation import Shadowing, doppler_hz, path_loss_db, snr_over_db
 from gr_ros2_lab.sim.world import World
 
@@ -57,10 +58,10 @@ class Positions(Surroundings):
         world: World | None = None,
     ) -> None:
         self.robots = len(tx_power_dbm)
-        self.passes = not any(path.channel.loses_packets or path.delay_s for heard in paths for path in heard)
         self._channel, self._motion, self._world, self._bandwidth = channel, motion, world, bandwidth
         self._power, self._figure = np.array(tx_power_dbm), np.array(noise_figure_db)
         self._paths = [{path.receiver: path for path in heard} for heard in paths]
+        self.passes = all_pass(self._paths)
         self._reached = [np.array([path.receiver for path in heard], int) for heard in paths]
         self._shadowing: Shadowing | None = None
         if channel.shadowing_db:
@@ -76,6 +77,12 @@ class Positions(Surroundings):
 
     def begin(self, now: float) -> None:
         self._begin_s = now
+
+    def change(self, sender: int, **settings: Any) -> None:
+        if "snr_db" in settings:
+            raise ConfigError("channel.snr_db: levels follow from positions; set channel.from: settings")
+        self._paths[sender] = changed_paths(self._paths[sender], settings)
+        self.passes = all_pass(self._paths)
 
     def path(self, sender: int, receiver: int) -> RadioPath:
         return self._paths[sender][receiver]

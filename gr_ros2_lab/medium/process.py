@@ -1,8 +1,9 @@
 """A medium process: what several links with front end ``zmq`` make of one simulated channel (`gr-ros2 medium`).
 
 It subscribes to what each robot sends, and publishes to each robot what it receives: the sum of all bursts that reach
-it, with their gains, and noise, by :class:`gr_ros2_lab.medium.samples.SampleMedium`. All robots use one channel: bursts
-that overlap at a receiver disturb each other, and a robot hears nothing while it sends.
+it, with their gains, and noise, by :class:`gr_ros2_lab.medium.samples.SampleMedium`. All robots of a configuration use
+one channel: bursts that overlap at a receiver disturb each other, and a robot hears nothing while it sends. A run may
+give each that sends a channel of its own.
 
 *Lock step* (``time: lockstep``): the process tells every robot the time in steps of ``STEP_S``, and goes on when all of
 them have answered that they have sent what begins before. Links take it as their clock. So a machine that is too slow,
@@ -181,11 +182,13 @@ class MediumProcess:
 
     :param clock: s, monotonic
     :param around: who hears whom; None: as the configuration says
+    :param shared: whether all robots use one channel
     :raises ConfigError: for a PHY whose bursts cannot be summed here
     :raises RadioError: when an address cannot be used
     :ivar counted: ``bursts``: from the robots; ``overlapping``: those that began while another robot sent;
         ``malformed``, ``wrong_rate``: refused messages; ``waited``: steps for which a robot was waited for in vain;
         ``unanswered``: times ``GONE_S`` in which a robot sent and did not answer the time
+    :ivar medium: says what reaches whom
     :ivar lost_s: s by which its clock is behind real time, in lock step: robots or this process were late
     """
 
@@ -194,11 +197,13 @@ class MediumProcess:
         config: MediumConfig,
         clock: Callable[[], float] = time.monotonic,
         around: Surroundings | None = None,
+        *,
+        shared: bool = True,
     ) -> None:
         self.config, self._clock = config, clock
         assert config.phy.sample_rate != AUTO
         phy = configured(config.phy, config.packet_len, config.phy.sample_rate)
-        if phy.burst_modem is None:
+        if shared and phy.burst_modem is None:
             raise ConfigError(
                 f"phy {phy.name}: a medium process needs one of this package's modems: ofdm, psk, gfsk, lora"
             )
@@ -206,8 +211,8 @@ class MediumProcess:
         self._said: set[tuple[str, int]] = set()
         self._rate = phy.sample_rate
         self._longest = phy.airtime_samples()
-        self._medium = SampleMedium(
-            around or config.around(), [phy] * len(config.robots), shared=True, seed=config.seed
+        self.medium = SampleMedium(
+            around or config.around(), [phy] * len(config.robots), shared=shared, seed=config.seed
         )
         self._id = int.from_bytes(os.urandom(4), "little")
         self._now = self._handed = 0.0
@@ -327,17 +332,17 @@ class MediumProcess:
         self.counted["bursts"] += 1
         self.counted["overlapping"] += any(until > start for n, until in enumerate(self._busy) if n != number)
         self._busy[number] = max(self._busy[number], end)
-        self._medium.transmit(Transmission(number, self.counted["bursts"], b"", start, end), samples)
+        self.medium.transmit(Transmission(number, self.counted["bursts"], b"", start, end), samples)
 
     def _hand_over(self) -> None:
         """Give every robot what has reached it."""
         for number, link in enumerate(self._links):
-            start, samples = self._medium.received(number, self._now)
-            for first in range(0, len(samples), self._longest):
-                part = samples[first : first + self._longest]
-                at = nan if self.config.time == "real" else start + first / self._rate
-                self._send(link, at, part.astype(SAMPLE, copy=False).tobytes())
-                link.number += 1
+            for start, samples in self.medium.received(number, self._now):
+                for first in range(0, len(samples), self._longest):
+                    part = samples[first : first + self._longest]
+                    at = nan if self.config.time == "real" else start + first / self._rate
+                    self._send(link, at, part.astype(SAMPLE, copy=False).tobytes())
+                    link.number += 1
         self._handed = self._now
 
     def _send(self, link: _Link, at: float, samples: bytes) -> None:

@@ -1,7 +1,7 @@
 """The medium at samples: every receiver gets the sum of the bursts that reach it, and noise.
 
-For the burst modems of this package, which need no flowgraph. Each burst reaches a receiver with the gain, the phase,
-the echoes, the fading, the carrier offset and the clock of its path.
+Each burst reaches a receiver with the gain, the phase, the echoes, the fading, the carrier offset and the clock of its
+path. The burst modems of this package need no flowgraph; receivers elsewhere may be of any PHY with samples.
 
 Invariants: one sample clock for all robots; noise is set from the mean power of the longest packet's burst, as in
 :mod:`gr_ros2.phy.channel`; while a robot sends on a shared channel its receiver gets noise alone; samples that no burst
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gr_ros2.link.events import AirPacket
 from gr_ros2.phy import Phy
-from gr_ros2.phy.burst import BurstModem, DemodulatedPacket
+from gr_ros2.phy.burst import DemodulatedPacket
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2_lab.medium.base import Medium, Reception, Surroundings, Transmission
 from gr_ros2_lab.medium.fading import RayleighFading
@@ -44,23 +44,30 @@ class _Burst:
     :param start: sample at which it begins
     :param packet: what it is a burst of
     :param snr_db: its level, dB; infinite without noise
+    :param amplitude: by how much it is larger than it was sent
     """
 
-    def __init__(self, packet: Transmission, snr_db: float, start: int, samples: Samples) -> None:
+    def __init__(
+        self, packet: Transmission, snr_db: float, start: int, samples: Samples, amplitude: float = 1.0
+    ) -> None:
         self.packet, self.snr_db, self.start, self.samples = packet, snr_db, start, samples
+        self.amplitude = amplitude
         self.end = start + len(samples)
 
 
 class _Ear:
     """One robot's receiver and what is on the air around it."""
 
-    def __init__(self, phy: Phy, modem: BurstModem, noise: np.random.Generator) -> None:
-        self._phy, self._modem, self._receiver = phy, modem, modem.receiver()
+    def __init__(self, phy: Phy, noise: np.random.Generator) -> None:
+        self._phy, self._modem = phy, phy.burst_modem
+        self._receiver = None if self._modem is None else self._modem.receiver()
         self._noise = noise
         self._taps = None if phy.receiver_taps is None else np.asarray(phy.receiver_taps, np.float32)
         self._tail = np.zeros(0 if self._taps is None else len(self._taps) - 1, np.complex64)
         self._power = phy.burst_power()
-        self._lead = modem.preamble_samples + modem.margin + len(self._tail) + _MARGIN
+        self._lead = _MARGIN + len(self._tail)
+        if self._modem is not None:
+            self._lead += self._modem.preamble_samples + self._modem.margin
         self._at = self._fed = 0
         self._coming: list[tuple[int, int, _Burst]] = []
         self._order = count()
@@ -74,6 +81,7 @@ class _Ear:
 
     def hear(self, until: int) -> list[tuple[DemodulatedPacket, _Burst | None]]:
         """The packets that are complete at a sample, and the burst of each."""
+        assert self._receiver is not None
         begin, samples = self.received(until)
         skipped = begin - self._fed
         self._fed += len(samples)
@@ -87,6 +95,7 @@ class _Ear:
         """
         if len(self.bursts) < 2:
             return self.bursts[0] if self.bursts else None
+        assert self._modem is not None
         length = self._modem.rates[packet.mcs].samples_of(len(packet.data))
         first = packet.end + skipped - self._phy.lag - length
         return min(self.bursts, key=lambda burst: (abs(burst.start - first), -burst.snr_db))
@@ -95,6 +104,11 @@ class _Ear:
         """Whether no burst reaches this receiver between the last sample that it got and this one."""
         coming = bool(self._coming) and self._coming[0][0] < until
         return not coming and all(burst.end <= self._at for burst in self.bursts)
+
+    def over(self, until: int) -> int:
+        """Where the last of those bursts ends that are over at a sample; the last sample that it got where none is."""
+        ends = [burst.end for burst in self.bursts] + [burst.end for _, _, burst in self._coming]
+        return max((end for end in ends if end <= until), default=self._at)
 
     def received(self, until: int) -> tuple[int, Samples]:
         """The samples that reach the receiver, up to one: the first of them, and its number. Where no burst does, there
@@ -156,33 +170,54 @@ class SampleMedium(Medium):
         phy = self._phys[sender]
         modem = phy.burst_modem
         assert modem is not None
-        self.transmit(sent, modem.rates[mcs].modulate(data))
+        self.transmit(sent, modem.rates[mcs].modulate(data), elsewhere=False)
         return sent
 
-    def transmit(self, sent: Transmission, burst: Samples) -> None:
-        """A burst starts, and reaches all who hear its sender."""
+    def transmit(self, sent: Transmission, burst: Samples, *, elsewhere: bool = True) -> None:
+        """A burst starts, and reaches all who hear its sender.
+
+        :param elsewhere: whether the receivers are: a packet that its path drops is no burst then, one that it delays a
+            later one
+        """
         sender, start, phy = sent.sender, sent.start, self._phys[sent.sender]
         first = round(start * phy.sample_rate)
         heard = self.hearers(sent)
         rows = (heard.ids.tolist(), heard.snr_db.tolist(), heard.shift_hz.tolist())
         for receiver, snr_db, shift_hz in zip(*rows, strict=True):
+            losses, delay_s = self.way((sender, receiver)) if elsewhere else (None, 0.0)
+            if losses is not None and not losses.passes(sent.end - self._begin_s):
+                continue
             channel = self.around.path(sender, receiver).channel
             phy.check_channel(channel)
-            samples = self._heard(_through(burst, channel, start, phy.sample_rate), channel, snr_db, shift_hz)
-            self._ear(receiver, sender).add(_Burst(sent, snr_db, first, samples))
+            amplitude = _amplitude(channel, snr_db)
+            samples = self._heard(_through(burst, channel, start, phy.sample_rate), channel, amplitude, shift_hz)
+            begin = first + round(delay_s * phy.sample_rate)
+            self._ear(receiver, sender).add(_Burst(sent, snr_db, begin, samples, amplitude))
         if self.shared:
             self._ear(sender, sender).deaf.append((first, first + len(burst)))
 
-    def received(self, receiver: int, until: float) -> tuple[float, Samples]:
-        """The samples that reach a robot on the shared channel up to a time in s, and the time of the first; none while
-        nothing is on the air around it. For receivers elsewhere."""
-        ear, rate = self._ear(receiver, receiver), self._phys[receiver].sample_rate
+    def received(self, receiver: int, until: float) -> list[tuple[float, Samples]]:
+        """The samples that reach a robot up to a time in s, in pieces, each with the time of its first; none while
+        nothing is on the air around it. For receivers elsewhere.
+
+        A robot there has one receiver. So bursts on channels of their own come one after the other, each whole once it
+        is over, and as strong as they were sent.
+        """
+        rate = self._phys[receiver].sample_rate
         last = round(until * rate)
-        if ear.silent(last):
-            ear.forget(last)
-            return until, np.zeros(0, np.complex64)
-        first, samples = ear.received(last)
-        return first / rate, samples
+        if self.shared:
+            ear = self._ear(receiver, receiver)
+            if ear.silent(last):
+                ear.forget(last)
+                return []
+            first, samples = ear.received(last)
+            return [(first / rate, samples)]
+        found = []
+        for ear in [ear for (hearer, _), ear in self._ears.items() if hearer == receiver]:
+            first, samples = ear.received(ear.over(last))
+            if len(samples):
+                found.append((first / rate, samples / np.float32(ear.bursts[-1].amplitude)))
+        return sorted(found, key=lambda piece: piece[0])
 
     def outcome(self, sent: Transmission) -> Iterator[Reception]:
         phy = self._phys[sent.sender]
@@ -210,20 +245,21 @@ class SampleMedium(Medium):
         key = receiver, -1 if self.shared else sender
         ear = self._ears.get(key)
         if ear is None:
-            phy = self._phys[receiver]
-            modem = phy.burst_modem
-            assert modem is not None
             noise = np.random.default_rng([self._seed, 2, receiver, key[1] + 1])
-            ear = self._ears[key] = _Ear(phy, modem, noise)
+            ear = self._ears[key] = _Ear(self._phys[receiver], noise)
         return ear
 
-    def _heard(self, samples: Wide, channel: ChannelConfig, snr_db: float, shift_hz: float) -> Samples:
+    def _heard(self, samples: Wide, channel: ChannelConfig, amplitude: float, shift_hz: float) -> Samples:
         """A burst with the level, the carrier and the phase with which it reaches a receiver."""
-        gain = sum(abs(tap) ** 2 for tap in channel.taps)
-        amplitude = 1.0 if snr_db == math.inf else math.sqrt(10 ** (snr_db / 10) / gain)
         offset = channel.frequency_offset + shift_hz / self._phys[0].sample_rate
         angle = self._phases.uniform(0, 2 * math.pi) + 2 * math.pi * offset * np.arange(len(samples))
         return np.asarray(samples * (amplitude * np.exp(1j * angle)), np.complex64)
+
+
+def _amplitude(channel: ChannelConfig, snr_db: float) -> float:
+    """Of a burst that reaches a receiver at a level, before its echoes are added."""
+    gain = sum(abs(tap) ** 2 for tap in channel.taps)
+    return 1.0 if snr_db == math.inf else math.sqrt(10 ** (snr_db / 10) / gain)
 
 
 def _through(burst: Samples, channel: ChannelConfig, start: float, rate: float) -> Wide:

@@ -7,11 +7,10 @@ all messages that were submitted at such times.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from gr_ros2.core.arrays import Floats
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.lateness import Lateness
 from gr_ros2_lab.record.result import LatenessResult
@@ -20,25 +19,6 @@ from gr_ros2_lab.record.trace import Trace
 AFTER_S = 1.0
 """s. After this time, queues that became full in a late moment are empty again, and incomplete messages have been given
 up."""
-
-
-def modem_lateness(passed_at: Sequence[float], received_at: Floats) -> Lateness:
-    """How much longer packets took from the gate to the sink than the fastest packet.
-
-    :param passed_at: s, when each packet of a source passed the gate
-    :param received_at: s, when each packet reached the sink, NaN for packets that did not. If the two lengths differ,
-        the rest of the longer one is ignored
-    """
-    count = min(len(passed_at), len(received_at))
-    passed, received = np.array(passed_at[:count]), received_at[:count]
-    here = ~np.isnan(received)
-    passed, received = passed[here], received[here]
-    lateness = Lateness()
-    if len(passed):
-        due = passed + (received - passed).min()
-        for n in np.argsort(received, kind="stable"):
-            lateness.happened(float(due[n]), float(received[n]))
-    return lateness
 
 
 def lateness_result(parts: Mapping[str, Iterable[Lateness]], begin: float, end: float, trace: Trace) -> LatenessResult:

@@ -12,7 +12,6 @@ from dataclasses import asdict
 from math import inf
 from typing import Any
 
-from gr_ros2.core.arrays import Floats
 from gr_ros2.link.events import Accepted, AirKind, Delivered, Received, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.observe.positions import PositionReader, position_reader
 from gr_ros2.observe.result import AgeResult, LatencyResult, TopicResult
@@ -137,11 +136,6 @@ class Recorder:
             "air_span_s": self._air_to - self._air_from + (mean or 0) if self._lengths else 0.0,
             "bytes_per_message": sent_bytes / self._delivered if self._delivered else None,
         }
-
-    def received_at(self, src_id: int) -> Floats:
-        """s on the run's clock, when each packet of a source reached the sink; NaN for packets that did not. Empty for
-        a source that it does not hear."""
-        return self._packets.get(src_id, PacketLog()).received_at()
 
     def trace(self, t0: float, t_end: float, published_as: Mapping[str, str]) -> Trace:
         """Every message, packet and position. To be called after :meth:`finish`.

@@ -28,7 +28,7 @@ RESULT_FILE = "result.json"
 class LatenessResult:
     """How late the computer was in a run that follows the wall clock; see :mod:`gr_ros2_lab.record.lateness`.
 
-    :param worst_s: greatest lateness, s, by part: ``threads``, ``gate``, ``modem``
+    :param worst_s: greatest lateness, s, by part: ``threads``, ``gate``
     :param moments: number of times that a part was late by 50 ms or more
     :param share: share of the run's time that these moments cover
     :param lost: messages submitted that did not arrive and are not in flight

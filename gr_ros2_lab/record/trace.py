@@ -126,10 +126,6 @@ class PacketLog:
         """The packet of this number, from 0, reached the sink."""
         self._t_received[number] = now
 
-    def received_at(self) -> Floats:
-        """s on the run's clock, when each packet reached the sink; NaN for packets that did not."""
-        return _copied(self._t_received, len(self._t_received))
-
     def columns(self, src_id: int, name_of: Callable[[int], str], t0: float) -> dict[str, Any]:
         """The columns of table `packets`, with topic names.
 

@@ -154,10 +154,11 @@ class RunRecords:
         clock: Callable[[], float] = time.monotonic,
         sources: Mapping[int, SendingBlock] | None = None,
         links: Sequence[LiveLink] = (),
+        alarms: Callable[[], Sequence[str]] = tuple,
     ) -> LiveRun:
         """The run as its observers see it.
 
-        :param sources, links: see :class:`LiveRun`; a run in simulated time has none
+        :param sources, links, alarms: see :class:`LiveRun`; a run in simulated time has none
         """
         return LiveRun(
             name=self._scenario.name,
@@ -174,6 +175,7 @@ class RunRecords:
             fates=self.recorder.ledger.fates,
             clock=clock,
             airtime=self._phy.airtime if self._phy.has_airtime else None,
+            alarms=alarms,
             team=None if self.team is None else self.team.view,
             heard=None
             if len(self._scenario.all_robots) == 2  # which share a recorder

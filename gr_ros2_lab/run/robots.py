@@ -52,13 +52,6 @@ def surroundings(scenario: Scenario, sample_rate: float, task: TaskRun | None = 
     :param task: moves them; None, where the scenario has one: as they move if they hear nothing
     :raises ConfigError: where levels follow from positions that nothing tells, or from what no link in real time has
     """
-    if not scenario.simulated:
-        shares = scenario.duplex == "half"
-        if scenario.channel.from_positions and not shares:
-            raise ConfigError(
-                "channel.from: time = 'real' has that with duplex = 'half' alone; set that, or time to packets or "
-                "samples, or leave it settings"
-            )
     robots = scenario.all_robots
     paths, levels = [robot.paths for robot in robots], [robot.levels for robot in robots]
     if not scenario.channel.from_positions:

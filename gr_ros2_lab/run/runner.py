@@ -203,10 +203,11 @@ class _Run:
             from gr_ros2_lab.run.live import LiveRobots  # only a run in real time needs GNU Radio
 
             self.live = LiveRobots(scenario, robots, registry, phy, around, records=self.records, stack=stack)
-            self.medium, self.clock = self.live.medium, self.live.medium.clock
+            self.clock = self.live.clock
             if out is not None:
                 self.listener = self._listen(make_folder(out), stack)
-            run_observers.run_started(self.records.live_run(self.clock, self.live.sources, self.medium.links))
+            live = self.live
+            run_observers.run_started(self.records.live_run(self.clock, live.sources, live.links, live.alarms))
             if scenario.bag_path is None:
                 fleet = self.task or Fleet(scenario.sim)
                 fleet.drive_ahead(scenario.duration_s)
@@ -233,13 +234,13 @@ class _Run:
         wall = time.monotonic()
         begin = end = self.clock()
         try:
-            self.medium.start()
+            self.live.start()
             self._wait_matched(on_progress)
             begin = end = self.clock()
             self.pulse.start()
             if self.task is not None:
                 self.task.begin(begin)
-            self.medium.run_began(begin)
+            self.live.began()
             (self.sim or self.live.robots[0].graph).start()
             while not self._submitted(begin):
                 time.sleep(_POLL_S)
@@ -256,7 +257,7 @@ class _Run:
         drained = not self.interrupted and self.live.empty(bool(self.records.unresolved()))
         self.pulse.close()
         stopped = self.clock()
-        self.medium.stop()
+        self.live.stop()
         self.run_observers.settle()
         self.records.check()
         self._check_alone()
@@ -269,7 +270,7 @@ class _Run:
             end=end,
             played=played,
             drained=drained,
-            channels=self.medium.channels,
+            channels=self.live.channels,
             began=wall,
             lateness=partial(self._lateness, begin, stopped),
             interrupted=self.interrupted,
@@ -279,7 +280,7 @@ class _Run:
 
     def _lateness(self, begin: float, end: float, trace: Trace) -> LatenessResult | None:
         """How late the computer was; None where the links wait for the computer."""
-        parts = self.medium.lateness(self.records)
+        parts = self.live.lateness()
         if parts is None:
             return None
         return lateness_result({"threads": [self.pulse.lateness], **parts}, begin, end, trace)
@@ -340,8 +341,7 @@ class _Run:
             own = {} if self.sim is None else self.sim.published
             self._compare(source.middleware, sent, own, own.keys())
         for robot in self.live.recorded:
-            assert robot.sink is not None
-            came_out = {name: topic["delivered"] for name, topic in robot.sink.stats()["topics"].items()}
+            came_out = {name: topic["delivered"] for name, topic in robot.link.sink.stats()["topics"].items()}
             self._compare(robot.graph, heard, came_out, robot.heard)
 
     def _compare(
@@ -357,7 +357,7 @@ class _Run:
 
     def _report(self, on_progress: Callable[[Progress], None] | None, begin: float) -> None:
         self.records.check()
-        self.medium.check()
+        self.live.check()
         if on_progress is not None:
             sent, delivered = self.records.recorder.progress()
             now = Progress(self.clock() - begin, self.scenario.duration_s, sent, delivered, self.live.graphs)

@@ -61,9 +61,9 @@ class Experiment:
     repetitions: Annotated[int, Field(ge=1, le=10_000)] = 1
     """runs, with seeds seed, seed + 1, ...; in a sweep of every cell"""
     time: Time = "real"
-    """what the clock of a run follows: the wall clock; or simulated time, of samples, or of packets alone, which are
-    lost as measured (docs/explanation/simulated-time.md). Simulated time has no ROS graphs, so `graph`, but for its
-    namespace, and `publish.depth` have no effect there"""
+    """what the clock of a run follows: the wall clock, as far as the computer keeps up; or simulated time, of samples,
+    or of packets alone, which are lost as measured (docs/explanation/simulated-time.md). Simulated time has no ROS
+    graphs, so `graph`, but for its namespace, and `publish.depth` have no effect there"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -203,16 +203,10 @@ class Scenario(Experiment, Traffic, AirConfig):
                     f"robots: what robot {sender.robot_id} sends comes out twice on one ROS graph; set own_domains: "
                     "true, or another graph.domain_id for each"
                 )
-        if self.duplex == "full":
-            return
-        if not PHY.load(self.phy.name).has_samples:
+        if self.duplex == "half" and not PHY.load(self.phy.name).has_samples:
             raise ValueError(
                 f"robots: phy {self.phy.name} has no samples, which they share in real time; choose another"
             )
-        if self.paper is not None:
-            raise ValueError("paper: on one channel in real time robots need version 1; leave it out")
-        if self.channel.loses_packets or any(path.loses_packets for path in self.paths):
-            raise ValueError("channel: bursts cross as samples, so none is dropped whole; leave these settings out")
 
     @cached_property
     def all_robots(self) -> tuple[RobotSettings, ...]:

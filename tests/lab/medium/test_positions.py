@@ -166,10 +166,6 @@ def test_a_recording_tells_places_by_its_odometry() -> None:
         (["channel={from: positions}", "gains_db=-100"], "gains_db: levels follow from positions"),
         (["channel={from: positions}", "phy={name: direct}"], "phy direct has no samples, so no level"),
         (["gains_db=-100", "phy={name: direct}"], "gains_db: phy direct has no samples, so no level"),
-        (
-            ["channel={from: positions}", "medium=exclusive", "time=real", "duplex=full"],
-            "channel.from: time = 'real' has that with duplex = 'half' alone",
-        ),
         (["channel={from: positions}", "sim.robots=1"], "/robot_2 is none of the 1 simulated robots, so nobody knows"),
     ],
 )

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from math import nan
 
-import numpy as np
 import pytest
 
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.lateness import Lateness
-from gr_ros2_lab.record.lateness import AFTER_S, lateness_result, modem_lateness
+from gr_ros2_lab.record.lateness import AFTER_S, lateness_result
 from gr_ros2_lab.record.ledger import TopicLedger
 from gr_ros2_lab.record.trace import Trace, make_trace
 
@@ -64,12 +63,3 @@ def test_what_is_late_in_several_parts_at_once_is_one_moment() -> None:
     assert found.moments == 3
     assert found.share == pytest.approx((0.5 + 1.5 + 0.2) / 10)
     assert found.worst_s == {"threads": 1.0, "gate": 1.5}
-
-
-def test_a_modem_is_late_against_its_own_quickest_packet() -> None:
-    passed = [1.0, 2.0, 3.0, 4.0, 5.0]
-    received = np.array([1.3, 2.2, nan, 4.5])  # the fifth is still on its way
-    found = modem_lateness(passed, received)
-    assert found.worst == pytest.approx(0.3)
-    assert found.moments == [pytest.approx((1.2, 1.3)), pytest.approx((4.2, 4.5))]
-    assert modem_lateness([], received).moments == modem_lateness(passed, np.full(5, nan)).moments == []

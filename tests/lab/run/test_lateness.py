@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2_lab.record.result import read_result
+from gr_ros2_lab.record.result import Result, read_result
 from gr_ros2_lab.record.trace import read_trace
 from gr_ros2_lab.report.explain import explanation
 from gr_ros2_lab.run.pulse import PERIOD_S, Pulse
@@ -40,7 +40,7 @@ def progress(now):
         say("stop me")
         sys.stdin.readline()
 
-run_scenario(load_scenario("paper-ofdm-paced", overrides, duration_s=1.0), out, progress)
+run_scenario(load_scenario(sys.argv[3], overrides, duration_s=1.0), out, progress)
 """
 
 
@@ -48,14 +48,12 @@ def state(pid: int) -> str:
     return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
 
 
-@pytest.mark.slow
-@pytest.mark.real_time
-def test_a_process_that_was_stopped_is_named_with_how_long(tmp_path: Path) -> None:
-    out = tmp_path / "run"
+def stopped(scenario: str, out: Path) -> Result:
+    """The result of a run whose process stood still for a while."""
     source, sink = free_domains()[:2]
     overrides = [f"robots.0.graph.domain_id={source}", f"robots.1.graph.domain_id={sink}"]
     with subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, json.dumps(overrides), str(out)],
+        [sys.executable, "-c", PROGRAM, json.dumps(overrides), str(out), scenario],
         cwd=ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -71,15 +69,32 @@ def test_a_process_that_was_stopped_is_named_with_how_long(tmp_path: Path) -> No
         process.stdin.write("\n")
         process.stdin.close()
         assert process.wait() == 0
-    result = read_result(out)
+    return read_result(out)
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_a_process_that_was_stopped_is_named_with_how_long(tmp_path: Path) -> None:
+    result = stopped("paper-direct", tmp_path)
     late = result.lateness
     assert late is not None
-    assert set(late.worst_s) == {"threads", "gate", "modem"}
+    assert set(late.worst_s) == {"threads"}
     assert late.worst_s["threads"] >= STOPPED_S - PERIOD_S
     assert late.moments >= 1
     assert 0 < late.share <= 1
     assert late.lost_after <= late.lost <= late.sent >= late.sent_after
-    assert explanation(result, read_trace(out))[0].startswith("The computer did not keep up with the clock: ")
+    first = explanation(result, read_trace(tmp_path))[0]
+    assert first.startswith("The computer did not keep up with the clock: ")
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_robots_with_a_radio_wait_for_a_process_that_was_stopped(tmp_path: Path) -> None:
+    result = stopped("paper-ofdm-paced", tmp_path)
+    assert result.lateness is None
+    assert result.counters["medium"]["slow_s"] >= STOPPED_S - 2 * PERIOD_S
+    assert all(topic.delivered == topic.sent for topic in result.topics)
+    assert explanation(result, read_trace(tmp_path))[0].startswith("The computer carried 2 robots at ")
 
 
 def test_a_pulse_measures_from_its_start_to_its_end() -> None:

@@ -87,9 +87,7 @@ def test_robots_that_drive_begin_to_do_so_with_the_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["paper={}", "medium=exclusive"], "on one channel in real time robots need version 1"),
         (["phy={name: modem, options: {bit_rate: 1e5}}"], "phy modem has no samples"),
-        (["channel.packet_loss=0.1"], "bursts cross as samples, so none is dropped whole"),
         (["own_domains=false"], "what robot 1 sends comes out twice on one ROS graph"),
         (["own_domains=false", "duplex=full", "medium=exclusive"], "what robot 1 sends comes out twice"),
     ],
@@ -111,7 +109,7 @@ def test_robots_on_channels_of_their_own_hear_whom_they_can_and_send_meanwhile(t
     assert heard == [{2}, {1, 3}, {2}]
     assert min(topic.delivered for topics in _tables(result) for topic in topics) >= 0.9 * 20
     assert result.phy["channels"] == 3
-    assert result.lateness is not None
+    assert result.counters["medium"]["bursts"] >= result.packets["sent"]
     assert len(result.counters["robots"]) == 2
 
 
@@ -120,17 +118,18 @@ def test_robots_on_channels_of_their_own_hear_whom_they_can_and_send_meanwhile(t
 @pytest.mark.parametrize(
     ("overrides", "arrives"),
     [
-        (["paper={}", "phy.options.detection_threshold=stock"], False),
-        (["phy={name: direct}", "gains_db=null"], True),
+        (["duplex=full", "medium=exclusive", "paper={}", "phy.options.detection_threshold=stock"], False),
+        (["duplex=full", "medium=exclusive", "phy={name: direct}", "gains_db=null"], True),
+        (["paths=[{from: 1, delay_s: 0.02}]"], True),
     ],
-    ids=["version 0, stock receiver", "version 1, no radio"],
+    ids=["version 0, stock receiver", "version 1, no radio", "version 1, one channel"],
 )
 def test_what_channels_lose_between_robots_in_real_time_is_repaired_by_version_1(
     tmp_path: Path, overrides: list[str], arrives: bool
 ) -> None:
     """A computer that is too slow has time to receive all of it. Robots with version 1 go on reporting: some of that is
     still on its way when the run ends."""
-    lossy = ["robots=2", "duration_s=1", "drain_s=60", "duplex=full", "medium=exclusive", "channel.packet_loss=0.2"]
+    lossy = ["robots=2", "duration_s=1", "drain_s=60", "channel.packet_loss=0.2"]
     run_scenario(load_scenario("team", [*LIVE, *lossy, *overrides]), tmp_path)
     result = read_result(tmp_path)
     lost = sum(counted["channel"]["packet_loss"] for counted in (result.counters, result.counters["back"]))
@@ -141,11 +140,14 @@ def test_what_channels_lose_between_robots_in_real_time_is_repaired_by_version_1
     assert all(topic.delivered == topic.sent for topic in result.topics) == arrives
 
 
-def test_a_channel_of_its_own_that_nobody_hears_is_refused_in_real_time() -> None:
-    gains = "[[null, null, null], [-90, null, -90], [null, -90, null]]"
-    scenario = load_scenario("team", [*LIVE, "duplex=full", "medium=exclusive", f"gains_db={gains}"])
-    with pytest.raises(ConfigError, match=r"^gains_db: nobody hears /robot_1"):
-        run_scenario(scenario)
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_where_robots_are_decides_who_hears_them_on_channels_of_their_own_too(tmp_path: Path) -> None:
+    """Robot 1 is too quiet for anybody."""
+    placed = ["gains_db=null", "channel={from: positions}", "robots=[{tx_power_dbm: -150}, {}, {}]"]
+    run_scenario(load_scenario("team", [*LIVE, *placed, "duplex=full", "medium=exclusive", "duration_s=2"]), tmp_path)
+    tables = _tables(read_result(tmp_path))
+    assert {topic.src_id: topic.delivered > 0 for topics in tables for topic in topics} == {1: False, 2: True, 3: True}
 
 
 def _tables(result: Result) -> list[tuple[TopicResult, ...]]:
