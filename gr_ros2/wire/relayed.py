@@ -30,9 +30,7 @@ bytes 3..6    number, and
 byte 7        place of the newest message of this topic that has come with all before it
 ```
 
-Ages are floating-point numbers of eight bits in steps of ``AGE_STEP_S``: c < 16 is c steps, and any other c is
-(16 + c mod 16) * 2^(c div 16 - 1) steps. So an age is exact to 10 ms or to 1 part in 16. 255 is an age that is greater
-or unknown, or no limit. An age is rounded up and a limit down, at every hop: nothing seems younger than it is.
+Ages are codes of :mod:`gr_ros2.wire.ages`: an age is rounded up and a limit down, at every hop.
 
 Invariants: reading raises nothing but a named WireError; every value has one encoding; no message is written younger
 than it is.
@@ -40,21 +38,17 @@ than it is.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
-from math import inf
 from struct import Struct
 from struct import error as struct_error
 from typing import NamedTuple
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
+from gr_ros2.wire.ages import NO_AGE, age_in_words
 from gr_ros2.wire.format import varint
 from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC, read_varint
 
 MOST_HOPS = 31
-AGE_STEP_S = 0.01
-NO_AGE = 255
-"""Code of an age that is greater than all others or unknown, and of no limit."""
 FIRST_PLACE, PLACES = 128, 128
 """Messages that their origin hands on have places that no entry has, one after the other, and again from the first."""
 RECEIPT_TOPIC = TABLE_TOPIC
@@ -64,8 +58,6 @@ RELAYED_LEN = _head.size
 """Bytes in front of a message for everybody. One for a single robot has one more."""
 _CODED, _ADDRESSED, _FOLLOWS = 0x80, 0x40, 0x20
 _MOST_BACK = (1 << 28) - 1
-_STEPS = [code if code < 16 else (16 + code % 16) << (code // 16 - 1) for code in range(NO_AGE)]
-"""The ages for which codes stand, in steps."""
 
 
 class Relayed(NamedTuple):
@@ -106,28 +98,8 @@ class Relayed(NamedTuple):
         after = "" if self.after is None else " after {}.{}".format(*self.after)
         return (
             f"robot {self.origin}'s (boot ends in {self.start:04x}) topic {self.topic_id}{to}, from its packet "
-            f"{self.number}.{self.place}{after}, hop {self.hops}, {_words(self.age)} old"
+            f"{self.number}.{self.place}{after}, hop {self.hops}, {age_in_words(self.age)} old"
         )
-
-
-def age_code(age_s: float) -> int:
-    """The code of an age in s; what it stands for is not less."""
-    return bisect_left(_STEPS, age_s / AGE_STEP_S)
-
-
-def limit_code(limit_s: float) -> int:
-    """The code of the age in s at which a message is of no more use, infinite for none; what it stands for is not
-    greater."""
-    return NO_AGE if limit_s == inf else max(bisect_right(_STEPS, limit_s / AGE_STEP_S) - 1, 0)
-
-
-def age_of(code: int) -> float:
-    """The age in s for which a code stands; infinite for ``NO_AGE``."""
-    return inf if code == NO_AGE else _STEPS[code] * AGE_STEP_S
-
-
-def _words(code: int) -> str:
-    return f"more than {age_of(NO_AGE - 1):g} s" if code == NO_AGE else f"{age_of(code):g} s"
 
 
 def write_relayed(message: Relayed) -> bytes:

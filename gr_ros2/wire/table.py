@@ -11,8 +11,8 @@ from typing import NamedTuple
 from zlib import crc32
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError, VersionError
+from gr_ros2.wire.ages import NO_AGE, age_of
 from gr_ros2.wire.format import BROADCAST, QOS_NAMES
-from gr_ros2.wire.relayed import NO_AGE, age_of
 
 _FORMAT = 1
 _QOS, _RELIABLE, _LATCHED, _FRESH, _ADDRESSED, _DEADLINE = 3, 4, 8, 16, 32, 64

@@ -9,14 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import EncodeError, WireError
+from gr_ros2.wire.ages import AGE_STEP_S, NO_AGE, age_code, age_of, limit_code
 from gr_ros2.wire.relayed import (
-    AGE_STEP_S,
     MOST_HOPS,
-    NO_AGE,
     Relayed,
-    age_code,
-    age_of,
-    limit_code,
     read_carried,
     read_relayed,
     write_carried,

@@ -22,11 +22,9 @@ from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, SealMode, subkey
 from gr_ros2.wire import v1
+from gr_ros2.wire.ages import age_code, age_of, limit_code
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.relayed import (
-    age_code,
-    age_of,
-    limit_code,
     read_carried,
     read_receipts,
     read_relayed,

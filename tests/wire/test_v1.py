@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from gr_ros2.core.errors import EncodeError, WireError
 from gr_ros2.wire import is_sealed, v1
+from gr_ros2.wire.ages import NO_AGE
 from gr_ros2.wire.control import About, Ask, Heard, Hello, Newest, Ping, Report
 from gr_ros2.wire.mac_block import MOST_LEN
-from gr_ros2.wire.relayed import NO_AGE
 from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 from gr_ros2.wire.v1 import Header, PacketV1, Part, RepairHeader, decode, encode
 

@@ -30,6 +30,7 @@ from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopics
 from gr_ros2.relay.gain import Gains
 from gr_ros2.relay.rooms import Rooms
 from gr_ros2.relay.routes import Routes
+from gr_ros2.wire.ages import age_code, limit_code
 from gr_ros2.wire.relayed import (
     FIRST_PLACE,
     MOST_HOPS,
@@ -37,8 +38,6 @@ from gr_ros2.wire.relayed import (
     RECEIPT_TOPIC,
     Receipt,
     Relayed,
-    age_code,
-    limit_code,
     write_carried,
     write_receipts,
 )

@@ -20,7 +20,7 @@ from gr_ros2.relay.gain import EXPIRES_S
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, options_of
-from gr_ros2.wire.relayed import NO_AGE, age_of
+from gr_ros2.wire.ages import NO_AGE, age_of
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST
 

@@ -46,6 +46,7 @@ from gr_ros2.relay.in_order import InOrder, Kept, Name
 from gr_ros2.relay.rooms import Rooms
 from gr_ros2.settings.registry import CALLS_TYPE
 from gr_ros2.wire import QOS_DEFAULT
+from gr_ros2.wire.ages import age_code, age_of
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import NOBODY, Block
 from gr_ros2.wire.relayed import (
@@ -54,8 +55,6 @@ from gr_ros2.wire.relayed import (
     RELAYED_LEN,
     Receipt,
     Relayed,
-    age_code,
-    age_of,
     read_carried,
     read_receipts,
     read_relayed,

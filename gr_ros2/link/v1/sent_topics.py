@@ -19,7 +19,7 @@ from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import CALLS_TYPE, Topic
 from gr_ros2.wire import QOS_BULK
-from gr_ros2.wire.relayed import NO_AGE, age_code
+from gr_ros2.wire.ages import NO_AGE, age_code
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, RELAYED_TOPIC, TABLE_TOPIC
 

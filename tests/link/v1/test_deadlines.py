@@ -10,7 +10,7 @@ from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire.relayed import age_of
+from gr_ros2.wire.ages import age_of
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 from tests.link.v1.test_ages import MODES, absent
 from tests.link.v1.test_relaying import Line, robot

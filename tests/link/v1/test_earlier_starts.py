@@ -8,7 +8,11 @@ from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.relaying import FAR_S, FORGET_S
 from gr_ros2.link.v1.sealing import SealMode
-from gr_ros2.wire.relayed import Relayed, age_code, write_relayed
+from gr_ros2.wire.ages import age_code
+from gr_ros2.wire.relayed import (
+    Relayed,
+    write_relayed,
+)
 from gr_ros2.wire.v1 import RELAYED_TOPIC
 from tests.link.v1.air import Robot
 from tests.link.v1.test_ages import MODES, absent, relaying_of
