@@ -23,7 +23,7 @@ from gr_ros2.mac import Slots
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import v1
-from gr_ros2.wire.control import ENCRYPTS, About, Ask, Control, Heard, Hello, Newest, Ping, Report
+from gr_ros2.wire.control import ENCRYPTS, About, Ask, Control, Heard, Hello, Newest, Ping, Report, Waited
 from gr_ros2.wire.mac_block import MAP_SLOTS, Block, write_block
 from gr_ros2.wire.relayed import MOST_HOPS, PLACES, Receipt, Relayed, write_carried, write_receipts, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, write_table
@@ -196,6 +196,7 @@ def _control(script: Script, echo: bytes) -> Control:
         lambda: About(script.number(), 1, 2, script.bytes(20)),
         lambda: Newest(script.pick(_ROBOTS), script.byte(), script.pick(_TOPICS), script.number()),
         lambda: Hello(script.byte(), script.byte(), script.byte(), script.byte()),
+        lambda: Waited(bytes([script.byte() for _ in range(1 + script.byte() % 4)])),
     ]
     return script.pick(kinds)()
 

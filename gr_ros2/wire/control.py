@@ -10,8 +10,9 @@ from struct import error as struct_error
 from typing import NamedTuple
 
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
+from gr_ros2.wire.ages import age_in_words, age_of
 
-_HELLO, _ASK, _REPORT, _HEARD, _PING, _ABOUT, _NEWEST = 0xF8, 0xF9, 0xFA, 0xFB, 0xFC, 0xFD, 0xFE
+_WAITED, _HELLO, _ASK, _REPORT, _HEARD, _PING, _ABOUT, _NEWEST = range(0xF7, 0xFF)
 
 _heard = Struct(">B4sH")
 _hello = Struct(">QIBI")
@@ -36,6 +37,8 @@ ABOUT_LEN = 2 + _about.size
 """Bytes without its text."""
 NEWEST_LEN, WHOLE_LEN = 2 + _newest.size, 2 + _whole.size
 """Bytes of the newest message of a topic, and of one up to which all are there."""
+WAITED_LEN = 2
+"""Bytes beside the ages."""
 HELD_STEP_S = 1e-4
 ECHO_LEN = 4
 
@@ -220,12 +223,31 @@ class Newest(NamedTuple):
         )
 
 
+class Waited(NamedTuple):
+    """For how long messages that begin in this packet have waited at the robot that made them.
+
+    :param ages: of the messages and fragments of the packet, in their order, the code of how long each has waited; 0
+        where that is not told, as of all behind the last one
+    """
+
+    ages: bytes
+
+    def age_s(self, place: int) -> float:
+        """How long the message at a place among the entries has waited, s; infinite for longer than can be told."""
+        return age_of(self.ages[place]) if place < len(self.ages) else 0.0
+
+    def describe(self) -> str:
+        """The entry in words."""
+        told = [f"entry {place} for {age_in_words(code)}" for place, code in enumerate(self.ages) if code]
+        return f"waited, {', '.join(told)}" if told else "waited, none"
+
+
 def length_of(newest: Newest) -> int:
     """Bytes of an entry."""
     return NEWEST_LEN if newest.place is None else WHOLE_LEN
 
 
-Control = Hello | Ask | Report | Heard | Ping | About | Newest
+Control = Hello | Ask | Report | Heard | Ping | About | Newest | Waited
 
 
 def reportable(snr_db: float) -> float:
@@ -260,6 +282,10 @@ def write_control(entry: Control) -> bytes:
             name, data = _PING, _ping.pack(robot, number, flags, arrived, held, clock_us, snr)
         elif isinstance(entry, Newest):
             name, data = _NEWEST, _newest.pack(*entry[:4]) if entry.place is None else _whole.pack(*entry)
+        elif isinstance(entry, Waited):
+            if not entry.ages:
+                raise EncodeError(f"{entry}: it tells of no message")
+            name, data = _WAITED, entry.ages
         elif isinstance(entry, About):
             name, data = _ABOUT, _about.pack(*entry[:3]) + entry.text
         else:
@@ -331,6 +357,10 @@ def _read_exchange(name: int, body: bytes, start: int, stop: int) -> Control | N
         if size not in (_newest.size, _whole.size):
             raise EntryBoundsError(f"a note of the newest message, of {size} bytes")
         return Newest(*(_newest if size == _newest.size else _whole).unpack_from(body, start))
+    if name == _WAITED:
+        if not size:
+            raise EntryBoundsError("a note of how long messages have waited, of no bytes")
+        return Waited(body[start:stop])
     if name == _ABOUT:
         if size < _about.size:
             raise EntryBoundsError(f"an about of {size} bytes")

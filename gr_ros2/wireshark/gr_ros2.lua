@@ -15,7 +15,7 @@ local QOS = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "default (11
 local QOS_V1 = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "a repair packet" }
 local KINDS = { [0] = "source", [1] = "repair", [2] = "control" }
 local PLACES = { [0] = "whole message", [1] = "first fragment", [2] = "middle fragment", [3] = "last fragment" }
-local CONTROLS = { [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard", [0xFC] = "ping", [0xFD] = "about",
+local CONTROLS = { [0xF7] = "waited", [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard", [0xFC] = "ping", [0xFD] = "about",
     [0xFE] = "newest" }
 local BROADCAST, MOST_BLOCK = 255, 12
 local CRC_LEN, HEADER_LEN, ENTRY_HEADER_LEN = 2, 5, 5
@@ -108,6 +108,7 @@ local f = {
     newest_topic_id = ProtoField.uint8("gr_ros2.newest.topic_id", "Topic id"),
     newest_number = ProtoField.uint32("gr_ros2.newest.number", "Its packet"),
     newest_place = ProtoField.uint8("gr_ros2.newest.place", "Place there, up to which all have come"),
+    waited_age = ProtoField.uint8("gr_ros2.waited.age", "A message has waited, code"),
     relayed_taker = ProtoField.uint8("gr_ros2.relayed.taker", "Taken on by robot"),
     relayed_origin = ProtoField.uint8("gr_ros2.relayed.origin", "Robot that made the message"),
     relayed_start = ProtoField.uint16("gr_ros2.relayed.start", "Its boot number, low 16 bits", base.HEX),
@@ -427,6 +428,7 @@ local function dissect_control(buffer, tree, at, limit)
         ping = size == PING_LEN,
         about = size >= ABOUT_LEN,
         newest = size == NEWEST_LEN or size == WHOLE_LEN,
+        waited = size > 0,
     }
     if sizes[name] == false then
         item:add_proto_expert_info(refused.overrun)
@@ -484,6 +486,10 @@ local function dissect_control(buffer, tree, at, limit)
         item:add(f.newest_number, buffer(start + 3, whole and 4 or 2))
         if whole then
             item:add(f.newest_place, buffer(start + 7, 1))
+        end
+    elseif name == "waited" then
+        for age = start, start + size - 1 do
+            item:add(f.waited_age, buffer(age, 1))
         end
     end
     return start + size, name

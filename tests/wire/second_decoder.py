@@ -161,6 +161,10 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
     def number(start: int, stop: int) -> int:
         return int.from_bytes(content[start:stop], "big")
 
+    if kind == 0xF7:
+        if not content:
+            raise Refused("entry_bounds")
+        return {"waited": list(content)}
     if kind == 0xF8:
         if len(content) < 17 or (len(content) - 17) % 5:
             raise Refused("entry_bounds")

@@ -249,7 +249,7 @@ class Custody:
         place = FIRST_PLACE + (place + 1 - FIRST_PLACE) % PLACES
         number = max(self._packets.newest, before + (place == FIRST_PLACE))
         self._newest[stream] = number, place
-        made, until = message.submitted, message.expires
+        made, until = message.made, message.expires
         relayed = Relayed(
             self._src_id,
             self._start,

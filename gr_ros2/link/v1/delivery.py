@@ -92,22 +92,25 @@ class DeliveryRules:
         """
         self._reached.append((number, now, late))
 
-    def made(self, ready: Ready, now: float, repaired_s: float = inf) -> float:
-        """When a message of this robot was made at the latest, s: before a packet arrived that left after it. One that
-        had to be repaired may have left right after the packet before it, unless its robot repairs it no longer than
-        it is of use: then it came in time if it came soon after it was missed.
+    def made(self, number: int, now: float, repaired_s: float = inf, *, repaired: bool) -> float:
+        """When what began in a packet of this robot was made at the latest, s: before a packet arrived that left after
+        it. One that had to be repaired may have left right after the packet before it, unless its robot repairs it no
+        longer than it is of use: then it came in time if it came soon after it was missed. What it had waited at its
+        robot is not counted.
 
-        :param repaired_s: s for which its robot repairs the packet that brought it
+        :param number: of the packet
+        :param repaired_s: s for which its robot repairs the packet
+        :param repaired: whether a packet with a part of it had to be repaired
         """
-        number, before, after = ready.order[0], now - UNKNOWN_S, now
+        before, after = now - UNKNOWN_S, now
         for reached, at, late in reversed(self._reached):
             if reached >= number:
                 after = at
             elif not late:
                 before = at
                 break
-        made = before if ready.repaired and repaired_s == inf else after
-        if ready.repaired and self.sealed_after is not None:
+        made = before if repaired and repaired_s == inf else after
+        if repaired and self.sealed_after is not None:
             made = max(made, self.sealed_after(number))
         return made if made < now else now
 

@@ -20,14 +20,14 @@ from gr_ros2.link.fates import FATES, Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.announced import ARRIVING_S, AnnouncedTopics
 from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
-from gr_ros2.link.v1.delivery import DeliveryRules, for_all_in_order, passed_over
+from gr_ros2.link.v1.delivery import UNKNOWN_S, DeliveryRules, for_all_in_order, passed_over
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready, nobody
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
-from gr_ros2.wire.control import MAP, Control
+from gr_ros2.wire.control import MAP, Control, Waited
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import CARRIED_TOPIC, SPAN, TABLE_TOPIC, EntryV1, Part, read_body
 
@@ -63,6 +63,16 @@ class Bounds(NamedTuple):
         rest = packets - equations * (room + _EQUATION_COST)
         span = max(min(SPAN, rest // (room + _PACKET_COST)), MAP)
         return cls(span, equations, most // 4, most // 8, most // 8)
+
+
+def _waited(entries: Sequence[EntryV1]) -> Waited | None:
+    """What a packet tells, behind its messages, of how long these have waited."""
+    for entry in reversed(entries):
+        if isinstance(entry, Part):
+            return None
+        if isinstance(entry, Waited):
+            return entry
+    return None
 
 
 class Passing(Protocol):
@@ -343,25 +353,27 @@ class Inbox:
         """Process the entries of a packet that is known now."""
         self.order.contents.learn(number)
         repaired_s = self._repaired_s(entries) if repaired else inf
+        waited = _waited(entries)
         for place, entry in enumerate(entries):
             if not isinstance(entry, Part):
                 self._control(entry)
                 continue
+            waited_s = 0.0 if waited is None else min(waited.age_s(place), UNKNOWN_S)
             topic = self.announced.topics.get(entry.topic_id)
             if topic is None or topic.reliable or topic.latched:
                 self.reports.confirms = True
             if entry.whole:
-                self._arrived(
-                    Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired), repaired_s
-                )
+                ready = Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired)
+                self._arrived(ready, repaired_s, waited_s)
             else:
-                self._fragment(entry, number, place, qos, repaired=repaired)
+                self._fragment(entry, number, place, qos, repaired=repaired, waited_s=waited_s)
 
-    def _fragment(self, part: Part, number: int, place: int, qos: int, *, repaired: bool) -> None:
+    def _fragment(self, part: Part, number: int, place: int, qos: int, *, repaired: bool, waited_s: float) -> None:
         if (number, place) < self.deliveries.newest.get(part.topic_id, (0, 0)) or number < part.back:
             self._stats.dropped["overtaken"] += 1
             return
-        whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now)
+        made = self.deliveries.made(number, self.began, repaired=repaired) - waited_s if waited_s else inf
+        whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now, made=made)
         for partial in self._reassembly.overflowing():
             self._lose(partial, Fate.MEMORY)
         if whole is None:
@@ -370,22 +382,26 @@ class Inbox:
         if payload is None:
             self._lose(whole, Fate.DAMAGED)
             return
-        self._arrived(Ready(whole.topic_id, whole.order, payload, qos, whole.coded, whole.repaired))
+        ready = Ready(whole.topic_id, whole.order, payload, qos, whole.coded, whole.repaired)
+        ready.made = whole.made
+        self._arrived(ready)
 
     def _repaired_s(self, entries: Iterable[EntryV1]) -> float:
         """s for which the sender repairs a packet: as long as one of its messages is of use."""
         rows = (self.announced.topics.get(entry.topic_id) for entry in entries if isinstance(entry, Part))
         return max((inf if row is None else row.deadline_s or inf for row in rows), default=inf)
 
-    def _arrived(self, ready: Ready, repaired_s: float = inf) -> None:
+    def _arrived(self, ready: Ready, repaired_s: float = inf, waited_s: float = 0.0) -> None:
         """A message is complete.
 
         :param repaired_s: s for which its sender repairs the packet that brought it
+        :param waited_s: s for which it had waited at its sender when that packet left
         """
         topic = self.announced.topics.get(ready.topic_id)
         if repaired_s < inf and topic is not None and repaired_s > self.deliveries.deadline_s(topic):
             repaired_s = inf
-        ready.made = self.deliveries.made(ready, self.began, repaired_s)
+        left = self.deliveries.made(ready.order[0], self.began, repaired_s, repaired=ready.repaired)
+        ready.made = min(ready.made, left - waited_s)
         if ready.topic_id > TABLE_TOPIC:
             if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
                 self.order.wait(ready, self._now)

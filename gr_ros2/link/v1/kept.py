@@ -52,6 +52,8 @@ class _Kept:
     """Time in s until which it is sent again."""
     keys: Keys = ALL
     """The instances that it speaks of."""
+    made: float = 0.0
+    """When it was submitted, s."""
     begin: int = 0
     """The packet in which its first fragment left for the first time; 0 if it left whole."""
 
@@ -93,7 +95,17 @@ class KeptMessages:
         for old in replaced(kept, message.keys) if message.keys else ():
             kept.remove(old)
         mark = crc32(message.payload)
-        kept.append(_Kept(message.serial, message.payload, message.coded, mark, until=until, keys=message.keys))
+        kept.append(
+            _Kept(
+                message.serial,
+                message.payload,
+                message.coded,
+                mark,
+                until=until,
+                keys=message.keys,
+                made=message.submitted,
+            )
+        )
         del kept[: -max(topic.kept_depth, 1)]
 
     def tabulate(self, rows: Sequence[AnnouncedTopic]) -> bool:
@@ -176,7 +188,7 @@ class KeptMessages:
             if now > kept.until:
                 continue
             again = Message(kept.serial, topic_id, kept.payload, qos, now, topic.weight, kept.until - now)
-            again.repeat, again.coded = True, kept.coded
+            again.repeat, again.coded, again.published = True, kept.coded, kept.made
             again.begin, again.dst_id, again.keys = kept.begin, topic.dst_id, kept.keys
             self._admit(topic, again)
             self._stats.repeats += 1

@@ -19,6 +19,7 @@ class Message(Outgoing):
     :param dst_id: the robot for which it is, 255 for all
     :param numbers: the packets that carry a frame of a coded topic, as far as somebody lacks them
     :param left_at: when its last fragment left, s
+    :param published: when it was submitted, s, where it is sent again for robots that join late
     :param key: it needs no earlier message of its topic, and these are of no more use when it has left
     :param plain: the message before it was coded, where later ones may be merged with it
     :param carried: its topic and key at the robot that made it, while it is carried over others
@@ -33,7 +34,13 @@ class Message(Outgoing):
     carried: tuple[int, Key] | None = None
     numbers: list[int] = field(default_factory=list)
     left_at: float = inf
+    published: float = inf
     key: bool = False
+
+    @property
+    def made(self) -> float:
+        """When it was made, s."""
+        return min(self.submitted, self.published)
 
     def back(self, number: int) -> int:
         """How many packets before this one it began; 0 if it begins there."""

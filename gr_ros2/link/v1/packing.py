@@ -4,6 +4,10 @@
 packets go last. Of the others the message with the largest value per byte sent goes first, ``weight * g^2 / c`` (see
 ``freshness``). Every ``TURN``-th packet begins with the topic whose last turn is longest ago, so that no topic starves.
 
+*Ages.* A message that has waited for more than one part in ``TOLD`` of the time for which it is of use is followed by
+its age (``Waited``), behind all messages of the packet. So who hears it, and who gets it over others, counts from when
+it was made.
+
 *Fragments.* A message that fits goes whole. A fragment that is not the last one fills its packet. Its size follows from
 the free bytes of the packet; it is not fixed beforehand.
 
@@ -25,6 +29,8 @@ from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import ON_AIR, SentTopics
 from gr_ros2.wire import QOS_BULK, QOS_LATENCY
+from gr_ros2.wire.ages import AGE_STEP_S, age_code
+from gr_ros2.wire.control import WAITED_LEN, Waited
 from gr_ros2.wire.v1 import TABLE_TOPIC, EntryV1, Part, fit
 
 FULL_PART = 2
@@ -34,6 +40,10 @@ lost with any of them. With smaller fragments (3), the scans of ``six-topics-pac
 LONG = 64
 """A message of more packets goes after all others of its class, into the room that these leave. Odometry at 35 Hz
 beside 1 MB is then 1.05 times as old as without it; by value alone 1.4 times, because the last 60 kB go before it."""
+TOLD = 8
+"""One part in this many of the time for which a message is of use may pass at its origin without being told. Commands
+of four robots in a line with slots of 13 ms then have an age in 36 % of the packets, all of which together are 2 %
+longer; with 4 in 2 %, with 16 in 65 % (4 %). If it were always told, they would be 6 % longer."""
 ENTRY = 3
 """Bytes that an entry takes beside its payload, at least."""
 
@@ -100,17 +110,21 @@ class Packing:
         if len(heap) == 1 and not spare and heap[0][2] == TABLE_TOPIC and self.fills:
             return None
         picks: list[tuple[Message, int, int]] = []
-        used = 0
+        used, ages = 0, b""
         while heap and used < room:
             _, _, topic_id, position = heappop(heap)
             queue = self._open[topic_id]
             message = queue[position]
             remaining, back = len(message.payload) - message.offset, message.back(number)
-            taken, size = fit(room - used, remaining, back, message.offset)
+            told = ages
+            if age := self._age(message, now):
+                told = ages.ljust(len(picks), b"\0") + bytes((age,))
+            free = room - used - _size(told)
+            taken, size = fit(free, remaining, back, message.offset)
             if taken < 0 or not (taken == remaining or _may_cut(message, taken, used, room)):
                 continue
             picks.append((message, taken, back))
-            used += size
+            used, ages = used + size, told
             if taken == remaining and position + 1 < len(queue):
                 following = queue[position + 1]
                 before = self._topics[topic_id].newest if following.repeat else message.submitted
@@ -118,7 +132,15 @@ class Packing:
                 heappush(heap, (self._rank(following), -worth, topic_id, position + 1))
         if not picks:
             return None
-        return self._take(picks, number, used, now)
+        return self._take(picks, number, used, ages, now)
+
+    def _age(self, message: Message, now: float) -> int:
+        """The code of the age that is told of a message which may begin in this packet; 0 where it is not told."""
+        if message.started:
+            return 0
+        waited_s, until = now - message.made, message.submitted + message.lifespan_s
+        limit_s = min(self._topics[message.topic_id].limit_s, until - message.made)
+        return age_code(waited_s) if waited_s > max(limit_s / TOLD, AGE_STEP_S) else 0
 
     def next_timeout(self, now: float) -> float:
         """When ``fill`` may have something, s; inf if nothing waits. What ``fills`` does not count."""
@@ -158,7 +180,7 @@ class Packing:
         heapify(heap)
         return heap
 
-    def _take(self, picks: list[tuple[Message, int, int]], number: int, used: int, now: float) -> Filling:
+    def _take(self, picks: list[tuple[Message, int, int]], number: int, used: int, ages: bytes, now: float) -> Filling:
         parts: list[EntryV1] = []
         sent: list[SentEntry] = []
         lifetimes: list[Lifetime] = []
@@ -200,7 +222,15 @@ class Packing:
         # On a shared channel a topic that goes along in a packet has had a turn: fresh messages are in every packet.
         self.turns.sent([message.topic_id for message, _, _ in picks] if self._shares else [self._holder])
         stats.entries += len(picks)
+        if ages:
+            parts.append(Waited(ages))
+            used += WAITED_LEN + len(ages)
         return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, since)
+
+
+def _size(ages: bytes) -> int:
+    """Bytes that ages take behind the last message, which then needs its length."""
+    return WAITED_LEN + len(ages) + 1 if ages else 0
 
 
 def _may_cut(message: Message, taken: int, used: int, room: int) -> bool:

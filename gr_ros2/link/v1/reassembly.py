@@ -17,6 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
+from math import inf
 
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.wire.v1 import Part
@@ -33,6 +34,7 @@ class PartialMessage:
     :param starts: offsets of its pieces, in order
     :param newest: packet of its newest fragment, and its place among the entries there
     :param place: its place among the entries of the packet in which it began; -1 until that packet is here
+    :param made: when it was made, s, as far as its origin told that it had waited
     """
 
     topic_id: int
@@ -46,6 +48,7 @@ class PartialMessage:
     newest: tuple[int, int] = (-1, -1)
     place: int = -1
     repaired: bool = False
+    made: float = inf
 
     @property
     def order(self) -> tuple[int, int]:
@@ -99,12 +102,15 @@ class Reassembly:
         """Bytes in use."""
         return self._held
 
-    def add(self, part: Part, number: int, place: int, *, repaired: bool, now: float) -> PartialMessage | None:
+    def add(
+        self, part: Part, number: int, place: int, *, repaired: bool, now: float, made: float = inf
+    ) -> PartialMessage | None:
         """Take a fragment.
 
         :param number: number of its packet
         :param place: its place among the entries there
         :param repaired: the packet did not arrive when it was first sent
+        :param made: when the message was made, s, if its packet tells that
         :return: its message, if that is complete now; it is then no longer held here
         """
         begin = number - part.back
@@ -123,6 +129,7 @@ class Reassembly:
         partial.newest = max(partial.newest, (number, place))
         self._grown[part.topic_id] = partial
         partial.repaired |= repaired
+        partial.made = min(partial.made, made)
         for offset, payload in partial.missing(part.offset, part.payload):
             partial.pieces[offset] = payload
             insort(partial.starts, offset)

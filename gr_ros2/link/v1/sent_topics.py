@@ -12,6 +12,7 @@ from gr_ros2.link.frames import MARK
 from gr_ros2.link.instances import ALL, InstanceKeys, InstancesOf, Keys, no_instances
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
+from gr_ros2.link.v1.delivery import MAX_AGE_S
 from gr_ros2.link.v1.lifetime import Lifetimes
 from gr_ros2.link.v1.message import Message
 from gr_ros2.settings.commands import is_command
@@ -52,6 +53,8 @@ class SentTopic:
     :ivar dst_id: the robot for which its messages are, 255 for all
     :ivar kept: whether its newest messages are kept for robots that lack them; commands never are
     :ivar in_order: whether its messages are delivered in order, each after all earlier ones
+    :ivar fresh: whether its old messages are of no use
+    :ivar limit_s: s after which its messages are of no use, as far as this is known here; infinite for never
     """
 
     topic: Topic
@@ -70,6 +73,8 @@ class SentTopic:
     dst_id: int = field(init=False)
     kept: bool = field(init=False)
     in_order: bool = field(init=False)
+    fresh: bool = field(init=False)
+    limit_s: float = field(init=False)
 
     def __post_init__(self) -> None:
         self._check(self.topic.options)
@@ -83,6 +88,10 @@ class SentTopic:
         self.kept = not self.command and (self.latched or options.keep_s > 0)
         reliable = self.publishers.reliable if options.reliability == AUTO else options.reliability == "reliable"
         self.in_order = self.coded or (reliable and (self.queue.policy != "latest" or self.shared))
+        self.fresh = self.queue.deadline_s > 0 or self.topic.type_name == CALLS_TYPE
+        if options.max_age_s != AUTO:
+            self.fresh = options.max_age_s > 0
+        self.limit_s = min(self.queue.deadline_s or inf, MAX_AGE_S if self.fresh else inf)
 
     @property
     def is_stream(self) -> bool:
@@ -180,9 +189,6 @@ class SentTopic:
         depth = self.publishers.depth if options.depth == AUTO else options.depth
         if self.coded:
             codec = f"{MARK} {self.output}".rstrip()
-        fresh = self.queue.deadline_s > 0 or topic.type_name == CALLS_TYPE
-        if options.max_age_s != AUTO:
-            fresh = options.max_age_s > 0
         return AnnouncedTopic(
             topic.topic_id,
             topic.name,
@@ -192,7 +198,7 @@ class SentTopic:
             self.kept,
             min(self.kept_depth if self.kept else depth, 255),
             codec,
-            fresh,
+            self.fresh,
             self.dst_id,
             age_code(self.queue.deadline_s) % NO_AGE,
         )

@@ -61,15 +61,15 @@ def test_a_late_repair_makes_no_packet_after_it_younger(mode: SealMode) -> None:
     inbox, before = three.end.neighbours.all[1].inbox, everybody.now - 4
     three.receive(late, everybody.now + 20, everybody.now + 20)
     after = Ready(0, (inbox.newest + 1, 0), b"", 0, False, True)
-    assert inbox.deliveries.made(after, everybody.now + 20) <= before
+    assert inbox.deliveries.made(after.order[0], everybody.now + 20, repaired=after.repaired) <= before
 
 
 def test_the_age_of_what_is_repaired_is_unknown_where_nothing_before_it_came() -> None:
     rules = DeliveryRules(Settings(2), {})
     rules.reached(7, 100.0)
-    assert rules.made(Ready(0, (8, 0), b"", 0, False, True), 110.0) == 100.0
-    assert rules.made(Ready(0, (7, 0), b"", 0, False, False), 110.0) == 100.0
-    assert rules.made(Ready(0, (7, 0), b"", 0, False, True), 110.0) < -1000.0
+    assert rules.made(8, 110.0, repaired=True) == 100.0
+    assert rules.made(7, 110.0, repaired=False) == 100.0
+    assert rules.made(7, 110.0, repaired=True) < -1000.0
 
 
 def test_a_late_message_tells_no_way() -> None:
