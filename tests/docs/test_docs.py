@@ -368,3 +368,15 @@ def test_pages_that_code_names_exist() -> None:
                 text = path.read_text(encoding="utf-8", errors="ignore")
                 named |= dict.fromkeys(re.findall(r"\bdocs/[\w/-]+\.md", text), path)
     assert [f"{path}: {name}" for name, path in named.items() if not (ROOT / name).is_file()] == []
+
+
+def test_files_that_pages_name_exist() -> None:
+    kinds = "gr_ros2|gr_ros2_lab|tests|tools|bench|packaging|debian"
+    named = {
+        (page.name, name)
+        for page in PAGES
+        for name in re.findall(rf"`((?:{kinds})/[\w./-]+)`", page.read_text(encoding="utf-8"))
+        if name != "gr_ros2/calls/Frame"  # a type of messages
+    }
+    assert len(named) > 50
+    assert [f"{page}: {name}" for page, name in sorted(named) if not (ROOT / name).exists()] == []
