@@ -380,3 +380,16 @@ def test_files_that_pages_name_exist() -> None:
     }
     assert len(named) > 50
     assert [f"{page}: {name}" for page, name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_the_way_to_a_running_link_has_no_words_of_ours() -> None:
+    """Who knows ROS alone reads these two pages. A link is explained there, the other words mean what they do
+    elsewhere."""
+    known = {"link", "packet", "channel", "peer", "version"}
+    glossary = (ROOT / "docs" / "reference" / "glossary.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+) \|", glossary.split("## Words of gr-ros2")[1], re.MULTILINE)
+    ours = {word.strip() for row in rows[1:] for word in row.split(",")} - known - {"---"}
+    assert len(ours) > 20
+    for page in ("README.md", "docs/how-to/two-laptops.md"):
+        text = re.sub(r"\]\([^)]*\)", "]", (ROOT / page).read_text(encoding="utf-8"))
+        assert {word for word in ours if re.search(rf"\b{re.escape(word)}s?\b", text, re.IGNORECASE)} == set(), page
