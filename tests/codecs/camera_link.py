@@ -20,7 +20,7 @@ from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 
 CAMERA, ODOMETRY, SCAN = range(3)
-STEP_S = 0.0005
+STEP_S = 0.001
 PACKET_LEN = 220
 
 
@@ -150,14 +150,15 @@ class Air:
                 continue
             robot.take(robot.end.handle_timeout(now), now)
             robot.coder.look(now)
-            if robot.free <= now:
+            while robot.free <= now:
                 if robot.end.pace.out_of_credit:
                     robot.end.pace.credit(1, robot.free)
-                if (sent := robot.end.next_packet(now)) is not None:
-                    robot.free = max(robot.free, now - STEP_S) + len(sent.data) * 8e-3 / robot.kbit_s
-                    self._count += 1
-                    heapq.heappush(self._under_way, (robot.free + self.delay_s, self._count, robot, sent.data))
-                    robot.coder.look(now)
+                if (sent := robot.end.next_packet(now)) is None:
+                    break
+                robot.free = max(robot.free, now - STEP_S) + len(sent.data) * 8e-3 / robot.kbit_s
+                self._count += 1
+                heapq.heappush(self._under_way, (robot.free + self.delay_s, self._count, robot, sent.data))
+                robot.coder.look(now)
 
 
 def registry(**camera: Any) -> Registry:
