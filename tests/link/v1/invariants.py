@@ -9,7 +9,8 @@ For each pair of robots that hear each other:
   within so many packets that each of the two has heard of the other. The oldest packet in order that the sender repairs
   for robots that report is confirmed, or over, within the same bound.
 
-Times do not count, so this holds for every packet rate, loss and medium access.
+Times do not count, so this holds for every packet rate, loss and medium access, and nothing is to be checked while
+nothing leaves or arrives.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ class PacketsEnd:
         peer = sender.end.window.peers.all.get(receiver.src_id)
         if peer is None or sender.end.window.mode == "off":
             return
-        urgent = {number for _, number in peer.urges}
-        for number in peer.lost - urgent if peer.newest >= 0 else ():
+        lost = peer.lost - {number for _, number in peer.urges} if peer.lost and peer.newest >= 0 else ()
+        for number in lost:
             assert not waited_for(sender.end, number), (
                 f"packet {number} of robot {sender.src_id} counts as lost at robot {receiver.src_id} and is not urgent"
             )
@@ -87,12 +88,16 @@ class PacketsEnd:
         self._moves(("confirmed", *pair), oldest_in_order(sender.end, peer.bit))
 
     def _moves(self, name: tuple[str, int, int, int, int], number: int) -> None:
-        one, other = name[1:3]
-        waiting, heard = self._waiting[name], (self._heard[one, other], self._heard[other, one])
+        waiting = self._waiting[name]
+        if number < 0:
+            waiting.number = -1
+            return
+        _, one, other, _, _ = name
+        there, back = self._heard[one, other], self._heard[other, one]
         if number != waiting.number:
-            waiting.number, waiting.begun = number, heard
-        passed = min(now - begun for now, begun in zip(heard, waiting.begun, strict=True))
-        assert number < 0 or passed < self.bound, (
+            waiting.number, waiting.begun = number, (there, back)
+        passed = min(there - waiting.begun[0], back - waiting.begun[1])
+        assert passed < self.bound, (
             f"packet {number} of robot {one} is not {name[0]} after {passed} packets each way between it and {other}"
         )
 
