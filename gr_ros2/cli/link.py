@@ -233,7 +233,21 @@ def _live(running: RobotLink) -> LiveRun:
         received_as=running.sink.outputs.heard.name_of,
         announced=running.sink.outputs.heard.announced,
         alarms=running.same_numbers,
+        wants_key=partial(_key_frame, running),
     )
+
+
+def _key_frame(running: RobotLink, src_id: int, topic_id: int) -> None:
+    """Ask for a key frame of a topic of this robot, or of another one."""
+    live = running.sink.live
+    with live.lock:
+        frames = live.endpoint.frames
+        if frames is not None and src_id == running.source.src_id:
+            frames.watched(topic_id)
+        elif frames is not None:
+            frames.lost(src_id, topic_id)
+        live.look()
+        live.wake()
 
 
 def _opening(running: Any) -> str:

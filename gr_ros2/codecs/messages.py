@@ -15,7 +15,7 @@ from rosbags.typesys.store import Typestore
 
 from gr_ros2.compression.zstd_frames import read_varint
 from gr_ros2.core.errors import DamagedError
-from gr_ros2.middleware.type_definitions import DAMAGED
+from gr_ros2.middleware.type_definitions import DAMAGED, MADE
 from gr_ros2.wire import varint
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -23,14 +23,6 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 VIDEO, PACKET = "foxglove_msgs/msg/CompressedVideo", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
 CLOUD, GRID = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/OccupancyGrid"
 
-_OF_OTHERS = {
-    VIDEO: "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n",
-    PACKET: (
-        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
-        "bool is_bigendian\nuint8[] data\n"
-    ),
-}
-"""Types that ROS does not ship."""
 _STAMP = Struct("<iI")
 
 
@@ -38,7 +30,7 @@ _STAMP = Struct("<iI")
 def store() -> Typestore:
     """The types of Humble and those of video."""
     found = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in _OF_OTHERS.items():
+    for name, text in MADE.items():
         found.register(get_types_from_msg(text, name))
     return found
 

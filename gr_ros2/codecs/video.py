@@ -184,7 +184,7 @@ def from_luma(luma: Pixels) -> av.VideoFrame:
 def _fill(plane: Any, rows: Pixels) -> None:
     size = plane.line_size
     if rows.shape == (plane.height, size) and rows.flags.c_contiguous:
-        plane.update(memoryview(rows).cast("B"))
+        plane.update(rows.data.cast("B"))
         return
     whole = np.zeros((plane.height, size), np.uint8)
     across = min(size, rows.shape[1])

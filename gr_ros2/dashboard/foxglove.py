@@ -11,18 +11,25 @@ subscribes to a latched topic gets its newest message.
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from gr_ros2.codecs.frames import frames_output
-from gr_ros2.core.errors import BackendMissingError, ConfigError
+from gr_ros2.codecs.frames import FrameReceiver, frames_output
+from gr_ros2.codecs.messages import VIDEO
+from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError
 from gr_ros2.link.events import Accepted, Announced, Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.link.frames import MARK
 from gr_ros2.middleware.type_definitions import definition
 from gr_ros2.observe.observers import LiveRun
 from gr_ros2.observe.result import RunResult
+from gr_ros2.settings.registry import PICTURES
+from gr_ros2.wire import AnnouncedTopic
 
 BACKLOG = 256
 """Messages that wait for one client at most."""
+VIDEO_NAME = "video"
+"""Of the topic beside one of pictures that has H.264 as it crossed the link."""
 _CACHED_BYTES = 1 << 26
 """Bytes of latched messages that are kept for clients that subscribe later."""
 
@@ -55,6 +62,8 @@ class FoxgloveServer:
         self._run: LiveRun | None = None
         self._told: dict[tuple[int, int], _Shown] = {}
         self._sent: dict[tuple[int, int], _Shown] = {}
+        self._videos: dict[tuple[int, int], _Shown] = {}
+        self._frames = FrameReceiver()
         self._channels: dict[str, tuple[str, Any]] = {}
         """Type and channel of each topic."""
         self._newest: dict[int, bytes] = {}
@@ -92,22 +101,44 @@ class FoxgloveServer:
         pass
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """Show a message that this robot sends, unless it is sent as frames."""
+        """Show a message that this robot sends. What is sent as frames is shown as it comes out: pictures as video."""
         if isinstance(event, Accepted) and self._run is not None:
-            subscriptions = self._run.sources[src_id].subscriptions
-            if subscriptions.frames is not None and event.topic_id in subscriptions.frames:
-                return
-            shown = self._sent.get((src_id, event.topic_id))
+            subscriptions, key = self._run.sources[src_id].subscriptions, (src_id, event.topic_id)
+            framed = subscriptions.frames is not None and event.topic_id in subscriptions.frames
+            shown = self._sent.get(key)
             if shown is None:
                 named = {topic.topic_id: (name, topic) for name, topic in subscriptions.named()}
                 if event.topic_id not in named:
                     return  # a call of a service
                 name, topic = named[event.topic_id]
-                shown = self._sent[src_id, event.topic_id] = _Shown(name, topic.type_name, topic.latched)
-            self._show(shown, event.payload)
+                shown = self._sent[key] = _Shown(name, topic.type_name, topic.latched)
+                if framed:
+                    self._see_frames(key, shown)
+            if framed:
+                self._show_frame(key, event.payload, event.now)
+            else:
+                self._show(shown, event.payload)
 
-    def receiver_event(self, event: ReceiverEvent, now: float) -> None:  # noqa: ARG002
-        """Show a message that came out."""
+    def _see_frames(self, key: tuple[int, int], shown: _Shown) -> None:
+        """Hand on the frames of a topic: H.264 as it is, beside pictures under the same name and ``VIDEO_NAME``."""
+        picture = shown.type_name in PICTURES
+        told = AnnouncedTopic(
+            key[1], shown.topic, shown.type_name, codec=f"{MARK} CompressedVideo" if picture else MARK
+        )
+        with suppress(BackendMissingError):
+            type_name = self._frames.announce(key, told)
+            topic = f"{shown.topic}/{VIDEO_NAME}" if picture else shown.topic
+            self._videos[key] = _Shown(topic, type_name, shown.latched)
+
+    def _show_frame(self, key: tuple[int, int], frame: bytes, now: float) -> None:
+        """Show what a frame is; depth and what passes exactly is no video."""
+        shown = self._videos.get(key)
+        if shown is not None:
+            with suppress(CodecError):
+                self._show(shown, self._frames.decode(key, shown.topic, frame, now))
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """Show a message that came out, and of pictures that came as video that, too."""
         if isinstance(event, Announced) and self._run is not None:
             for row in event.topics:
                 output = frames_output(row)
@@ -116,10 +147,14 @@ class FoxgloveServer:
                     from gr_ros2.codecs.camera import OUTPUTS
 
                     type_name = OUTPUTS.get(output, type_name)
-                name = self._run.received_as(event.src_id, row.name)
-                self._told[event.src_id, row.topic_id] = _Shown(name, type_name, row.latched)
+                name, key = self._run.received_as(event.src_id, row.name), (event.src_id, row.topic_id)
+                self._told[key] = _Shown(name, type_name, row.latched)
+                self._videos.pop(key, None)
+                if output is not None and row.type_name in PICTURES and type_name != VIDEO:
+                    self._see_frames(key, _Shown(name, row.type_name, row.latched))
         elif isinstance(event, Delivered) and (shown := self._told.get((event.src_id, event.topic_id))) is not None:
             self._show(shown, event.message)
+            self._show_frame((event.src_id, event.topic_id), event.payload, now)
 
     # ---- listener of the server
 
@@ -129,6 +164,9 @@ class FoxgloveServer:
             message, found = self._newest.get(channel.id), self._channels.get(channel.topic)
         if message is not None and found is not None:
             found[1].log(message)
+        for key, shown in list(self._videos.items()):
+            if shown.topic == channel.topic and self._run is not None:
+                self._run.wants_key(*key)
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:
         """A client has had enough: the server stops by itself."""

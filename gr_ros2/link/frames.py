@@ -75,5 +75,8 @@ class FrameSide(Protocol):
     def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
         """A message of a topic is not coded."""
 
+    def watched(self, topic_id: int) -> None:
+        """Somebody has begun to watch a topic of this robot, and needs a key frame."""
+
     def lost(self, src_id: int, topic_id: int) -> None:
         """A frame of another robot could not be decoded: that robot is asked for a key frame."""

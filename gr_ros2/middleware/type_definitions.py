@@ -24,6 +24,18 @@ _IDL = "=" * 80 + "\nIDL: "
 """First line of a definition in IDL, as rosbag2 writes it."""
 
 
+MADE = {
+    "foxglove_msgs/msg/CompressedVideo": (
+        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+    ),
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": (
+        "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
+        "bool is_bigendian\nuint8[] data\n"
+    ),
+}
+"""Types that ROS does not ship and that pictures come out as, with their definitions."""
+
+
 class Definition(NamedTuple):
     """The text of a type, with those of the types it is made of, and its RIHS01 hash (REP-2011)."""
 
@@ -75,7 +87,7 @@ def definition(type_name: str, text: str | None = None) -> Definition:
 
     :param text: of the type, None = as ROS ships it; one that cannot be read is as good as none
     """
-    if text is None and (store := _shipped(type_name)) is not None:
+    if text is None and (store := _shipped(type_name) or _made(type_name)) is not None:
         return Definition(store.generate_msgdef(type_name, ros_version=2)[0], _hash(store, type_name))
     digest = text_hash(type_name, text) if text is not None else ""
     return Definition(text, digest) if text is not None and digest else _unknown(type_name)
@@ -156,6 +168,16 @@ def _uint8_for_char(kind: FieldDesc) -> FieldDesc:
 def _distributions() -> tuple[Typestore, ...]:
     """The types of every distribution of ROS 2, the oldest first."""
     return tuple(get_typestore(store) for store in Stores if store.name.startswith("ROS2_"))
+
+
+@cache
+def _made(type_name: str) -> Typestore | None:
+    """One of ``MADE``, with what it is made of."""
+    if type_name not in MADE:
+        return None
+    store = Typestore()
+    store.register({**typestore().fielddefs, **get_types_from_msg(MADE[type_name], type_name)})
+    return store
 
 
 def _unknown(type_name: str) -> Definition:

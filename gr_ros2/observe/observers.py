@@ -116,6 +116,7 @@ class LiveRun:
     :param announced: source id, absolute name here and meaning of each topic that other robots have announced so far
     :param alarms: what is wrong with the robots that are heard, or with what lies between them, one line each
     :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
+    :param wants_key: called where somebody has begun to watch a topic of a robot, by their ids, that is sent as frames
     :param changed: told of each change that somebody makes while it runs
     """
 
@@ -134,6 +135,7 @@ class LiveRun:
     announced: Callable[[], Sequence[tuple[int, str, Topic]]] = tuple
     alarms: Callable[[], Sequence[str]] = tuple
     heard: frozenset[int] | None = None
+    wants_key: Callable[[int, int], None] = lambda _src_id, _topic_id: None
     changed: Callable[[Change], None] = lambda _: None
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
@@ -19,7 +20,8 @@ pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import websocket_connect
 
-from gr_ros2.codecs.messages import GRID
+from gr_ros2.codecs import CodedTopic
+from gr_ros2.codecs.messages import GRID, IMAGE, VIDEO, read
 from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.dashboard.foxglove import BACKLOG, FoxgloveServer
 from gr_ros2.link.events import Accepted, Announced, Delivered
@@ -108,6 +110,48 @@ def test_what_is_sent_and_what_comes_out_is_seen_as_it_is_with_its_definition(se
     assert (channel["encoding"], channel["schemaName"], channel["schemaEncoding"]) == ("cdr", TF, "ros2msg")
     assert "geometry_msgs/TransformStamped[] transforms" in channel["schema"].replace("/msg/", "/")
     assert "MSG: geometry_msgs/" in channel["schema"]
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_camera_is_handed_on_as_the_video_that_crossed_the_link(server: FoxgloveServer, own: bool) -> None:
+    """Beside the picture; who begins to watch gets a key frame. Depth is no video."""
+    pytest.importorskip("av", reason="needs PyAV")
+    encoder = CodedTopic(IMAGE).encoder()
+    asked: list[tuple[int, int]] = []
+    run = _run()
+    run.wants_key = lambda *key: asked.append(key)
+    rows = [Topic(2, "camera/image", IMAGE), Topic(3, "depth/image", IMAGE)]
+    run.sources[1].subscriptions.frames = {2, 3}
+    run.sources[1].subscriptions.named = lambda: [(f"/robot_1/{topic.name}", topic) for topic in rows]
+    server.run_started(run)
+    told = [AnnouncedTopic(topic.topic_id, topic.name, IMAGE, codec="frames") for topic in rows]
+    server.receiver_event(Announced(2, tuple(told)), 0.0)
+    pictures = [scenes.image(scenes.view(number, 64, 48), "rgb8", number) for number in range(4)]
+    depth = scenes.image((scenes.room(0, 64, 48) * 1000).astype(np.uint16), "16UC1", 0)
+    exact = CodedTopic(IMAGE, {"camera": "off", "depth": "off"}).encoder().encode(depth).data
+    client, count = Client(server.port), 0
+
+    def work() -> None:
+        nonlocal count
+        coded = encoder.encode(pictures[count % 4], 900, key=bool(asked) and not count % 8)
+        for topic_id, frame, shown in ((2, coded.data, pictures[count % 4]), (3, exact, depth)):
+            if own:
+                server.sender_event(1, Accepted(count, topic_id, frame, float(count)))
+            else:
+                server.receiver_event(Delivered(2, topic_id, frame, 0, shown=shown), float(count))
+        count += 1
+
+    name = "/robot_1/camera/image/video" if own else "/rx_robot_2/camera/image/video"
+    client.watch(lambda: len([topic for topic, _ in client.seen if topic == name]) > 12, work)
+    assert (1 if own else 2, 2) in asked
+    (channel,) = [channel for channel in client.channels.values() if channel["topic"] == name]
+    assert channel["schemaName"] == VIDEO
+    assert "uint8[] data" in channel["schema"]
+    videos = [read(VIDEO, message) for topic, message in client.seen if topic == name]
+    assert {video.format for video in videos} == {"h264"}
+    assert any(bytes(video.data[4:5])[0] & 31 == 7 for video in videos), "a key frame begins with its parameters"
+    assert not any("depth" in topic and "video" in topic for topic, _ in client.seen)
+    assert own or ("/rx_robot_2/camera/image", pictures[0]) in client.seen
 
 
 def test_who_comes_late_sees_the_map(server: FoxgloveServer) -> None:

@@ -124,6 +124,10 @@ class SentFrames:
         """A message is not coded."""
         self._outlet.refuse_new(topic_id, fate, detail)
 
+    def watched(self, topic_id: int) -> None:
+        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        self._outlet.asks[topic_id] += 1
+
     def lost(self, src_id: int, topic_id: int) -> None:
         """See :class:`gr_ros2.link.frames.FrameSide`."""
         if (neighbour := self._neighbours.get(src_id)) is not None:
