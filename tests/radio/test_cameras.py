@@ -59,13 +59,13 @@ class Camera:
 
 
 @contextmanager
-def link(number: int, tmp_path: Path, **values: Any) -> Iterator[RobotLink]:
+def link(number: int, tmp_path: Path, observer: Any = None, **values: Any) -> Iterator[RobotLink]:
     """A robot's end over a link of 250 kBd, as long as it runs."""
     own, other = (f"ipc://{tmp_path}/{end}" for end in (number, 3 - number))
     phy = {"name": "psk", "sample_rate": 500e3, "options": {"lengths": "any"}}
     front_end = {"name": "zmq", "bind": own, "connect": [other]}
     found = {"registry": "", "packet_len": 220, "phy": phy, **values}
-    made = RobotLink(config(number, front_end, **found))
+    made = RobotLink(config(number, front_end, **found), observer=observer)
     try:
         made.start()
         yield made
@@ -127,6 +127,29 @@ def test_a_camera_is_turned_off_and_on_while_it_is_seen(tmp_path: Path, watcher:
                 return exact in [read(IMAGE, data).data.tobytes() in made for data in watcher.pictures[begin:]]
 
             wait_for(comes, f"pictures with camera: {value}")
+
+
+@pytest.mark.real_time
+def test_an_operator_who_comes_late_sees_the_video_of_a_live_link(tmp_path: Path) -> None:
+    pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+    from gr_ros2.cli.link import _live
+    from gr_ros2.dashboard.foxglove import FoxgloveServer
+    from gr_ros2.observe.observers import RunObservers
+    from tests.dashboard.test_foxglove import Client
+
+    with FoxgloveServer("127.0.0.1", 0) as server, Camera(1, 80):
+        observers = RunObservers([server], threaded=True)
+        with link(1, tmp_path), link(2, tmp_path, observer=observers, topics=[]) as two:
+            observers.run_started(_live(two))
+            name = f"{SEEN}/video"
+            wait_for(lambda: name in server._channels, "its channel")
+            client = Client(server.port)
+
+            def keys() -> list[bytes]:
+                return [data for topic, data in client.seen if topic == name and b"\0\0\0\1\x67" in data]
+
+            client.watch(lambda: bool(keys()))
+        observers.run_ended(None)
 
 
 @pytest.mark.real_time
