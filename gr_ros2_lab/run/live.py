@@ -102,7 +102,7 @@ class LiveRobots:
         """Those of which the bag has what comes out: what counts in the tables of the first receiver."""
         every = [robot.link for robot in self.robots]
         senders = [number for number in range(len(every)) if around.reached(number)]
-        self.links = [LiveChannel(self._medium.medium, number, every) for number in senders]
+        self.links = [LiveChannel(self._medium, number, every) for number in senders]
         self.clock: Callable[[], float] = every[0].front_end.clock
         delays = [around.path(number, other).delay_s for number in senders for other in around.reached(number)]
         self._quiet_s = _QUIET_S + max(delays, default=0.0)

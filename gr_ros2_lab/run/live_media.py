@@ -191,8 +191,9 @@ class LiveChannel:
 
     changeable = True
 
-    def __init__(self, medium: Medium, sender: int, links: Sequence[RobotLink]) -> None:
-        self._medium, self._sender, self._receiver = medium, sender, hearer_of(medium.around, sender)
+    def __init__(self, live: LiveMedium, sender: int, links: Sequence[RobotLink]) -> None:
+        self._live, self._medium, self._sender = live, live.medium, sender
+        self._receiver = hearer_of(live.medium.around, sender)
         self._sends, self._hears = links[sender].radio, links[self._receiver].radio
 
     @property
@@ -212,7 +213,7 @@ class LiveChannel:
         return self._sends.transmits
 
     def gate_lateness(self) -> Lateness | None:
-        return self._sends.gate_lateness()
+        return None if self._live.waits else self._sends.gate_lateness()
 
     def counts(self) -> LinkCounts:
         return replace(self._sends.counts(), losses=dict(self._medium.lost.dropped[self._sender, self._receiver]))
