@@ -156,6 +156,10 @@ class LiveRobots:
 
     def stop(self) -> None:
         """Stop the links, and then the medium, for which they may wait."""
+        if not self._medium.waits:  # what one robot sends after another has stopped would be lost
+            for robot in self.robots:
+                robot.source.stop()
+            time.sleep(POLL_S)
         for robot in self.robots:
             robot.link.stop()
         self._medium.stop()
