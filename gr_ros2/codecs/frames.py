@@ -17,9 +17,9 @@ from math import inf
 from typing import Any, NamedTuple
 
 from gr_ros2.codecs.base import MAX_SIZE, Coded
-from gr_ros2.codecs.messages import CAMERA_INFO, CLOUD, GRID
+from gr_ros2.codecs.messages import CAMERA_INFO, CLOUD
 from gr_ros2.codecs.pull import FramePull, Pull, StatePull
-from gr_ros2.codecs.topic import OFF, CodedTopic, TopicDecoder, TopicEncoder
+from gr_ros2.codecs.topic import CODECS, OFF, CodedTopic, TopicDecoder, TopicEncoder
 from gr_ros2.core.errors import BackendMissingError, CodecError, MissingFrameError
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.frames import MARK, FrameSide
@@ -40,6 +40,10 @@ _DAMAGED_BYTES = 1 << 23
 """Bytes that a damaged frame counts: whatever was wrong with it may have been found at its end."""
 _BESIDE = ("image_raw", "image", "image_color", "image_mono")
 """Ends of the names of pictures that a CameraInfo beside them is of, the likeliest first."""
+MOST_HELD = 1 << 28
+"""Bytes of maps and the like of others that are kept, for what changes of them: of those used longest ago none are."""
+_STATES = {CODECS["grid"].number, CODECS["growing"].number}
+"""Codecs of messages of which the newest counts, however old it is."""
 _SECONDS = 2.0
 """s over which what is said of a topic is a mean."""
 _log = logging.getLogger(__name__)
@@ -73,7 +77,8 @@ class _Sent:
     def __init__(self, topic: Topic, coded: CodedTopic) -> None:
         self.name = topic.name
         self.use(topic, coded)
-        self.is_map, self.is_cloud = topic.type_name == GRID, topic.type_name == CLOUD
+        self.is_map = not _STATES.isdisjoint(coded.codecs)
+        self.is_cloud = topic.type_name == CLOUD
         self.pull: FramePull | StatePull = (StatePull if self.is_map else FramePull)(coding_s=CODING_S)
         self.limit(topic)
         self.said: set[str] = set()
@@ -292,14 +297,16 @@ def coded_topic(topic: Topic, *, latched: bool = False) -> CodedTopic | None:
 
     :param latched: whether one publisher keeps its newest message for late joiners
     """
-    if topic.type_name == GRID and topic.options.codec == AUTO and latched:
-        return CodedTopic(GRID)
+    states = (*CODECS["grid"].types, *CODECS["growing"].types)
+    if latched and topic.type_name in states and topic.options.codec == AUTO:
+        return CodedTopic(topic.type_name, {"growing": {}})
     if not topic.as_frames:
         return None
     options, depth = topic.options, topic.options.depth_image
     if topic.type_name == CLOUD:
         cloud = {"voxel": options.cloud.voxel, "range": options.cloud.range, "keep": options.cloud.keep}
-        return CodedTopic(CLOUD, {"cloud": {name: value for name, value in cloud.items() if value != AUTO}})
+        given = {name: value for name, value in cloud.items() if value != AUTO}
+        return CodedTopic(CLOUD, {"cloud": given})
     chosen: dict[str, Mapping[str, Any] | str] = {
         "camera": OFF if options.camera.off else {"size": options.camera.size, "output_type": options.camera.output},
         "depth": OFF if depth.off else {"mode": depth.mode, "near": depth.near, "far": depth.far},
@@ -351,7 +358,7 @@ class FrameReceiver:
         if key not in self._topics or self._topics[key][:2] != (told.type_name, output):
             coded = self._shared.get((told.type_name, output))
             if coded is None:
-                coded = CodedTopic(told.type_name, {"camera": {"output_type": output}})
+                coded = CodedTopic(told.type_name, {"camera": {"output_type": output}, "growing": {}})
                 if len(self._shared) == MOST_DECODERS:
                     self._shared.clear()
                 self._shared[told.type_name, output] = coded
@@ -381,6 +388,8 @@ class FrameReceiver:
         decoder = self._decoders.setdefault(key, self._topics[key][2].decoder(self._max_size))
         self._decoders.move_to_end(key)
         if len(self._decoders) > MOST_DECODERS:
+            self._decoders.popitem(last=False)
+        while len(self._decoders) > 1 and sum(each.held for each in self._decoders.values()) > MOST_HELD:
             self._decoders.popitem(last=False)
         made = _DAMAGED_BYTES
         try:

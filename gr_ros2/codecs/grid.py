@@ -121,6 +121,11 @@ class GridDecoder:
         self._packer, self._max_size = Packer(), max_size
         self._held: OrderedDict[int, _Grid] = OrderedDict()
 
+    @property
+    def held(self) -> int:
+        """Bytes in use."""
+        return sum(grid.cells.size for grid in self._held.values())
+
     def decode(self, data: bytes) -> bytes:
         form, before, body = opened(data)
         if form > _CHANGES or (form == _CHANGES) != (before is not None):

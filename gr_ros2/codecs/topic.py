@@ -26,11 +26,13 @@ class CodecRow(Backend):
     :param number: of its frames, 1..255; those of other packages have 128 and more
     :param types: that it takes; of two that take a type, the first codec of the table that codes a message does
     :param alone: whether each of its frames stands alone, so that a link codes every message of these types with it
+    :param asked: whether it is used only where options name it
     """
 
     number: int = 0
     types: tuple[str, ...] = ()
     alone: bool = False
+    asked: bool = False
 
 
 _VIDEO = "PyAV (pip install 'gr-ros2[video]')"
@@ -59,6 +61,19 @@ CODECS = BackendTable(
         ),
         "cloud": CodecRow("gr_ros2.codecs.cloud", "CloudCodec", "point clouds", number=3, types=(CLOUD,), alone=True),
         "grid": CodecRow("gr_ros2.codecs.grid", "GridCodec", "what changes of a map", number=4, types=(GRID,)),
+        "growing": CodecRow(
+            "gr_ros2.codecs.growing",
+            "GrowingCodec",
+            "what changes of a latched message that grows",
+            number=5,
+            asked=True,
+            types=(
+                "nav_msgs/msg/Path",
+                "nav2_msgs/msg/Costmap",
+                "octomap_msgs/msg/Octomap",
+                "grid_map_msgs/msg/GridMap",
+            ),
+        ),
     },
     CodecRow,
 )
@@ -85,7 +100,7 @@ class CodedTopic:
         if unknown := [name for name in options if name not in CODECS]:
             raise ConfigError(f"no codec {unknown[0]!r}; known are {', '.join(CODECS)}")
         for name, row in rows_of(type_name):
-            if options.get(name) != OFF:
+            if options.get(name) != OFF and (name in options or not row.asked):
                 try:
                     CODECS.modules(name)
                     self.codecs[row.number] = configured(name, type_name, options.get(name, {}))
@@ -170,6 +185,11 @@ class TopicDecoder:
         self._made: dict[int, Decoder] = {}
         self.size: tuple[int, int] | None = None
         """Width and height of the newest message; None for one that is no resized picture."""
+
+    @property
+    def held(self) -> int:
+        """Bytes of messages that later frames may refer to."""
+        return sum(getattr(decoder, "held", 0) for decoder in self._made.values())
 
     def decode(self, data: bytes) -> bytes:
         number = data[0] if data else 0

@@ -12,6 +12,7 @@ from gr_ros2.codecs import CODECS, CodedTopic, video
 from gr_ros2.codecs.messages import CLOUD, COMPRESSED_IMAGE, GRID, IMAGE
 from tests.codecs import scenes
 
+PATH = "nav_msgs/msg/Path"
 SCAN = "sensor_msgs/msg/LaserScan"
 
 
@@ -43,6 +44,10 @@ def _texts() -> list[bytes]:
 
 def _maps() -> list[bytes]:
     return scenes.exploring(3, 200)
+
+
+def _paths() -> list[bytes]:
+    return [scenes.path(20 * n) for n in range(4)]
 
 
 def _colours() -> list[bytes]:
@@ -83,6 +88,7 @@ SAMPLES = {
     "cloud with intensity": Sample("cloud", CLOUD, {"voxel": 0.2, "keep": "intensity"}, cache(_clouds)),
     "cloud in a budget": Sample("cloud", CLOUD, {"voxel": 0.05}, cache(_clouds), budget=900),
     "grid": Sample("grid", GRID, {}, cache(_maps), exact=True),
+    "path": Sample("growing", PATH, {}, cache(_paths), exact=True),
 }
 if "scan" in CODECS:  # the worked example of docs/how-to/extend.md, where a test has installed it
     SAMPLES["scan"] = Sample("scan", SCAN, {}, cache(_scans), exact=True)

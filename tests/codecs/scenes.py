@@ -122,6 +122,19 @@ def grid(
     return write(GRID, header=made, info=info, data=cells.astype(np.int8).ravel())
 
 
+def path(length: int, number: int = 0) -> bytes:
+    """A Path of so many poses, each a step beyond the one before."""
+    types, rng = _TYPES, np.random.default_rng(7)
+    poses = []
+    for n, (x, y) in enumerate(np.cumsum(rng.normal(0.1, 0.02, (length, 2)), 0)):
+        pose = types["geometry_msgs/msg/Pose"](
+            position=types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0),
+            orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+        )
+        poses.append(types["geometry_msgs/msg/PoseStamped"](header=header(n, "map"), pose=pose))
+    return write("nav_msgs/msg/Path", header=header(number, "map"), poses=poses)
+
+
 def exploring(steps: int, size: int = 600) -> list[bytes]:
     """Maps of a robot that explores rooms: cells of 5 cm, the laser sees 6 m, occupied cells flicker."""
     rng = np.random.default_rng(1)

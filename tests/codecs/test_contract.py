@@ -125,7 +125,7 @@ def test_whatever_is_lost_doubled_or_late_what_is_shown_is_what_was_sent(sample:
 def test_messages_that_are_not_of_the_type_are_damaged_and_the_next_passes(sample: Sample) -> None:
     encoder = sample.topic().encoder()
     for message in sample.messages():
-        for cut in (0, 3, len(message) // 2) if sample.codec != "exact" else ():
+        for cut in (0, 3, len(message) // 2) if sample.codec not in ("exact", "growing") else ():
             with pytest.raises(DamagedError):
                 encoder.encode(message[:cut], sample.budget)
         assert encoder.encode(message, sample.budget).data

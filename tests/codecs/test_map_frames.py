@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gr_ros2.codecs import CodedTopic
+from gr_ros2.codecs.frames import FrameReceiver
 from gr_ros2.codecs.messages import GRID
 from gr_ros2.link.events import Refused, SentPacket
 from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.wire import AnnouncedTopic
 from tests.codecs import scenes
 from tests.codecs.camera_link import Air, Robot
 
@@ -123,3 +126,42 @@ def test_a_map_that_is_too_large_is_counted_and_the_next_passes(large: int) -> N
     assert len(refused) == 1
     assert distinct(follower) == [MAPS[number] for number in range(7) if number != large]
     assert not follower.failed
+
+
+PATHS = [scenes.path(100 + 20 * n) for n in range(8)]
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_a_latched_message_that_grows_costs_what_is_new(loss: float) -> None:
+    """And a robot that joins has all of it."""
+    messages, topic = PATHS, Topic(0, "plan", "nav_msgs/msg/Path", SendOptions(durability="transient_local"))
+    planner, follower = Robot(1, Registry([topic]), 256), Robot(2, None, 256)
+    air = Air(planner, follower, loss=loss)
+    costs = []
+    for message in messages:
+        planner.submit(0, message, air.now)
+        before = sent_bytes(planner)
+        air.run(air.now + 4)
+        costs.append(sent_bytes(planner) - before)
+    assert distinct(follower) == messages
+    assert max(costs[1:]) < costs[0] / 2
+    late = Robot(3, None, 256)
+    air.robots.append(late)
+    air.run(air.now + 6)
+    assert distinct(late) == messages[-1:]
+    assert not follower.failed
+
+
+def test_a_path_that_is_not_latched_or_has_a_codec_is_a_message_as_any() -> None:
+    for options in ({}, {"durability": "transient_local", "codec": "zstd"}):
+        assert 0 not in Robot(1, Registry([Topic(0, "plan", "nav_msgs/msg/Path", SendOptions(**options))]), 256).sender
+
+
+def test_the_memory_for_maps_of_others_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gr_ros2.codecs.frames.MOST_HELD", 3 * 600 * 600)
+    receiver, frame = FrameReceiver(), CodedTopic(GRID).encoder().encode(MAPS[0]).data
+    for topic_id in range(8):
+        receiver.announce((1, topic_id), AnnouncedTopic(topic_id, "map", GRID, codec="frames"))
+        receiver.decode((1, topic_id), "map", frame, 0.0)
+        assert sum(decoder.held for decoder in receiver._decoders.values()) <= 4 * 600 * 600
+    assert len(receiver._decoders) <= 4

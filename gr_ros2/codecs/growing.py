@@ -1,0 +1,103 @@
+"""The codec of latched messages that grow, such as a path, an octree or a costmap: exact, as what zstd makes of them
+where it may refer to one that was confirmed.
+
+Invariants: exact to the byte; changes refer to a message that all receivers have decoded, as far as the encoder was
+told; a decoder keeps at most ``KEPT`` messages, and an encoder refers to no other.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from gr_ros2.codecs.base import MAX_SIZE, Coded, frame, name_of, opened
+from gr_ros2.codecs.pack import Packer
+from gr_ros2.compression import bounds
+from gr_ros2.compression.zstd_frames import Zstd
+from gr_ros2.core.errors import DamagedError, MissingFrameError
+
+KEPT = 4
+_WHOLE, _CHANGES = range(2)
+_LEVEL = 6
+"""Of zstd: 1 MB takes some 20 ms."""
+
+
+@dataclass(frozen=True)
+class GrowingCodec:
+    """Messages as what has changed. It has no options."""
+
+    type_name: str
+
+    def encoder(self) -> GrowingEncoder:
+        return GrowingEncoder()
+
+    def decoder(self, max_size: int = MAX_SIZE) -> GrowingDecoder:
+        return GrowingDecoder(max_size)
+
+    @property
+    def output(self) -> str:
+        return self.type_name
+
+
+class GrowingEncoder:
+    """Messages to frames."""
+
+    def __init__(self) -> None:
+        self._packer = Packer(_LEVEL)
+        self._sent: OrderedDict[int, bytes] = OrderedDict()
+        self._base: int | None = None
+        """The newest message that was confirmed, by the name of its frame."""
+
+    def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:  # noqa: ARG002
+        coded = frame(_WHOLE, self._packer.pack(message))
+        if key:
+            self._sent.clear()
+            self._base = None
+        elif self._base is not None and self._base in self._sent:
+            changes = Zstd(self._sent[self._base], _LEVEL).compress(message, least=bounds.least(len(message)))
+            if len(changes) + 4 < len(coded.data):
+                coded = frame(_CHANGES, changes, self._base)
+        _keep(self._sent, coded.name, message)
+        return coded
+
+    def confirmed(self, name: int) -> None:
+        if name in self._sent:
+            self._base = name
+            while next(iter(self._sent)) != name:
+                self._sent.popitem(last=False)
+
+
+class GrowingDecoder:
+    """Frames back to messages."""
+
+    def __init__(self, max_size: int) -> None:
+        self._packer, self._max_size = Packer(), max_size
+        self._kept: OrderedDict[int, bytes] = OrderedDict()
+
+    @property
+    def held(self) -> int:
+        """Bytes in use."""
+        return sum(map(len, self._kept.values()))
+
+    def decode(self, data: bytes) -> bytes:
+        form, before, body = opened(data)
+        if form > _CHANGES or (form == _CHANGES) != (before is not None):
+            raise DamagedError(f"damaged frame: no form {form}")
+        if before is None:
+            message = self._packer.unpack(body, self._max_size)
+        else:
+            base = self._kept.get(before)
+            if base is None:
+                raise MissingFrameError("the message that this one changes was not decoded here")
+            self._kept.move_to_end(before)
+            message = Zstd(base).decompress(body, min(self._max_size, bounds.largest(len(body))))
+        _keep(self._kept, name_of(data), message)
+        return message
+
+
+def _keep(messages: OrderedDict[int, bytes], name: int, message: bytes) -> None:
+    """Keep a message as the newest of ``KEPT``. Equal ones have one name."""
+    messages[name] = message
+    messages.move_to_end(name)
+    while len(messages) > KEPT:
+        messages.popitem(last=False)
