@@ -26,8 +26,6 @@ HALF, ROUND = 1 << 15, 1 << 16
 """Packets of a sender's lives: some are SHORT at most, others begin BEFORE half of the numbers, or all, and
 end AFTER."""
 
-pytestmark = pytest.mark.usefixtures("relaying")
-
 
 def topics() -> Registry:
     return registry(a=SendOptions(), b=SendOptions(queue="latest"), c=SendOptions(qos="bulk"))
@@ -69,6 +67,7 @@ def grow_old(robot: Robot, numbers: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("relaying")
 @pytest.mark.parametrize(("loss", "mode"), [(0.01, "none"), (0.1, "none"), (0.5, "none"), (0.1, "encrypt")])
 def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float, mode: SealMode) -> None:
     """In each run both ends have several lives, in which packet numbers pass their half and come round."""
@@ -154,6 +153,7 @@ def test_nothing_is_accepted_that_was_not_sent_and_memory_is_bounded(kind: Kind)
     assert kind == "forged" or outcome.delivered >= 0.95 * outcome.submitted
 
 
+@pytest.mark.usefixtures("relaying")
 @pytest.mark.parametrize("per_topic", [1, 20])
 def test_nothing_is_reserved_for_a_message_that_is_announced(per_topic: int) -> None:
     """The last fragments of messages of 16 MB, and of none of them anything else."""
