@@ -63,14 +63,15 @@ class Routes:
 
         :param usable: whether a robot may be taken
         """
-        ways = self._ways.get(robot, {}).items()
+        since = now - self.stale_s
         open_ways = [
             (now < self._doubted.get((robot, via), now), hops, via)
-            for via, (hops, at) in ways
-            if now <= at + self.stale_s and usable(via)
+            for via, (hops, at) in self._ways.get(robot, {}).items()
+            if since <= at and usable(via)
         ]
         return min(open_ways)[2] if open_ways else None
 
     def hops(self, robot: int, now: float) -> int | None:
         """Robots between this one and another; 0 if it is heard, None if nothing is known."""
-        return min((hops for hops, at in self._ways.get(robot, {}).values() if now <= at + self.stale_s), default=None)
+        since = now - self.stale_s
+        return min((hops for hops, at in self._ways.get(robot, {}).values() if since <= at), default=None)

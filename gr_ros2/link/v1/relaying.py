@@ -389,8 +389,9 @@ class Relaying:
         """Give up robots of which nothing comes any more, and robots that are never heard themselves."""
         for inbox in self.far.values():
             inbox.handle_timeout(now)
+        stale_s = self.custody.routes.stale_s
         for src_id, (boot, at) in list(self._here.items()):
-            if now >= at + self.custody.routes.stale_s:
+            if now >= at + stale_s:
                 del self._here[src_id]
                 neighbour = self._neighbours.all.get(src_id)
                 if neighbour is None or neighbour.gone:
@@ -398,7 +399,8 @@ class Relaying:
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do."""
-        times = [at + self.custody.routes.stale_s for _, at in self._here.values()]
+        stale_s = self.custody.routes.stale_s
+        times = [at + stale_s for _, at in self._here.values()]
         times += [at for inbox in self.far.values() if (at := inbox.next_timeout()) is not None]
         return min(times, default=None)
 
