@@ -434,12 +434,15 @@ def test_an_example_compiles_and_carries_messages(path: Path, platform: Platform
             other.subscribe("/rx_robot_1/odom", "nav_msgs/Odometry", Qos(depth=0), heard.append)
             top.start()
             publisher = robot.advertise("/robot_1/odom", "nav_msgs/Odometry", Qos(depth=0))
-            # Radios of two programs find each other first; what is sent before is lost, as on the air.
-            wait_for(lambda: publisher.publish(b"\0\1\0\0" + bytes(720)) or heard, "the first message")
+            # Radios of two programs find each other first; what is sent before is lost, as on the air. Until then a
+            # message now and then is enough: more would fill the queue of a busy computer.
+            first = b"\0\1\0\0" + bytes(720)
+            wait_for(lambda: publisher.publish(first) or heard, "the first message", longest_s=0.5)
             sent = [b"\0\1\0\0" + bytes([number]) * 720 for number in range(1, 11)]
             for payload in sent:
                 publisher.publish(payload)
-            wait_for(lambda: heard[-len(sent) :] == sent, "every message, in order")
+                wait_for(lambda payload=payload: heard[-1:] == [payload], "a message")  # type: ignore[misc]
+            assert heard[-len(sent) :] == sent, "every message, in order"
     finally:
         top.stop()
         top.wait()
