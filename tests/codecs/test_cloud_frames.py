@@ -76,6 +76,8 @@ def test_clouds_are_young_in_order_and_hold_odometry_up_little(kbit_s: float, lo
 
 
 def test_cells_are_as_small_as_the_air_allows() -> None:
+    """With the option fit."""
+
     def points(kbit_s: float) -> int:
         air = link(kbit_s)
         air.run(3.0)
