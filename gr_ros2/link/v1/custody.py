@@ -126,12 +126,12 @@ class Custody:
     :param packets: what has left
     :param peers: the robots that report
     :param gains: knows who hears whom
+    :param routes: over whom other robots are reached
     :param room: bytes of the longest body
     :param most: bytes of messages of others that may be held, and of own ones of a topic
     :param dropped: counts what is lost
     :param drop: called with own messages that are too late
     :param ended: called with own messages that have come, or of which this is not known and that are kept no longer
-    :ivar routes: over whom other robots are reached
     """
 
     def __init__(
@@ -142,13 +142,14 @@ class Custody:
         peers: Peers,
         *,
         gains: Gains,
+        routes: Routes,
         room: int,
         most: int,
         dropped: Counter[str],
         drop: Callable[[list[Dropped[Message]]], None],
         ended: Callable[[Message, bool], None],
     ) -> None:
-        self.routes = Routes(gains.slower)
+        self.routes = routes
         self._src_id, self._start, self._boot = own[0], own[1] & 0xFFFF, own[1]
         self._topics, self._packets, self._peers, self._gains = topics, packets, peers, gains
         self._room, self._most, self._dropped, self._drop, self._ended = room, most, dropped, drop, ended

@@ -168,6 +168,7 @@ class EndpointV1:
                 window.packets,
                 window.peers,
                 gains=relaying.gains,
+                routes=relaying.routes,
                 room=room,
                 most=settings.max_source_bytes,
                 dropped=self.received.dropped,
@@ -230,7 +231,7 @@ class EndpointV1:
 
     def peers(self, now: float) -> list[HeardRobot]:
         relaying = self._receiving.relaying
-        far = [] if relaying is None else relaying.robots(now, sealed=self.keys.sealed)
+        far = [] if relaying is None else relaying.far.reached(now, sealed=self.keys.sealed)
         over = {robot.robot for robot in far}
         return far + [
             HeardRobot(
@@ -261,7 +262,7 @@ class EndpointV1:
         """What has come of a robot, directly or over others."""
         neighbour, relaying = self.neighbours.all.get(src_id), self._receiving.relaying
         if relaying is not None:
-            return relaying.present(src_id)
+            return relaying.far.present(src_id)
         return neighbour.inbox if neighbour is not None and neighbour.proven else None
 
     def unpublished(self, event: Delivered) -> Lost:

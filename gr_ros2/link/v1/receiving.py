@@ -116,11 +116,9 @@ class ReceivingSide:
                 settings.src_id,
                 self.neighbours,
                 self._outcomes,
+                lambda src_id, boot, first: self._inbox(src_id, boot, first, settings.packet_len, far=True),
                 most=settings.max_source_bytes,
                 slower=lambda: settings.slower,
-            )
-            self.relaying.tell(
-                lambda src_id, boot, first: self._inbox(src_id, boot, first, settings.packet_len, far=True)
             )
         self._now = -inf
         self._sender: Neighbour | None = None
@@ -151,10 +149,10 @@ class ReceivingSide:
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now, self._give_up_s):
             self._facts.append(PeerLeft(gone.src_id, ended=False))
-            if self.relaying is None or not self.relaying.reaches(gone.src_id, gone.boot, now):
+            if self.relaying is None or not self.relaying.far.reaches(gone.src_id, gone.boot, now):
                 self._outcomes.events.append(Gone(gone.src_id, gone.boot))
         if self.relaying is not None:
-            self.relaying.handle_timeout(now)
+            self.relaying.far.handle_timeout(now)
         for neighbour in self.neighbours.all.values():
             neighbour.timeout = None
         facts, self._facts = self._facts, []
@@ -164,7 +162,7 @@ class ReceivingSide:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
         # Asked after each packet, so only its sender is looked at anew.
         times = [n.timeout if n.timeout is not None else self._timeout(n) for n in self.neighbours.all.values()]
-        if self.relaying is not None and (at := self.relaying.next_timeout()) is not None:
+        if self.relaying is not None and (at := self.relaying.far.next_timeout()) is not None:
             times.append(at)
         soonest = min(times, default=inf)
         return None if soonest == inf else soonest
@@ -306,7 +304,7 @@ class ReceivingSide:
             self._facts.append(PeerMet(neighbour.src_id, *proof))
         self._outcomes.events.append(Met(neighbour.src_id, neighbour.boot, hears))
         if self.relaying is not None:
-            self.relaying.met(neighbour, now)
+            self.relaying.far.met(neighbour, now)
         self._greeted(neighbour)
         if self._settings.shares and self._settings.slower > 1:  # its table comes unasked
             neighbour.asked[TABLE_TOPIC] = now + ARRIVING_S * self._settings.slower

@@ -113,7 +113,7 @@ class SendingSide:
             return repair
         if self._relaying is not None:
             leaves = now if self._writer.leave_at is None else max(now, self._writer.leave_at)
-            self._relaying.offer(messages.sent, now, leaves)
+            self._relaying.sent_on.offer(messages.sent, now, leaves)
             self._relaying.custody.offer(now, leaves)
         if (sent := self._fill(due, now)) is not None:
             return sent

@@ -161,10 +161,10 @@ def test_max_age_s_of_a_receiver_counts_from_the_origin(limit_s: float, comes: b
 def test_nothing_of_a_robot_is_sent_on_long_after_it_was_there() -> None:
     line = Line(*(robot(src_id) for src_id in (1, 2, 3)))
     line.run(10)
-    assert any(stream.origin == 1 for stream in relaying_of(line.robots[1])._newest)
+    assert any(stream.origin == 1 for stream in relaying_of(line.robots[1]).sent_on._newest)
     absent(line, 1)
     line.run(FORGET_S + 20)
-    assert not any(stream.origin == 1 for one in line.robots[1:] for stream in relaying_of(one)._newest)
+    assert not any(stream.origin == 1 for one in line.robots[1:] for stream in relaying_of(one).sent_on._newest)
 
 
 def test_commands_are_not_kept_for_late_robots() -> None:
@@ -205,14 +205,14 @@ def test_ages_in_a_mesh_are_never_less_than_the_truth() -> None:
 
         one.end.messages.submit = submitted  # type: ignore[assignment,method-assign]
         relaying = relaying_of(one)
-        keep = relaying._take
+        keep = relaying.sent_on.take
 
         def taken(via: int, kept: Any, now: float, keep: Any = keep) -> bool:
             if kept.message.payload in given:
                 seen.append(kept.made - given[kept.message.payload])
             return bool(keep(via, kept, now))
 
-        relaying._take = taken  # type: ignore[method-assign]
+        relaying.sent_on.take = taken  # type: ignore[method-assign]
     for _ in range(20):
         absent(line, *(src_id for src_id in range(1, 6) if rng.random() < 0.2))
         line.run(3)
@@ -232,5 +232,5 @@ def test_a_message_that_seemed_older_than_it_is_does_not_come_again(mode: SealMo
         message = Relayed(1, line.robots[0].boot & 0xFFFF, number + later, 0, 0, 1, text, age=0)
         came = Ready(RELAYED_TOPIC, (1, 0), write_relayed(message), 0, False, True, made=line.now - seems_s)
         last.receive(2, came, line.now)
-        events += last._outcomes.take()
+        events += last.far._outcomes.take()
     assert [event.payload for event in events if isinstance(event, Delivered)] == [b"second"]

@@ -287,5 +287,5 @@ def test_what_waits_for_the_table_of_its_origin_has_not_come() -> None:
     assert not custody_of(last)._receipts
     announced.topics = table
     relaying.direct(1, origin.boot, Ready(TABLE_TOPIC, (1, 0), b"", 0, False, False, made=line.now), line.now)
-    assert [event.payload for event in relaying._outcomes.take() if isinstance(event, Delivered)] == [b"goal"]
+    assert [event.payload for event in relaying.far._outcomes.take() if isinstance(event, Delivered)] == [b"goal"]
     assert list(custody_of(last)._receipts) == [1]

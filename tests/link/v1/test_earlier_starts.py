@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.link.events import Delivered
+from gr_ros2.link.v1.far import FAR_S
 from gr_ros2.link.v1.order import Ready
-from gr_ros2.link.v1.relaying import FAR_S, FORGET_S
+from gr_ros2.link.v1.relaying import FORGET_S
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.wire.ages import age_code
 from gr_ros2.wire.relayed import (
@@ -25,7 +26,7 @@ def brought(one: Robot, said: Relayed, now: float, age_s: float = 0.0) -> list[b
     relaying = relaying_of(one)
     message = write_relayed(said._replace(age=age_code(age_s)))
     relaying.receive(2, Ready(RELAYED_TOPIC, (said.number, 0), message, 0, False, False, made=now), now)
-    return [event.payload for event in relaying._outcomes.take() if isinstance(event, Delivered)]
+    return [event.payload for event in relaying.far._outcomes.take() if isinstance(event, Delivered)]
 
 
 def odom(origin: int, boot: int, number: int, payload: bytes) -> Relayed:
@@ -49,7 +50,7 @@ def test_a_late_table_of_an_earlier_start_takes_no_place(mode: SealMode, silent_
     age_s = line.now - now
     brought(three, old._replace(number=6), line.now, age_s)
     assert brought(three, odom(1, 1000, 10, b"old"), line.now, age_s) == []
-    known = relaying_of(three).present(1)
+    known = relaying_of(three).far.present(1)
     assert known is None or known.boot == 2000
 
 

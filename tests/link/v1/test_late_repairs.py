@@ -28,7 +28,7 @@ def over(one: Robot, origin: Robot, number: int, text: bytes, now: float) -> lis
     relaying = relaying_of(one)
     message = Relayed(origin.src_id, origin.boot & 0xFFFF, number, 0, 0, 1, text, age=0)
     relaying.receive(2, Ready(RELAYED_TOPIC, (1, 0), write_relayed(message), 0, False, False, made=now), now)
-    return [event.payload for event in relaying._outcomes.take() if isinstance(event, Delivered)]
+    return [event.payload for event in relaying.far._outcomes.take() if isinstance(event, Delivered)]
 
 
 def behind(mode: SealMode) -> tuple[Cell, bytes]:

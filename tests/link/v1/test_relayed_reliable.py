@@ -166,7 +166,7 @@ def test_long_messages_cross_a_line_in_one_try(loss: float, mode: SealMode) -> N
     line = Line(*(robot(src_id, mode, TOPICS) for src_id in (1, 2, 3)), loss=loss)
     line.run(15)
     goals = [(b"goal %d " % n).ljust(1000, b"x") for n in range(8)]
-    relayed = line.robots[1].end._receiving.relaying.relayed  # type: ignore[union-attr]
+    relayed = line.robots[1].end._receiving.relaying.sent_on.relayed  # type: ignore[union-attr]
     before = relayed[1, 1]
     for goal in goals:
         line.robots[0].end.messages.submit(1, goal, line.now)
@@ -213,7 +213,7 @@ def test_a_robot_that_was_away_has_its_time_to_bring_what_is_missing() -> None:
     last, near = line.robots[2], line.near
     relaying = last.end._receiving.relaying
     assert relaying is not None
-    order = relaying.far[1].order
+    order = relaying.far.inboxes[1].order
     number = line.robots[0].end.window.packets.newest + 10_000
     order.wait(Ready(1, (number, 0), b"later", -1, False, False, 1, 2, made=line.now, after=(number - 1, 0)), line.now)
     line.near = lambda one: [other for other in near(one) if 2 not in (one, other)]  # type: ignore[method-assign]

@@ -113,10 +113,10 @@ def test_where_all_hear_all_next_to_nothing_is_relayed() -> None:
     line = Line(*(robot(src_id) for src_id in range(1, 4)))
     line.near = lambda one: [other for other in range(3) if other != one]  # type: ignore[method-assign]
     line.run(10)
-    relayed = [one.end._receiving.relaying for one in line.robots]
-    before = sum(one.relayed.total() for one in relayed if one is not None)
+    relaying = [one.end._receiving.relaying for one in line.robots]
+    before = sum(one.sent_on.relayed.total() for one in relaying if one is not None)
     line.run(20)
-    assert sum(one.relayed.total() for one in relayed if one is not None) - before < 20
+    assert sum(one.sent_on.relayed.total() for one in relaying if one is not None) - before < 20
 
 
 def test_without_the_key_nobody_relays_or_is_relayed() -> None:

@@ -26,22 +26,22 @@ ROW = AnnouncedTopic(0, "odom", "std_msgs/msg/String", 1, False, False, 1, "", F
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """What was false expires after 15 s."""
-    for module in ("relay.gain", "link.v1.delivery", "link.v1.relaying", "link.v1.sequences"):
+    for module in ("relay.gain", "link.v1.delivery", "link.v1.far", "link.v1.sequences"):
         monkeypatch.setattr(f"gr_ros2.{module}.EXPIRES_S", EXPIRES_S)
 
 
 def says(insider: Robot, false: Relayed, now: float) -> None:
     """This robot sends a message on that nobody has made."""
-    relaying = relaying_of(insider)
-    offer = relaying.offer
+    passing = relaying_of(insider).sent_on
+    offer = passing.offer
 
     def once(topics, *_):  # type: ignore[no-untyped-def]
         topic = topics[RELAYED_TOPIC]
         if not topic.queue:
-            relaying.offer, relaying._chosen = offer, None  # type: ignore[method-assign]
+            passing.offer, passing._chosen = offer, None  # type: ignore[method-assign]
             topic.queue.append(Message(-1, RELAYED_TOPIC, write_relayed(false), 1, now, repeat=True))
 
-    relaying.offer = once  # type: ignore[method-assign,assignment]
+    passing.offer = once  # type: ignore[method-assign,assignment]
 
 
 def number(false: int, start: int) -> Relayed:
@@ -114,7 +114,7 @@ def test_a_false_start_ends_a_robot_for_a_while_only(mode: SealMode, soon: None)
     line.run(15)
     says(line.robots[3], table(1, LAST_BOOT, 0), line.now)
     line.run(1)
-    assert relaying_of(line.robots[2]).far[1].boot == LAST_BOOT
+    assert relaying_of(line.robots[2]).far.inboxes[1].boot == LAST_BOOT
     line.run(EXPIRES_S + 10)
     assert count(line.robots[2], line, 10) > 10
     assert count(line.robots[1], line, 10) > 20
@@ -130,7 +130,7 @@ def test_a_table_with_a_false_number_stops_reliable_topics_for_a_while_only(mode
     rows = [AnnouncedTopic(n, name, "std_msgs/msg/String", 0, n == 1) for n, name in enumerate(("odom", "all"))]
     says(line.robots[3], table(1, line.robots[0].boot, LAST_NUMBER, *rows), line.now)
     line.run(2)
-    assert relaying_of(line.robots[2]).far[1].first > LAST_NUMBER
+    assert relaying_of(line.robots[2]).far.inboxes[1].first > LAST_NUMBER
     del line.near
     line.run(EXPIRES_S + 10)
     for n in range(5):
@@ -162,7 +162,7 @@ def test_a_robot_that_starts_again_takes_the_place_of_its_earlier_start_over_hop
         line.robots[0].start()
         line.run(10)
         assert count(line.robots[2], line, 5) > 5
-    streams = relaying_of(line.robots[2])._newest
+    streams = relaying_of(line.robots[2]).sent_on._newest
     assert {stream.start for stream in streams if stream.origin == 1} == {line.robots[0].boot}
 
 
@@ -194,7 +194,7 @@ def test_twenty_robots_with_ten_topics_start_twenty_times_and_are_still_relayed(
             for topic_id in range(10):
                 heard_over(one, 2, Relayed(origin, start, 2, topic_id, topic_id, 1, b"odom", age=0), line.now)
         line.run(0.1)
-    streams = relaying_of(one)._newest
+    streams = relaying_of(one).sent_on._newest
     assert {(stream.origin, stream.start, stream.topic_id) for stream in streams if stream.topic_id < TABLE_TOPIC} >= {
         (origin, 20, topic_id) for origin in range(10, 30) for topic_id in range(10)
     }
@@ -206,7 +206,7 @@ def test_twenty_robots_with_ten_topics_start_twenty_times_and_are_still_relayed(
 
 
 def test_who_brings_much_takes_no_room_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gr_ros2.link.v1.relaying.MOST_STREAMS", 20)
+    monkeypatch.setattr("gr_ros2.link.v1.sent_on.MOST_STREAMS", 20)
     line = Line(robot(1), robot(2), robot(3))
     line.run(10)
     one = line.robots[1]
@@ -214,9 +214,9 @@ def test_who_brings_much_takes_no_room_of_others(monkeypatch: pytest.MonkeyPatch
     heard_over(one, 3, table(9, 1, 1, *rows), line.now)
     for topic_id in range(100):
         heard_over(one, 3, Relayed(9, 1, 2, topic_id, topic_id, 1, b"odom", age=0), line.now)
-    relaying = relaying_of(one)
-    assert len(relaying._newest) <= 20
-    assert {stream.topic_id for stream in relaying._newest if stream.origin == 1} == {0, TABLE_TOPIC}
+    passing = relaying_of(one).sent_on
+    assert len(passing._newest) <= 20
+    assert {stream.topic_id for stream in passing._newest if stream.origin == 1} == {0, TABLE_TOPIC}
     assert one.end.received.dropped["relay_full"] > 80
 
 
