@@ -72,7 +72,7 @@ class Relaying:
     :ivar gains: who lacks what
     :ivar routes: over whom robots are reached
     :ivar far: the robots that are known over others
-    :ivar passing: what is sent on
+    :ivar sent_on: what is sent on
     """
 
     def __init__(
