@@ -36,6 +36,8 @@ MOST_BYTES_S = 256e6
 """Bytes of messages in a second that are made of one robot's frames, on average over a second: 250 bytes of video may
 say "the same as before" of 8 million pixels, which takes 18 ms. It is more than a camera of 1920 × 1080 pixels at 30/s,
 and keeps half a core busy."""
+_TOGETHER, _ALL = 4, -1
+"""Times as many of all robots together, and whose they are."""
 _DAMAGED_BYTES = 1 << 23
 """Bytes that a damaged frame counts: whatever was wrong with it may have been found at its end."""
 _BESIDE = ("image_raw", "image", "image_color", "image_mono")
@@ -379,12 +381,11 @@ class FrameReceiver:
         if key not in self._topics:
             self._sizes.pop(camera, None)  # of the same camera as video
             return payload
-        left, at = self._left.get(key[0], (MOST_BYTES_S, now))
-        left = min(left + (now - at) * MOST_BYTES_S, MOST_BYTES_S)
-        if left < 0:
-            raise CodecError(
-                f"frames of robot {key[0]} make more than {MOST_BYTES_S / 1e6:.0f} MB of messages in a second"
-            )
+        left = {whose: self._allowed(whose, now) for whose in (key[0], _ALL)}
+        if min(left.values()) < 0:
+            who = f"robot {key[0]} make" if left[key[0]] < 0 else "all robots make"
+            most = f"{(MOST_BYTES_S if left[key[0]] < 0 else _TOGETHER * MOST_BYTES_S) / 1e6:,.0f} MB"
+            raise CodecError(f"frames of {who} more than {most} of messages in a second")
         decoder = self._decoders.setdefault(key, self._topics[key][2].decoder(self._max_size))
         self._decoders.move_to_end(key)
         if len(self._decoders) > MOST_DECODERS:
@@ -399,13 +400,19 @@ class FrameReceiver:
             made = 0
             raise
         finally:
-            self._left[key[0]] = left - made, now
+            self._left |= {whose: (bytes_left - made, now) for whose, bytes_left in left.items()}
         self._sizes.pop(camera, None)
         if self._topics[key][0] in PICTURES:
             self._sizes[camera] = decoder.size
         if len(self._sizes) > MOST_DECODERS:
             del self._sizes[next(iter(self._sizes))]
         return message
+
+    def _allowed(self, whose: int, now: float) -> float:
+        """Bytes of messages that may be made of the frames of a robot, or of all, now."""
+        most = MOST_BYTES_S * (_TOGETHER if whose == _ALL else 1)
+        left, at = self._left.get(whose, (most, now))
+        return min(left + (now - at) * most, most)
 
     def scaled(self, src_id: int, name: str, type_name: str, message: bytes) -> bytes:
         """A CameraInfo for the picture beside it, as large as that came out; any other message as it is.
