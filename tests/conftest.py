@@ -72,7 +72,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 GROUPS = {
     "real_time": "radios that the processor must keep up with",
-    "viewer": "one Chromium",
+    "browser": "one Chromium",
     "cluster": "Dask with two workers",
     "installed": "a wheel and a virtual environment",
     "platform": "GRC with all its blocks",
