@@ -13,7 +13,7 @@ with most of it loses first; work for a choice is bounded by ``WINDOW``, the rob
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from math import inf
 from typing import NamedTuple
@@ -73,6 +73,7 @@ class _Row:
 
     late: int = 0
     orders: list[Order] = field(default_factory=list)
+    """Ascending."""
     kept: list[Kept] = field(default_factory=list)
     has: dict[int, Order] = field(default_factory=dict)
     told: dict[int, float] = field(default_factory=dict)
@@ -110,9 +111,10 @@ class InOrder:
         """
         message = kept.message
         stream, order = Stream(message.origin, message.start, message.topic_id), (message.number, message.place)
-        self.drop(stream, lambda newer: newer >= order)
         row = self._rows.get(stream)
-        if row is None:
+        if row is not None:
+            self._drop(stream, row.orders[bisect_left(row.orders, order) :])
+        else:
             row = self._rows[stream] = self._named[stream.origin, stream.start & 0xFF, stream.topic_id] = _Row()
         row.late = late
         row.orders.append(order)
@@ -125,7 +127,11 @@ class InOrder:
     def drop(self, stream: Stream, which: Callable[[Order], bool] = lambda _: True) -> None:
         """Keep these messages of a topic no longer."""
         row = self._rows.get(stream)
-        for order in [order for order in row.orders if which(order)] if row is not None else ():
+        if row is not None:
+            self._drop(stream, [order for order in row.orders if which(order)])
+
+    def _drop(self, stream: Stream, orders: Iterable[Order]) -> None:
+        for order in orders:
             self._rooms.drop(Name(stream, order))
             self._remove(Name(stream, order))
 
@@ -149,8 +155,9 @@ class InOrder:
     def heard(self, via: int, name: Name, now: float) -> None:
         """A robot has sent a message on: those that it hears should have it, too."""
         row = self._rows.get(name.stream)
-        if row is not None and name.order in row.orders:
-            kept = self[name]
+        place = 0 if row is None else bisect_left(row.orders, name.order)
+        if row is not None and row.orders[place : place + 1] == [name.order]:
+            kept = row.kept[place]
             for robot in self._gains.heard_by(via):
                 kept.sent[robot] = now, kept.sent.get(robot, (0.0, 0))[1]
 
