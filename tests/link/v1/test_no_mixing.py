@@ -20,7 +20,7 @@ from tests.link.v1.air import SLOT_S, Robot, registry
 from tests.link.v1.invariants import PacketsEnd
 
 TOPICS = 3
-MESSAGES = 5_000
+MESSAGES = 3_500
 SHORT, BEFORE, AFTER = 3_000, 2_000, 1_000
 HALF, ROUND = 1 << 15, 1 << 16
 """Packets of a sender's lives: some are SHORT at most, others begin BEFORE half of the numbers, or all, and
