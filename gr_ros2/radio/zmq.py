@@ -166,6 +166,7 @@ class ZmqFrontEnd(FrontEnd):
         self._passed: Callable[[], int | None] = lambda: None
         self._medium_clock = MediumClock() if self.options.medium_process == "lockstep" else None
         self._sink: _BurstPublisher | None = None
+        self._source: _BurstSubscriber | None = None  # the thread behind it may be told the time at once
         if self._medium_clock is not None:
             self.timing_error_s = _LOCKED_S
         try:
@@ -204,12 +205,13 @@ class ZmqFrontEnd(FrontEnd):
         self._passed = passed
 
     def _told(self, medium: int, at: float) -> None:
-        """The medium process has told the time: answer when all has been sent that begins before."""
+        """The medium process has told the time: answer when all has been sent that begins before, and the receiver has
+        what came."""
         assert self._medium_clock is not None
         assert self._sink is not None
         self._medium_clock.tick(medium, at)
         limit = time.monotonic() + _ANSWER_S
-        while self._passed() != self._counters["bursts_out"]:
+        while self._passed() != self._counters["bursts_out"] or self._source is None or self._source.behind:
             if time.monotonic() > limit or self._sink.closed:
                 return
             time.sleep(_LOOK_S)
@@ -355,6 +357,11 @@ class _Arrivals:
         except queue.Empty:
             return None
 
+    @property
+    def waits(self) -> bool:
+        """Whether a burst waits."""
+        return not self._waiting.empty()
+
     def _run(self) -> None:
         with self._socket:
             while True:
@@ -427,6 +434,11 @@ class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._medium_clock = clock
         self._rest: NDArray[np.complex64] = np.empty(0, np.complex64)
         self.set_blkd_input_timer_value(AGAIN_MS)
+
+    @property
+    def behind(self) -> bool:
+        """Whether the flowgraph has not taken all that has arrived."""
+        return bool(len(self._rest)) or self.arrivals.waits
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
         if not len(self._rest):

@@ -155,14 +155,14 @@ class LiveRobots:
             robot.link.check()
 
     def stop(self) -> None:
-        """Stop the links, and then the medium, for which they may wait."""
+        """Stop the medium, which would wait for a link that is gone, and then the links."""
         if not self._medium.waits:  # what one robot sends after another has stopped would be lost
             for robot in self.robots:
                 robot.source.stop()
             time.sleep(POLL_S)
+        self._medium.stop()
         for robot in self.robots:
             robot.link.stop()
-        self._medium.stop()
 
     def alarms(self) -> Sequence[str]:
         """What is wrong with the medium now, one line each."""
