@@ -33,6 +33,7 @@ class Thrift:
         self._flight.append((now, first, newest))
         for peer in self._peers.all.values():
             peer.asked = min(peer.asked, now)
+            peer.repairs += 1
 
     def worth(self, window: list[Sent], now: float) -> bool:
         """Whether a combination of a window is worth its slot."""

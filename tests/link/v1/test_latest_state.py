@@ -33,6 +33,30 @@ def test_one_best_effort_message_arrives_although_nothing_follows(loss: float) -
         assert two.delivered() == [b"stop"]
 
 
+@pytest.mark.parametrize("seed", [28, 60])
+def test_a_late_report_about_what_was_repaired_does_not_delay_the_next_repairs(seed: int) -> None:
+    """Reports of the start come after seconds, because they were lost, or the packets before them."""
+    one, two = stopper(), Robot(2)
+    air = Air(one, two, loss=0.6, seed=seed)
+    air.run(5.0)
+    one.end.messages.submit(0, b"stop", air.now)
+    assert air.run(20.0, lambda: bool(two.delivered())) < 5.0
+
+
+@pytest.mark.parametrize("seed", [1, 4, 7])
+def test_a_message_every_minute_is_repaired_as_soon_as_any(seed: int) -> None:
+    """Nothing is reported meanwhile, since nothing comes: that says nothing of how soon reports come."""
+    one, two = stopper(), Robot(2)
+    air = Air(one, two, loss=0.4, seed=seed)
+    air.run(5.0)
+    for n in range(30):
+        text = b"stop %d" % n
+        one.end.messages.submit(0, text, air.now)
+        took = air.run(60.0, lambda: text in two.delivered())  # noqa: B023 - called at once
+        assert took < 5.0
+        air.run(60.0 - took)
+
+
 @pytest.mark.parametrize(("keep_s", "away_s", "arrives"), [(0.0, 30.0, False), (60.0, 30.0, True), (20.0, 40.0, False)])
 def test_keep_s_says_how_long_a_robot_out_of_range_can_still_get_it(
     keep_s: float, away_s: float, arrives: bool
