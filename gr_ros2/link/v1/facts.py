@@ -32,7 +32,12 @@ class Early(NamedTuple):
 
 
 class Appeared(NamedTuple):
-    """Something of a robot came for the first time, or again after long."""
+    """Something of a robot came for the first time, or again after long.
+
+    :param knows: it has said that it has heard this start of this robot
+    """
+
+    knows: bool = False
 
 
 class PeerMet(NamedTuple):
@@ -85,4 +90,8 @@ class ProofWanted(NamedTuple):
     """A robot lacks the proof that this one hears it."""
 
 
-Fact = Taken | Early | Appeared | PeerMet | PeerLeft | Reported | Asked | Questioned | ProofWanted
+class Unproven(NamedTuple):
+    """A robot sends messages that cannot be taken, since its proof is not here."""
+
+
+Fact = Taken | Early | Appeared | PeerMet | PeerLeft | Reported | Asked | Questioned | ProofWanted | Unproven

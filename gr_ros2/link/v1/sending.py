@@ -13,7 +13,18 @@ from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import RateController
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.facts import Appeared, Asked, Fact, PeerLeft, PeerMet, ProofWanted, Questioned, Reported, Taken
+from gr_ros2.link.v1.facts import (
+    Appeared,
+    Asked,
+    Fact,
+    PeerLeft,
+    PeerMet,
+    ProofWanted,
+    Questioned,
+    Reported,
+    Taken,
+    Unproven,
+)
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.neighbours import Neighbours
@@ -105,7 +116,7 @@ class SendingSide:
             self._repeat(now)
         if messages.sent.deadlines:
             messages.expire(now, self._pace.sure_interval(now))
-        due = reports.due(now)
+        due = reports.due(now, last=packing.awaits_row)
         if due and reports.overdue:
             return reports.packet(due, now)
         first = self._window.pressing and not packing.urgent
@@ -182,8 +193,8 @@ class SendingSide:
                 self.urged = self.urged or urges or self.reports.requests.lacking
             case Reported(robot, number, report):
                 self._reported(robot, number, report, now)
-            case Appeared():
-                self._appeared(now)
+            case Appeared(knows):
+                self._appeared(now, knows=knows)
             case PeerMet(robot, proven, wanted):
                 self._window.peers.meet(robot, now)
                 if proven is not None:
@@ -202,6 +213,8 @@ class SendingSide:
                 self.pings.receive(robot, self.settings.src_id, entry, now)
             case ProofWanted():
                 self.hellos.answer(now)
+            case Unproven():
+                self.hellos.unproven(now)
 
     def _reported(self, robot: int, number: int, report: Report, now: float) -> None:
         loss = report.loss / 128
@@ -225,15 +238,19 @@ class SendingSide:
         if self._rate is not None:
             self._rate.forget(robot)
 
-    def _appeared(self, now: float) -> None:
-        """A robot is heard for the first time, or again: kept messages are repeated soon, and hellos sent."""
+    def _appeared(self, now: float, *, knows: bool) -> None:
+        """A robot is heard for the first time, or again: kept messages are repeated soon, and hellos sent.
+
+        :param knows: it has heard this robot already
+        """
         if self._repeats > 1:
             self._repeats = 1
             self._plan_repeat(now)
         if self.settings.hears:
-            self.hellos.met(now)
+            self.hellos.met(now, knows=knows)
         if self.settings.shares and self.settings.slower > 1 and self._started:
-            self._messages.kept.asked(TABLE_TOPIC, now)  # it lacks the table, and would say so some turns later
+            # It lacks the table, and would say so some turns later.
+            self._messages.kept.asked(TABLE_TOPIC, now, anew=True)
 
     def reconfigure(self, settings: Settings, now: float) -> None:
         """Use other settings from now on."""
@@ -298,7 +315,9 @@ class SendingSide:
             kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
         sent = self._writer.control(entries, "hello", now, clear=isinstance(entries[0], Hello))
-        self._neighbours.own_hellos.said(sent.data, now)
+        proving = [entry.src_id for entry in entries if isinstance(entry, Heard)]
+        starts = frozenset((src_id, self._neighbours.all[src_id].boot) for src_id in proving)
+        self._neighbours.own_hellos.said(sent.data, now, starts, self._writer.leave_at)
         for entry in entries:
             if isinstance(entry, Heard):
                 since, wanted = self._neighbours.since(entry.src_id)
