@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.link.events import Delivered, ReceiverEvent, SentPacket
+from gr_ros2.link.v1.delivery import MAX_AGE_S
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.packing import TOLD
 from gr_ros2.link.v1.sealing import SealMode
@@ -281,3 +282,24 @@ def test_over_random_lines_no_message_comes_later_than_its_deadline_and_an_eight
             limit_s = limits[event.topic_id]
             assert age_s <= limit_s * (1 + 1 / TOLD) + AGE_STEP_S + 3 * SLOT_S
             assert event.age_s >= age_s - max(limit_s / TOLD, AGE_STEP_S) - 3 * SLOT_S
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_message_may_wait_at_its_origin_for_longer_than_it_may_be_withheld(mode: SealMode, kept: bool) -> None:
+    """Its deadline is longer than ``max_age_s``: robots over hops get it, too. It waits for its robot to send, or since
+    it was published."""
+    option = SendOptions(queue="deadline", deadline_s=3 * MAX_AGE_S)
+    if kept:
+        option = SendOptions(queue="deadline", deadline_s=3 * MAX_AGE_S, durability="transient_local", to=3)
+    line = Line(robot(1, mode, rows(option)), *(robot(src_id, mode) for src_id in (2, 3)))
+    absent(line, *([3] if kept else []))
+    line.run(10)
+    line.robots[0].end.messages.submit(1, b"goal", line.now)
+    if kept:
+        line.run(1.5 * MAX_AGE_S)
+        absent(line)
+    else:
+        hold_back(line.robots[0], 1.5 * MAX_AGE_S, line.run)
+    line.run(10)
+    assert line.robots[2].delivered(1).count(b"goal") == 1
