@@ -287,6 +287,10 @@ class Planner:
         self._now: Forecast | None = None
         self._begun: Generator[Forecast, None, None] | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process: without what was found here so far."""
+        return {**vars(self), "_remembering": None, "_now": None, "_begun": None}
+
     def begin(self) -> None:
         """Have other processes try all changes from the first :meth:`forecast` on, for :meth:`advice`."""
         scenarios = [scenario for _, scenario in self._trials()]
@@ -627,7 +631,7 @@ class _Remembering:
 def _on_all_processors(
     work: Callable[[Scenario], Forecast], scenarios: Sequence[Scenario]
 ) -> Generator[Forecast, None, None]:
-    """The same as ``map``, by forked processes: each has all that this one has loaded and coded.
+    """The same as ``map``, by other processes. Forks would have the locks of this one's threads, and wait for ever.
 
     :raises RunError: for a process that was ended from outside
     """
@@ -635,7 +639,7 @@ def _on_all_processors(
     if processors < 2:
         yield from map(work, scenarios)
         return
-    pool = ProcessPoolExecutor(processors, get_context("fork"), _begin_process, (work,))
+    pool = ProcessPoolExecutor(processors, get_context("forkserver"), _begin_process, (work,))
     try:
         yield from pool.map(_process, scenarios)
     except BrokenProcessPool as error:
