@@ -5,9 +5,9 @@ picks its slots among those that nobody it hears has announced, and that no neig
 of a neighbour would destroy what that neighbour receives. Of two robots that want one slot, the lower id keeps it.
 
 *Rate.* A robot's weight says how many packets it sends while others send one: 1, and more where it has much to relay. A
-frame has a slot for each packet around the one of this robot and its neighbours that has most around it, and one for
-each newcomer, at least one: where some come, more are to be expected, and they need free slots. It lasts at least the
-period of the messages.
+frame has a slot for each packet around the one of this robot and its neighbours that has most around it, one more, and
+one for each newcomer: where some come, more are to be expected, and they need free slots. It lasts at least the period
+of the messages.
 
 *Choice.* The first free slot after an equal part of the frame. Slots go on from frame to frame, so one counts as free
 only if nobody else is known to send in the slot one frame before (without this 6 instead of 2 % of the receptions in a
@@ -48,11 +48,11 @@ from gr_ros2.wire.mac_block import (
     write_block,
 )
 
-LISTEN, QUIET, FRAMES = 24, 4, 2
+LISTEN, QUIET, FRAMES = 24, 6, 2
 """Slots for which a robot listens before it enters: two frames of those it hears, since each has announced its slots
 in one, but ``LISTEN`` at most; ``QUIET`` at least, and where nobody is heard. With a ``LISTEN`` of 12, one of 20 whose
 clock has jumped by 1 s may collide with others 5 s later; with a ``QUIET`` of 24, two robots hear each other after 31
-slots instead of 15 (median), 50 from cold after 521 instead of 548. With 3, it is the same as with 4."""
+slots instead of 15 (median), 50 from cold after 521 instead of 548."""
 HEARD = 210
 """Slots for which a robot that was heard counts as heard; more where robots send less than three times in them."""
 CHOICE = 4
@@ -83,11 +83,8 @@ EASED = 0.97
 VAIN = 4
 """What v is multiplied by after an entry in vain. With 2, v stays near 2 while 50 robots enter from cold, most entries
 collide, and it takes 10 instead of 7.5 s on average; with 3 to 8 it is the same."""
-_FIRST_RATE, _NAMED_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 1.0, 4.0, 64.0, 64.0
-"""v at the start; of one that was alone and is named by the first robot it hears; after an entry (with 8 a grid of 5 ×
-4 is 3 % older); and the most that entries in vain make. With 8 at the start and 4 for one that is named (and a
-``QUIET`` of 6), the first message of two robots comes after 14 instead of 10 s where packets take half a second
-(``python -m bench first``), 50 robots from cold take as long. With 3 or 2 at the start, it is the same."""
+_FIRST_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 8.0, 4.0, 64.0, 64.0
+"""v at the start, after an entry (with 8 a grid of 5 × 4 is 3 % older), and the most that entries in vain make."""
 _NEVER = -1 << 40
 _SWEEP = 64
 _SILENT = 4096
@@ -293,10 +290,10 @@ class Slots:
 
     def _frame(self, now: int, loads: list[int]) -> int:
         """Slots in which every robot around sends as often as its weight says, and newcomers find room."""
-        known = max(loads)
-        oldest = now - min(NEWCOMER, NEWCOMER_FRAMES * (known + 1))
+        known = max(loads) + 1
+        oldest = now - min(NEWCOMER, NEWCOMER_FRAMES * known)
         newcomers = sum([robot.first >= oldest for robot in self._robots.values()])
-        return max(math.ceil(self._period - 1e-9), known + max(newcomers, 1))
+        return max(math.ceil(self._period - 1e-9), known + newcomers)
 
     def _memory(self) -> int:
         """Slots for which a robot that was heard counts as heard."""
@@ -357,8 +354,7 @@ class Slots:
         """Note a burst. Who says nothing about slots cannot be avoided."""
         if block is None or src_id == self.src_id or not (trusted or checked or not self.clock.agreeing(began)):
             return
-        joins = block.heard > 0 and not self._robots
-        slot = self._placed(src_id, block.slot, began, trusted=trusted, checked=checked, joins=joins)
+        slot = self._placed(src_id, block.slot, began, trusted=trusted, checked=checked)
         if slot is None:
             return
         first, second = block.ahead
@@ -409,12 +405,10 @@ class Slots:
             self._leave()
             self._rate = min(self._rate, _ENTRY_RATE)
 
-    def _placed(
-        self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool, joins: bool
-    ) -> int | None:
+    def _placed(self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool) -> int | None:
         """The slot of a packet; None where its sender has other slots."""
         jumps = self.clock.jumps
-        slot = self.clock.heard(src_id, number, began, trusted=trusted, checked=checked, joins=joins)
+        slot = self.clock.heard(src_id, number, began, trusted=trusted, checked=checked)
         if self.clock.jumps > jumps:
             assert slot is not None
             self._elsewhere = dict.fromkeys(self._robots, began)
@@ -443,7 +437,7 @@ class Slots:
             other = self._robots.get(name)
             if name == self.src_id:
                 self._confirmed_at = max(self._confirmed_at, slot)
-                self._rate = _NAMED_RATE if self._entered_at is None else _ENTRY_RATE
+                self._rate = _ENTRY_RATE
             elif other is not None and other.named == _NEVER:
                 other.named = self._turn(slot)  # one confirmation is enough
             elif name != NOBODY:

@@ -32,12 +32,7 @@ class Early(NamedTuple):
 
 
 class Appeared(NamedTuple):
-    """Something of a robot came for the first time, or again after long.
-
-    :param knows: it has said that it has heard this start of this robot
-    """
-
-    knows: bool = False
+    """Something of a robot came for the first time, or again after long."""
 
 
 class PeerMet(NamedTuple):
@@ -90,8 +85,4 @@ class ProofWanted(NamedTuple):
     """A robot lacks the proof that this one hears it."""
 
 
-class Unproven(NamedTuple):
-    """A robot sends messages that cannot be taken, since its proof is not here."""
-
-
-Fact = Taken | Early | Appeared | PeerMet | PeerLeft | Reported | Asked | Questioned | ProofWanted | Unproven
+Fact = Taken | Early | Appeared | PeerMet | PeerLeft | Reported | Asked | Questioned | ProofWanted

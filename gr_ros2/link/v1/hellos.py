@@ -106,14 +106,8 @@ class Hellos:
         """Whether hellos are still frequent."""
         return bool(self._starting)
 
-    def met(self, now: float, *, knows: bool = False) -> None:
-        """A start of a robot is heard for the first time: send it hellos, several because any of them may be lost.
-
-        :param knows: it has opened a packet of this robot, so it has a hello
-        """
-        if knows and self._settings.slower > 1:
-            self._eager = EAGER
-            return
+    def met(self, now: float) -> None:
+        """A start of a robot is heard for the first time: send it hellos, several because any of them may be lost."""
         self._starting = deque(now + after * self._settings.slower for after in STARTING_S[1:])
         self._eager = EAGER
         self.answer(now)
@@ -121,11 +115,6 @@ class Hellos:
     def answer(self, now: float) -> None:
         """Send the next hello at once, before messages."""
         self._answering = True
-        self.hurry(now)
-
-    def unproven(self, now: float) -> None:
-        """A robot sends messages that cannot be taken: its proof was lost, and the next hello says so."""
-        self.rests = 0
         self.hurry(now)
 
     def hurry(self, now: float) -> None:
@@ -143,8 +132,7 @@ class Hellos:
         if late < 0 or idle or self._answering:
             return late >= 0
         if self._starting:
-            slower = self._settings.slower
-            rests = slower > 1 and self._rests and late <= SELDOM_S * slower
+            rests = self.rests > 0 and self.named and self._settings.slower > 1 and self._hears_others
             return late >= latency * LATENCY_S and not rests
         return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
 
@@ -156,14 +144,6 @@ class Hellos:
     @property
     def _hears_others(self) -> bool:
         return any(not neighbour.silent for neighbour in self._neighbours.all.values())
-
-    @property
-    def _rests(self) -> bool:
-        """Whether messages go before hellos on a slow channel: always where all that are heard have heard this robot,
-        and prove it."""
-        heard = [neighbour for neighbour in self._neighbours.all.values() if not neighbour.silent]
-        met = all(neighbour.knows and neighbour.proven for neighbour in heard)
-        return bool(heard) and (met or (self.rests > 0 and self.named))
 
     @property
     def _period(self) -> float:
@@ -214,9 +194,6 @@ class Hellos:
 
     def _next(self, now: float, *, wants: bool) -> float:
         """When the next hello is due, s."""
-        slow = self._settings.shares and self._settings.slower > 1
-        while slow and self._starting and self._starting[0] <= now:
-            self._starting.popleft()  # messages went first for so long that this hello stands for several
         due = self._starting.popleft() if self._starting else now + self._pause
         if not wants or not self._eager:
             return due

@@ -129,14 +129,8 @@ class KeptMessages:
         """Keep none of the messages of a topic so far."""
         self._kept.pop(topic_id, None)
 
-    def asked(self, topic_id: int, now: float, *, anew: bool = False) -> bool:
-        """A robot asks for the kept message of a topic; returns whether that is not too often.
-
-        :param anew: it has nothing of it. Otherwise rows of the table that wait may be those that it lacks
-        """
-        slow = self._settings.shares and self._settings.slower > 1
-        if slow and topic_id == TABLE_TOPIC and not anew and self._topics[TABLE_TOPIC].queue:
-            return True
+    def asked(self, topic_id: int, now: float) -> bool:
+        """A robot asks for the kept message of a topic; returns whether that is not too often."""
         if not self._of(topic_id):
             return True
         pause = max(PAUSE_S * self._settings.slower, PAUSE * self._took.get(topic_id, 0.0))
@@ -207,10 +201,7 @@ class KeptMessages:
 
     def _send_rows(self, rows: Collection[_Kept], qos: int, now: float) -> None:
         queue = self._topics[TABLE_TOPIC].queue
-        for row in rows:
-            message = Message(-1, TABLE_TOPIC, row.payload, qos, now, repeat=True, begin=row.begin)
-            message.left_at = row.named  # whether it has left before
-            queue.append(message)
+        queue.extend(Message(-1, TABLE_TOPIC, row.payload, qos, now, repeat=True, begin=row.begin) for row in rows)
         self._stats.repeats += len(rows)
 
     def _of(self, topic_id: int) -> Collection[_Kept]:

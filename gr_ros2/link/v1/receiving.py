@@ -35,7 +35,6 @@ from gr_ros2.link.v1.facts import (
     ProofWanted,
     Questioned,
     Reported,
-    Unproven,
 )
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
@@ -192,8 +191,6 @@ class ReceivingSide:
         opened = self._open(arrival.data, header, now)
         if self._access is not None and (opened is None or opened.new):  # what was here says nothing about now
             self._note_slot(self._access, header, arrival, now, opened)
-        if opened is not None and opened.kept and self._access is not None:
-            self._facts.append(Unproven())
         if opened is None or opened.kept:
             return
         opened.neighbour.timeout = None
@@ -215,8 +212,6 @@ class ReceivingSide:
         trusted = opened is not None and opened.trusted
         checked = opened is not None and (trusted or self.neighbours.proves_soon(opened.neighbour))
         access.hear(header.src_id, block, arrival.at, trusted=trusted, checked=checked)
-        if opened is not None and block is not None and self._settings.src_id in block.names:
-            opened.neighbour.knows = True
         if self.relaying is not None and trusted:
             self.relaying.heard(header.src_id, block, now)
 
@@ -276,7 +271,7 @@ class ReceivingSide:
         inbox = neighbour.inbox
         if repair.clear:
             neighbour.echo = arrival.data[-ECHO_LEN:], self._sent.newest
-            if neighbour.hello.capabilities & WANTS_PROOF and not self._answered(neighbour, entries, now):
+            if neighbour.hello.capabilities & WANTS_PROOF:
                 self._facts.append(ProofWanted())
         if not opened.trusted:
             if not repair.clear:
@@ -299,15 +294,7 @@ class ReceivingSide:
             self._facts.append(PeerLeft(opened.replaced.src_id, ended=True))
             if self.relaying is not None:
                 self.relaying.started(opened.replaced, now)
-        self._facts.append(Appeared(opened.neighbour.knows))
-
-    def _answered(self, neighbour: Neighbour, entries: Sequence[EntryV1], now: float) -> bool:
-        """Whether a robot whose hello says that it lacks a proof means other robots, or an answer is under way."""
-        if self._access is None or self._settings.slower <= 1:
-            return False
-        began = neighbour.inbox.began
-        since = 2 * began - now - self._access.lead_s  # another packet took as long, and this one was written before
-        return self.neighbours.own_hellos.knows((neighbour.src_id, neighbour.boot), entries, since)
+        self._facts.append(Appeared())
 
     def _meet(self, neighbour: Neighbour, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""

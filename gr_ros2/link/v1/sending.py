@@ -13,18 +13,7 @@ from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import RateController
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.facts import (
-    Appeared,
-    Asked,
-    Fact,
-    PeerLeft,
-    PeerMet,
-    ProofWanted,
-    Questioned,
-    Reported,
-    Taken,
-    Unproven,
-)
+from gr_ros2.link.v1.facts import Appeared, Asked, Fact, PeerLeft, PeerMet, ProofWanted, Questioned, Reported, Taken
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.neighbours import Neighbours
@@ -116,7 +105,7 @@ class SendingSide:
             self._repeat(now)
         if messages.sent.deadlines:
             messages.expire(now, self._pace.sure_interval(now))
-        due = reports.due(now, last=packing.awaits_row)
+        due = reports.due(now)
         if due and reports.overdue:
             return reports.packet(due, now)
         first = self._window.pressing and not packing.urgent
@@ -193,8 +182,8 @@ class SendingSide:
                 self.urged = self.urged or urges or self.reports.requests.lacking
             case Reported(robot, number, report):
                 self._reported(robot, number, report, now)
-            case Appeared(knows):
-                self._appeared(now, knows=knows)
+            case Appeared():
+                self._appeared(now)
             case PeerMet(robot, proven, wanted):
                 self._window.peers.meet(robot, now)
                 if proven is not None:
@@ -213,8 +202,6 @@ class SendingSide:
                 self.pings.receive(robot, self.settings.src_id, entry, now)
             case ProofWanted():
                 self.hellos.answer(now)
-            case Unproven():
-                self.hellos.unproven(now)
 
     def _reported(self, robot: int, number: int, report: Report, now: float) -> None:
         loss = report.loss / 128
@@ -238,19 +225,15 @@ class SendingSide:
         if self._rate is not None:
             self._rate.forget(robot)
 
-    def _appeared(self, now: float, *, knows: bool) -> None:
-        """A robot is heard for the first time, or again: kept messages are repeated soon, and hellos sent.
-
-        :param knows: it has heard this robot already
-        """
+    def _appeared(self, now: float) -> None:
+        """A robot is heard for the first time, or again: kept messages are repeated soon, and hellos sent."""
         if self._repeats > 1:
             self._repeats = 1
             self._plan_repeat(now)
         if self.settings.hears:
-            self.hellos.met(now, knows=knows)
+            self.hellos.met(now)
         if self.settings.shares and self.settings.slower > 1 and self._started:
-            # It lacks the table, and would say so some turns later.
-            self._messages.kept.asked(TABLE_TOPIC, now, anew=True)
+            self._messages.kept.asked(TABLE_TOPIC, now)  # it lacks the table, and would say so some turns later
 
     def reconfigure(self, settings: Settings, now: float) -> None:
         """Use other settings from now on."""
@@ -315,9 +298,7 @@ class SendingSide:
             kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
         sent = self._writer.control(entries, "hello", now, clear=isinstance(entries[0], Hello))
-        proving = [entry.src_id for entry in entries if isinstance(entry, Heard)]
-        starts = frozenset((src_id, self._neighbours.all[src_id].boot) for src_id in proving)
-        self._neighbours.own_hellos.said(sent.data, now, starts, self._writer.leave_at)
+        self._neighbours.own_hellos.said(sent.data, now)
         for entry in entries:
             if isinstance(entry, Heard):
                 since, wanted = self._neighbours.since(entry.src_id)
