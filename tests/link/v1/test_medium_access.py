@@ -159,7 +159,6 @@ class Sound:
         self._airtime_s, self._on = airtime_s, on
         self._gates = [AirtimeClock[bytes](airtime_s, ahead=AHEAD_S) for _ in on]
         self._air: list[tuple[float, int, bytes]] = []
-        self._over: list[tuple[float, int, bytes]] = []
         self._steps = 0
         for src_id in range(1, len(on) + 1):
             rng = random.Random(100 * seed + src_id)
@@ -174,15 +173,12 @@ class Sound:
                 if self.now >= on:
                     self._leave(robot, gate, speak=speak and not self._steps % round(1 / LEAD_S))
             lasts = self._airtime_s + HEARD_AFTER_S
-            over = [one for one in self._air if one[0] + lasts <= self.now and one not in self._over]
-            self._over += over
-            for began, src_id, data in over:
+            for began, src_id, data in [one for one in self._air if self.now - LEAD_S < one[0] + lasts <= self.now]:
                 alone = not any(o != src_id and abs(at - began) < self._airtime_s for at, o, _ in self._air)
                 for robot, on in zip(self.robots, self._on, strict=True):
                     if alone and robot.src_id != src_id and self.now >= on:
                         robot.receive(data, self.now, began)
             self._air = [one for one in self._air if one[0] > self.now - 2 - self._airtime_s]
-            self._over = [one for one in self._over if one in self._air]
             self._steps += 1
             self.now = self._steps * LEAD_S
 
