@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gr_ros2.codecs.base import MAX_SIZE, Coded, frame, name_of, opened
+from gr_ros2.codecs.base import MAX_SIZE, Coded, frame, keep, name_of, opened
 from gr_ros2.codecs.messages import GRID, read, take
 from gr_ros2.codecs.pack import Packer
 from gr_ros2.compression import bounds
@@ -24,8 +24,6 @@ from gr_ros2.compression.zstd_frames import read_varint
 from gr_ros2.core.errors import DamagedError, MissingFrameError
 from gr_ros2.wire import varint
 
-KEPT = 4
-"""Grids that wait to be confirmed; older ones are not referred to any more."""
 _UNKNOWN = 0xFF
 _WHOLE, _CHANGES = range(2)
 _PLAIN, _XOR = range(2)
@@ -86,7 +84,7 @@ class GridEncoder:
         elif self._base is not None and self._base in self._sent:  # others hold the newest ``KEPT`` that they got
             changes = self._changes(self._base, self._sent[self._base], grid)
             coded = changes if len(changes.data) < len(coded.data) else coded
-        _keep(self._sent, coded.name, grid)
+        keep(self._sent, coded.name, grid)
         return coded
 
     def confirmed(self, name: int) -> None:
@@ -140,7 +138,7 @@ class GridDecoder:
             grid = self._changed(body, base)
             message = grid.message
             grid = _split(message)  # which also checks that it is one
-        _keep(self._held, name_of(data), grid)
+        keep(self._held, name_of(data), grid)
         return message
 
     def _changed(self, body: bytes, base: _Grid) -> _Grid:
@@ -163,14 +161,6 @@ class GridDecoder:
         new = np.frombuffer(box, np.uint8).reshape(down, across)
         part[...] = part ^ new if way == _XOR else new
         return _Grid(_xor(parts[:head_size], base.head), cells, parts[head_size:], None)
-
-
-def _keep(grids: OrderedDict[int, _Grid], name: int, grid: _Grid) -> None:
-    """Keep a grid as the newest of ``KEPT``. Equal ones have one name."""
-    grids[name] = grid
-    grids.move_to_end(name)
-    while len(grids) > KEPT:
-        grids.popitem(last=False)
 
 
 def _split(message: bytes) -> _Grid:

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from gr_ros2.codecs.base import MAX_SIZE, Coded, frame, name_of, opened
+from gr_ros2.codecs.base import MAX_SIZE, Coded, frame, keep, name_of, opened
 from gr_ros2.codecs.pack import Packer
 from gr_ros2.compression import bounds
 from gr_ros2.compression.zstd_frames import Zstd
 from gr_ros2.core.errors import DamagedError, MissingFrameError
 
-KEPT = 4
 _WHOLE, _CHANGES = range(2)
 _LEVEL = 6
 """Of zstd: 1 MB takes some 20 ms."""
@@ -57,7 +56,7 @@ class GrowingEncoder:
             changes = Zstd(self._sent[self._base], _LEVEL).compress(message, least=bounds.least(len(message)))
             if len(changes) + 4 < len(coded.data):
                 coded = frame(_CHANGES, changes, self._base)
-        _keep(self._sent, coded.name, message)
+        keep(self._sent, coded.name, message)
         return coded
 
     def confirmed(self, name: int) -> None:
@@ -91,13 +90,5 @@ class GrowingDecoder:
                 raise MissingFrameError("the message that this one changes was not decoded here")
             self._kept.move_to_end(before)
             message = Zstd(base).decompress(body, min(self._max_size, bounds.largest(len(body))))
-        _keep(self._kept, name_of(data), message)
+        keep(self._kept, name_of(data), message)
         return message
-
-
-def _keep(messages: OrderedDict[int, bytes], name: int, message: bytes) -> None:
-    """Keep a message as the newest of ``KEPT``. Equal ones have one name."""
-    messages[name] = message
-    messages.move_to_end(name)
-    while len(messages) > KEPT:
-        messages.popitem(last=False)

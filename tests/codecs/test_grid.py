@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.codecs import CodedTopic
-from gr_ros2.codecs.grid import KEPT
+from gr_ros2.codecs.base import KEPT
 from gr_ros2.codecs.messages import GRID
 from gr_ros2.core.errors import MissingFrameError
 from tests.codecs.scenes import exploring, grid
