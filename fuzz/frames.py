@@ -15,9 +15,10 @@ from functools import cache, partial
 from fuzz.insider import STARTS, Robot, Script
 from fuzz.loop import main, work
 from gr_ros2.codecs import CODECS
-from gr_ros2.codecs.frames import MOST_DECODERS, FrameReceiver, FrameSender, TimedCoder
+from gr_ros2.codecs.frames import FrameSender, TimedCoder
 from gr_ros2.codecs.messages import CLOUD, GRID, IMAGE
 from gr_ros2.codecs.pull import KEY_S
+from gr_ros2.codecs.received_frames import MOST_DECODERS, FrameReceiver
 from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import AirPacket

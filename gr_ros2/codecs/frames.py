@@ -1,7 +1,7 @@
 """Topics as chains of frames on a link: cameras, depth, maps, and clouds that fit the air.
 
 :class:`FrameSender` decides when the newest message of each topic is coded and keeps the encoders, whoever runs them:
-a thread of a link, or a simulation at once. :class:`FrameReceiver` keeps one decoder for each topic of each robot.
+a thread of a link, or a simulation at once. ``received_frames`` is the other end.
 
 Invariants: sans-IO; encoding needs no lock, and one message of a topic is encoded at a time; every message that is
 offered becomes a frame or is refused by name; a message that no codec takes passes exactly, and is named once; one that
@@ -11,41 +11,33 @@ cannot be coded ends nothing but itself.
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict, deque
-from collections.abc import Mapping
+from collections import Counter, deque
+from collections.abc import Hashable, Iterable, Mapping
 from math import inf
 from typing import Any, NamedTuple
 
-from gr_ros2.codecs.base import MAX_SIZE, Coded
-from gr_ros2.codecs.messages import CAMERA_INFO, CLOUD
+from gr_ros2.codecs.base import MAX_SIZE, OF_CHAIN, Coded
+from gr_ros2.codecs.grid import updated
+from gr_ros2.codecs.messages import CLOUD, GRID, GRID_UPDATE
 from gr_ros2.codecs.pull import FramePull, Pull, StatePull
-from gr_ros2.codecs.topic import CODECS, OFF, CodedTopic, TopicDecoder, TopicEncoder
-from gr_ros2.core.errors import BackendMissingError, CodecError, MissingFrameError
+from gr_ros2.codecs.topic import CODECS, OFF, CodedTopic, TopicEncoder
+from gr_ros2.core.errors import CodecError, ConfigError, DamagedError
 from gr_ros2.link.fates import Fate
-from gr_ros2.link.frames import MARK, FrameSide
+from gr_ros2.link.frames import FrameSide
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import PICTURES, Topic
-from gr_ros2.wire import AnnouncedTopic
+from gr_ros2.settings.registry import Topic
 
 CODING_S = 0.008
 """s that coding takes: one of 640 × 480 pixels needs half of it, and the computer has more to do."""
-MOST_DECODERS = 32
-"""Topics of others that are decoded at a time; each may hold some pictures. The one that was used longest ago begins
-anew with a key frame."""
-MOST_BYTES_S = 256e6
-"""Bytes of messages in a second that are made of one robot's frames, on average over a second: 250 bytes of video may
-say "the same as before" of 8 million pixels, which takes 18 ms. It is more than a camera of 1920 × 1080 pixels at 30/s,
-and keeps half a core busy."""
-_TOGETHER, _ALL = 4, -1
-"""Times as many of all robots together, and whose they are."""
-_DAMAGED_BYTES = 1 << 23
-"""Bytes that a damaged frame counts: whatever was wrong with it may have been found at its end."""
-_BESIDE = ("image_raw", "image", "image_color", "image_mono")
-"""Ends of the names of pictures that a CameraInfo beside them is of, the likeliest first."""
-MOST_HELD = 1 << 28
-"""Bytes of maps and the like of others that are kept, for what changes of them: of those used longest ago none are."""
 _STATES = {CODECS["grid"].number, CODECS["growing"].number}
 """Codecs of messages of which the newest counts, however old it is."""
+MOST_CHAINS = 16
+"""Publishers of a topic whose newest messages are kept; with more, those of others than came last are not."""
+_STARTS = 2
+"""Chains for each of several publishers: one that has started again counts as another."""
+_UPDATES = "_updates"
+"""End of the name of a topic that says what changes of the map whose name stands before."""
 _SECONDS = 2.0
 """s over which what is said of a topic is a mean."""
 _log = logging.getLogger(__name__)
@@ -55,12 +47,15 @@ class Job(NamedTuple):
     """A message to be encoded.
 
     :param encoder: whose ``encode`` it is for, without a lock
+    :param number, chain: of the topic, for which it is
     :param sent: the topic
     """
 
     topic_id: int
     pull: Pull
     encoder: TopicEncoder
+    number: int
+    chain: _Chain
     sent: _Sent
 
     def run(self) -> Coded | CodecError:
@@ -73,15 +68,44 @@ class Job(NamedTuple):
             return CodecError(f"image: {error}")
 
 
+class Changed(NamedTuple):
+    """A map that another message has changed.
+
+    :param topic_id: of that message
+    :param made: the map as it is now, or why the message does not fit it
+    :param publisher: of the map
+    """
+
+    topic_id: int
+    map_id: int
+    made: bytes | DamagedError
+    publisher: Hashable
+
+
+class _Chain:
+    """The messages of one publisher, or of all, of a topic that is sent as frames."""
+
+    def __init__(self, pull: FramePull | StatePull, encoder: TopicEncoder) -> None:
+        self.pull, self.encoder = pull, encoder
+
+
 class _Sent:
-    """A topic that is sent as frames."""
+    """A topic that is sent as frames.
+
+    :ivar chains: by number, the next whose turn it is first
+    :ivar publishers: how many publish it
+    """
 
     def __init__(self, topic: Topic, coded: CodedTopic) -> None:
         self.name = topic.name
-        self.use(topic, coded)
         self.is_map = not _STATES.isdisjoint(coded.codecs)
-        self.is_cloud = topic.type_name == CLOUD
-        self.pull: FramePull | StatePull = (StatePull if self.is_map else FramePull)(coding_s=CODING_S)
+        self.is_cloud = topic.type_name == CLOUD and not self.is_map
+        self.is_grid = topic.type_name == GRID and self.is_map
+        self.publishers = 1
+        self.chains: dict[int, _Chain] = {}
+        self._whose: dict[Hashable, int] = {}
+        """Chains of those who have published, who published last is the last."""
+        self.use(topic, coded)
         self.limit(topic)
         self.said: set[str] = set()
         self.frames = self.failed = self.bytes = 0
@@ -91,8 +115,44 @@ class _Sent:
 
     def use(self, topic: Topic, coded: CodedTopic) -> None:
         """Code from now on so, with a key frame first."""
-        self.options, self.coded = _coding(topic), coded
-        self.encoder = coded.encoder()
+        self.options, self.cloud, self.coded = _coding(topic.options), topic.options.cloud, coded
+        for chain in self.chains.values():
+            chain.encoder = coded.encoder()
+
+    def chain_of(self, publisher: Hashable) -> tuple[_Chain, list[_Chain]]:
+        """The chain of a publisher of whom a message has come, and those that end, since others have ended or come."""
+        if not self.is_map:
+            publisher, most = None, 1
+        elif self.publishers <= 1:
+            most = 1
+        else:
+            most = min(_STARTS * self.publishers, MOST_CHAINS)
+            publisher = object() if publisher is None else publisher  # not known: the newest messages of all are kept
+        number, ended = self._whose.pop(publisher, None), []
+        while len(self._whose) >= most:
+            free = self._whose.pop(next(iter(self._whose)))
+            if number is None:
+                number = free
+            else:
+                ended.append(self.chains.pop(free))
+        if number is None:
+            number = next(free for free in range(MOST_CHAINS) if free not in self.chains)
+            pull = (StatePull if self.is_map else FramePull)(period_s=self._period_s, coding_s=CODING_S)
+            self.chains[number] = _Chain(pull, self.coded.encoder())
+        self._whose[publisher] = number
+        return self.chains[number], ended
+
+    @property
+    def only(self) -> tuple[Hashable, bytes] | None:
+        """The one publisher and its newest message; None if there are more, or none."""
+        whose, pulls = list(self._whose), [chain.pull for chain in list(self.chains.values())]
+        pull = pulls[0] if len(pulls) == len(whose) == 1 else None
+        return (whose[0], pull.newest) if isinstance(pull, StatePull) and pull.newest is not None else None
+
+    def forget(self) -> None:
+        """Send nothing of what came so far."""
+        self.chains.clear()
+        self._whose.clear()
 
     def note(self, now: float, came: int = 0, frame: int = 0) -> None:
         """So many bytes came, or were sent."""
@@ -119,7 +179,9 @@ class _Sent:
         """Heed the options of the topic that may change while it is sent."""
         options = topic.options
         fps = options.max_rate if options.camera.fps == AUTO else options.camera.fps
-        self.weight, self.pull.period_s = options.weight, 1 / fps if fps else 0.0
+        self.weight, self._period_s = options.weight, 1 / fps if fps else 0.0
+        for chain in self.chains.values():
+            chain.pull.period_s = self._period_s
 
 
 class FrameSender:
@@ -131,18 +193,24 @@ class FrameSender:
     def __init__(self, frames: FrameSide) -> None:
         self._frames = frames
         self._sent: dict[int, _Sent] = {}
+        self._updates: dict[int, str] = {}
+        """Names of the maps whose changes topics say, by topic id."""
+        self._became: Counter[int] = Counter()
+        """How many messages of these became a part of their map."""
 
     def add(self, topic: Topic, *, latched: bool = False) -> bool:
         """Send a topic as frames if it is a camera, depth, a latched map or a cloud that is to fit the air, and its
         options do not say otherwise.
         Returns whether it is sent so. For one that is, its options may have changed.
 
-        :param latched: whether its one publisher keeps its message for late joiners
+        :param latched: whether its publishers keep their messages for late joiners
         """
+        if topic.type_name == GRID_UPDATE and topic.name.endswith(_UPDATES) and topic.options.codec == AUTO:
+            self._updates[topic.topic_id] = topic.name.removesuffix(_UPDATES)
         known = self._sent.get(topic.topic_id)
         if known is not None:
             known.limit(topic)
-            if known.options != _coding(topic) and (changed := coded_topic(topic)) is not None:
+            if known.options != _coding(topic.options) and (changed := coded_topic(topic)) is not None:
                 known.use(topic, changed)
                 self._begin(topic)
             return True
@@ -157,48 +225,96 @@ class FrameSender:
         output = topic.options.camera.output
         self._frames.begin(topic.topic_id, "" if output == "same" else output)
 
+    def check(self, topic_id: int, options: SendOptions) -> None:
+        """Refuse options that cannot change while a topic is sent.
+
+        :raises ConfigError: naming topic and option
+        """
+        sent = self._sent.get(topic_id)
+        if sent is not None and sent.is_map and sent.cloud != options.cloud:
+            raise ConfigError(
+                f"topic {sent.name}: cloud cannot change while its newest message is kept for late robots"
+            )
+
     def change(self, before: Topic, after: Topic) -> None:
         """A topic has other options, and may have another topic id with them."""
+        if before.topic_id in self._updates:
+            self._updates[after.topic_id] = self._updates[before.topic_id]
         if not before.as_frames or after.as_frames:
             if before.topic_id in self._sent or before.topic_id != after.topic_id:
                 self.add(after)
         elif (sent := self._sent.pop(before.topic_id, None)) is not None:
-            if sent.pull.end():
-                why = "the topic's options changed before the air was free for it"
-                self._frames.refuse(before.topic_id, Fate.SUPERSEDED, why)
+            self._end(before.topic_id, sent.chains.values(), "the topic's options changed before the air was free")
             self._frames.end(before.topic_id)
 
     def forget(self, topic_id: int) -> None:
         """Send no message of a topic so far to those who come."""
-        if topic_id in self._sent and self._sent[topic_id].is_map:
-            self._sent[topic_id].pull = StatePull(period_s=self._sent[topic_id].pull.period_s, coding_s=CODING_S)
+        if topic_id in self._sent and (sent := self._sent[topic_id]).is_map:
+            self._end(topic_id, sent.chains.values(), "its publisher has changed its type")
+            sent.forget()
+
+    def follow(self, topic_id: int, publishers: int) -> None:
+        """So many publish a topic now."""
+        if topic_id in self._sent:
+            self._sent[topic_id].publishers = publishers
 
     def __contains__(self, topic_id: int) -> bool:
         return topic_id in self._sent
 
-    def offer(self, topic_id: int, message: bytes, now: float) -> None:
-        """A message has come."""
+    def changed(self, topic_id: int, message: bytes) -> Changed | None:
+        """The map that a message changes, if it says what changes of one that is sent as frames and has one publisher;
+        None for any other message. Needs no lock. ``take`` has to follow."""
+        name = self._updates.get(topic_id)
+        for map_id, sent in list(self._sent.items()) if name is not None else ():
+            if sent.name == name and sent.is_grid and (only := sent.only) is not None:
+                try:
+                    return Changed(topic_id, map_id, updated(only[1], message), only[0])
+                except DamagedError as error:
+                    return Changed(topic_id, map_id, error, only[0])
+        return None
+
+    def take(self, changed: Changed, now: float) -> None:
+        """A map has changed."""
+        if isinstance(changed.made, DamagedError):
+            self._frames.refuse(changed.topic_id, Fate.DAMAGED, str(changed.made))
+        elif changed.map_id in self._sent:
+            self._became[changed.topic_id] += 1
+            self.offer(changed.map_id, changed.made, now, changed.publisher)
+        else:
+            self._frames.refuse(changed.topic_id, Fate.SUPERSEDED, "the options of its map changed")
+
+    def offer(self, topic_id: int, message: bytes, now: float, publisher: Hashable = None) -> None:
+        """A message has come.
+
+        :param publisher: whose it is; of a latched topic, the newest of each is kept; None = not known
+        """
         sent = self._sent[topic_id]
         sent.note(now, came=len(message))
-        if sent.pull.offer(message, now):
+        chain, ended = sent.chain_of(publisher)
+        self._end(topic_id, ended, "its publisher has gone")
+        if chain.pull.offer(message, now):
             self._frames.refuse(topic_id, Fate.SUPERSEDED, "a newer one came before the air was free for it")
 
     def next(self, now: float) -> Job | None:
         """A message that is to be encoded now. ``done`` has to follow."""
         for topic_id, sent in self._sent.items():
-            if sent.pull.waits(now):
+            for number, chain in list(sent.chains.items()):
+                if not chain.pull.waits(now):
+                    continue
                 share = sent.weight / sum(
                     other.weight for other in self._sent.values() if other is sent or other.lives(now)
                 )
-                pull = sent.pull.pull(now, self._frames.progress(topic_id, now), share)
+                pull = chain.pull.pull(now, self._frames.progress(topic_id, now), share)
                 if pull is not None:
-                    return Job(topic_id, pull, sent.encoder, sent)
+                    sent.chains[number] = sent.chains.pop(number)  # then it is the turn of the others
+                    return Job(topic_id, pull, chain.encoder, number, chain, sent)
         return None
 
     def done(self, job: Job, made: Coded | CodecError, now: float) -> None:
         """What has become of a message."""
-        sent = job.sent
-        if job.encoder is not sent.encoder or self._sent.get(job.topic_id) is not sent:
+        sent, chain = job.sent, job.chain
+        gone = self._sent.get(job.topic_id) is not sent or sent.chains.get(job.number) is not chain
+        if job.encoder is not chain.encoder or gone:
             taken = False
             self._frames.refuse(job.topic_id, Fate.SUPERSEDED, "the topic's options changed while it was coded")
         elif isinstance(made, CodecError):
@@ -206,8 +322,8 @@ class FrameSender:
             sent.failed += 1
             self._frames.refuse(job.topic_id, Fate.DAMAGED, str(made))
         elif not (taken := self._taken(job, made, now)) and made.data[0] and not sent.is_map:
-            sent.encoder = sent.coded.encoder()  # no frame may follow one that is not sent
-        sent.pull.done(None if taken else job.pull)
+            chain.encoder = sent.coded.encoder()  # no frame may follow one that is not sent
+        chain.pull.done(None if taken else job.pull)
 
     def _taken(self, job: Job, made: Coded, now: float) -> bool:
         """Whether a frame is sent. One of which no receiver makes a message is not."""
@@ -222,8 +338,7 @@ class FrameSender:
             return False
         if size > MAX_SIZE and (sent.is_map or made.data[0] == 0):
             self._frames.refuse(job.topic_id, Fate.TOO_LARGE, f"{size} bytes; at most {MAX_SIZE}")
-        elif self._frames.submit(job.topic_id, made.data, job.pull.came, now, key=self._is_key(job, made)):
-            self._sent_off(sent, made, now)
+        elif self._submit(job, made, now):
             return True
         sent.failed += 1
         if Fate.TOO_LARGE not in sent.said:
@@ -236,29 +351,43 @@ class FrameSender:
         all are repaired as long as somebody follows."""
         return job.pull.key if job.sent.is_cloud else made.before is None
 
-    def _sent_off(self, sent: _Sent, made: Coded, now: float) -> None:
-        """A frame is sent."""
-        sent.frames, sent.what, sent.bytes = sent.frames + 1, made.said, sent.bytes + len(made.data)
-        sent.note(now, frame=len(made.data))
+    def _submit(self, job: Job, made: Coded, now: float) -> bool:
+        """Send a frame. Returns whether it is sent."""
+        sent = job.sent
+        data = bytes([OF_CHAIN, job.number]) + made.data if job.number else made.data
+        key = self._is_key(job, made)
+        if not self._frames.submit(job.topic_id, data, job.pull.came, now, key=key, chain=job.number):
+            return False
+        sent.frames, sent.what, sent.bytes = sent.frames + 1, made.said, sent.bytes + len(data)
+        sent.note(now, frame=len(data))
         if sent.is_map:
-            sent.encoder.confirmed(made.name)  # frames arrive in order
+            job.encoder.confirmed(made.name)  # frames arrive in order
         elif made.data[0] == 0 and made.said not in sent.said:
             sent.said.add(made.said)
             what = "cells" if sent.is_cloud else "pictures"
             _log.warning("topic %s: passes exactly, not as %s: %s", sent.name, what, made.said)
+        return True
 
     def end(self) -> None:
         """Code nothing more: messages that wait are not sent."""
         for topic_id, sent in self._sent.items():
-            if sent.pull.end():
-                self._frames.refuse(topic_id, Fate.SUPERSEDED, "sending ended before the air was free for it")
+            self._end(topic_id, sent.chains.values(), "sending ended before the air was free for it")
+
+    def _end(self, topic_id: int, chains: Iterable[_Chain], why: str) -> None:
+        for chain in chains:
+            if chain.pull.end():
+                self._frames.refuse(topic_id, Fate.SUPERSEDED, why)
 
     def stats(self, topic_id: int, now: float) -> dict[str, Any] | None:
         """What is made of a topic: frames so far and their bytes, messages that could not be coded, and in words what
         the newest frame leaves out and what the topic has become lately; None for one that is not sent as frames."""
         sent = self._sent.get(topic_id)
         if sent is None:
-            return None
+            if not self._became[topic_id]:
+                return None
+            of = self._updates[topic_id]
+            said = f"{of}{_UPDATES}: {self._became[topic_id]} messages became part of {of}"
+            return {"frames": 0, "bytes": 0, "not_coded": 0, "made": "", "words": said}
         state = self._frames.progress(topic_id, now)
         words = {"made": sent.what, "words": sent.words(now, state.age)}
         return {"frames": sent.frames, "bytes": sent.bytes, "not_coded": sent.failed, **words}
@@ -288,20 +417,21 @@ class TimedCoder:
             self._jobs.append((now + CODING_S, following, following.run()))
 
 
-def _coding(topic: Topic) -> tuple[Any, ...]:
+def _coding(options: SendOptions) -> tuple[Any, ...]:
     """Options with which another encoder is made."""
-    camera = topic.options.camera
-    return camera.off, camera.size, camera.output, topic.options.depth_image
+    camera = options.camera
+    return camera.off, camera.size, camera.output, options.depth_image, options.cloud
 
 
 def coded_topic(topic: Topic, *, latched: bool = False) -> CodedTopic | None:
     """How a topic is coded as frames; None if it is not. What has to be installed for it is said.
 
-    :param latched: whether one publisher keeps its newest message for late joiners
+    :param latched: whether its publishers keep their newest messages for late joiners
     """
     states = (*CODECS["grid"].types, *CODECS["growing"].types)
-    if latched and topic.type_name in states and topic.options.codec == AUTO:
-        return CodedTopic(topic.type_name, {"growing": {}})
+    exact = topic.options.codec == AUTO and not topic.options.cloud.voxel
+    if latched and topic.type_name in states and exact:
+        return CodedTopic(topic.type_name, {"growing": {}, "cloud": OFF})
     if not topic.as_frames:
         return None
     options, depth = topic.options, topic.options.depth_image
@@ -318,130 +448,3 @@ def coded_topic(topic: Topic, *, latched: bool = False) -> CodedTopic | None:
         _log.warning("topic %s: passes as it is, and is not made small: %s", topic.name, coded.missing)
         return None
     return coded
-
-
-def frames_output(told: AnnouncedTopic) -> str | None:
-    """The option ``output`` of a topic that comes as frames; None if it does not."""
-    mark, _, output = told.codec.partition(" ")
-    return (output or "same") if mark == MARK else None
-
-
-class FrameReceiver:
-    """The frames of other robots to messages.
-
-    :param max_size: bytes of the largest message that is made
-    """
-
-    def __init__(self, max_size: int = MAX_SIZE) -> None:
-        self._max_size = max_size
-        self._topics: dict[tuple[int, int], tuple[str, str, CodedTopic]] = {}
-        self._shared: dict[tuple[str, str], CodedTopic] = {}
-        """Some of these, by type and output: topics share them, since others may announce many."""
-        self._left: dict[int, tuple[float, float]] = {}
-        """Bytes of messages that may be made of each robot's frames, at a time in s."""
-        self._decoders: OrderedDict[tuple[int, int], TopicDecoder] = OrderedDict()
-        """Those that were used last, the newest last."""
-        self._sizes: dict[tuple[int, str], tuple[int, int] | None] = {}
-        """Width and height of the newest picture of each camera of a robot; None for one that has its own size. Only of
-        the cameras that were used last, the newest last."""
-
-    def announce(self, key: tuple[int, int], told: AnnouncedTopic) -> str:
-        """A robot has announced a topic. Returns the type of the messages that come out.
-
-        :param key: of the robot and the topic
-        :raises ConfigError: for an output that is not known here
-        :raises BackendMissingError: when what decodes it is not installed
-        """
-        output = frames_output(told)
-        if output is None:
-            if self._topics.pop(key, None):
-                self._sizes.pop((key[0], _camera(told.name)), None)
-            return told.type_name
-        if key not in self._topics or self._topics[key][:2] != (told.type_name, output):
-            coded = self._shared.get((told.type_name, output))
-            if coded is None:
-                coded = CodedTopic(told.type_name, {"camera": {"output_type": output}, "growing": {}})
-                if len(self._shared) == MOST_DECODERS:
-                    self._shared.clear()
-                self._shared[told.type_name, output] = coded
-            if coded.missing:
-                raise BackendMissingError(f"topic {told.name} comes as video: {coded.missing}")
-            self._topics[key] = told.type_name, output, coded
-            self._decoders.pop(key, None)
-        return self._topics[key][2].output
-
-    def decode(self, key: tuple[int, int], name: str, payload: bytes, now: float) -> bytes:
-        """The message of a frame, and any other as it is.
-
-        :param name: of its topic
-        :raises CodecError: the frame before is missing, or it is damaged, or its robot's frames make more messages than
-            ``MOST_BYTES_S``
-        """
-        camera = key[0], _camera(name)
-        if key not in self._topics:
-            self._sizes.pop(camera, None)  # of the same camera as video
-            return payload
-        left = {whose: self._allowed(whose, now) for whose in (key[0], _ALL)}
-        if min(left.values()) < 0:
-            who = f"robot {key[0]} make" if left[key[0]] < 0 else "all robots make"
-            most = f"{(MOST_BYTES_S if left[key[0]] < 0 else _TOGETHER * MOST_BYTES_S) / 1e6:,.0f} MB"
-            raise CodecError(f"frames of {who} more than {most} of messages in a second")
-        decoder = self._decoders.setdefault(key, self._topics[key][2].decoder(self._max_size))
-        self._decoders.move_to_end(key)
-        if len(self._decoders) > MOST_DECODERS:
-            self._decoders.popitem(last=False)
-        while len(self._decoders) > 1 and sum(each.held for each in self._decoders.values()) > MOST_HELD:
-            self._decoders.popitem(last=False)
-        made = _DAMAGED_BYTES
-        try:
-            message = decoder.decode(payload)
-            made = len(message)
-        except MissingFrameError:
-            made = 0
-            raise
-        finally:
-            self._left |= {whose: (bytes_left - made, now) for whose, bytes_left in left.items()}
-        self._sizes.pop(camera, None)
-        if self._topics[key][0] in PICTURES:
-            self._sizes[camera] = decoder.size
-        if len(self._sizes) > MOST_DECODERS:
-            del self._sizes[next(iter(self._sizes))]
-        return message
-
-    def _allowed(self, whose: int, now: float) -> float:
-        """Bytes of messages that may be made of the frames of a robot, or of all, now."""
-        most = MOST_BYTES_S * (_TOGETHER if whose == _ALL else 1)
-        left, at = self._left.get(whose, (most, now))
-        return min(left + (now - at) * most, most)
-
-    def scaled(self, src_id: int, name: str, type_name: str, message: bytes) -> bytes:
-        """A CameraInfo for the picture beside it, as large as that came out; any other message as it is.
-
-        Of several pictures beside it, it fits the first of ``_BESIDE``, or else the first by name.
-        """
-        if type_name != CAMERA_INFO:
-            return message
-        place, _, own = name.rpartition("/")
-        begin = f"{place}/{own.removesuffix('camera_info')}".lstrip("/")
-        beside = {
-            camera.rpartition("/")[2]: size
-            for (robot, camera), size in self._sizes.items()
-            if robot == src_id and camera.startswith(begin) and camera.rpartition("/")[0] == place
-        }
-        size = beside[min(beside, key=_rank)] if beside else None
-        if size is None:
-            return message
-        from gr_ros2.codecs.camera import scaled_camera_info
-
-        return scaled_camera_info(message, *size)
-
-
-def _camera(name: str) -> str:
-    """The name of a camera, without that of its transport: its CameraInfo is beside it."""
-    return name.removesuffix("/compressed").removesuffix("/compressedDepth")
-
-
-def _rank(name: str) -> tuple[int, str]:
-    """The place of a picture among those beside a CameraInfo."""
-    known = [place for place, end in enumerate(_BESIDE) if name.endswith(end)]
-    return min(known, default=len(_BESIDE)), name

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from struct import pack
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gr_ros2.codecs.base import MAX_SIZE, Coded, frame, keep, name_of, opened
-from gr_ros2.codecs.messages import GRID, read, take
+from gr_ros2.codecs.messages import GRID, GRID_UPDATE, read, take
 from gr_ros2.codecs.pack import Packer
 from gr_ros2.compression import bounds
 from gr_ros2.compression.zstd_frames import read_varint
@@ -161,6 +162,27 @@ class GridDecoder:
         new = np.frombuffer(box, np.uint8).reshape(down, across)
         part[...] = part ^ new if way == _XOR else new
         return _Grid(_xor(parts[:head_size], base.head), cells, parts[head_size:], None)
+
+
+def updated(message: bytes, update: bytes) -> bytes:
+    """The map of ``message`` with the box of an OccupancyGridUpdate in it, and with the time of that.
+
+    :raises DamagedError: not such messages, or a box that does not fit
+    """
+    box, grid = read(GRID_UPDATE, update), _split(message)
+    if box.width * box.height != len(box.data):
+        raise DamagedError(f"damaged update: {box.width} × {box.height} cells, but {len(box.data)} are there")
+    height, width = grid.cells.shape
+    right, bottom = box.x + box.width, box.y + box.height
+    if min(box.x, box.y) < 0 or right > width or bottom > height:
+        raise DamagedError(
+            f"damaged update: {box.width} × {box.height} cells at {box.x}, {box.y} of a map of {width} × {height}"
+        )
+    cells = grid.cells.copy()
+    cells[box.y : bottom, box.x : right] = box.data.view(np.uint8).reshape(box.height, box.width)
+    order = "<" if message[1] else ">"
+    stamp = pack(f"{order}iI", box.header.stamp.sec, box.header.stamp.nanosec)
+    return message[:4] + stamp + grid.head[4 + len(stamp) :] + cells.tobytes() + grid.tail
 
 
 def _split(message: bytes) -> _Grid:

@@ -22,15 +22,17 @@ IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedIm
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 VIDEO, PACKET = "foxglove_msgs/msg/CompressedVideo", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
 CLOUD, GRID = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/OccupancyGrid"
+GRID_UPDATE = "map_msgs/msg/OccupancyGridUpdate"
+_UPDATE_TEXT = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data\n"
 
 _STAMP = Struct("<iI")
 
 
 @cache
 def store() -> Typestore:
-    """The types of Humble and those of video."""
+    """The types of Humble, those of video, and the changes of a map."""
     found = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in MADE.items():
+    for name, text in {**MADE, GRID_UPDATE: _UPDATE_TEXT}.items():
         found.register(get_types_from_msg(text, name))
     return found
 

@@ -62,6 +62,11 @@ class StatePull:
         self._key = True
         self._asks = 0
 
+    @property
+    def newest(self) -> bytes | None:
+        """The newest message, as long as it counts."""
+        return self._newest
+
     def offer(self, message: bytes, now: float) -> bool:
         """A message has come. Returns whether it takes the place of one that was not coded."""
         superseded, self._new = self._new, True

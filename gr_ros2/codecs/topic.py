@@ -68,6 +68,7 @@ CODECS = BackendTable(
             number=5,
             asked=True,
             types=(
+                CLOUD,
                 "nav_msgs/msg/Path",
                 "nav2_msgs/msg/Costmap",
                 "octomap_msgs/msg/Octomap",

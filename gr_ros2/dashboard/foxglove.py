@@ -15,8 +15,8 @@ from contextlib import suppress
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from gr_ros2.codecs.frames import FrameReceiver, frames_output
 from gr_ros2.codecs.messages import VIDEO
+from gr_ros2.codecs.received_frames import FrameReceiver, frames_output
 from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError
 from gr_ros2.link.events import Accepted, Announced, Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.frames import MARK

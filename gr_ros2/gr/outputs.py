@@ -11,9 +11,10 @@ import logging
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from hashlib import blake2b
 from typing import Any
 
-from gr_ros2.codecs.frames import FrameReceiver
+from gr_ros2.codecs.received_frames import FrameReceiver, chain_of
 from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError, DescriptionError, GrRos2Error
 from gr_ros2.core.names import topic_fault
 from gr_ros2.gr.early import EarlyMessages
@@ -46,7 +47,7 @@ class Output:
     :param published: number of messages
     :param delivered_at: time of the newest one, s
     :param way: how many robots have sent it on, and the last of them
-    :param kept: the newest message of a latched topic that comes as frames
+    :param kept: digests of the newest messages of a latched topic that comes as frames, by chain
     """
 
     topic: Topic
@@ -58,7 +59,7 @@ class Output:
     delivered_at: float | None = None
     latency: LatencyWindow | None = None
     way: tuple[int, int | None] = (0, None)
-    kept: bytes = b""
+    kept: dict[int, bytes] = field(default_factory=dict)
 
 
 class Outputs:
@@ -241,7 +242,9 @@ class Outputs:
             output = self._outputs.get(key) or self._output(key)
             topic = output.topic
             shown = self._shown(event, topic)
-            if shown == output.kept:
+            framed = topic.latched and shown is not event.payload
+            chain, digest = (chain_of(event.payload)[0], blake2b(shown).digest()) if framed else (0, b"")
+            if framed and output.kept.get(chain) == digest:
                 return event._replace(shown=shown)  # a key frame for another robot
             payload = self._prefix.apply(topic.type_name, event.src_id, shown)
             publisher = output.publisher or self._advertise(key, output)
@@ -251,8 +254,8 @@ class Outputs:
             self._failures.note(Fate.PUBLISH_FAILED.value, f"ros2_sink: a message of {named} was not published", error)
             with self._lock:
                 return self._end.unpublished(event)
-        if topic.latched and shown is not event.payload:
-            output.kept = shown
+        if framed:
+            output.kept[chain] = digest
         with self._lock:
             output.published += 1
             output.delivered_at, output.way = self._clock(), (event.hops, event.over)

@@ -9,11 +9,11 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from gr_ros2.codecs.frames import FrameSender
+from gr_ros2.codecs.messages import GRID_UPDATE
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.frame_ids import STATIC_DEPTH, TF_TYPE, StaticTransforms
 from gr_ros2.gr.frame_worker import FrameWorker
@@ -75,8 +75,8 @@ class Subscriptions:
         frames = live.endpoint.frames if config.compression else None
         self.frames = None if frames is None else FrameSender(frames)
         self._worker = None if self.frames is None else FrameWorker(self.frames, live, clock, log)
-        self._moved: dict[int, int] = {}
-        """Topic ids under which messages leave now, by those that were subscribed, where ``to`` has changed."""
+        self._moved: dict[int, Topic] = {}
+        """As what messages leave now, by the topic ids that were subscribed, where options have changed."""
         chosen = registry.chosen(config.words) if registry else []
         self.subscribed = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_topic}
         self.services = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_service}
@@ -155,7 +155,7 @@ class Subscriptions:
 
     def _now(self, topic_id: int) -> int:
         """The topic id under which messages of a subscription leave now."""
-        return self._moved.get(topic_id, topic_id)
+        return self._moved[topic_id].topic_id if topic_id in self._moved else topic_id
 
     def _code(self, topic: Topic) -> None:
         """Send a topic as frames if it is one of pictures."""
@@ -184,7 +184,7 @@ class Subscriptions:
         publishers = PublisherQos(
             reliable=qos.reliability != "best_effort",
             latched=all(offer.durability == "transient_local" for offer in offers),
-            depth=qos.depth,
+            depth=0 if topic.type_name == GRID_UPDATE else qos.depth,  # each is of use with all before it
             lifespan_s=qos.lifespan_s,
             period_s=qos.deadline_s,
             count=len(offers),
@@ -196,9 +196,12 @@ class Subscriptions:
         """Adapt the queue of a topic to the QoS that its publishers offer, where the queue is not configured."""
         with self._live.lock:
             changed = self._adapt(topic, offers)
-            if len(offers) == 1 and offers[0].durability == "transient_local" and self.frames is not None:
-                now = self._now(topic.topic_id)
-                self.frames.add(replace(topic, topic_id=now), latched=topic.options.durability != "volatile")
+            if self.frames is not None:
+                now = self._moved.get(topic.topic_id, topic)
+                latched = all(offer.durability == "transient_local" for offer in offers)
+                if latched and now.topic_id not in self.frames:
+                    self.frames.add(now, latched=now.options.durability != "volatile")
+                self.frames.follow(now.topic_id, len(offers))
             policy, deadline_s = self._messages.queue(self._now(topic.topic_id))
         if changed:
             limit = f", stale after {deadline_s * 1e3:g} ms" if deadline_s else ""
@@ -207,28 +210,34 @@ class Subscriptions:
     def _take(self, topic_id: int, payload: bytes) -> None:
         """Accept a message of the ROS graph, in a thread of the middleware."""
         now_id = self._now(topic_id)
+        changed = None if self.frames is None else self.frames.changed(now_id, payload)
         plain = topic_id not in self._static and (self.frames is None or now_id not in self.frames)
         prepared = self._messages.prepare(now_id, payload) if plain else None  # the sending thread goes on meanwhile
         with self._live.lock:
             now_id = self._now(topic_id)
             frames = self.frames if self.frames is not None and now_id in self.frames else None
-            while self._backpressure and frames is None and not self._closed and not self._messages.room(now_id):
+            held_back = self._backpressure and frames is None and changed is None
+            while held_back and not self._closed and not self._messages.room(now_id):
                 self.room.wait()
                 now_id = self._now(topic_id)
             if self._closed:
                 self._counters["held_back_at_close"] += 1
                 return
+            if changed is not None and self.frames is not None:
+                self.frames.take(changed, self._clock())
+                self._live.look()
+                return
             subscription = self._subscriptions.get(topic_id)
             if subscription is not None and subscription.lost:
                 self._messages.missed(topic_id, subscription.lost)
+            waited_s, publisher = (0.0, None) if subscription is None else (subscription.waited_s, subscription.source)
             if frames is not None:
-                frames.offer(now_id, payload, self._clock())
+                frames.offer(now_id, payload, self._clock(), publisher)
                 self._live.look()
                 return
             # A late robot gets only the newest message of a topic. So this message must hold all static transforms.
             static = self._static.get(topic_id)
             whole = None if static is None else static.union(payload)
-            waited_s, publisher = (0.0, None) if subscription is None else (subscription.waited_s, subscription.source)
             self._messages.submit(
                 now_id, whole or payload, self._clock(), waited_s=waited_s, publisher=publisher, prepared=prepared
             )
@@ -265,6 +274,8 @@ class OpenSubscriptions(Subscriptions):
                 if topic.is_service:
                     raise ConfigError(f"{topic.name}: the options of a service change with a restart only")
                 check_live_options(topic.name, old, new)
+                if self.frames is not None:
+                    self.frames.check(self._now(topic.topic_id), new)
                 changed[topic.topic_id] = new
         for topic_id, new in changed.items():
             self._change(topic_id, new)
@@ -325,7 +336,7 @@ class OpenSubscriptions(Subscriptions):
     def _change(self, topic_id: int, options: SendOptions) -> None:
         before = self.registry[self._now(topic_id)]
         self.registry, after = self._messages.change(before.topic_id, options)
-        self._moved[topic_id] = after.topic_id
+        self._moved[topic_id] = after
         if self.frames is not None and topic_id not in self._static:
             self.frames.change(before, after)
 

@@ -41,7 +41,7 @@ def check_live(changes: Mapping[str, Any], live: Sequence[str]) -> None:
 
 LIVE_OPTIONS = (
     *("to", "qos", "queue", "queue_depth", "deadline_s", "weight", "max_rate", "keep_s"),
-    *("camera", "depth_image"),
+    *("camera", "depth_image", "cloud"),
 )
 """Options of a topic that may change at run time in a version that allows it. The others are those of its subscription
 and of its codec, or of a sink."""

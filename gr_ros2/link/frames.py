@@ -1,7 +1,8 @@
 """Topics whose messages are coded when the air is about to be free for them: what a coder has to know and to tell.
 
 Each coded message is a *frame*. Most frames need the one before, so the frames of a topic are a chain: they leave in
-order, and are repaired until all who report have them, or until a key frame has left, which needs none.
+order, and are repaired until all who report have them, or until a key frame has left, which needs none. A topic of
+several publishers has a chain of each.
 
 Invariant: a frame that is submitted leaves; a message that is not coded ends in a Refused.
 """
@@ -64,12 +65,12 @@ class FrameSide(Protocol):
     def progress(self, topic_id: int, now: float) -> FrameState:
         """How it stands."""
 
-    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> bool:
+    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool, chain: int = 0) -> bool:
         """Send a frame. Returns whether it is sent: one that is longer than a message may be is not.
 
         :param came: when its message came, s
-        :param key: it needs no other frame: all before it are of no more use when it has left, and those that somebody
-            has lacked for ``LONG_S`` at once
+        :param key: it needs no other frame: all of its chain before it are of no more use when it has left, and those
+            that somebody has lacked for ``LONG_S`` at once
         """
 
     def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:

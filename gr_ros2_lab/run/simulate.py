@@ -20,7 +20,8 @@ from functools import lru_cache
 from math import inf
 from typing import Any, Protocol
 
-from gr_ros2.codecs.frames import FrameReceiver, FrameSender, TimedCoder
+from gr_ros2.codecs.frames import FrameSender, TimedCoder
+from gr_ros2.codecs.received_frames import FrameReceiver
 from gr_ros2.core.errors import BagError, CodecError, ConfigError, RunError
 from gr_ros2.gr.factory import make_endpoint
 from gr_ros2.link import Delivered, Lost, Received, ReceiverEvent, SenderEvent, SenderStats, SentPacket
@@ -434,7 +435,10 @@ class Robot:
             self.endpoint.pace.credit(credits, inf if credits and self._clock.held else None)
         while self._coming is not None and self._coming.t <= now:
             topic_id, payload = self._coming.topic_id, self._coming.payload
-            if self._frames is not None and topic_id in self._frames:
+            changed = None if self._frames is None else self._frames.changed(topic_id, payload)
+            if self._frames is not None and changed is not None:
+                self._frames.take(changed, now)
+            elif self._frames is not None and topic_id in self._frames:
                 self._frames.offer(topic_id, payload, now)
             else:
                 self.endpoint.messages.submit(topic_id, payload, now)

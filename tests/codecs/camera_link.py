@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import heapq
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from gr_ros2.codecs.frames import FrameReceiver, FrameSender, TimedCoder
+from gr_ros2.codecs.frames import FrameSender, TimedCoder
 from gr_ros2.codecs.messages import IMAGE
+from gr_ros2.codecs.received_frames import FrameReceiver
 from gr_ros2.core.errors import CodecError
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Announced, Delivered
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.settings.config import SendOptions
@@ -75,13 +77,22 @@ class Robot:
         self.boot += 1
         self.coder = TimedCoder(self.sender)
 
-    def submit(self, topic_id: int, message: bytes, now: float) -> None:
+    def published_by(self, publishers: int, topic_id: int = 0) -> None:
+        """So many publish a latched topic now."""
+        self.end.messages.follow(topic_id, PublisherQos(latched=True, count=publishers, keeps=publishers))
+        self.sender.follow(topic_id, publishers)
+
+    def submit(self, topic_id: int, message: bytes, now: float, publisher: Hashable = None) -> None:
         topic_id = self.camera.topic_id if topic_id == CAMERA else topic_id
-        if topic_id in self.sender:
-            self.sender.offer(topic_id, message, now)
+        changed = self.sender.changed(topic_id, message)
+        if changed is not None:
+            self.sender.take(changed, now)
+            self.coder.look(now)
+        elif topic_id in self.sender:
+            self.sender.offer(topic_id, message, now, publisher)
             self.coder.look(now)
         else:
-            self.end.messages.submit(topic_id, message, now)
+            self.end.messages.submit(topic_id, message, now, publisher=publisher)
 
     def change(self, options: SendOptions) -> None:
         """Give the camera other options."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gr_ros2.codecs.messages import CLOUD, read
+from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Accepted, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.settings.config import SendOptions
@@ -138,3 +139,38 @@ def test_what_is_said_of_a_cloud() -> None:
     sent = [len(event.payload) for event in air.robots[0].events if isinstance(event, Accepted) and not event.topic_id]
     assert max(sent[10:]) < 128e3 / 8 / RATE
     assert np.mean(sent[10:]) > 0.4 * 128e3 / 8 / RATE
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_the_options_of_a_cloud_change_while_it_is_seen(loss: float) -> None:
+    """Exact, as cells, as cells that fit the air, and back; each cloud that comes out is one that was sent."""
+    air = link(kbit_s=2000, loss=loss)
+    sender, receiver = air.robots
+    small = [scenes.cloud(scenes.street(number, 16, 200), number=number) for number in range(130)]
+    air._feeds[0] = sender, POINTS, RATE, small.__getitem__, 0
+    for cloud in ({}, {"voxel": 1.0}, FITTING, {"voxel": 2.0, "range": 20.0}, FITTING | {"range": 10.0}, {}):
+        sender.change(SendOptions(cloud=cloud, queue="latest"))
+        begin = air.now + 1.0
+        air.run(begin + 1.0)
+        seen = [message for now, key, message in receiver.seen if now > begin and sender.camera.topic_id == key[1]]
+        assert seen or (loss and not cloud), "of an exact cloud some packet is lost, and a newer one takes its place"
+        for message in seen:
+            out = read(CLOUD, message)
+            if not cloud:
+                assert message == small[number_of(message)]
+            else:
+                assert [field.name for field in out.fields] == ["x", "y", "z"]
+                places = np.frombuffer(out.data, "<f4").reshape(-1, 3)
+                assert len(places)
+                assert np.linalg.norm(places, axis=1).max() < cloud.get("range", 200.0) + cloud["voxel"]
+                assert (len(places) < 1000) == ("fit" not in cloud)
+    numbers = [number_of(message) for _, key, message in receiver.seen if key[1] != ODOMETRY]
+    assert numbers == sorted(numbers)
+
+
+def test_the_cells_of_a_latched_cloud_cannot_change() -> None:
+    topic = Topic(POINTS, "points", CLOUD, SendOptions(durability="transient_local"))
+    sender = Robot(1, Registry([topic]), 128).sender
+    sender.check(POINTS, SendOptions(durability="transient_local", max_rate=1.0))
+    with pytest.raises(ConfigError, match=r"^topic points: cloud cannot change while its newest message is kept"):
+        sender.check(POINTS, SendOptions(durability="transient_local", cloud={"voxel": 1.0}))

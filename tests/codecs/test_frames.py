@@ -15,8 +15,8 @@ import pytest
 pytest.importorskip("av", reason="needs PyAV")
 
 from gr_ros2.codecs import CodedTopic
-from gr_ros2.codecs.frames import MOST_BYTES_S, MOST_DECODERS, FrameReceiver
 from gr_ros2.codecs.messages import CAMERA_INFO, GRID, IMAGE, VIDEO, read
+from gr_ros2.codecs.received_frames import MOST_BYTES_S, MOST_DECODERS, FrameReceiver
 from gr_ros2.core.errors import BackendMissingError, CodecError, DamagedError, MissingFrameError
 from gr_ros2.link.events import Accepted, Delivered, Refused
 from gr_ros2.link.fates import Fate
@@ -494,7 +494,7 @@ def test_an_output_changes_while_it_is_seen() -> None:
     assert receiver.types[1, CAMERA] == VIDEO
     assert {read(VIDEO, message).format for _, message in receiver.of(1)[before + 3 :]} == {"h264"}
     assert len(receiver.of(1)) - before > 30
-    assert receiver.receiver._decoders[1, CAMERA].size == (160, 120)
+    assert receiver.receiver._decoders[1, CAMERA, 0].size == (160, 120)
 
 
 def test_a_picture_that_is_coded_while_the_camera_is_turned_off_has_a_fate() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from hypothesis import strategies as st
 
 from gr_ros2.codecs import CodedTopic
 from gr_ros2.codecs.base import KEPT
-from gr_ros2.codecs.messages import GRID
-from gr_ros2.core.errors import MissingFrameError
-from tests.codecs.scenes import exploring, grid
+from gr_ros2.codecs.grid import updated
+from gr_ros2.codecs.messages import GRID, GRID_UPDATE, read
+from gr_ros2.core.errors import DamagedError, MissingFrameError
+from tests.codecs.scenes import exploring, grid, header, write
 
 SIZE = 1000
 
@@ -86,6 +88,40 @@ def test_any_history_is_exact(data: st.DataObject) -> None:
             arrived = [*arrived, coded.name][-KEPT:]
         if arrived and data.draw(st.booleans()):
             encoder.confirmed(data.draw(st.sampled_from(arrived)))
+
+
+def box(x: int, y: int, height: int, width: int, cells: int | None = None) -> bytes:
+    data = np.full(height * width if cells is None else cells, 42, np.int8)
+    return write(GRID_UPDATE, header=header(77, "map"), x=x, y=y, width=width, height=height, data=data)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0), (float("nan"), 0.0)])
+def test_a_box_that_has_changed_becomes_part_of_a_map_and_nothing_else_changes(origin: tuple[float, float]) -> None:
+    cells = np.arange(12 * 9, dtype=np.int8).reshape(9, 12) % 100
+    for x, y, high, wide in ((0, 0, 9, 12), (3, 2, 4, 5), (11, 8, 1, 1), (5, 5, 0, 3)):
+        made = read(GRID, updated(grid(cells, 3, origin), box(x, y, high, wide)))
+        wanted = cells.copy()
+        wanted[y : y + high, x : x + wide] = 42
+        assert (made.data.reshape(9, 12) == wanted).all()
+        assert made.header == header(77, "map")
+        assert repr(made.info) == repr(read(GRID, grid(cells, 3, origin)).info)
+
+
+@pytest.mark.parametrize(
+    "bad", [(9, 0, 4, 5), (-1, 0, 1, 1), (0, 7, 3, 1), (0, 0, 2, 3, 5), (0, 0, 0, 13), (2**31 - 1, 0, 1, 1)]
+)
+def test_a_box_that_does_not_fit_its_map_is_damaged(bad: tuple[int, ...]) -> None:
+    with pytest.raises(DamagedError):
+        updated(grid(np.zeros((9, 12), np.int8)), box(*bad))
+
+
+def test_bytes_that_are_no_box_are_damaged() -> None:
+    whole = box(1, 1, 2, 3)
+    for cut in range(len(whole)):
+        with suppress(DamagedError):
+            assert len(updated(grid(np.zeros((9, 12), np.int8)), whole[:cut])) > 100
+    with pytest.raises(DamagedError):
+        updated(whole, whole)
 
 
 @pytest.mark.parametrize("shape", [(0, (1 << 32) - 1), ((1 << 32) - 1, 0)])

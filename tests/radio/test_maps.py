@@ -4,18 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 
-from gr_ros2.codecs.messages import GRID
+from gr_ros2.codecs.grid import updated
+from gr_ros2.codecs.messages import GRID, GRID_UPDATE
 from gr_ros2.middleware.memory import MemoryMiddleware
 from tests.codecs import scenes
 from tests.domains import domain
 from tests.middleware.support import LATCHED
 from tests.radio.test_instances import robot
 from tests.waiting import wait_for
+
+
+def box(value: int) -> bytes:
+    """Some cells of a map that have changed."""
+    header, cells = scenes.header(value, "map"), np.full(20, value, np.int8)
+    return scenes.write(GRID_UPDATE, header=header, x=3, y=2, width=5, height=4, data=cells)
 
 
 def test_a_growing_map_crosses_as_what_changes_and_whole_to_a_late_robot(tmp_path: Path) -> None:
@@ -41,3 +49,41 @@ def test_a_growing_map_crosses_as_what_changes_and_whole_to_a_late_robot(tmp_pat
             wait_for(lambda: heard[3], "the late robot")
             assert heard[3] == [maps[-1]]
         assert heard[2] == maps, "what another robot asked for does not come out here"
+
+
+def test_maps_of_two_nodes_and_what_changes_of_one_reach_who_is_there_and_who_comes_late(tmp_path: Path) -> None:
+    own, others = list(scenes.exploring(4)), list(scenes.exploring(2, 300))
+    heard: dict[int, list[bytes]] = {2: [], 3: []}
+    with (
+        MemoryMiddleware(domain_id=domain(1)) as near,
+        MemoryMiddleware(domain_id=domain(2)) as second,
+        MemoryMiddleware(domain_id=domain(3)) as third,
+        robot(1, tmp_path, 2, 3) as one,
+        robot(2, tmp_path, 1),
+    ):
+        second.subscribe("/rx_robot_1/map", GRID, LATCHED, heard[2].append)
+        third.subscribe("/rx_robot_1/map", GRID, LATCHED, heard[3].append)
+        mapper, boxes = (
+            near.advertise("/robot_1/map", GRID, LATCHED),
+            near.advertise("/robot_1/map_updates", GRID_UPDATE, LATCHED),
+        )
+        mapper.publish(own[0])
+        wait_for(lambda: own[0] in heard[2], "a map")
+        boxes.publish(box(7))
+        changed = updated(own[0], box(7))
+        wait_for(lambda: heard[2][-1] == changed, "the map with a box that has changed")
+        other = near.advertise("/robot_1/map", GRID, LATCHED)
+        topics = one.link.source.stats
+        for number in (1, 2, 3):
+            mapper.publish(own[number])
+            wait_for(lambda number=number: own[number] in heard[2], "a map")
+            if number < 3:
+                other.publish(others[number - 1])
+                wait_for(lambda number=number: others[number - 1] in heard[2], "a map of the other")
+        with robot(3, tmp_path, 1):
+            wait_for(lambda: len(heard[3]) == 2, "the late robot")
+            assert set(heard[3]) == {own[3], others[1]}
+        assert len(heard[2]) == len(set(heard[2])) == 7, "what another robot asked for does not come out here"
+        made = topics()["topics"]
+        assert made["/robot_1/map"]["frames"]["frames"] >= 7
+        assert made["/robot_1/map_updates"]["frames"]["words"] == "map_updates: 1 messages became part of map"

@@ -41,7 +41,9 @@ class Outlet(Protocol):
 
     asks: Counter[int]
 
-    def submit_frame(self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool) -> Message | None:
+    def submit_frame(
+        self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool, chain: int
+    ) -> Message | None:
         """Put a frame into the queue of its topic; None if it is too large."""
 
     def refuse_new(self, topic_id: int, fate: Fate, detail: str) -> None:
@@ -109,13 +111,13 @@ class SentFrames:
         lacked, behind = min(lags, default=0.0), max(lags, default=0.0)
         return FrameState(self._free(now), waiting, lacked, behind, silent, age, joined, bool(self._peers), asks)
 
-    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool) -> bool:
+    def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool, chain: int = 0) -> bool:
         """See :class:`gr_ros2.link.frames.FrameSide`."""
-        message = self._outlet.submit_frame(self._topics[topic_id], frame, came, now, key=key)
+        message = self._outlet.submit_frame(self._topics[topic_id], frame, came, now, key=key, chain=chain)
         if message is None:
             return False
         for before in self.sent[topic_id] if key else ():
-            if now - before.left_at > LONG_S:
+            if before.keys == message.keys and now - before.left_at > LONG_S:
                 before.lifetime.end()
         self.sent[topic_id].append(message)
         return True

@@ -77,7 +77,8 @@ class Lifetimes:
         while len(earlier) > most:
             earlier.popleft().end()
 
-    def restart(self) -> None:
-        """The newest message needs no earlier one, and whoever has it needs none."""
-        while len(self._left) > 1:
-            self._left.popleft().end()
+    def restart(self, keys: Keys) -> None:
+        """The newest message of these instances needs no earlier one, and whoever has it needs none."""
+        for old in [lifetime for lifetime in self._left if lifetime.keys == keys][:-1]:
+            self._left.remove(old)
+            old.end()

@@ -106,8 +106,8 @@ class Outbox:
         self._observer = observer
         self._serial = 0
         self.asks: Counter[int] = Counter()
-        self._kept_frames: dict[int, tuple[int, bytes]] = {}
-        """Serial and bytes of the newest frame of each latched topic, which may be sent again."""
+        self._kept_frames: dict[tuple[int, int], tuple[int, bytes]] = {}
+        """Serial and bytes of the newest frame of each chain of a latched topic, which may be sent again."""
         self.sent = SentTopics(codec, settings.commands, instances)
         self.kept = KeptMessages(self.sent, room, settings, self.stats, self._admit)
         self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)
@@ -159,6 +159,7 @@ class Outbox:
         before = self.sent[topic_id]
         name, type_name = before.topic.name, before.topic.type_name
         check_live_options(name, before.topic.options, options)
+        other_cloud = before.topic.options.cloud != options.cloud
         meant = replace(before.topic, options=options)
         known = [one for one in self.sent.named() if one.topic.stream == meant.stream]
         after = known[0] if known else self.sent[self.add([(name, type_name, options)])[-1].topic_id]
@@ -167,6 +168,8 @@ class Outbox:
             before.queue.clear()
         after.publishers = before.publishers
         after.change(options)
+        if other_cloud and self._codec is not None:
+            self._codec.add(after.topic)
         self.sent.find_deadlines()
         if self._tabulate() or after is not before:
             self._owner.topics_changed()
@@ -283,12 +286,14 @@ class Outbox:
         if self._tabulate():
             self._owner.topics_changed()
 
-    def submit_frame(self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool) -> Message | None:
+    def submit_frame(
+        self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool, chain: int
+    ) -> Message | None:
         """See :class:`gr_ros2.link.v1.frames.Outlet`."""
         topic_id = topic.topic.topic_id
         self._owner.submitted(topic_id, now)
         self.packing.turns.join(topic_id)
-        serial, before = self._kept_frames.get(topic_id, (-1, b""))
+        serial, before = self._kept_frames.get((topic_id, chain), (-1, b""))
         again = topic.kept and frame == before
         if again:
             self.stats.repeats += 1
@@ -301,10 +306,10 @@ class Outbox:
             self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return None
         message = Message(serial, topic_id, payload, topic.qos, came, topic.weight, coded=True, key=key)
-        message.dst_id, message.repeat = topic.dst_id, again
+        message.dst_id, message.repeat, message.keys = topic.dst_id, again, frozenset([chain])
         if topic.kept:
             self.kept.keep(topic, message)
-            self._kept_frames[topic_id] = serial, frame
+            self._kept_frames[topic_id, chain] = serial, frame
         topic.queue.append(message)
         return message
 
@@ -334,7 +339,7 @@ class Outbox:
             waited_for=inf if message.repeat else now + WORTH * self._settings.hold_s,
         )
         if message.key:
-            topic.lifetimes.restart()
+            topic.lifetimes.restart(message.keys)
         if topic.kept or message.topic_id == TABLE_TOPIC:
             self.kept.left(message, now, reported=reported)
         if message.topic_id in (RELAYED_TOPIC, RELAYED_IN_ORDER):
