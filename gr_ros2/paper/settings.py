@@ -54,8 +54,7 @@ class PaperConfig:
     hop: Annotated[int, Field(ge=0, le=15, title="Hop limit (hops)")] = 1
     """initial hop count (TTL) 0..15"""
     entry_ids: Annotated[Literal["sequential", "random"], Field(title="Entry IDs")] = "sequential"
-    """random as the paper has it is for compatibility trials: on a lossy link it joins fragments of different
-    messages"""
+    """random, as the paper has it, joins fragments of different messages on a lossy link"""
     compression: bool = False
     """code every message, which the paper leaves off"""
     reassembly_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0

@@ -50,10 +50,10 @@ class AirOptions:
     """Settings that every PHY with samples has."""
 
     gap: Annotated[int, Field(ge=16, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
-    """zero samples after each packet, 16..100000; auto = 32, or two symbols with `stock`, 32 chips with `lora_sdr`"""
+    """zero samples after each packet; auto = 32, two symbols with `stock`, 32 chips with `lora_sdr`"""
     lengths: Annotated[Literal["any", "fixed"], Field(title="Packet lengths on the air")] = "any"
-    """`any` = a packet is as long on the air as its bytes need; `fixed` = as the longest, which the blocks of others
-    always send. The same at both ends"""
+    """a packet is as long on the air as its bytes need, or (fixed) as the longest, which the blocks of others always
+    send. The same at both ends"""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

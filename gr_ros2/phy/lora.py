@@ -63,21 +63,20 @@ class LoraOptions(BurstOptions):
     """Settings of this PHY beside packet length and sample rate, and those of every burst PHY."""
 
     spreading_factor: Annotated[int, Field(ge=7, le=12, title="Spreading factor (bits/symbol)")] = 7
-    """bits per symbol of 2^this samples, 7..12; each step more takes about twice the time and 2.5 dB less SNR"""
+    """bits per symbol of 2^this samples, 7..12; one more takes twice the time and 2.5 dB less SNR"""
     coding_rate: Annotated[int, Field(ge=1, le=4, title="Coding rate (check bits per 4 bits)")] = 4
-    """check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word, 1 and 2 none"""
+    """check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word"""
     implementation: Literal["own", "lora_sdr"] = "own"
-    """`lora_sdr` = the frames of LoRa modems, by the GNU Radio module gr-lora_sdr. Neither understands the other: the
-    same at both ends"""
+    """`lora_sdr` = the frames of LoRa modems, by the module gr-lora_sdr. The same at both ends"""
     oversampling: Annotated[Literal[2, 4, 8] | Auto, Field(title="Oversampling (samples/chip)")] = AUTO
-    """`lora_sdr` only: samples per chip; auto = 2. Symbols of more than 2048 samples (factor 11 with 2) are refused"""
+    """`lora_sdr` only: samples per chip; auto = 2. A symbol has 2048 samples at most"""
     sync_word: Annotated[int, Field(ge=0x11, le=0xFF)] | Auto = AUTO
     """``lora_sdr`` only: of the network, 0x11..0xff, no nibble 0; auto = 0x12, private networks"""
     ldro: Annotated[bool | Auto, Field(title="Low data rate optimisation")] = AUTO
     """`lora_sdr` only: low data rate optimisation, two bits fewer per symbol; auto = off"""
     carrier_hz: Annotated[float, Field(ge=1e6, le=4.2e9, title="Carrier frequency (Hz)")] | None = None
-    """`lora_sdr` only: carrier frequency, 1e6..4.2e9 Hz, by which the module tells how much the clocks differ; null =
-    not at all"""
+    """`lora_sdr` only: carrier frequency, Hz, by which the module tells how much the clocks differ; null = not at
+    all"""
 
 
 class _ChirpPlace(NamedTuple):

@@ -52,15 +52,13 @@ class OfdmOptions(BurstOptions):
     pilots: Annotated[tuple[int, ...] | Auto, Field(title="Pilot carriers")] = AUTO
     """carriers by which phase is followed; auto = (-21, -7, 7, 21), spread over a larger `fft_len`"""
     scramble: Annotated[bool, Field(title="Scrambling")] = False
-    """scramble header and payload bits: without, data of many zeros makes high peaks, and the stock receiver loses
-    packets at a clock offset of 0.1 %"""
+    """scramble header and payload bits, against high peaks where data has many zeros"""
     detection_threshold: Annotated[float, Field(ge=0.05, le=0.95)] | Literal["stock"] | Auto = AUTO
-    """of the preamble's metric (Schmidl and Cox), 0.05..0.95, from which on samples are looked at closely; auto = what
-    noise alone passes once in 1000 samples. ``stock`` = GNU Radio's own blocks and their 0.9, which need 5 to 7 dB more
-    SNR; at a lower one these lose packets without any noise"""
+    """of the preamble's metric (Schmidl and Cox), 0.05..0.95; auto = what noise passes once in 1000 samples, ``stock``
+    = GNU Radio's own blocks and their 0.9, which need 5 to 7 dB more SNR"""
     rate: Literal["fixed", "adaptive"] = "fixed"
-    """`adaptive` = the sender chooses modulation and code of each packet by what its receivers report;
-    `payload_modulation` and `fec` are then left out. The same at both ends"""
+    """`adaptive` = the sender chooses modulation and code of each packet by what receivers report, instead of
+    `payload_modulation` and `fec`. The same at both ends"""
     rates: Annotated[tuple[RateName, ...], Field(min_length=1)] | Auto = AUTO
     """what `adaptive` may choose from, the most robust first; auto = bpsk-cc, qpsk-cc, 8psk-cc, 16qam-cc, 64qam-cc,
     16qam, 64qam"""

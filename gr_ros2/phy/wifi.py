@@ -89,10 +89,10 @@ class WifiOptions(AirOptions):
     encoding: Literal[
         "bpsk-1/2", "bpsk-3/4", "qpsk-1/2", "qpsk-3/4", "16qam-1/2", "16qam-3/4", "64qam-2/3", "64qam-3/4"
     ] = "bpsk-1/2"
-    """modulation and code rate; at 10 MS/s 3, 4.5, 6, 9, 12, 18, 24 and 27 Mbit/s. A receiver hears all"""
+    """modulation and code rate: 3 to 27 Mbit/s at 10 MS/s. A receiver hears all"""
     equalizer: Literal["ls", "lms", "comb", "sta"] = "ls"
-    """how the receiver estimates the channel: from the preamble; `lms` also by the decided symbols; `comb` from the
-    pilots, without an SNR; `sta` averages over time and carriers"""
+    """how the channel is estimated: from the preamble; `lms` also by decided symbols; `comb` from the pilots, without
+    an SNR; `sta` averages"""
     gap: Annotated[int, Field(ge=360, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
     """zero samples after each packet, 360..100000; auto = 400"""
     sensitivity: Annotated[float, Field(ge=0.3, le=0.9)] = 0.5
@@ -103,8 +103,7 @@ class WifiOptions(AirOptions):
     address: Annotated[Address, Field(title="Own address")] = "02:67:72:00:00:01"
     """address 2 of the frames sent"""
     channel_hz: Annotated[float, Field(ge=1e6, le=1e11, title="Channel frequency (Hz)")] | None = None
-    """centre frequency of the channel, 1e6..1e11 Hz, by which the module tells how much the clocks differ; null = not
-    at all"""
+    """centre frequency of the channel, Hz, by which the module tells how much the clocks differ; null = not at all"""
 
 
 class WifiPhy(Phy):

@@ -38,8 +38,7 @@ class AudioOptions(BurstDeviceOptions):
     """Settings of this front end."""
 
     device: Annotated[Text, Field(title="Device")] = AUTO
-    """sound device that plays: name, part of a name, or number (``gr-ros2 sound check`` lists them); auto = the
-    system's choice"""
+    """sound device that plays: number or part of its name (``gr-ros2 sound check`` lists them); auto = the system's"""
     device_rx: Annotated[Text, Field(title="Device that records")] = AUTO
     """sound device that records; auto = ``device``"""
     centre_hz: Annotated[float, Field(gt=0, lt=CARD_RATE / 2, title="Middle of the band (Hz)")] = 4500.0
@@ -47,18 +46,16 @@ class AudioOptions(BurstDeviceOptions):
     ptt: Annotated[Literal["none", "vox", "rts", "dtr", "rigctld", "cm108"], Field(title="What keys the radio")] = (
         "none"
     )
-    """what keys a transmitter: a tone before each packet (vox), a serial line's rts or dtr, rigctld, or a sound chip's
-    pin (cm108)"""
+    """what keys a transmitter: a tone (vox), a serial line's rts or dtr, rigctld, or a sound chip's pin (cm108)"""
     ptt_device: Annotated[Text | Literal[""], Field(title="Device of the key")] = ""
     """``/dev/ttyUSB0`` for rts and dtr, ``HOST:PORT`` for rigctld, ``/dev/hidraw0`` for cm108"""
     lead_s: Annotated[_KeyedS | Auto, Field(title="Silence before a packet (s)")] = AUTO
     """s of silence, or with ``ptt: vox`` of a tone, before each packet; auto = .3 with a transmitter to key, otherwise
     .02"""
     tail_s: Annotated[_KeyedS | Auto, Field(title="Silence behind a packet (s)")] = AUTO
-    """s of silence behind each packet, while a key is still pressed; auto = .1 with a transmitter to key, otherwise
-    .02"""
+    """s of silence behind each packet; auto = .1 with a transmitter to key, otherwise .02"""
     latency_s: Annotated[float, Field(gt=0, le=2, title="Latency of the card (s)")] = 0.1
-    """s that the card is asked to be ahead and behind; shorter needs a computer that is never busy"""
+    """s that the card is asked to be ahead and behind"""
     turnaround_s: Annotated[Seconds, Field(title="Turn-around time (s)")] = 0.05
 
     @property

@@ -40,11 +40,9 @@ class BurstDeviceOptions(SharedAir):
     """What every device takes."""
 
     level: Annotated[float, Field(gt=0, le=1, title="Burst level (share of full scale)")] = 0.1
-    """root mean square of a burst's samples, 1 = full scale of the converter; OFDM has peaks 12 dB above it,
-    unscrambled 17"""
+    """root mean square of a burst's samples, 1 = full scale; OFDM peaks 12 dB above it, unscrambled 17"""
     turnaround_s: Annotated[Seconds, Field(title="Turn-around time (s)")] = 0.005
-    """s, with `half_duplex`: from the end of a burst until the device hears again and its buffers are empty; nothing is
-    sent in it"""
+    """s, with `half_duplex`, from the end of a burst until the device hears again; nothing is sent in it"""
 
     def layout(self, samples: int, sample_rate: float) -> BurstLayout:
         """How a burst of so many samples from the transmitter is laid out."""

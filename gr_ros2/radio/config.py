@@ -33,7 +33,7 @@ class LinkConfig(AirConfig, RobotConfig):
     front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
     """``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings (docs/how-to/radios.md)"""
     transmit: bool | Auto = AUTO
-    """whether it sends: a radio needs true, the word of the person who answers for it; auto = yes without a radio"""
+    """whether it sends: a radio needs true, auto = yes without a radio"""
     open: Annotated[bool, Field(title="Without a key")] = False
     """a radio may send without a key"""
     channel: ChannelConfig = Field(default_factory=ChannelConfig)
@@ -41,7 +41,7 @@ class LinkConfig(AirConfig, RobotConfig):
     record: Annotated[str, Field(title="Recording of what is received")] = ""
     """SigMF recording to write of all samples received, '' = none"""
     diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
-    """what the link says of itself on ``/diagnostics``, and its limits (docs/how-to/ros2.md)"""
+    """what the link says on ``/diagnostics`` (docs/how-to/ros2.md)"""
 
     @model_validator(mode="after")
     def _known(self) -> LinkConfig:

@@ -50,7 +50,7 @@ class DeviceOptions(BurstDeviceOptions):
     tail: Annotated[int, Field(ge=0, le=_MOST_ZEROS, title="Zeros behind a burst (samples)")] = 64
     """zero samples behind each burst at least"""
     multiple: Annotated[int, Field(ge=1, le=1 << 22, title="Burst length in steps of (samples)")] = 1
-    """a burst is filled up to a multiple of so many samples, for drivers that send whole transfers only"""
+    """samples of a transfer, for drivers that send whole ones only"""
 
     @property
     def receive_frequency(self) -> float:

@@ -27,9 +27,9 @@ class KissOptions(StreamOptions):
     tnc_port: Annotated[int, Field(ge=0, le=_MAX_PORT, title="Port of the TNC")] = 0
     """which radio of the TNC, 0..15"""
     callsign: Annotated[Callsign, Field(title="Own callsign")] = ""
-    """own callsign, for packets as AX.25 UI frames, as direwolf needs them; '' = packets as they are"""
+    """own callsign, for AX.25 UI frames, as direwolf needs them; '' = packets as they are"""
     destination: Annotated[Callsign, Field(title="Callsign of the group")] = "GRROS2"
-    """callsign of the group of robots; frames for others are not taken"""
+    """callsign of the group of robots"""
 
     @model_validator(mode="after")
     def _addressed(self) -> KissOptions:

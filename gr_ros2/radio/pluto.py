@@ -61,7 +61,7 @@ class PlutoOptions(DeviceOptions):
     """dB, 0 = full power"""
     gain_rx: Annotated[float, Field(ge=-3, le=76, title="Receive gain (dB)")] = 30.0
     bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
-    """Hz, of the transmitter's analogue filter, auto = ``sample_rate``; the receiver's stays as it is"""
+    """Hz, of the transmitter's analogue filter, auto = ``sample_rate``"""
     buffer_rx: Annotated[int, Field(ge=1, le=1 << 22, title="Receive buffer (samples)")] | Auto = AUTO
     """samples the receiver hands over at a time, auto = 5 ms of them"""
 

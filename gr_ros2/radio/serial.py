@@ -22,7 +22,7 @@ class SerialOptions(StreamOptions):
     framing: Literal["cobs", "slip"] = "cobs"
     """how packets are told apart, the same at every robot: `cobs` adds one byte in 254, `slip` is RFC 1055"""
     rssi: Annotated[bool, Field(title="Byte of signal strength")] = False
-    """the radio adds a byte of signal strength behind each packet (E22 modules: bit 7 of REG3)"""
+    """the radio adds a byte of signal strength behind each packet (E22: REG3, bit 7)"""
 
 
 class SerialFrontEnd(StreamFrontEnd):

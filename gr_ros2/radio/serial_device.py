@@ -48,8 +48,7 @@ class StreamOptions(SharedAir):
     baud: Annotated[int, Field(ge=50, le=4_000_000, title="Speed of the serial line (baud)")] = 57_600
     """speed of a serial line, the same as in the modem's settings"""
     backoff_s: Annotated[Seconds, Field(title="Random silence after a packet (s)")] = 0.0
-    """s of further silence after each packet, at random from 0 to this, where modems share a frequency and do not
-    listen before they send"""
+    """s of silence after each packet, at random from 0 to this, where modems share a frequency and do not listen"""
     half_duplex: bool = True
 
 

@@ -102,13 +102,11 @@ class ZmqOptions(FrontEndOptions):
     """Settings of this front end."""
 
     bind: Annotated[OwnAddress, Field(title="Own address")]
-    """address to publish at: `5555` (all interfaces), `10.0.0.1:5555`, `ipc:///tmp/a`. Whoever can reach it can
-    listen"""
+    """address to publish at: `5555` (all interfaces), `10.0.0.1:5555`, `ipc:///tmp/a`"""
     connect: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses of other robots")]
     """addresses of the other robots, ``10.0.0.2:5555``"""
     burst_queue: Annotated[int, Field(ge=1, le=10_000, title="Queue (bursts)")] = 300
-    """bursts that may wait for a slow peer, and for this computer when received, 1..10000; beyond, new ones are
-    dropped"""
+    """bursts that may wait for a slow peer, and for this computer, 1..10000; of more the new ones are dropped"""
     medium_process: Annotated[Literal["none", "lockstep", "real"], Field(title="Medium process")] = "none"
     """what ``connect`` names: none = other robots; lockstep or real = ``gr-ros2 medium`` with this ``time``"""
 

@@ -94,8 +94,7 @@ class AirtimeConfig:
         BeforeValidator(_sends),
         Field(title="Largest share of the time that it sends"),
     ] = AUTO
-    """largest share of any ``window_s`` during which this robot sends, above 0 to 1; auto = the band's, without one no
-    limit"""
+    """largest share of any ``window_s`` in which it sends, above 0 to 1; auto = the band's, without one no limit"""
     window_s: Annotated[
         Annotated[float, Field(ge=1, le=86400, allow_inf_nan=False)] | Auto, Field(title="Time of that share (s)")
     ] = AUTO
@@ -105,8 +104,7 @@ class AirtimeConfig:
     ] = AUTO
     """most s without a pause of 0.1 s, 0 = no limit; auto = the band's, without one no limit"""
     listen_before_send: bool = False
-    """a packet waits while the receiver hears a signal, 6 dB above the noise; for front ends of SDRs with
-    ``half_duplex``"""
+    """a packet waits while the receiver hears a signal; for SDRs with ``half_duplex``"""
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("window_s",),

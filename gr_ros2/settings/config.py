@@ -105,14 +105,13 @@ class CloudOptions:
     """What leaves of a point cloud."""
 
     voxel: Annotated[Literal[0] | Annotated[float, Field(ge=0.001, le=1000)], Field(title="Cell (m)")] = 0
-    """m, edge of the cells that the points of a cloud become, each a point at its middle; 0 = every point, exactly"""
+    """m, edge of the cells that points become; 0 = every point, exactly"""
     range: Annotated[float, Field(gt=0, le=1e6)] | Auto = AUTO
-    """m from the origin of the cloud's frame, beyond which cells are left out; auto = none are"""
+    """m from the origin of the cloud's frame, beyond which cells are left out; auto = none"""
     keep: Literal["", "intensity", "rgb"] = ""
     """what of a cell's points is sent beside their place, as a mean"""
     fit: bool = False
-    """cells become larger where the air is short: clouds leave as pictures of a camera do, the newest alone, coded into
-    what other topics leave"""
+    """the newest cloud fits what other topics leave of the air, with larger cells where that is little"""
     conditions: ClassVar[Any] = (
         ActsWhere(
             ("range", "keep", "fit"), lambda cloud: cloud.voxel > 0, "an exact cloud has every point; set voxel above 0"
@@ -145,9 +144,9 @@ class CameraOptions:
     off: bool = False
     """pictures pass exactly"""
     size: Annotated[str, Field(pattern=r"^(auto|full|[1-9]\d{0,4}x[1-9]\d{0,4})$")] = AUTO
-    """pixels at most, such as 320x240; full = as they come, auto = halved while the air has too few bytes"""
+    """pixels at most, such as 320x240; full = as they come, auto = halved where the air is short"""
     fps: Annotated[float, Field(gt=0, le=1000)] | Auto = AUTO
-    """pictures/s at most; auto = as many as the air carries, and as max_rate allows"""
+    """pictures/s at most; auto = as many as the air carries"""
     output: Literal["same", "CompressedImage", "CompressedVideo", "FFMPEGPacket"] = "same"
     """type that comes out; CompressedVideo is of foxglove_msgs, FFMPEGPacket of ffmpeg_image_transport_msgs"""
     conditions: ClassVar[Any] = (
@@ -167,7 +166,7 @@ class DepthOptions:
     off: bool = False
     """they pass exactly"""
     mode: Literal["auto", "8", "10", "12", "exact"] = AUTO
-    """auto = video of inverse distances within what the air has; or so many bits"""
+    """auto = video of inverse distances that fits the air; or so many bits"""
     near: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Nearest (m)")] = 0.0
     """m, the nearest distance; 0 = found from the images"""
     far: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Farthest (m)")] = 0.0
@@ -189,46 +188,44 @@ class SendOptions:
     """Options of one topic that a robot sends."""
 
     qos: QosClass | Auto = AUTO
-    """class of its packets, the two QoS bits of the header; auto = latency for ``commands``, else default"""
+    """class of its packets; auto = latency for ``commands``, else default"""
     reliability: Literal["reliable", "best_effort"] | Auto = AUTO
     """auto adapts the subscription to the publishers found"""
     durability: Literal["volatile", "transient_local"] | Auto = AUTO
     """auto adapts likewise; the sink publishes volatile unless this says transient_local"""
     depth: Count | Auto = AUTO
-    """QoS depth of subscription and publisher, auto takes that of `graph` or `publish`; of a transient-local topic also
-    how many messages late robots get, auto 1"""
+    """QoS depth, auto that of `graph` or `publish`; of a transient-local topic also how many messages late robots get,
+    auto 1"""
     queue_depth: Annotated[Count | Auto, Field(title="Queue depth (messages per topic)")] = AUTO
-    """messages waiting, the oldest dropped and counted; 0 unbounded, auto takes the source's"""
+    """as of the robot, which auto takes"""
     queue: QueuePolicy | Auto = AUTO
-    """what waits: latest (a new message replaces what has not started), fifo (all, up to `queue_depth`), deadline
-    (fifo, stale after `deadline_s`); auto follows `depth` and the publishers' QoS (docs/explanation/scheduling.md)"""
+    """what waits: the newest, all up to `queue_depth`, or all until `deadline_s`; auto follows the publishers' QoS
+    (docs/explanation/scheduling.md)"""
     deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
-    """s until which a message must be across, or it is dropped; 0 none, auto the publishers' lifespan where `queue` is
-    auto too, otherwise 0.3 for `commands` and none for others. Of a service: s that a call waits, auto 30"""
+    """s after which a message is dropped; 0 none, auto the publishers' lifespan where `queue` is auto, else 0.3 for
+    `commands` and none for others. Of a service: s that a call waits, auto 30"""
     weight: Annotated[float, Field(ge=0.001, le=1000, allow_inf_nan=False)] = 1.0
     """what a second of this topic's age counts beside other topics, 0.001..1000"""
     max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
-    """messages/s sent at most, the newest at each turn unless `queue` is set; 0 unlimited"""
+    """messages/s at most, the newest unless `queue` is set; 0 unlimited"""
     max_age_s: Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")] = AUTO
-    """as of the robot, 0 = any time, auto takes the receiver's; a number above 0 at the sender has every receiver take
-    its own"""
+    """auto = as the receiver has it, 0 = any time; above 0 every receiver takes its own"""
     keep_s: Seconds = 0.0
-    """s for which its newest message is sent again to robots that lack it, though not transient-local: an e-stop, a
-    mode; 0 = as the publishers' durability has it. Commands are never kept"""
+    """s for which robots that lack its newest message get it, though not transient-local (an e-stop, a mode). Commands
+    are never kept"""
     to: RobotId | Auto = AUTO
-    """robot for which its messages are, 0..254; auto = all robots"""
+    """robot for which it is; auto = all"""
     codec: str = AUTO
     """auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)"""
     quantize: str = ""
     """bounded loss per field, '' lossless (docs/explanation/compression.md)"""
     instance: str = ""
-    """fields that tell apart the things of which messages speak, so that max_rate and queue latest work for each, such
-    as robots[].id; '' = those known of its type (/tf, /diagnostics, JointState, markers), none = not told apart"""
+    """fields that tell apart what messages speak of, such as robots[].id, so that max_rate and queue latest act on
+    each; '' = those known of its type (/tf, /diagnostics, JointState, markers), none = no fields"""
     cloud: CloudOptions = Field(default_factory=CloudOptions)
     """what leaves of a PointCloud2, such as {voxel: 0.1, range: 30} (docs/explanation/codecs.md)"""
     camera: Annotated[CameraOptions, BeforeValidator(_off)] = Field(default_factory=CameraOptions)
-    """what leaves of an Image or CompressedImage, such as {size: 320x240, fps: 10}; off = exactly
-    (docs/how-to/cameras.md)"""
+    """the same of pictures, such as {size: 320x240, fps: 10}; off = exactly (docs/how-to/cameras.md)"""
     depth_image: Annotated[DepthOptions, BeforeValidator(_off)] = Field(default_factory=DepthOptions)
     """the same of depth images, such as {mode: 10}"""
     conditions: ClassVar[Any] = (
@@ -262,11 +259,11 @@ class BurstLoss:
     """
 
     p_good_to_bad: Probability
-    """probability that the packet after one in the good state finds the bad one, 0..1"""
+    """that a packet after one in the good state finds the bad one, 0..1"""
     p_bad_to_good: Annotated[float, Field(gt=0, le=1)]
     """the other way round, above 0..1"""
     loss_good: Probability = 0.0
-    """probability that a packet is lost in the good state, 0..1"""
+    """that a packet is lost in the good state, 0..1"""
     loss_bad: Probability = 1.0
     """the same in the bad state, 0..1"""
 
@@ -308,9 +305,9 @@ class ChannelConfig:
     burst_loss: BurstLoss | None = None
     """losses in bursts; null = none"""
     outages: tuple[tuple[Seconds, Seconds], ...] = ()
-    """[from_s, to_s) during which nothing passes, s since the run began, in order of time"""
+    """[from_s, to_s) since the run began in which nothing passes, in order of time"""
     seed: Seed = 0
-    """of noise, fading and losses; in a scenario that of the scenario unless it is set"""
+    """of noise, fading and losses; in a scenario by default the scenario's"""
 
     @model_validator(mode="after")
     def _outages_in_order(self) -> ChannelConfig:
@@ -367,20 +364,20 @@ class ScenarioChannel(Transceiver, ChannelConfig):
     """The channel of a scenario, which may follow from where the robots are (docs/explanation/medium.md)."""
 
     from_: Annotated[Literal["settings", "positions"], Field(alias="from", title="From")] = "settings"
-    """what says the levels: settings = ``snr_db``; positions = where the robots are, in the simulator's world or by a
-    recording's odometry"""
+    """what says the levels: ``snr_db``, or where the robots are in the simulator's world or by a recording's
+    odometry"""
     model: Literal["log_distance", "two_ray", "free_space"] = "log_distance"
-    """of the path loss: free_space, two_ray (with the reflection from the ground) or log_distance"""
+    """of the path loss; two_ray has the reflection from the ground"""
     exponent: Annotated[float, Field(ge=1, le=8)] = 3.0
     """of log_distance: 2 as in free space, 1.6 to 1.8 in corridors, 2.7 to 4 among obstacles"""
     height_m: Annotated[float, Field(gt=0, le=1000)] = 0.5
     """of two_ray: height of all antennas, m"""
     walls_db: Annotated[float, Field(ge=0, le=100)] = 0.0
-    """loss in each obstacle of the simulated world on the straight line between two robots, dB"""
+    """loss in each obstacle on the straight line between two robots, dB"""
     shadowing_db: Annotated[float, Field(ge=0, le=30)] = 0.0
     """standard deviation of the shadowing, dB; 0 = none"""
     decorrelation_m: Annotated[float, Field(gt=0, le=10_000)] = 5.0
-    """way of one robot after which its shadowing has 1/e of the correlation left, m"""
+    """way of a robot after which 1/e of the correlation is left, m"""
     tx_power_dbm: Decibels = 20.0
     """power that a robot transmits, dBm"""
     noise_figure_db: Decibels = 6.0
@@ -458,11 +455,11 @@ class PhyConfig:
     name: str = "ofdm"
     """a name of ``gr_ros2.phy.PHY``"""
     sample_rate: Annotated[SampleRate | Auto, Field(title="Sample rate (samples/s)")] = AUTO
-    """samples/s; auto = an experiment chooses it by what it offers. A link of radios has to be told"""
+    """samples/s, which a radio needs; auto = an experiment chooses it by what it offers"""
     headroom: Annotated[float, Field(gt=0, le=1000)] = 1.2
     """capacity over offered load where sample_rate is auto"""
     kernels: Kernels = AUTO
-    """auto = compiled kernels where they were built; numpy = the reference, several times slower"""
+    """auto = compiled ones where they were built; numpy = the reference, several times slower"""
     options: dict[str, Any] = Field(default_factory=dict)
     """settings of that PHY"""
     conditions: ClassVar[Any] = (
@@ -493,12 +490,12 @@ class AirConfig:
     phy: PhyConfig = Field(default_factory=PhyConfig)
     """which physical layer, and how fast; the same at every robot"""
     medium: Medium = "exclusive"
-    """when a robot sends: in slots that it derives from the packets heard, by aloha (at random, as rarely as the robots
-    heard call for), or exclusive = whenever it has something"""
+    """when a robot sends: whenever it has something, in slots that it derives from the packets heard, or at random
+    (aloha)"""
     relay: Literal["off", "gain"] = "off"
     """gain = a robot sends messages of others on; medium: slots"""
     airtime: Airtime = Field(default_factory=AirtimeConfig)
-    """how much a robot may send, whatever waits: settings, or the name of a band alone"""
+    """how much a robot may send: settings, or the name of a band"""
 
     @model_validator(mode="after")
     def _medium_fits(self) -> AirConfig:

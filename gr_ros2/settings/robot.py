@@ -65,13 +65,13 @@ class GraphConfig:
     domain_id: Annotated[DomainId | Auto, Field(title="Domain ID")] = AUTO
     """ROS domain, 0..232; auto takes ROS_DOMAIN_ID"""
     localhost_only: bool | Auto = AUTO
-    """DDS stays on the loopback interface; auto takes what ROS's environment says, in a scenario true"""
+    """DDS stays on the loopback interface; auto = as ROS's environment says, in a scenario true"""
     namespace: Namespace | Auto = AUTO
-    """namespace of the robot's topics there; '' is the root, auto the name of the robot"""
+    """of the robot's topics there; '' is the root, auto its name"""
     depth: Annotated[Count, Field(title="Depth of subscriptions (messages)")] = 10
     """QoS depth of the subscriptions, 0 unbounded"""
     use_sim_time: Annotated[bool, Field(title="Use /clock")] = False
-    """take latency from stamps on the graph's /clock instead of wall time"""
+    """latency counts from stamps by the graph's /clock instead of wall time"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_ALIASED)
@@ -87,8 +87,8 @@ class PublishOptions:
     depth: Count | Auto = AUTO
     """QoS depth of its publisher; auto = ``publish.depth``, of a transient-local topic 1"""
     deadline_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto = AUTO
-    """s after which a message is not delivered any more; 0 = any time, auto takes that of its sender. Of a service: s
-    that a call waits, auto 30"""
+    """s after which a message is not delivered; 0 = any time, auto that of its sender. Of a service: s that a call
+    waits, auto 30"""
     max_age_s: Age = AUTO
     """as of the robot, which auto takes; 0 = any time"""
 
@@ -102,14 +102,13 @@ class PublishConfig:
     depth: Annotated[Count, Field(title="Depth of publishers (messages)")] = 10
     """QoS depth of the publishers, 0 unbounded"""
     frame_prefix: FrameForm = ""
-    """before every frame name of a message, ``{robot}`` is the sender; '' leaves messages as sent"""
+    """before every frame name of a message, ``{robot}`` is the sender; '' none"""
     merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
-    """topic on which the transforms of all senders come out too, static ones on this + `_static`; needs `frame_prefix`;
-    '' off"""
+    """topic for the transforms of all senders too, static ones on this + `_static`; needs `frame_prefix`; '' off"""
     topics: Annotated[dict[str, PublishOptions], AfterValidator(_named), Field(title="Topics that come out")] = Field(
         default_factory=dict
     )
-    """single topics of others, such as {odom: {depth: 100}}; * and ? stand for others"""
+    """single topics, such as {odom: {depth: 100}}; with * and ?"""
 
     @property
     def merged_topics(self) -> tuple[str, ...]:
@@ -122,63 +121,59 @@ class RobotConfig:
     """One robot: what it sends, what it takes, and how it joins its graph and the link."""
 
     robot: Annotated[int, Field(ge=0, le=BROADCAST - 1)] | str
-    """its number on the air, 0..254, or its name: the number then is the last digits, /robot_1 is robot 1"""
+    """its number on the air, 0..254, or its name, of which the last digits are the number: /robot_1 is robot 1"""
     direction: Literal["both", "send", "receive"] = "both"
-    """with send or receive alone it gets no reports, or gives none"""
+    """with send it gets no reports, with receive it gives none"""
     topics: Annotated[dict[str, SendOptions], BeforeValidator(topics_of), AfterValidator(_checked_topics)] = Field(
         default_factory=lambda: {AUTO: SendOptions()}
     )
-    """what it sends: names, in which * and ? stand for others, or a mapping of names to options; auto = every topic of
-    the registry or, without one, of the robot's namespace on the graph; -NAME leaves out; [] = nothing"""
+    """what it sends: names (with * and ?), or a mapping of names to options; auto = every topic of the registry,
+    without one of its namespace on the graph; -NAME leaves out; [] = nothing"""
     publish: PublishConfig = Field(default_factory=PublishConfig)
     """how what it receives comes out"""
     graph: GraphConfig = Field(default_factory=GraphConfig)
     """its ROS graph"""
     registry: Annotated[str, Field(title="Registry CSV")] = ""
-    """file of topics and their types, or a built-in one such as `table4`; '' = `topics` are looked for on the graph"""
+    """file of topics and types, or a built-in one such as `table4`; '' = topics are found on the graph"""
     services: Annotated[bool, Field(title="Services and actions too")] = True
-    """whether ``topics`` choose services and actions of the graph too, which other robots may then call"""
+    """``topics`` choose services and actions of the graph too, which other robots may call"""
     commands: Annotated[tuple[str, ...], AfterValidator(checked_commands)] = COMMAND_TYPES
-    """types and topic names (with * and ?) whose messages come within 0.3 s or not at all, and before others, unless
-    their options say otherwise"""
+    """types and names (with * and ?) of topics whose messages come first, and within 0.3 s or not at all"""
     packet_len: Annotated[PacketLen, Field(title="Packet length (bytes)")] = 220
-    """bytes of the longest packet, 40..4095 (14 or more of the paper's blocks), the same at all robots"""
+    """bytes of the longest packet, 40 at least (14 of the paper's blocks), the same at all robots"""
     key: Annotated[str, Field(title="Keys of the fleet"), AfterValidator(checked_key_file)] = ""
-    """file of the fleet's keys (gr-ros2 key new), with which sealed packets alone are taken; '' = anybody can read and
-    forge packets"""
+    """file of the fleet's keys (gr-ros2 key new); '' = anybody can read and forge packets"""
     seal: Literal["encrypt", "authenticate"] = "encrypt"
     """with a key: authenticate alone, where a radio's licence forbids encryption"""
     state: Annotated[str, Field(title="State file")] = ""
-    """file that counts starts and says what was heard before; '' = in the user's state folder"""
+    """file with the starts of this robot and what was heard of others; '' = in the user's state folder"""
     packet_rate: Annotated[
         Annotated[float, Field(ge=0, allow_inf_nan=False)] | Auto, Field(title="Packet rate (packets/s)")
     ] = AUTO
-    """packets/s at most, beside what the PHY grants, which is the limit of auto; 0 = every packet at once, as the paper
-    has it"""
+    """packets/s at most; auto = what the PHY grants, 0 = every packet at once, as the paper has it"""
     queue_depth: Annotated[Count, Field(title="Queue depth (messages per topic)")] = 100
-    """messages waiting per topic, the oldest dropped and counted; 0 unbounded"""
+    """messages waiting per topic, of more the oldest goes; 0 unbounded"""
     compression: bool = True
-    """code every message, which a receiver sees by itself"""
+    """code messages; receivers see it by themselves"""
     repair: Repairs | Auto = AUTO
-    """idle = all idle air for what may have been lost, thrifty = as much as losses are known or expected; auto =
-    thrifty where receivers report, else idle"""
+    """idle = in all idle air, thrifty = what is known or expected to be lost; auto = thrifty where receivers report,
+    else idle"""
     expected_loss: Annotated[float, Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
-    """share of packets lost, 0..1, as long as no report tells (thrifty)"""
+    """share of packets lost, while no report tells (thrifty)"""
     repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
-    """s between repeats of a transient-local topic while no robot reports, and up to 32 times as long while none is
-    heard; 0 off"""
+    """s between repeats of transient-local topics while no robot reports, up to 32 times as long while none is heard; 0
+    off"""
     beacon_s: Annotated[Seconds, Field(title="Time until only beacons are sent (s)")] = 0.0
-    """s without hearing any robot after which only one hello every so many s is sent, until one is heard; 0 = never"""
+    """s without hearing any robot after which one hello every so many s is all that is sent; 0 = never"""
     hold_s: Annotated[Seconds, Field(title="Wait for repair (s)")] = 1.0
-    """s that a reliable message waits for an earlier one where the sender gets no reports; where it does, until that
-    one is repaired or given up"""
+    """s that a reliable message waits for an earlier one where the sender gets no reports"""
     max_age_s: Age = AUTO
-    """s for which a sealed message may have been withheld, or it is not taken; auto: 15 for calls and topics with a
-    deadline or lifespan, any time for others; 0 = any time"""
+    """s for which a sealed message may have been withheld; auto = 15 for calls and topics with a deadline or lifespan,
+    else any time; 0 = any time"""
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
-    """robots heard at a time; packets of further ones are counted and dropped"""
+    """robots heard at a time; packets of more are dropped"""
     max_source_bytes: Annotated[Bytes, Field(title="Memory per sender (bytes)")] = 72_000_000
-    """memory per robot heard, a quarter for incomplete messages; the oldest goes first"""
+    """memory per robot heard, a quarter of it for incomplete messages; the oldest goes first"""
     debug: Annotated[bool, Field(title="Debug log")] = False
     """readable log of headers, topic ids and entries"""
     conditions: ClassVar[tuple[ActsWhere, ...]] = (

@@ -52,10 +52,9 @@ class RaceSettings(Traffic):
     """One race: every contender at every load and every loss."""
 
     robots: Annotated[int, Field(ge=2, le=MOST_ROBOTS)] | None = None
-    """all send to all others on one channel, of a bag the same topic one after the other; null = one robot sends to
-    another one"""
+    """all send to all others on one channel; null = one robot sends to another"""
     bag_topic: Text = AUTO
-    """the topic of the bag that is carried; auto where it has only one"""
+    """topic of the bag; auto where it has only one"""
     peers: tuple[str, ...] = ()
     """names of ``CONTENDERS``; [] = all"""
     loss: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.0, 0.05, 0.2, 0.4)

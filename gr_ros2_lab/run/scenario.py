@@ -59,11 +59,10 @@ class Experiment:
     description: str = ""
     """one line"""
     repetitions: Annotated[int, Field(ge=1, le=10_000)] = 1
-    """runs, with seeds seed, seed + 1, ...; in a sweep of every cell"""
+    """runs, with seeds one apart; in a sweep of every cell"""
     time: Time = "real"
-    """what the clock of a run follows: the wall clock, as far as the computer keeps up; or simulated time, of samples,
-    or of packets alone, which are lost as measured (docs/explanation/simulated-time.md). Simulated time has no ROS
-    graphs, so `graph`, but for its namespace, and `publish.depth` have no effect there"""
+    """what the clock follows: the wall clock, samples, or packets, which are lost as measured
+    (docs/explanation/simulated-time.md). Only `real` has ROS graphs, on which `graph` and `publish.depth` act"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -71,19 +70,19 @@ class Scenario(Experiment, Traffic, AirConfig):
     """One experiment: robots, the medium between them, what they send, and for how long."""
 
     robots: Annotated[tuple[ScenarioRobot, ...], Field(max_length=BROADCAST)]
-    """the robots, those that send first; a number stands for as many that differ in their names alone"""
+    """the robots, those that send first; or how many, which differ in their names alone"""
     channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
     """what lies between all of them"""
     paths: tuple[PathConfig, ...] = ()
     """the channels that differ: what is not set in one is as in ``channel``"""
     duplex: Literal["full", "half"] = "full"
-    """full = each robot sends on a channel of its own; half = all use one: who sends hears nothing meanwhile, and
-    packets that overlap disturb each other"""
+    """full = each robot sends on a channel of its own; half = all use one, and packets that overlap disturb each
+    other"""
     gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
-    """gain from one robot to another, dB: one number, or a row for each robot, null where nothing arrives. The SNR then
-    follows from transmit power, noise figure and `phy.sample_rate`; null = `channel.snr_db` between all"""
+    """gain from robot to robot, dB: one number, or a row for each, null where nothing arrives; the SNR then follows
+    from power, noise figure and `phy.sample_rate`. null = `channel.snr_db` between all"""
     paper: PaperConfig | None = None
-    """the robots are the paper's blocks, with these settings; null = they are ROS Links"""
+    """the robots are the paper's blocks; null = ROS Links"""
     drain_s: Seconds = 2.0
     """s the link may go on delivering after ``duration_s``"""
     bag_speed: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
@@ -91,13 +90,12 @@ class Scenario(Experiment, Traffic, AirConfig):
     sim: SimSettings = Field(default_factory=SimSettings)
     """settings of the simulator"""
     task: str = ""
-    """what the robots do on what they hear of each other: `formation`, `rendezvous`, or `module:Class`, a subclass of
+    """what robots do on what they hear: `formation`, `rendezvous`, or `module:Class`, a subclass of
     :class:`gr_ros2_lab.sim.tasks.Task`; '' = each drives its own ways"""
     controller: Literal["task", "ros"] = "task"
-    """who drives the robots of a task. `task`: the task itself; `ros`: a node on the graph of each robot, by
-    ``cmd_vel`` (in real time)"""
+    """who drives the robots: the task, or a node on each robot's graph, by ``cmd_vel`` (in real time)"""
     own_domains: bool = True
-    """robots without `graph.domain_id` are on ROS domains that no other program here uses; false = on ROS_DOMAIN_ID"""
+    """robots without `graph.domain_id` are on domains that no other program here uses; false = on ROS_DOMAIN_ID"""
     also: ClassVar[Any] = {RobotConfig: ("robot",)}
     """Settings of these may stand here too, but for some."""
     conditions: ClassVar[Any] = (

@@ -21,7 +21,7 @@ class SimSettings:
     """Robots, world, rates and noise."""
 
     seed: Seed = 0
-    """of the world, the routes and all noise; in a scenario that of the scenario unless it is set"""
+    """of the world, the routes and all noise; in a scenario by default the scenario's"""
     robots: Annotated[int, Field(ge=1, le=255)] = 2
     """number of robots; they are called robot_1, robot_2, ..."""
     size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
@@ -59,7 +59,7 @@ class SimSettings:
     prefix_frames: bool = False
     """frame ids carry the robot's name (robot_1/odom), for robots that share one graph"""
     transforms: bool = False
-    """robots that publish in real time publish ``/tf`` and ``/tf_static`` too, which no link carries"""
+    """robots publish ``/tf`` and ``/tf_static`` too, in real time, which no link carries"""
 
     def frame_prefix(self, robot_id: int) -> str:
         """The prefix of the names of a robot's frames; '' if they have none."""

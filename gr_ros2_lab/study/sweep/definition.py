@@ -73,11 +73,11 @@ class Sweep(Experiment):
     """mappings of settings that belong together, each run in turn"""
     time: Time = "samples"
     x: Text = AUTO
-    """key along the horizontal axis; auto chooses channel.snr_db or else the first that has numbers"""
+    """key along the horizontal axis; auto = channel.snr_db, or the first that has numbers"""
     y: Text = AUTO
-    """key up the vertical axis of the heat map; auto chooses the next one that has numbers"""
+    """key up the vertical axis of the heat map; auto = the next that has numbers"""
     by: Keys = (AUTO,)
-    """keys that make a curve each; auto chooses those that are no numbers, or else the next one"""
+    """keys that make a curve each; auto = those without numbers, or the next one"""
     value: str = PDR
     """what the figures show, a name of ``VALUES``"""
     topic: str = ""
