@@ -226,3 +226,47 @@ def test_what_has_no_docstring_is_found() -> None:
         'class Page(Handler):\n "x"\n def get(self): ...\nclass _Hidden:\n def get(self): ...'
     )
     assert undocumented([base, derived]) == {"Base.close", "alone", "End.more"}
+
+
+def forking(tree: ast.Module) -> list[int]:
+    """Lines that make a process as a fork of one with threads, whose locks nobody there opens."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name, owner = name_of(node.func), name_of(getattr(node.func, "value", node.func))
+            context = [word for word in node.keywords if word.arg in ("context", "mp_context")] or node.args[1:]
+            if (
+                (name in ("fork", "forkpty") and owner in ("os", "pty"))
+                or (owner == "multiprocessing" and name in ("Process", "Pool", "Manager"))
+                or (name == "get_context" and [ast.unparse(word) for word in node.args] in ([], ["'fork'"]))
+                or (name == "ProcessPoolExecutor" and not context)
+            ):
+                found.append(node.lineno)
+    return found
+
+
+def test_no_process_is_a_fork_of_one_with_threads() -> None:
+    paths = [
+        path for folder in ("gr_ros2*", "tests", "bench", "tools", "fuzz") for path in ROOT.glob(f"{folder}/**/*.py")
+    ]
+    said = {str(path): forking(ast.parse(path.read_text())) for path in paths}
+    assert {path: lines for path, lines in said.items() if lines} == {}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "os.fork()",
+        "multiprocessing.Process(target=work)",
+        "multiprocessing.get_context('fork').Process(target=work)",
+        "get_context()",
+        "ProcessPoolExecutor(2)",
+    ],
+)
+def test_a_fork_is_found(text: str) -> None:
+    assert forking(ast.parse(text)) == [1]
+
+
+def test_processes_that_are_no_forks_are_left_alone() -> None:
+    text = "get_context('spawn').Process()\nProcessPoolExecutor(2, get_context('forkserver'))\nforest.fork()"
+    assert forking(ast.parse(text)) == []

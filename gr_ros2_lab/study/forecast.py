@@ -654,7 +654,7 @@ def _begin_process(work: Callable[[Scenario], Forecast]) -> None:
 
 
 _work: list[Callable[[Scenario], Forecast]] = []
-"""What a forked process is for."""
+"""What a process of this kind is for."""
 
 
 def _process(scenario: Scenario) -> Forecast:
