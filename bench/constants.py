@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
@@ -23,7 +24,6 @@ from statistics import mean, stdev
 from typing import Any
 
 from bench import repair, repair_backlog, saturated, uneven
-from bench.processes import processes
 from bench.rows import Row
 from gr_ros2.link.v1.reports import Reporter
 
@@ -228,7 +228,7 @@ def constants(chosen: Callable[[str], bool] = lambda _: True) -> list[Row]:
     """One row per variant: the promises that it changes."""
     names = [name for name in variants() if chosen(name)]
     rows = []
-    with processes() as pool:
+    with ProcessPoolExecutor(2) as pool:
         base = list(pool.map(promises, SEEDS))
         for name, found in zip(names, pool.map(variant, names, repeat(base)), strict=True):
             shown = {p: c for p, (c, half) in changes(base, found).items() if abs(c) >= SHOWN and abs(c) > half}

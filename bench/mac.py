@@ -10,13 +10,13 @@ import random
 import resource
 import time
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import repeat
 from statistics import mean, median
 from typing import NamedTuple
 
 from bench.mac_rivals import Csma, Sotdma
-from bench.processes import processes
 from bench.rows import Row
 from bench.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
 from gr_ros2.mac import Aloha, Slots
@@ -140,7 +140,7 @@ def measured(
     graphs: Iterable[Graph | Callable[[float], Graph]], configs: Sequence[SwarmConfig], until: float = 80.0
 ) -> list[Measured]:
     """Several swarms, on all processors."""
-    with processes() as pool:
+    with ProcessPoolExecutor() as pool:
         return list(pool.map(_measure, graphs, configs, repeat(until)))
 
 
@@ -312,7 +312,7 @@ def _crowded(robots: int, every_s: float) -> list[Row]:
 def crowd() -> list[Row]:
     """One cell of many robots that are switched on at once, or one after another."""
     cases = ((255, 0.5), (100, 0.4), (60, 0.0), (80, 0.0), (100, 0.0))
-    with processes() as pool:
+    with ProcessPoolExecutor() as pool:
         return [row for rows in pool.map(_crowded, *zip(*cases, strict=True)) for row in rows]
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from bench.processes import processes
 from bench.rows import Row
 from gr_ros2.link import rate as engine
 from gr_ros2.link.rate import Mcs, RateController
@@ -223,7 +223,7 @@ def rate_rules() -> list[Row]:
         value = getattr(engine, name)
         for new in (value / 2, value * 2):
             variants[f"{name} = {new:.3g}, not {value:.3g}"] = {name: type(value)(new)}
-    with processes() as pool:
+    with ProcessPoolExecutor(2) as pool:
         base, *found = pool.map(airtimes, [{}, *variants.values()])
     rows = []
     for what, result in zip(variants, found, strict=True):

@@ -12,7 +12,6 @@ from gr_ros2.cli.capture import DEFAULT_PACKET_LEN, from_hex, packets_in
 from gr_ros2.core.errors import ConfigError, WireError
 from gr_ros2.link.reader import Dissection, Reader
 from gr_ros2.settings.config import MAX_PACKET_LEN, MIN_PACKET_LEN
-from gr_ros2.settings.files import find_registry
 from gr_ros2.settings.registry import Registry
 from gr_ros2.state.keys import read_key_file
 from gr_ros2.wire import BROADCAST, QOS_NAMES, Entry, Packet, decode, format_of
@@ -48,7 +47,7 @@ def decode_packets(
     A packet of version 1 is checked by a hello of its sender among the inputs; the topics that robots announce there
     are shown by name. What is encrypted stays hidden without --key.
     """
-    registry = Registry.from_csv(find_registry(registry_path, Path())) if registry_path else None
+    registry = Registry.from_csv(registry_path) if registry_path else None
     keys = read_key_file(key_path) if key_path else ()
     packets = list(_packets(inputs or ("-",), packet_len))
     if not packets:

@@ -26,7 +26,6 @@ from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.observe.positions import humble_types
 from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
-from gr_ros2.settings.files import find_registry
 from gr_ros2.settings.registry import MAX_TOPICS, Registry, Topic
 from gr_ros2.settings.service_rows import OF_ACTION, ServiceRow, parts, rows_of
 
@@ -40,9 +39,8 @@ _SHARED = [name for name, backend in MIDDLEWARE.own.items() if backend.scope == 
 @click.command()
 @click.argument("file", metavar="FILE")
 def check(file: str) -> None:
-    """Validate a registry CSV, or a built-in one: print ids, names and types, and the digest by which two ends
-    compare."""
-    registry = Registry.from_csv(find_registry(file, Path()))
+    """Validate a registry CSV: print ids, names and types, and the digest by which two ends compare."""
+    registry = Registry.from_csv(file)
     known = humble_types().fielddefs
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("id", justify="right")

@@ -587,7 +587,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     try:
         text = read_bounded(Path(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+        raise ConfigError(f"{path}: cannot be read ({error})") from error
     values = parse_yaml(text, str(path))
     if values is None:
         return {}

@@ -70,13 +70,6 @@ def explain(cls: type[Any], items: Sequence[Any], where: str = "") -> str:
     groups = {
         keys: group for keys, group in places.items() if len(keys) == 1 or (keys[-1:], group[0]["input"]) not in top
     }
-    # A list of which no entry is right counts as empty.
-    shortened = {
-        keys
-        for keys, group in groups.items()
-        if group[0]["type"] == "too_short" and any(other[:-1] == keys for other in groups)
-    }
-    groups = {keys: group for keys, group in groups.items() if keys not in shortened}
     complaints = {keys: _complaint(keys, owners[keys], group) for keys, group in groups.items()}
     # What both ends of a link share is refused at the first one.
     once = {text.removeprefix(f"{'.'.join(keys)}: "): text for keys, text in reversed(complaints.items())}

@@ -198,7 +198,7 @@ class Registry(Sequence[Topic]):
                 reader = csv.reader(file, skipinitialspace=True, strict=True)
                 rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
         except (OSError, UnicodeDecodeError) as error:
-            raise RegistryError(f"cannot be read ({getattr(error, 'strerror', None) or error})", path) from error
+            raise RegistryError(f"cannot be read ({error})", path) from error
         except csv.Error as error:
             raise RegistryError(f"no CSV ({error})", path, reader.line_num) from error
         return cls(list(_topics(rows, path)), path)

@@ -161,8 +161,7 @@ class RobotConfig:
     expected_loss: Annotated[float, Field(ge=0, lt=1, title="Expected loss (share of packets)")] = 0.2
     """share of packets lost, while no report tells (thrifty)"""
     repeat_s: Annotated[Seconds, Field(title="Repeat latched topics every (s)")] = 10.0
-    """s between repeats of transient-local topics while no robot reports, up to 32 times as long while none is heard; 0
-    off"""
+    """s between repeats of transient-local topics while no robot reports, longer while none is heard; 0 off"""
     beacon_s: Annotated[Seconds, Field(title="Time until only beacons are sent (s)")] = 0.0
     """s without hearing any robot after which one hello every so many s is all that is sent; 0 = never"""
     hold_s: Annotated[Seconds, Field(title="Wait for repair (s)")] = 1.0

@@ -69,8 +69,6 @@ def read_key_file(path: str | Path) -> tuple[bytes, ...]:
         with open(path, encoding="ascii") as file:
             others = stat.S_IMODE(os.fstat(file.fileno()).st_mode) & 0o077
             lines = [line.split("#")[0].strip() for line in file]
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; make a key with gr-ros2 key new FILE") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError:

@@ -10,7 +10,7 @@ import click
 from gr_ros2.cli.console import console
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.cli.params import pictures_option, written_line
-from gr_ros2_lab.report.compare import compare_grid, remarks_of, write_comparison
+from gr_ros2_lab.report.compare import compare_grid, lateness_of, write_comparison
 from gr_ros2_lab.report.page import read_runs
 from gr_ros2_lab.report.table import as_table
 
@@ -27,7 +27,7 @@ def compare(directories: tuple[Path, ...], out: Path | None, pictures: bool) -> 
     written = write_comparison(
         runs, out or Path("results") / f"compare-{time.strftime('%Y%m%d-%H%M%S')}", pictures=pictures
     )
-    for line in remarks_of(runs):
+    for line in lateness_of(runs):
         console().print(line, style="bold red", soft_wrap=True)
     console().print(as_table(compare_grid(runs)))
     print(written_line(written))

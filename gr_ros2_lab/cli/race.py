@@ -50,10 +50,9 @@ def race(
         **options,
     }
     chosen = {name: value for name, value in given.items() if value is not None}
-    preset = {**(_TEAM if options["robots"] else {}), **(_SHORT if short else {})}
-    if "sample_rate" in chosen:
-        preset.pop("load", None)
-    settings = build(RaceSettings, {**preset, **chosen}, "race")
+    settings = build(
+        RaceSettings, {**(_TEAM if options["robots"] else {}), **(_SHORT if short else {}), **chosen}, "race"
+    )
     out = out or Path("results") / f"race-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())

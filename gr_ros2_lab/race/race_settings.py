@@ -11,9 +11,9 @@ from dataclasses import asdict, replace
 from dataclasses import dataclass as plain_dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError
@@ -23,7 +23,6 @@ from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.bag_files import bag_contents, read_bag
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import PacketLen, SampleRate, Text, Traffic
-from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.wire import FORMATS
 from gr_ros2_lab.race.contenders import MTU, chosen
@@ -68,19 +67,6 @@ class RaceSettings(Traffic):
     """s of the recording"""
     packet_len: PacketLen = 64
     """bytes of gr-ros2's longest packets; of `gr-ros2-plain` they are as long as a message needs"""
-    conditions: ClassVar[Any] = (
-        ActsWhere(
-            ("bag_topic",),
-            lambda race: race.source != "sim",
-            "a simulated robot has one topic; leave it out, or set source: bag:PATH",
-        ),
-        ActsWhere(("load",), lambda race: race.sample_rate == AUTO, "sample_rate decides it; leave one of both out"),
-    )
-
-    @model_validator(mode="after")
-    def _with_effect(self) -> RaceSettings:
-        refuse_without_effect(self)
-        return self
 
 
 @plain_dataclass(frozen=True)

@@ -176,8 +176,6 @@ def read_result(path: str | Path) -> Result:
         path /= RESULT_FILE
     try:
         values = json.loads(path.read_bytes().decode("utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; give the folder of a run") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, RecursionError) as error:

@@ -11,9 +11,8 @@ from typing import Any
 
 from gr_ros2.link.fates import Fate, fate_order
 from gr_ros2.observe.result import TopicResult
-from gr_ros2_lab.record.team_numbers import TEAM_VALUES, team_numbers
 from gr_ros2_lab.record.trace import Messages
-from gr_ros2_lab.report.explain import change_lines, lateness_lines
+from gr_ros2_lab.report.explain import lateness_lines
 from gr_ros2_lab.report.figures import latency_figure, ledger_figure
 from gr_ros2_lab.report.page import (
     Drawings,
@@ -26,7 +25,7 @@ from gr_ros2_lab.report.page import (
     render_page,
     write_summary,
 )
-from gr_ros2_lab.report.table import Grid, faults, milliseconds, number
+from gr_ros2_lab.report.table import Grid, milliseconds, number
 from gr_ros2_lab.report.timelines import Deliveries, age_figure, delivery_figure
 
 COMPARISON_FILE = "compare.html"
@@ -54,8 +53,8 @@ _DASH = "–"
 
 
 def compare_grid(runs: Sequence[Run]) -> Grid:
-    """What differs, with a column per run: the settings, all robots together, a section per topic, and the link. What
-    is equal in all runs is left out, and so are their names where they head the columns."""
+    """What differs, with a column per run: the settings, a section per topic, and the link. What is equal in all runs
+    is left out, and so are their names where they head the columns."""
     by_topic = [{topic.topic: topic for topic in run.result.topics} for run in runs]
     sections = []
     for name in dict.fromkeys(name for topics in by_topic for name in topics):
@@ -85,13 +84,8 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
             )
         )
     link += [("link", what, *(milliseconds(result.phy.get(key)) for result in results)) for what, key in _PHY.items()]
-    teams = [team_numbers(result) for result in results]
-    team = [
-        ("team", TEAM_VALUES.get(name, name), *(number(numbers.get(name), "{:.3g}") for numbers in teams))
-        for name in dict.fromkeys(name for numbers in teams for name in numbers)
-    ]
     labels = tuple(run.label for run in runs)
-    lines_of = [_settings([result.config for result in results]), team, *sections, link]
+    lines_of = [_settings([result.config for result in results]), *sections, link]
     kept = [tuple(line for line in section if len(set(line[2:])) > 1 and line[2:] != labels) for section in lines_of]
     title = "What differs" if any(kept) else "Nothing differs"
     return Grid(title, ("", "", *labels), tuple(filter(None, kept)), texts=2)
@@ -117,15 +111,9 @@ def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str
             yield above + key, str(value)
 
 
-def remarks_of(runs: Sequence[Run]) -> list[str]:
-    """Runs in which the computer did not keep up, somebody changed a setting, or something was wrong: what differs may
-    be an effect of that."""
-    return [
-        f"{run.label}: {line}"
-        for run in runs
-        for lines in (lateness_lines, change_lines, faults)
-        for line in lines(run.result)
-    ]
+def lateness_of(runs: Sequence[Run]) -> list[str]:
+    """The runs in which the computer did not keep up: what differs may be an effect of that."""
+    return [f"{run.label}: {line}" for run in runs for line in lateness_lines(run.result)]
 
 
 def write_comparison(
@@ -142,7 +130,7 @@ def write_comparison(
     with drawing(out, pictures) as drawn:
         sections = [
             Section(
-                sentences=[*remarks_of(runs), *(f"{run.label}: {lead_of(run)}" for run in runs)],
+                sentences=[*lateness_of(runs), *(f"{run.label}: {lead_of(run)}" for run in runs)],
                 grids=[*first, compare_grid(runs)],
             ),
             Section(pictures=_draw(runs, drawn)),

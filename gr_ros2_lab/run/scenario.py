@@ -131,8 +131,8 @@ class Scenario(Experiment, Traffic, AirConfig):
             raise ValueError("airtime.listen_before_send: no receiver of a run measures power; leave it to live links")
         if self.airtime.rule is not None and any(robot.packet_rate == 0 for robot in self.robots):
             raise ValueError("packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out")
-        self._check_robots()
         self.airtime.check_seal(encrypts=bool(self.key) and self.robots[0].seal == "encrypt")
+        self._check_robots()
         if self.paper is not None:
             for robot in self.robots:
                 check(robot, self.paper)
@@ -381,14 +381,14 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
     return scenario
 
 
-_UNDESCRIBED = {"time", "seed", "repetitions", "duration_s", "drain_s", "graph", "publish", "own_domains"}
-"""Settings of which no description of a built-in scenario speaks, alone and of a robot or channel."""
+_DESCRIBED = ("phy", "medium", "relay", "channel", "paths", "repair", "duplex", "gains_db", "paper", "task")
+"""Settings of which the description of a scenario may speak, beside how many robots there are."""
 
 
 def _contradicted(overrides: Sequence[str]) -> bool:
     """Whether the description of a scenario may not be true any more."""
     keys = [override.partition("=")[0].strip() for override in overrides]
-    return "description" not in keys and any(_UNDESCRIBED.isdisjoint(key.split(".")) for key in keys)
+    return any(key == "robots" or key.partition(".")[0] in _DESCRIBED for key in keys)
 
 
 def _described(scenario: Scenario, overrides: Sequence[str]) -> str:

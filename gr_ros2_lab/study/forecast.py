@@ -654,7 +654,7 @@ def _begin_process(work: Callable[[Scenario], Forecast]) -> None:
 
 
 _work: list[Callable[[Scenario], Forecast]] = []
-"""What a process of this kind is for."""
+"""What a forked process is for."""
 
 
 def _process(scenario: Scenario) -> Forecast:

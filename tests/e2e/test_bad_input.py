@@ -98,7 +98,7 @@ def files(folder: Path) -> dict[str, str]:
         ("packet demo", "No such command 'demo'; see gr-ros2 packet --help"),
         ("registry run", "No such command 'run'; see gr-ros2 registry --help"),
         ("registry check {f}/twice.csv", "twice.csv:2: duplicate topic"),
-        ("registry check {f}/nowhere.csv", "nowhere.csv': no such file; built in are "),
+        ("registry check {f}/nowhere.csv", "nowhere.csv: cannot be read"),
     ],
 )
 def test_wrong_input_is_one_line_on_stderr_and_status_2(

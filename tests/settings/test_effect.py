@@ -25,7 +25,6 @@ from gr_ros2.settings.config import (
 from gr_ros2.settings.effect import conditions_of
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.process import MediumConfig
-from gr_ros2_lab.race.race_settings import RaceSettings
 from gr_ros2_lab.run.robot_settings import ScenarioRobot
 from gr_ros2_lab.run.scenario import Scenario, scenario_from
 from tests.settings.test_fields import classes
@@ -95,8 +94,6 @@ IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
         {"task": "formation"},
         "set task and time: real",
     ),
-    (RaceSettings, "bag_topic"): ({"bag_topic": "/odom"}, {}, {"source": "bag:here"}, "set source: bag:PATH"),
-    (RaceSettings, "load"): ({"load": (0.5,)}, {"sample_rate": 1e5}, {}, "leave one of both out"),
 }
 for cls in (ScenarioRobot, LinkConfig):
     for name, given in (

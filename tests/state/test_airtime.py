@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import resource
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -69,17 +68,18 @@ def test_a_power_cut_within_a_write_leaves_the_account_before(tmp_path: Path, cu
 def test_a_full_disk_takes_an_account_that_is_there(tmp_path: Path) -> None:
     path, times = tmp_path / "a", Times()
     stored(path, times)
-    assert exit_code(save_on_a_full_disk, path, times) == 0
-    assert [round(airtime, 3) for _, airtime in times.open(path).spent] == [4.0]
-
-
-def save_on_a_full_disk(path: Path, times: Times) -> None:
     size = path.stat().st_size
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))  # no file grows any more
-    file = times.open(path)
-    for number in range(5):
-        file.save([(0.0, float(number))])
+
+    def full() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))  # no file grows any more
+        file = times.open(path)
+        for number in range(5):
+            file.save([(0.0, float(number))])
+        os._exit(0)
+
+    assert _done_by(full) == 0
+    assert [round(airtime, 3) for _, airtime in times.open(path).spent] == [4.0]
 
 
 def test_a_file_that_cannot_be_made_is_said_and_tried_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -98,27 +98,28 @@ def test_a_file_that_cannot_be_made_is_said_and_tried_again(tmp_path: Path, capl
 
 def test_kill_9_at_any_moment_forgets_nothing_that_was_sent(tmp_path: Path) -> None:
     path, sent = tmp_path / "a", tmp_path / "sent"
+    rule = AirtimeRule(0.5, 100.0)
     total = 0.0
     for _ in range(3):
-        assert exit_code(send_until_killed, path, sent) == -signal.SIGKILL
+
+        def run() -> None:
+            file = AirtimeFile(path)
+            limit = AirtimeLimit(rule, 0.5, spent=file.spent, save=file.save)
+            with sent.open("a") as said:
+                now = 0.0
+                while limit.reserve(now, 0.5):
+                    limit.spend(now, 0.5)
+                    said.write("x")
+                    said.flush()
+                    if said.tell() % 7 == 6:
+                        os.kill(os.getpid(), signal.SIGKILL)
+
+        assert _done_by(run) == -signal.SIGKILL
         total = 0.5 * len(sent.read_text())
         file = AirtimeFile(path)
         assert sum(airtime for _, airtime in file.spent) >= total
         file.close()
     assert total > 5
-
-
-def send_until_killed(path: Path, sent: Path) -> None:
-    file = AirtimeFile(path)
-    limit = AirtimeLimit(AirtimeRule(0.5, 100.0), 0.5, spent=file.spent, save=file.save)
-    with sent.open("a") as said:
-        now = 0.0
-        while limit.reserve(now, 0.5):
-            limit.spend(now, 0.5)
-            said.write("x")
-            said.flush()
-            if said.tell() % 7 == 6:
-                os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_two_links_do_not_share_an_account(tmp_path: Path) -> None:
@@ -144,9 +145,8 @@ def test_an_account_that_cannot_be_opened_is_not_forgotten(tmp_path: Path) -> No
         AirtimeFile(tmp_path / "a")
 
 
-def exit_code(work: Callable[..., None], *arguments: object) -> int | None:
-    """Of a process that does this work."""
-    process = multiprocessing.get_context("forkserver").Process(target=work, args=arguments)
+def _done_by(work: object) -> int | None:
+    process = multiprocessing.get_context("fork").Process(target=work)  # type: ignore[arg-type]
     process.start()
     process.join()
     return process.exitcode

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from gr_ros2_lab.record.result import ChangeResult, LatenessResult
-from gr_ros2_lab.report.compare import compare_grid, remarks_of, write_comparison
+from gr_ros2_lab.record.result import LatenessResult
+from gr_ros2_lab.report.compare import compare_grid, lateness_of, write_comparison
 from gr_ros2_lab.report.page import Run
 from tests.lab.record.runs import make_run
 
@@ -60,27 +60,8 @@ def test_settings_that_differ_stand_first(tmp_path: Path) -> None:
 def test_a_run_in_which_the_computer_was_late_is_named_first(tmp_path: Path) -> None:
     one, other = _two(tmp_path)
     late = replace(other, result=replace(other.result, lateness=LatenessResult({"gate": 0.4}, 9, 0.86, 1, 1, 9, 9)))
-    assert remarks_of([one, other]) == []
-    [line] = remarks_of([one, late])
+    assert lateness_of([one, other]) == []
+    [line] = lateness_of([one, late])
     assert line.startswith("two: The computer did not keep up with the clock: 9 times")
     page, *_ = write_comparison([one, late], tmp_path / "out")
     assert page.read_text().index("did not keep up") < page.read_text().index("What differs")
-
-
-def test_what_somebody_changed_in_a_run_is_said(tmp_path: Path) -> None:
-    one, other = _two(tmp_path)
-    turned = replace(other, result=replace(other.result, changes=(ChangeResult(2.0, "channel.snr_db", 3.0),)))
-    stopped = replace(one, result=replace(one.result, interrupted=True))
-    assert remarks_of([stopped, turned]) == [
-        "one: stopped after 4.0 s",
-        "two: Changed while it ran: channel.snr_db to 3 at 2.0 s.",
-    ]
-
-
-def test_robots_of_a_team_are_compared_together(tmp_path: Path) -> None:
-    runs = []
-    for name, error_m in (("near", 0.2), ("far", 0.31)):
-        run = make_run(tmp_path / name, name)
-        config = {**run.result.config, "robots": [{"topics": ["auto"], "direction": "both"}] * 2}
-        runs.append(replace(run, result=replace(run.result, config=config, task={"formation_error_m": error_m})))
-    assert compare_grid(runs).sections == ((("team", "formation error [m]", "0.2", "0.31"),),)

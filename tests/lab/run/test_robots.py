@@ -131,7 +131,6 @@ def test_without_gains_the_snr_is_that_of_the_channel() -> None:
     ("override", "message"),
     [
         ("robots=1", "two or more"),
-        ("robots=0", "two or more"),
         ("robots=[{}, {robot: /robot_1}]", "two are robot 1"),
         ("gains_db=[[1, 2]]", "2 robots need 2 rows of 2 numbers"),
         ("robots=null", "must be a list"),

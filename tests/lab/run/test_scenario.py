@@ -205,24 +205,8 @@ def test_neither_a_file_nor_built_in() -> None:
 
 
 def test_a_description_that_settings_contradict_is_made_from_them() -> None:
-    harmless = ("time=packets", "seed=3", "robots.0.graph.domain_id=5", "channel.seed=4")
-    assert load_scenario("team", harmless).description == "four robots on one channel, in slots"
+    assert load_scenario("team", ("time=packets", "seed=3")).description == "four robots on one channel, in slots"
     assert load_scenario("team", ("medium=exclusive", "phy.name=lora", "robots=3")).description == (
         "3 robots, lora at 200,000 samples/s, one channel, exclusive; "
         "team with medium=exclusive, phy.name=lora, robots=3"
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "override"),
-    [
-        ("demo", "topics=[odom]"),
-        ("paper-direct", "packet_len=128"),
-        ("paper-direct", "sim.odom_rate=10"),
-        ("paper-ofdm-paced", "compression=false"),
-        ("demo", "robots.0.repair=off"),
-    ],
-)
-def test_a_description_does_not_say_what_a_setting_has_changed(name: str, override: str) -> None:
-    assert load_scenario(name, [override]).description.endswith(f"{name} with {override}")
-    assert load_scenario(name, [override, "description=mine"]).description == "mine"
