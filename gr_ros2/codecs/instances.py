@@ -140,7 +140,8 @@ class Instances:
         return made
 
     def merged(self, waiting: Sequence[bytes], message: bytes) -> bytes:
-        """See :class:`gr_ros2.link.instances.InstanceKeys`. Messages whose other fields differ are left out.
+        """A message with what it and those before it say of each instance. Messages whose other fields differ are left
+        out.
 
         :raises DamagedError: not messages of the type
         """

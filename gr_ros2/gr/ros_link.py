@@ -176,7 +176,7 @@ class RosLink(LinkBlock):
         self._connect()
 
     def set_topics(self, topics: Any) -> None:
-        """See :meth:`LinkSendingBlock.set_topics`."""
+        """Use other options of single topics from now on."""
         self.source.set_topics(topics)
         self.config = self.source.config
 

@@ -11,7 +11,7 @@ from gr_ros2.link.rate import Mcs
 
 @dataclass(frozen=True, kw_only=True)
 class Air:
-    """See the module.
+    """What an endpoint has to know of its robot's radio.
 
     :param hears: whether the robots that it may hear can hear it, so that it reports to them
     :param half_duplex: whether sending and receiving share the airtime

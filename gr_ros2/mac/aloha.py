@@ -24,7 +24,7 @@ LONGEST = 300
 
 
 class Aloha:
-    """See the module.
+    """The random times at which a robot may send.
 
     :param airtime_s: s of the longest packet
     :param period_s: s from one message to the next; a robot sends no more often

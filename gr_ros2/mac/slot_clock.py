@@ -51,7 +51,7 @@ class _Odd(NamedTuple):
 
 
 class SlotClock:
-    """See the module.
+    """The robot's own clock of slots, which follows the packets that it hears.
 
     :param slot_s: s that a slot lasts
     :ivar jumps: how often this clock has moved to other slots

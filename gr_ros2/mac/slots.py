@@ -113,7 +113,7 @@ class _HeardRobot:
 
 
 class Slots:
-    """See the module.
+    """The slots in which this robot and those that it hears send.
 
     :param src_id: of this robot
     :param slot_s: s that a slot lasts: the airtime of the longest packet and the guard

@@ -143,7 +143,7 @@ class BagMiddleware(Middleware):
         qos: Qos,  # noqa: ARG002 - a file fits any QoS
         callback: MessageCallback,
     ) -> BagSubscription:
-        """See base; nothing can be subscribed after :meth:`start`.
+        """Subscribe a topic of the bag, before :meth:`start`.
 
         :raises ConfigError: the bag has the topic with another type, or the topic cannot be carried
         """
@@ -210,7 +210,7 @@ class BagMiddleware(Middleware):
     # Writing
 
     def advertise(self, topic: str, type_name: str, qos: Qos) -> BagPublisher:
-        """See base. Also writes the definition of the type: from ``definitions``, or that of ROS.
+        """Write a topic, with the definition of its type: from ``definitions``, or that of ROS.
 
         :raises ConfigError: the topic is being written with another type
         """

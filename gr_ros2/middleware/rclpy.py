@@ -181,7 +181,7 @@ class RclpyMiddleware(RclpyParticipant):
         atexit.register(self.close)  # a daemon thread inside rcl must not outlive the interpreter
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
-        """See base.
+        """Subscribe a topic, with a QoS that adapts to its publishers.
 
         :raises ConfigError: a type that cannot be imported, a topic name ROS does not allow
         """
@@ -192,7 +192,7 @@ class RclpyMiddleware(RclpyParticipant):
         return subscription
 
     def advertise(self, topic: str, type_name: str, qos: Qos) -> Publisher:
-        """See base.
+        """Publish a topic.
 
         :raises ConfigError: a type that cannot be imported, a topic name ROS does not allow
         """
@@ -200,7 +200,7 @@ class RclpyMiddleware(RclpyParticipant):
         return _RclpyPublisher(self, topic, type_name, qos)
 
     def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> RclpyServer:
-        """See services.
+        """Offer a service.
 
         :raises ConfigError: a type that cannot be imported, a name ROS does not allow
         """
@@ -208,7 +208,7 @@ class RclpyMiddleware(RclpyParticipant):
         return RclpyServer(self, check_topic(service), type_name, on_request, node)
 
     def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> RclpyClient:
-        """See services.
+        """Call a service.
 
         :raises ConfigError: a type that cannot be imported, a name ROS does not allow
         """
@@ -218,8 +218,8 @@ class RclpyMiddleware(RclpyParticipant):
         return client
 
     def discover(self) -> list[TopicInfo]:
-        """See base. A topic with several types has one row per type; depths are known only where the RMW announces
-        them."""
+        """The topics of others. One with several types has a row per type; depths are known only where the RMW
+        announces them."""
         self.check_open()
         node = self._node
         found = []

@@ -88,8 +88,8 @@ class _ChirpPlace(NamedTuple):
 
 
 class LoraModem(BurstModem):
-    """See :class:`LoraOptions`. The reference sample is approximately the first sample of an up-chirp early in the
-    preamble."""
+    """Makes and reads bursts of chirps. The reference sample is approximately the first sample of an up-chirp early in
+    the preamble."""
 
     def __init__(self, frames: Frames, options: LoraOptions) -> None:
         super().__init__(frames)

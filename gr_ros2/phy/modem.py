@@ -29,7 +29,7 @@ class ModemOptions:
 
 
 class ModemPhy(PacketPhy):
-    """See :class:`ModemOptions`.
+    """A modem that takes packets and modulates them itself.
 
     Airtime of a packet of n bytes: ``overhead_s + 8 (n + overhead_bytes) / bit_rate``.
     """

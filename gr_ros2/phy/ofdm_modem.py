@@ -56,7 +56,7 @@ class _SymbolClock(NamedTuple):
 
 
 class OfdmModem(BurstModem):
-    """See :class:`gr_ros2.phy.ofdm.OfdmOptions`. The reference sample is the first of the first sync word's prefix.
+    """Makes and reads OFDM bursts. The reference sample is the first of the first sync word's prefix.
 
     :param frames: the frames that bursts carry, lowest bit of a byte first
     :param layout: carriers and constellation

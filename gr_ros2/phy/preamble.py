@@ -53,7 +53,7 @@ class _Carrier(NamedTuple):
 
 
 class Preamble:
-    """See the module. Samples have passed the receive filter; the reference sample is that of the first symbol.
+    """Finds preambles in filtered samples; the reference sample is that of the first symbol.
 
     :param sps: samples per symbol, 2 or more
     :param turn: phase step of the modulation in addition to data and carrier, radians per symbol

@@ -40,7 +40,7 @@ def seconds_of(value: Any) -> float | None:
 
 
 class StreamTimes:
-    """See the module. Any thread may ask.
+    """The times of the samples of a stream. Any thread may ask.
 
     :param sample_rate: samples/s
     :param clock: s, monotonic

@@ -78,7 +78,7 @@ class AudioOptions(BurstDeviceOptions):
 
 
 class AudioFrontEnd(BurstFrontEnd):
-    """See :class:`AudioOptions`.
+    """A sound card that plays and records bursts.
 
     :raises ConfigError: for a sample rate of which the card's is no multiple, or a key without a device
     """

@@ -19,7 +19,7 @@ _FEW = 10
 
 
 class Mismatch:
-    """See the module.
+    """Finds what other ends have set differently, when most of what arrives cannot be used.
 
     :param own: what this end tells those who ask, as :func:`gr_ros2.radio.findings.about` returns it
     :param ask: asks a robot; returns what has come of all questions to it, with what it is as ``about``

@@ -25,7 +25,7 @@ from gr_ros2.radio.front_end import FrontEnd
 
 
 class RosSide:
-    """See the module.
+    """A robot's participant on its ROS graph, and its block.
 
     :param sends: whether the robot may send
     :param middleware: an open Middleware for both directions, which the caller closes; None: opened here

@@ -92,7 +92,7 @@ class _Heard:
 
 
 class Gains:
-    """See the module.
+    """The gain of sending each message that this robot has, for those who hear it.
 
     :param src_id: of this robot
     :param slower: by how much longer than written robots are waited for, where they send seldom

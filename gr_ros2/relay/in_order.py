@@ -83,7 +83,7 @@ class _Row:
 
 
 class InOrder:
-    """See the module.
+    """The messages of reliable topics that are kept for robots that do not hear who made them.
 
     :param gains: knows who hears whom
     :param rooms: where the messages are kept

@@ -31,7 +31,7 @@ _LOG = logging.getLogger("gr_ros2.state.airtime")
 _UPTIME = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
 Spent = Sequence[tuple[float, float]]
-"""See :data:`gr_ros2.link.airtime_limit.Spent`."""
+"""Airtime and until when it counts as being sent: (s after the present moment, may be negative; s of airtime)."""
 
 
 def boot_id() -> str:

@@ -276,7 +276,7 @@ class Medium(ABC):
         self.around.begin(now)
 
     def change(self, sender: int, **settings: Any) -> None:
-        """See :meth:`Surroundings.change`."""
+        """Change settings of the channels of a robot that sends."""
         self.around.change(sender, **settings)
         self._ways.clear()
 

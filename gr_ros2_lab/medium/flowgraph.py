@@ -21,7 +21,7 @@ _SEEDS = 2**31 - 1
 
 
 class FlowgraphMedium(Medium):
-    """See the module.
+    """Carries packets through the blocks of a PHY in a flowgraph of its own.
 
     :param phys: of every robot
     :param ahead: what the robots are going to send, in order, as far as it can be known: where nobody answers. What it

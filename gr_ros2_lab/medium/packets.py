@@ -98,7 +98,7 @@ class _Reach:
 
 
 class PacketMedium(Medium):
-    """See the module.
+    """Loses packets as often as the tables of their PHYs say.
 
     :param phys: of every robot
     :param seed: of the losses of the PHY

@@ -178,7 +178,7 @@ class _Link:
 
 
 class MediumProcess:
-    """See the module.
+    """Receives bursts of links, and publishes to each what it hears.
 
     :param clock: s, monotonic
     :param around: who hears whom; None: as the configuration says

@@ -152,7 +152,8 @@ class _Ear:
 
 
 class SampleMedium(Medium):
-    """See the module. A burst's amplitude is that of its SNR, over noise of the power that a burst is sent with.
+    """Adds the bursts at each receiver. A burst's amplitude is that of its SNR, over noise of the
+    power that a burst is sent with.
 
     :param phys: of every robot, each with a modem of its own
     :param seed: of noise and phases

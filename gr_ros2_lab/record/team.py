@@ -51,7 +51,7 @@ class Pair:
 
 
 class TeamRecord:
-    """See the module.
+    """Collects what all robots on one channel sent, heard and believed.
 
     :param robots: their source ids
     :param airtime: s of a packet by its bytes and MCS

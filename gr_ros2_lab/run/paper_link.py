@@ -23,7 +23,8 @@ from gr_ros2.settings.robot import RobotConfig
 
 
 class PaperLink(LinkBlock):
-    """See the module. The parameters are those of :class:`gr_ros2.gr.ros_link.RosLink`.
+    """The blocks ROS Source and ROS Sink as one block, whose parameters are those of
+    :class:`gr_ros2.gr.ros_link.RosLink`.
 
     :param seed: of sequence number and entry ids
     """

@@ -26,7 +26,7 @@ from gr_ros2_lab.run.scenario import Scenario
 
 
 class PassedOn(LiveMedium):
-    """See the module."""
+    """Passes packets on in real time, each when its airtime and the delay of its path are over."""
 
     def __init__(self, scenario: Scenario, phy: Phy, around: Surroundings, stack: ExitStack) -> None:
         self.medium = make_medium(around, [phy] * around.robots, samples=False, seed=scenario.seed)

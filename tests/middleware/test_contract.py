@@ -131,7 +131,7 @@ DIFFERENT: dict[str, dict[str, Any]] = {
     "dds": {"padding": 3},
     "rclpy": {"padding": 3, "custom_types": False, "tells_depth": False},
 }
-"""See :class:`World`."""
+"""Fields of :class:`World` in which a back-end differs."""
 NEEDED = {"zenoh": "zenoh_router"}
 """Fixtures without which there is no graph."""
 LIVE = [name for name, row in MIDDLEWARE.items() if row.scope != "none"]

@@ -71,7 +71,7 @@ def _run(number: int, front_end: dict[str, Any], first: int, values: Mapping[str
 
 
 class RobotProcess:
-    """See the module.
+    """One robot, its programs and its link, in a process that a test can kill.
 
     :param first: number of the first message that it publishes; each further one is one higher
     :ivar heard: messages of the other robot, in the order in which they came out
@@ -98,7 +98,7 @@ class RobotProcess:
 
     @property
     def heard(self) -> list[Heard]:
-        """See the class. Who waits for more of a process that has ended by itself is told so at once."""
+        """Messages of the other robot. Who waits for more of a process that has ended by itself is told so at once."""
         assert self._killed or self.alive, f"the process of a robot has ended with code {self._process.exitcode}"
         return self._heard
 

@@ -119,7 +119,7 @@ class _Held:
 
 
 class Custody:
-    """See the module.
+    """The messages that this robot keeps until the next robot on their way has them.
 
     :param own: id and boot number of this robot
     :param topics: what it sends

@@ -71,7 +71,7 @@ class _Limits:
 
 
 class DeliveryRules:
-    """See the module.
+    """The rules by which messages of one robot are delivered, wait, or are dropped.
 
     :param marks: CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as
         many as its depth, or where that is more than 1, ``_MARKS`` more; what a hello has named counts as new again

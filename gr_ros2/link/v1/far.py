@@ -28,7 +28,7 @@ FAR_S = 600.0
 
 
 class FarRobots:
-    """See the module.
+    """The robots that this one knows over others.
 
     :param neighbours: the robots that are heard
     :param outcomes: takes what comes of it

@@ -88,14 +88,14 @@ class SentFrames:
         self._sum = 0
 
     def begin(self, topic_id: int, output: str = "") -> None:
-        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        """Send frames of a topic from now on."""
         self._topics[topic_id].become_frames(output)
         self.sent.setdefault(topic_id, deque())
         self._ages.setdefault(topic_id, 0.0)
         self._outlet.tabulate()
 
     def end(self, topic_id: int) -> None:
-        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        """No frame of a topic follows, and those that have left are of no more use."""
         sent = self.sent[topic_id]
         while sent:
             sent.popleft().lifetime.end()
@@ -112,7 +112,7 @@ class SentFrames:
         return FrameState(self._free(now), waiting, lacked, behind, silent, age, joined, bool(self._peers), asks)
 
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool, chain: int = 0) -> bool:
-        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        """Send a frame; False where it is too large. A key frame ends those that somebody has long lacked."""
         message = self._outlet.submit_frame(self._topics[topic_id], frame, came, now, key=key, chain=chain)
         if message is None:
             return False
@@ -127,11 +127,11 @@ class SentFrames:
         self._outlet.refuse_new(topic_id, fate, detail)
 
     def watched(self, topic_id: int) -> None:
-        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        """Somebody has begun to watch a topic, and needs a key frame."""
         self._outlet.asks[topic_id] += 1
 
     def lost(self, src_id: int, topic_id: int) -> None:
-        """See :class:`gr_ros2.link.frames.FrameSide`."""
+        """A frame of another robot could not be decoded: that robot is asked for a key frame."""
         if (neighbour := self._neighbours.get(src_id)) is not None:
             neighbour.lost_frames.add(topic_id)
 

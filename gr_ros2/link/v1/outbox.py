@@ -124,7 +124,7 @@ class Outbox:
             self._tabulate()
 
     def add(self, topics: Sequence[NewTopic]) -> Registry:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one are told."""
+        """Offer further topics. The robots that hear this one are told."""
         together = (Registry.empty() if self.topics is None else self.topics).extended(topics)
         added = together[-len(topics) :] if topics else ()
         if self._codec is not None:
@@ -137,7 +137,7 @@ class Outbox:
         return together
 
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
-        """See :class:`gr_ros2.link.endpoint.MessageSide`. The robots that hear this one are told."""
+        """Take definitions of a type, by which its messages are coded. The robots that hear this one are told."""
         self.sent.learn(type_name, definitions)
         if self._codec is None:
             return
@@ -289,7 +289,7 @@ class Outbox:
     def submit_frame(
         self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool, chain: int
     ) -> Message | None:
-        """See :class:`gr_ros2.link.v1.frames.Outlet`."""
+        """Queue a frame of a coded topic; None where it is too large."""
         topic_id = topic.topic.topic_id
         self._owner.submitted(topic_id, now)
         self.packing.turns.join(topic_id)
@@ -314,7 +314,7 @@ class Outbox:
         return message
 
     def refuse_new(self, topic_id: int, fate: Fate, detail: str) -> None:
-        """See :class:`gr_ros2.link.v1.frames.Outlet`."""
+        """A message that was submitted ends here, with this fate."""
         self._refuse(self._new(topic_id), topic_id, fate, detail)
 
     def _new(self, topic_id: int) -> int:

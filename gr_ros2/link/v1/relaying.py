@@ -61,7 +61,7 @@ _BOOT_LEN = 8
 
 
 class Relaying:
-    """See the module.
+    """What one robot does with messages of other robots.
 
     :param src_id: of this robot
     :param neighbours: the robots that are heard

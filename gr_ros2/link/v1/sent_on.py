@@ -47,7 +47,7 @@ class ToPass(NamedTuple):
 
 
 class SentOn:
-    """See the module.
+    """The messages of other robots that are worth sending on.
 
     :param gains: knows who lacks what
     :param dropped: counts what is not sent on any more

@@ -54,7 +54,7 @@ class _Sequence(Generic[T]):
 
 
 class Sequences(Generic[T]):
-    """See the module.
+    """Messages that wait for those before them.
 
     :param most: bytes of messages that may wait
     """
