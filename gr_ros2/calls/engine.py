@@ -149,7 +149,7 @@ class Calls:
         robot, boot, name = service.robot, service.boot, service.name
         self.expire(now)
         self.counters[f"called:{name}"] += 1
-        if len(self._made) >= MAX_CALLS and not self._room(self._made, list(self._made), "too_many"):
+        if len(self._made) >= MAX_CALLS and not self._make_space(self._made, list(self._made), "too_many"):
             self.counters[f"too_many:{name}"] += 1
             return None
         self._number += 1
@@ -238,7 +238,7 @@ class Calls:
         name = offer.name
         self.counters[f"served:{name}"] += 1
         waiting = [ticket for ticket, call in self._served.items() if call.robot == robot]
-        if len(waiting) >= MAX_CALLS and not self._room(self._served, waiting, "refused"):
+        if len(waiting) >= MAX_CALLS and not self._make_space(self._served, waiting, "refused"):
             return self._dropped(f"refused:{name}")
         self._ticket += 1
         self._served[self._ticket] = _Served(name, robot, boot, frame.number, expires)
@@ -252,11 +252,11 @@ class Calls:
         self.counters[f"answered:{made.name}"] += 1
         return Answer(made.service.robot, made.service.service_id, made.token, frame.payload)
 
-    def _give_up(self, over: Callable[[Service], bool]) -> None:
-        for number in [number for number, made in self._made.items() if over(made.service)]:
+    def _give_up(self, ended: Callable[[Service], bool]) -> None:
+        for number in [number for number, made in self._made.items() if ended(made.service)]:
             self.counters[f"server_gone:{self._made.pop(number).name}"] += 1
 
-    def _room(self, calls: dict[int, _Made] | dict[int, _Served], keys: list[int], counter: str) -> bool:
+    def _make_space(self, calls: dict[int, _Made] | dict[int, _Served], keys: list[int], counter: str) -> bool:
         """Give up the oldest of these calls that has no deadline, as its caller may have left long ago."""
         for key in keys:
             if calls[key].expires == inf:

@@ -36,7 +36,7 @@ class EarlyMessages:
         self.waiting.append(event)
         self._size += len(event.payload)
 
-    def over(self, now: float) -> bool:
+    def ended(self, now: float) -> bool:
         """Whether nothing needs to wait any longer."""
         if not self._matched and self._publisher.matched():
             self._matched, self._until = True, min(self._until, now + self._settling_s)

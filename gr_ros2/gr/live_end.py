@@ -48,7 +48,7 @@ class LiveEnd(Generic[_E_co]):
         at = self.endpoint.next_departure()
         if at is None:
             self._foreseen = False
-        elif at < self.sleeps_until or self.endpoint.urged:
+        elif at < self.sleeps_until or self.endpoint.urgent:
             self.work.notify()
 
     def sleep(self, clock: Callable[[], float]) -> None:

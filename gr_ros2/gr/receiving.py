@@ -276,7 +276,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         outputs = self.outputs
         while True:
             opening = list(outputs.opening)
-            outputs.release([o for o in opening if o.early is None or o.early.over(self._clock())])
+            outputs.release([o for o in opening if o.early is None or o.early.ended(self._clock())])
             with self._lock:
                 if not self._running:
                     return

@@ -81,7 +81,7 @@ class LinkSendingBlock(SendingBlock):
             self.subscriptions.change(config.options)
             self.config = config
             self.live.wake()
-            self._room.notify_all()
+            self._space.notify_all()
 
 
 class LinkBlock(gr.hier_block2):  # type: ignore[misc]

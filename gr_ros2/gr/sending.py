@@ -111,7 +111,7 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
             backpressure=backpressure,
         )
         """What it sends."""
-        self._room = self.subscriptions.room
+        self._space = self.subscriptions.space
         try:
             self.subscriptions.open()
         except GrRos2Error:
@@ -230,7 +230,7 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
             self._end.reconfigure(**{name: getattr(config, name) for name in changes})  # as validated
             self.config = config
             self._work.notify_all()
-            self._room.notify_all()
+            self._space.notify_all()
 
     def _credit(self, message: Any) -> None:
         packets, since = credited(message)
@@ -263,7 +263,7 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
                 self.live.look()
                 self.composed += len(packets)
                 self._mcs = packets[-1].mcs
-                self._room.notify_all()
+                self._space.notify_all()
             elif self._running:
                 self.live.sleep(self.clock)
         return packets

@@ -43,7 +43,7 @@ class Subscriptions:
     :ivar registry: all topics so far
     :ivar frames: the topics that are sent as frames; None in a version, or with a setting, without them
     :ivar options: the options of single topics, by name
-    :ivar room: notified when a message that is held back may be submitted; uses the lock of ``live``
+    :ivar space: notified when a message that is held back may be submitted; uses the lock of ``live``
     :ivar subscribed: topics by their absolute names on the ROS graph, as they were subscribed. The mapping is replaced
         as a whole when a topic is added
     :ivar services: the same for the services that other robots may call
@@ -64,7 +64,7 @@ class Subscriptions:
         self._given = registry
         self.options: Mapping[str, SendOptions] = config.options
         self.registry = registry = registry.with_options(self.options)
-        self.room = threading.Condition(live.lock)
+        self.space = threading.Condition(live.lock)
         self._config, self._graph, self._live, self._backpressure = config, graph, live, backpressure
         self._messages = live.endpoint.messages
         self._clock, self._counters, self._log = clock, counters, log
@@ -96,7 +96,7 @@ class Subscriptions:
         """Take no further messages. Idempotent."""
         with self._live.lock:
             self._closed = True
-            self.room.notify_all()
+            self.space.notify_all()
         for subscription in self._subscriptions.values():
             subscription.close()
         if self._worker is not None:
@@ -217,8 +217,8 @@ class Subscriptions:
             now_id = self._now(topic_id)
             frames = self.frames if self.frames is not None and now_id in self.frames else None
             held_back = self._backpressure and frames is None and changed is None
-            while held_back and not self._closed and not self._messages.room(now_id):
-                self.room.wait()
+            while held_back and not self._closed and not self._messages.has_space(now_id):
+                self.space.wait()
                 now_id = self._now(topic_id)
             if self._closed:
                 self._counters["held_back_at_close"] += 1

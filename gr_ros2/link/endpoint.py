@@ -121,7 +121,7 @@ class MessageSide(Protocol):
     def depth(self, topic_id: int) -> int:
         """Number of messages of a topic that may wait, 0 for unbounded."""
 
-    def room(self, topic_id: int) -> bool:
+    def has_space(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without dropping another one."""
 
     def queued(self) -> dict[int, int]:
@@ -181,7 +181,7 @@ class PacketSide(Protocol):
         """The rates of an adaptive rate, the most robust one first; () for a fixed rate."""
 
     @property
-    def urged(self) -> bool:
+    def urgent(self) -> bool:
         """Whether a received packet may let one leave at once, before ``next_departure``."""
 
     def next_packet(self, now: float) -> SentPacket | None:

@@ -152,7 +152,7 @@ class TopicQueue(deque[M], Generic[M]):
         """Let so many messages/s start from now on, 0 for any number."""
         self._interval = 1 / max_rate if max_rate else 0.0
 
-    def room(self, depth: int) -> bool:
+    def has_space(self, depth: int) -> bool:
         """Whether one more message fits without a drop. ``depth``: messages that may wait, 0 for unbounded."""
         if self.policy == "latest":
             return not self or (len(self) == 1 and self[0].started)

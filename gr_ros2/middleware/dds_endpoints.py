@@ -158,12 +158,12 @@ class DdsSubscription(Subscription):
         with self.calling:
             if self._closed:
                 return
-            over = [reader for until, reader in self._outdated if until <= now]
-            for reader in over:
+            ended = [reader for until, reader in self._outdated if until <= now]
+            for reader in ended:
                 self._serve_all(reader)
                 self._middleware.drop_reader(reader)
             self._outdated = [(until, reader) for until, reader in self._outdated if until > now]
-            if over:
+            if ended:
                 self._middleware.announce()
 
     def service(self, reader: RawReader) -> int:

@@ -231,7 +231,7 @@ class ThreadedObserver(Observers[RunObserver]):
         self.instruments = observer.instruments
         self._observer, self._guard = self._guarded[0]
         self._backlog = Backlog(f"gr-ros2-{self.name}"[:40], _HELD_BYTES)
-        self._over = self._hangs = False
+        self._ended = self._hangs = False
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         self._pass_on(_size(event), self._observer.sender_event, src_id, event)
@@ -248,13 +248,13 @@ class ThreadedObserver(Observers[RunObserver]):
             self._give_up()
 
     def run_ended(self, result: RunResult | None) -> None:
-        self._over = True
+        self._ended = True
         self._backlog.offer(0, self._guard.last, self._observer.run_ended, result)
         if not self._backlog.close(0 if self._hangs else _PATIENCE_S):
             self._give_up()
 
     def _pass_on(self, size: int, call: Callable[..., object], *arguments: object) -> None:
-        if self._over:
+        if self._ended:
             return
         if self._guard.error is not None or not self._backlog.offer(_EVENT_BYTES + size, self._guard, call, *arguments):
             self._guard.miss()

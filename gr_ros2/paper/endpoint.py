@@ -28,7 +28,7 @@ class EndpointV0:
     :param observer: called with every SenderEvent, in order
     """
 
-    answers = urged = False
+    answers = urgent = False
     frames = None
     mcs_table: Sequence[Mcs] = ()
     live_settings = ("packet_rate", "dst_id", "repeat_s", "queue_depth")

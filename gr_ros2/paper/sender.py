@@ -178,9 +178,9 @@ class Sender:
         depth = self._depths[topic_id]
         return self.robot.queue_depth if depth == AUTO else depth
 
-    def room(self, topic_id: int) -> bool:
+    def has_space(self, topic_id: int) -> bool:
         """Whether a message of that topic could be submitted without dropping another one."""
-        return self._queues[topic_id].room(self.depth(topic_id))
+        return self._queues[topic_id].has_space(self.depth(topic_id))
 
     @property
     def idle(self) -> bool:

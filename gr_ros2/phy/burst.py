@@ -354,14 +354,14 @@ class BurstReceiver:
         """Take the next samples; returns the packets they complete."""
         packets: list[DemodulatedPacket] = []
         while len(samples):
-            room = self._make_room()
-            self._buffer[self._end : self._end + len(samples[:room])] = samples[:room]
-            self._end += len(samples[:room])
-            samples = samples[room:]
+            space = self._make_space()
+            self._buffer[self._end : self._end + len(samples[:space])] = samples[:space]
+            self._end += len(samples[:space])
+            samples = samples[space:]
             packets += self._take()
         return packets
 
-    def _make_room(self) -> int:
+    def _make_space(self) -> int:
         if self._end == len(self._buffer):
             first = self._cursor - self._modem.margin
             self._buffer[: self._end - first] = self._buffer[first : self._end].copy()

@@ -236,14 +236,14 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         """Samples of a packet's burst and gap."""
         return modem.samples_of(len(packet.data)) + self._gap
 
-    def _fitting(self, modem: BurstModem, room: int) -> tuple[list[AirPacket], list[int]]:
+    def _fitting(self, modem: BurstModem, space: int) -> tuple[list[AirPacket], list[int]]:
         """The next packets whose bursts fit, all of one modem, and the samples of each."""
         packets: list[AirPacket] = []
         sizes: list[int] = []
-        while self._waiting and self._waiting[0][0] is modem and (size := self._size(*self._waiting[0])) <= room:
+        while self._waiting and self._waiting[0][0] is modem and (size := self._size(*self._waiting[0])) <= space:
             packets.append(self._waiting.popleft()[1])
             sizes.append(size)
-            room -= size
+            space -= size
         return packets, sizes
 
     def _begin(self, place: int, size: int, packet: AirPacket) -> None:

@@ -62,8 +62,8 @@ class Decoders(Protocol):
     def convolutional(self, bits: int) -> Decoder:
         """A decoder of ``2 * bits + 12`` levels, 0..255, into ``bits`` bits."""
 
-    def ldpc(self, path: Path, room: int) -> Decoder:
-        """A decoder of log-likelihood ratios into the ``room`` data bits of a block.
+    def ldpc(self, path: Path, data_bits: int) -> Decoder:
+        """A decoder of log-likelihood ratios into the ``data_bits`` data bits of a block.
 
         :param path: the matrix, in the alist format
         """
@@ -82,12 +82,12 @@ class GnuRadioDecoders:
         arguments = (bits, _CONSTRAINT, 2, list(POLYNOMIALS), 0)
         return partial(_work, _fec().cc_decoder.make(*arguments, -1, _fec().CC_TERMINATED, False), size=bits)
 
-    def ldpc(self, path: Path, room: int) -> Decoder:
-        return partial(_work, _ldpc_decoder(str(path)), size=room)
+    def ldpc(self, path: Path, data_bits: int) -> Decoder:
+        return partial(_work, _ldpc_decoder(str(path)), size=data_bits)
 
     def polar(self, size: int, frozen: list[int]) -> Decoder:
-        room = size - len(frozen)
-        return partial(_work, _fec().polar_decoder_sc.make(size, room, frozen, [0] * len(frozen)), size=room)
+        data_bits = size - len(frozen)
+        return partial(_work, _fec().polar_decoder_sc.make(size, data_bits, frozen, [0] * len(frozen)), size=data_bits)
 
 
 GNU_RADIO = GnuRadioDecoders()
@@ -176,17 +176,17 @@ class Blocks(Code):
 
     The remaining data bits of a block are zeros that both ends know and that are not sent ("shortening").
 
-    :param room: data bits of a block
+    :param data_bits: data bits of a block
     """
 
-    def __init__(self, bits: int, room: int) -> None:
+    def __init__(self, bits: int, data_bits: int) -> None:
         super().__init__(bits)
-        self.count, self.each = self.cut(bits, room)
+        self.count, self.each = self.cut(bits, data_bits)
 
     @staticmethod
-    def cut(bits: int, room: int) -> tuple[int, int]:
+    def cut(bits: int, data_bits: int) -> tuple[int, int]:
         """Number of blocks, and data bits of each."""
-        count = -(-bits // room)
+        count = -(-bits // data_bits)
         return count, -(-bits // count)
 
     def blocks_of(self, bits: Bits) -> Bits:
@@ -199,20 +199,20 @@ class Blocks(Code):
 class Matrix:
     """One of GNU Radio's LDPC matrices. GNU Radio needs most of a second to set one up.
 
-    :param room: data bits of a block
+    :param data_bits: data bits of a block
     :param size: coded bits of a block
     :raises BackendMissingError: if GNU Radio's matrices are not installed
     """
 
-    def __init__(self, decoders: Decoders, room: int, size: int, name: str) -> None:
+    def __init__(self, decoders: Decoders, data_bits: int, size: int, name: str) -> None:
         from gnuradio import gr
 
         path = Path(gr.prefix()) / "share" / "gnuradio" / "fec" / "ldpc" / f"{name}.alist"
         if not path.is_file():
             raise BackendMissingError(f"fec 'ldpc' needs {path}, which comes with GNU Radio (apt install gnuradio)")
-        self.room, self.size, self.checks = room, size, size - room
+        self.data_bits, self.size, self.checks = data_bits, size, size - data_bits
         self.encoder = _fec().ldpc_encoder.make(str(path))
-        self.decode = decoders.ldpc(path, room)
+        self.decode = decoders.ldpc(path, data_bits)
 
 
 class Ldpc(Blocks):
@@ -222,7 +222,7 @@ class Ldpc(Blocks):
     """
 
     def __init__(self, bits: int, matrix: Matrix) -> None:
-        super().__init__(bits, matrix.room)
+        super().__init__(bits, matrix.data_bits)
         self._matrix = matrix
         self.coded_bits = self.coded(bits)
 
@@ -234,13 +234,13 @@ class Ldpc(Blocks):
     @classmethod
     def coded(cls, bits: int) -> int:
         """Coded bits for this number of bits."""
-        room, size, _ = cls.shape(bits)
-        count, each = cls.cut(bits, room)
-        return count * (each + size - room)
+        data_bits, size, _ = cls.shape(bits)
+        count, each = cls.cut(bits, data_bits)
+        return count * (each + size - data_bits)
 
     def encode(self, bits: Bits) -> Bits:
         matrix = self._matrix
-        word = np.zeros(matrix.room, np.uint8)
+        word = np.zeros(matrix.data_bits, np.uint8)
         out = []
         for block in self.blocks_of(bits):
             word[: self.each] = block

@@ -97,7 +97,7 @@ class OfdmLayout:
         return -(packet_len + CRC_LEN) % self.multiple
 
     def fits_header(self, packet_len: int) -> bool:
-        """Whether the header has room for the length of a frame with a CRC-32."""
+        """Whether the header has space for the length of a frame with a CRC-32."""
         return packet_len + self.fill(packet_len) + CRC_LEN <= _MAX_FRAME_LEN
 
     def symbols(self, bits: int) -> int:

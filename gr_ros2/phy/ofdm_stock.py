@@ -45,8 +45,8 @@ _SMALLEST_BUFFER = 32768
 class StockFrame:
     """The frame of a packet.
 
-    A ``packet_len`` above 4091 leaves no room for the CRC-32 in the header's 12-bit length. Such frames have none: only
-    the packet's own CRC-16 protects them, and damaged ones reach the sink, which refuses and counts them.
+    A ``packet_len`` above 4091 leaves no space for the CRC-32 in the header's 12-bit length. Such frames have none:
+    only the packet's own CRC-16 protects them, and damaged ones reach the sink, which refuses and counts them.
 
     :param gap: zero samples after each packet
     """
@@ -57,7 +57,7 @@ class StockFrame:
 
     @property
     def with_crc32(self) -> bool:
-        """Whether the header has room for the length with a CRC-32."""
+        """Whether the header has space for the length with a CRC-32."""
         return self.layout.fits_header(self.packet_len)
 
     @property

@@ -19,7 +19,7 @@ from math import inf
 from typing import NamedTuple
 
 from gr_ros2.relay.gain import FIRST_PERIOD_S, Gains, Stream
-from gr_ros2.relay.rooms import Rooms
+from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Relayed
 
@@ -86,11 +86,11 @@ class InOrder:
     """The messages of reliable topics that are kept for robots that do not hear who made them.
 
     :param gains: knows who hears whom
-    :param rooms: where the messages are kept
+    :param quotas: where the messages are kept
     """
 
-    def __init__(self, gains: Gains, rooms: Rooms[Name]) -> None:
-        self._gains, self._rooms = gains, rooms
+    def __init__(self, gains: Gains, quotas: Quotas[Name]) -> None:
+        self._gains, self._quotas = gains, quotas
         self._rows: dict[Stream, _Row] = {}
         self._named: dict[tuple[int, int, int], _Row] = {}
         """The same by what an entry ``Newest`` names."""
@@ -119,7 +119,7 @@ class InOrder:
         row.late = late
         row.orders.append(order)
         row.kept.append(kept)
-        lost = self._rooms.put(Name(stream, order), via, len(message.payload) + _COST)
+        lost = self._quotas.put(Name(stream, order), via, len(message.payload) + _COST)
         for name in lost:
             self._remove(name)
         return len(lost)
@@ -132,7 +132,7 @@ class InOrder:
 
     def _drop(self, stream: Stream, orders: Iterable[Order]) -> None:
         for order in orders:
-            self._rooms.drop(Name(stream, order))
+            self._quotas.drop(Name(stream, order))
             self._remove(Name(stream, order))
 
     def drop_of(self, origin: int, which: Callable[[Stream], bool]) -> None:
@@ -241,7 +241,7 @@ class InOrder:
             kept = row.kept[n + 1]
             kept.message = kept.message._replace(after=row.kept[n].message.after)
             kept.sent.clear()  # who has it may wait for the one that is skipped
-        self._rooms.drop(name)
+        self._quotas.drop(name)
         self._remove(name)
 
     def _remove(self, name: Name) -> None:

@@ -166,11 +166,11 @@ def test_messages_that_max_rate_holds_back_do_not_wait_for_the_computer() -> Non
 def test_latest_holds_a_recording_back_while_one_waits() -> None:
     source = robot(queue="latest")
     leave(source, 0.0)
-    assert source.end.messages.room(0)
+    assert source.end.messages.has_space(0)
     source.end.messages.submit(0, b"a" * 100, 0.1)
-    assert not source.end.messages.room(0)
+    assert not source.end.messages.has_space(0)
     leave(source, 0.1, 1)
-    assert source.end.messages.room(0)
+    assert source.end.messages.has_space(0)
 
 
 def test_a_queue_follows_the_depth_of_its_topic() -> None:

@@ -28,7 +28,7 @@ from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopics
 from gr_ros2.relay.gain import Gains
-from gr_ros2.relay.rooms import Rooms
+from gr_ros2.relay.quotas import Quotas
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.ages import age_code, limit_code
 from gr_ros2.wire.relayed import (
@@ -153,7 +153,7 @@ class Custody:
         self._src_id, self._start, self._boot = own[0], own[1] & 0xFFFF, own[1]
         self._topics, self._packets, self._peers, self._gains = topics, packets, peers, gains
         self._room, self._most, self._dropped, self._drop, self._ended = room, most, dropped, drop, ended
-        self._rooms: Rooms[_Name] = Rooms(MOST_HELD, most)
+        self._quotas: Quotas[_Name] = Quotas(MOST_HELD, most)
         self._held: dict[_Name, _Held] = {}
         self._own: dict[tuple[int, int], list[_Held]] = {}
         """Own messages by topic and robot, in order."""
@@ -201,7 +201,7 @@ class Custody:
         self._held[held.name] = held
         self._bytes += len(held.message.payload)
         if held.own is None:
-            for lost in self._rooms.put(held.name, held.came, len(held.message.payload)):
+            for lost in self._quotas.put(held.name, held.came, len(held.message.payload)):
                 self._dropped["custody_full"] += 1
                 self._forget(self._held[lost])
 
@@ -450,7 +450,7 @@ class Custody:
 
     def _forget(self, held: _Held) -> None:
         del self._held[held.name]
-        self._rooms.drop(held.name)
+        self._quotas.drop(held.name)
         if held.own is not None:
             stream = held.own.topic_id, held.own.dst_id
             self._own[stream].remove(held)

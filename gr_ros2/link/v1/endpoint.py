@@ -212,8 +212,8 @@ class EndpointV1:
         return self.messages.idle and not mending
 
     @property
-    def urged(self) -> bool:
-        return self._sending.urged
+    def urgent(self) -> bool:
+        return self._sending.urgent
 
     @property
     def held_bytes(self) -> int:

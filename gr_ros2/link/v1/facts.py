@@ -11,14 +11,14 @@ class Taken(NamedTuple):
     """A packet was taken.
 
     :param trusted: it shows that its sender is there
-    :param urges: an answer to it may leave at once
+    :param urgent: an answer to it may leave at once
     """
 
     trusted: bool
-    urges: bool
+    urgent: bool
 
 
-TAKEN = {(trusted, urges): Taken(trusted, urges) for trusted in (False, True) for urges in (False, True)}
+TAKEN = {(trusted, urgent): Taken(trusted, urgent) for trusted in (False, True) for urgent in (False, True)}
 """All of them: there is one for every packet."""
 
 

@@ -19,7 +19,7 @@ from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.relay.gain import EXPIRES_S
-from gr_ros2.relay.rooms import Rooms
+from gr_ros2.relay.quotas import Quotas
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.v1 import BROADCAST
 
@@ -56,7 +56,7 @@ class FarRobots:
         self._make_inbox = make_inbox
         self._here: dict[int, tuple[int, float]] = {}
         """Robots that are reached over others: boot number, and when something of them last came, s."""
-        self._rooms: Rooms[int] = Rooms(BROADCAST, most)
+        self._quotas: Quotas[int] = Quotas(BROADCAST, most)
         self._first_made: dict[int, float] = {}
         """When that was made with which each start in ``inboxes`` began, s."""
         self._came: dict[int, float] = {}
@@ -152,7 +152,7 @@ class FarRobots:
         """A table of so many bytes is kept; returns how many robots are forgotten for it."""
         if robot not in self.inboxes:
             return 0
-        lost = list(self._rooms.put(robot, via, size))
+        lost = list(self._quotas.put(robot, via, size))
         for other in lost:
             self.forget(other, Fate.MEMORY)
         return len(lost)
@@ -208,7 +208,7 @@ class FarRobots:
 
     def forget(self, robot: int, reason: Fate) -> None:
         """A start of a robot that was known over others is over."""
-        self._rooms.drop(robot)
+        self._quotas.drop(robot)
         self._first_made.pop(robot, None)
         if (inbox := self.inboxes.pop(robot, None)) is not None:
             inbox.close(reason)

@@ -419,7 +419,7 @@ class Neighbours:
         if again and stores and number < floor:
             raise ReplayedError(f"a hello of robot {src_id} from before packet {floor}, up to which it was heard")
         if neighbour is None:
-            neighbour = self._room_for(src_id)
+            neighbour = self._place_for(src_id)
         first = 1 if number <= START else number + 1
         if again:
             first = max(first, floor if stores else number + 1)
@@ -466,8 +466,8 @@ class Neighbours:
                 failed = error
         raise failed
 
-    def _room_for(self, src_id: int) -> Neighbour | None:
-        """The robot whose state is dropped to make room for another one, if there is no more room."""
+    def _place_for(self, src_id: int) -> Neighbour | None:
+        """The robot whose state is dropped for another one, if there are as many as may be."""
         if len(self.all) < self._settings.max_sources:
             return None
         quiet = min(self.all.values(), key=lambda neighbour: (not neighbour.gone, neighbour.heard))

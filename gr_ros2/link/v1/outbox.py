@@ -252,8 +252,8 @@ class Outbox:
         depth = self.sent[topic_id].topic.options.queue_depth
         return self._settings.queue_depth if depth == AUTO else depth
 
-    def room(self, topic_id: int) -> bool:
-        return self.sent[topic_id].queue.room(self.depth(topic_id))
+    def has_space(self, topic_id: int) -> bool:
+        return self.sent[topic_id].queue.has_space(self.depth(topic_id))
 
     def queued(self) -> dict[int, int]:
         return {topic.topic.topic_id: len(topic.queue) for topic in self.sent.named()}

@@ -63,7 +63,7 @@ class Peer:
     """It needs no packet before this number."""
     interval: float = _INTERVAL_S
     """Mean time in s between its reports, while there is something to report."""
-    prompt: bool = False
+    reports_soon: bool = False
     """Whether it reports every packet, so soon that it is better to wait for a report than to expect losses."""
     asked: float = inf
     """Time in s at which the first repair left that no report has followed."""
@@ -75,7 +75,7 @@ class Peer:
     answers: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
     """Times in s from the departure of packets that were sent once to the report that covers them."""
     lost: set[int] = field(default_factory=set)
-    urges: list[tuple[bool, int]] = field(default_factory=list)
+    urgent: list[tuple[bool, int]] = field(default_factory=list)
     """Heap of those of them for which later messages wait, or may wait soon: whether all in it are long, its number."""
     turn: int = 0
     """Which of all packets that were urgent was for it last."""
@@ -96,7 +96,7 @@ class Peer:
     @property
     def answer(self) -> float:
         """Time in s after which a report about a packet is to be expected."""
-        return max(self.answers) if self.prompt else self.delay + self.interval
+        return max(self.answers) if self.reports_soon else self.delay + self.interval
 
     def under_way(self, now: float) -> float:
         """Time in s for which a repair may be on its way; ever longer where no report follows. Otherwise a robot that
@@ -106,12 +106,12 @@ class Peer:
     @property
     def patience(self) -> float:
         """Time in s after which a packet that no report covers counts as lost, with ``doubt``."""
-        return max(self.answer if self.prompt else 2 * self.answer, UNDER_WAY_S)
+        return max(self.answer if self.reports_soon else 2 * self.answer, UNDER_WAY_S)
 
     @property
     def doubt(self) -> float:
         """Probability that a packet is lost if its report does not come: it or the report was lost."""
-        return 1 / (2 - self.loss) if self.prompt else max(self.loss, 0.5)
+        return 1 / (2 - self.loss) if self.reports_soon else max(self.loss, 0.5)
 
 
 class Peers:
@@ -130,7 +130,7 @@ class Peers:
     :ivar provens: the same of each peer, the highest first
     :ivar joined: how often a peer that has come, or has come back, has reported for the first time
     :ivar in_vain: whether a peer waits for a packet in vain
-    :ivar urging: whether a packet may be urgent for some peer
+    :ivar any_urgent: whether a packet may be urgent for some peer
     :ivar once: the newest packets that were neither sent again nor combined: what a report says arrived when it was
         sent
     """
@@ -149,7 +149,7 @@ class Peers:
         self._packets, self._unreported, self._shared = packets, unreported, shared
         self._resend: list[int] = []
         """Negated numbers of the packets that the only peer lacks."""
-        self.urging = False
+        self.any_urgent = False
         self._turn = 0
         self._times: dict[int, float] = {}
         """When the newest packets left, s."""
@@ -182,7 +182,7 @@ class Peers:
 
     def meet(self, src_id: int, now: float) -> Peer:
         """A peer that reports is known; from now on, a packet is confirmed only after this one confirmed it too."""
-        self._unreported.over()
+        self._unreported.end()
         peer = self.all.get(src_id)
         if peer is None:
             packets = self._packets
@@ -203,7 +203,7 @@ class Peers:
         if peer is not None:
             peer.waits, peer.waits_since = -1, inf
             peer.lost.clear()  # its next reports name anew what it lacks, and make that urgent
-            peer.urges.clear()
+            peer.urgent.clear()
             self._away[src_id] = peer
             self._packets.leave(peer.bit)
             self._note()
@@ -297,11 +297,11 @@ class Peers:
                 peer.lost.add(record.number)
                 heappush(self._resend, -record.number)
                 if self._ordered < inf or any(lifetime.in_order for lifetime in record.lifetimes):
-                    heappush(peer.urges, (all(lifetime.long for lifetime in record.lifetimes), record.number))
-                    self.urging = True
+                    heappush(peer.urgent, (all(lifetime.long for lifetime in record.lifetimes), record.number))
+                    self.any_urgent = True
         records = self._packets.records
-        if len(peer.urges) + len(self._resend) > 4 * len(records) + MAP:  # most of these are over
-            peer.urges = sorted({urge for urge in peer.urges if urge[1] in records})
+        if len(peer.urgent) + len(self._resend) > 4 * len(records) + MAP:  # most of these are over
+            peer.urgent = sorted({entry for entry in peer.urgent if entry[1] in records})
             self._resend = sorted({resend for resend in self._resend if -resend in records})
 
     def urgent(self, now: float) -> Sent | None:
@@ -311,7 +311,7 @@ class Peers:
         The peers take turns: one that comes back after minutes lacks hundreds of packets, which keep nothing back from
         another one that lacks a newer one.
         """
-        waiting = [peer for peer in self.all.values() if peer.urges]
+        waiting = [peer for peer in self.all.values() if peer.urgent]
         for peer in sorted(waiting, key=_turn) if len(waiting) > 1 else waiting:
             record = self._oldest_urge(peer, now)
             if record is not None:
@@ -322,13 +322,13 @@ class Peers:
                     other.turn = self._turn
                 self._served = {id(other) for other in lacking}
                 return record
-        self.urging = any(peer.urges for peer in waiting)
+        self.any_urgent = any(peer.urgent for peer in waiting)
         self._served = set()
         return None
 
     def _oldest_urge(self, peer: Peer, now: float) -> Sent | None:
-        while peer.urges and peer.urges[0][1] <= self._ordered:
-            _, number = heappop(peer.urges)
+        while peer.urgent and peer.urgent[0][1] <= self._ordered:
+            _, number = heappop(peer.urgent)
             record = self._packets.records.get(number)
             if number in peer.lost and record is not None and record.alive(now):
                 return record
@@ -371,7 +371,7 @@ class Peers:
         """Whether a report names one of these packets as lost."""
         return any(record.number in peer.lost for peer in self.all.values() if peer.lost for record in packets)
 
-    def over(self, now: float, patience_s: float = 0.0) -> int:
+    def given_up(self, now: float, patience_s: float = 0.0) -> int:
         """The oldest packet that a peer has waited for longer than so many s in vain: it is not repaired any more.
         -1 for none."""
         if not self.in_vain:
@@ -379,7 +379,7 @@ class Peers:
         waits = [p.waits for p in self.all.values() if p.waits >= 0 and p.waits_since + patience_s <= now]
         return min(waits, default=-1)
 
-    def told(self, numbers: Container[int]) -> None:
+    def announced(self, numbers: Container[int]) -> None:
         """The peers are told which of these packets are not repaired any more."""
         for peer in self.all.values():
             if peer.waits in numbers:
@@ -416,7 +416,7 @@ class Peers:
                 peer.answers.append(took)
         peer.newest = max(peer.newest, number)
         soon = bool(peer.answers) and max(peer.answers) <= _SOON * self._period
-        peer.prompt = loss >= PROMPT and soon
+        peer.reports_soon = loss >= PROMPT and soon
 
 
 def _turn(peer: Peer) -> int:

@@ -235,8 +235,8 @@ class ReceivingSide:
         """Take an opened packet."""
         self.stats.packets += 1
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
-        urges = repair is not None and not repair.mask
-        self._facts.append(TAKEN[opened.trusted or opened.appeared, urges])
+        urgent = repair is not None and not repair.mask
+        self._facts.append(TAKEN[opened.trusted or opened.appeared, urgent])
         if opened.appeared:
             self._appear(opened, now)
         if opened.met:

@@ -130,7 +130,7 @@ class RepairWindow:
         self.packets.retire(now)
         window = self._combining.window(now)
         if not window:
-            self._unreported.over()
+            self._unreported.end()
             return None
         return self._combination(window, now)
 
@@ -143,12 +143,12 @@ class RepairWindow:
 
     @property
     def pressing(self) -> bool:
-        """Whether ``urgent`` or ``Peers.over`` may have something."""
+        """Whether ``urgent`` or ``Peers.given_up`` may have something."""
         if self._shared is not None and self._shared.due:
             return True
         peers = self.peers
         if peers.all:
-            return peers.in_vain or peers.urging
+            return peers.in_vain or peers.any_urgent
         return self._unreported.due(self.packets.newest)
 
     def tell(self, number: int, now: float) -> Repair | None:
@@ -157,7 +157,7 @@ class RepairWindow:
         packets = self.packets
         packets.retire(now)
         if self._shared is None:
-            self.peers.told(range(packets.newest + 1))
+            self.peers.announced(range(packets.newest + 1))
             window = self._combining.around(number, now)
         else:
             window = self._of_all(now, number)
@@ -202,7 +202,7 @@ class RepairWindow:
         assert self._shared is not None
         window = [record for record in self._shared.window(now, lost) if record.number >= first]
         window = self._combining.fitting(window, lost)
-        self.peers.told(self._shared.spanned(window))
+        self.peers.announced(self._shared.spanned(window))
         self._shared.combined(window, now)
         return window
 

@@ -61,18 +61,18 @@ class RepairSlots:
             self._number = newest
             if not self._ahead:
                 return None
-        over = self._window.peers.over(now, PATIENCE_S * self._settings.slower)
-        if over < 0 or not self._window.may_tell(waiting=waiting):
+        given_up = self._window.peers.given_up(now, PATIENCE_S * self._settings.slower)
+        if given_up < 0 or not self._window.may_tell(waiting=waiting):
             again = self._window.urgent(now)
             if again is not None:
                 self._ahead -= waiting
                 return self._writer.repair(again, now)
-        return self._tell(over, now) if over >= 0 else None
+        return self._tell(given_up, now) if given_up >= 0 else None
 
     def spare(self, now: float) -> SentPacket | None:
         """What a slot carries that nothing else needs."""
-        if self._window.peers.in_vain and (over := self._window.peers.over(now)) >= 0:
-            return self._tell(over, now)
+        if self._window.peers.in_vain and (given_up := self._window.peers.given_up(now)) >= 0:
+            return self._tell(given_up, now)
         self._waits_until = -inf
         chosen = self._window.next(now, self.held)
         held = self._waits_until > now

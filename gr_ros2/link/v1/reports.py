@@ -135,8 +135,8 @@ class Reporter:
         if not self.unreported:
             waits = self._order.held and self._order.told
             return self.reported_at + max(_AGAIN_S, self._pause_s) if waits else inf
-        prompt = (self._missed or (self.tells_snr and self.snr.changed)) and not self._rare and self._unspent >= 1
-        if prompt or self.unreported >= self._most:
+        at_once = (self._missed or (self.tells_snr and self.snr.changed)) and not self._rare and self._unspent >= 1
+        if at_once or self.unreported >= self._most:
             return now
         return self.reported_at + self._pause_s * self._slowly
 

@@ -49,7 +49,7 @@ class SendingSide:
     :ivar pings: its questions and answers
     :ivar repairs: its repairs
     :ivar reports: what it tells others of their packets
-    :ivar urged: whether a received packet may let one leave at once, before ``next_departure``
+    :ivar urgent: whether a received packet may let one leave at once, before ``next_departure``
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class SendingSide:
         self.pings = Pings(turn_s=settings.turn_s)
         self.repairs = RepairSlots(settings, self._pace, window, writer=writer, hold=hold)
         self.reports = ReportSlots(settings, neighbours.all.values(), writer)
-        self.urged = False
+        self.urgent = False
         self._heard_at = inf
         """When any robot was heard last, or when this one began to send, s."""
         self._messages, self._window, self._neighbours = messages, window, neighbours
@@ -90,7 +90,7 @@ class SendingSide:
         """The next packet, None if there is nothing to send."""
         if self.settings.beacon_s and self._alone(now):
             return self._beacon(now)
-        self.urged = False
+        self.urgent = False
         if not self._started:
             self._start(now)
         messages, packing, hellos, reports = self._messages, self._messages.packing, self.hellos, self.reports
@@ -175,11 +175,11 @@ class SendingSide:
     def learn(self, fact: Fact, now: float) -> None:
         """Something that matters here has arrived."""
         match fact:
-            case Taken(trusted, urges):
+            case Taken(trusted, urgent):
                 if trusted:
                     self._heard_at = now
                     self.repairs.look_anew()
-                self.urged = self.urged or urges or self.reports.requests.lacking
+                self.urgent = self.urgent or urgent or self.reports.requests.lacking
             case Reported(robot, number, report):
                 self._reported(robot, number, report, now)
             case Appeared():

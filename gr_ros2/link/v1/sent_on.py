@@ -18,7 +18,7 @@ from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import RELAYED_IN_ORDER, SentTopic, SentTopics
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.in_order import InOrder, Kept, Name
-from gr_ros2.relay.rooms import Rooms
+from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire import QOS_DEFAULT
 from gr_ros2.wire.ages import age_code
 from gr_ros2.wire.relayed import MOST_HOPS, RELAYED_LEN, Relayed, write_relayed
@@ -58,10 +58,10 @@ class SentOn:
 
     def __init__(self, gains: Gains, dropped: Counter[str], most: int) -> None:
         self.relayed: Counter[tuple[int, int]] = Counter()
-        self.in_order = InOrder(gains, Rooms(MOST_KEPT, most))
+        self.in_order = InOrder(gains, Quotas(MOST_KEPT, most))
         self._gains, self._dropped = gains, dropped
         self._newest: dict[Stream, ToPass] = {}
-        self._rooms: Rooms[Stream] = Rooms(MOST_STREAMS, most)
+        self._quotas: Quotas[Stream] = Quotas(MOST_STREAMS, most)
         self._chosen: Stream | None = None
         self._next: Name | None = None
 
@@ -72,7 +72,7 @@ class SentOn:
         if not self._gains.message(via, stream, message.number, now, to_pass.made):
             return False
         self._newest[stream] = to_pass
-        for lost in self._rooms.put(stream, via, len(message.payload)):
+        for lost in self._quotas.put(stream, via, len(message.payload)):
             self._dropped["relay_full"] += 1
             self._drop(lost)
         return True
@@ -89,9 +89,9 @@ class SentOn:
         if lost := self.in_order.keep(kept, via, late):
             self._dropped["relay_full"] += lost
 
-    def drop_of(self, origin: int, over: Callable[[Stream], bool] = lambda _: True) -> None:
+    def drop_of(self, origin: int, which: Callable[[Stream], bool] = lambda _: True) -> None:
         """Send no newest message on of these streams of a robot."""
-        for stream in [stream for stream in self._newest if stream.origin == origin and over(stream)]:
+        for stream in [stream for stream in self._newest if stream.origin == origin and which(stream)]:
             self._drop(stream)
 
     def drop_other_starts(self, origin: int, start: int) -> None:
@@ -152,7 +152,7 @@ class SentOn:
     def _drop(self, stream: Stream) -> None:
         """Send nothing of a stream on."""
         self._newest.pop(stream, None)
-        self._rooms.drop(stream)
+        self._quotas.drop(stream)
         self._gains.drop(stream)
         if stream == self._chosen:
             self._chosen = None

@@ -47,7 +47,7 @@ class Thrift:
             loss = self._peers.loss
             return len(window) * loss > len(under_way) * (1 - loss) + _ENOUGH
         for peer in peers:
-            expected = 0.0 if peer.prompt else peer.loss
+            expected = 0.0 if peer.reports_soon else peer.loss
             patience, doubt = peer.patience, peer.doubt
             need = 0.0
             for record in window:

@@ -54,7 +54,7 @@ class Unreported:
         """Whether a repair of a long message goes before new packets."""
         return self._owed >= 1 and newest <= self._awaited
 
-    def over(self) -> None:
+    def end(self) -> None:
         """Somebody reports, or nothing is left to repair."""
         self._owed = 0.0
 

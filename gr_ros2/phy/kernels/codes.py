@@ -50,7 +50,7 @@ class CompiledDecoders:
 
         return decode
 
-    def ldpc(self, path: Path, room: int) -> Decoder:
+    def ldpc(self, path: Path, data_bits: int) -> Decoder:
         bits_of_checks, bit_count = _alist(path)
         checks = _Checks(bits_of_checks, bit_count)
 
@@ -58,7 +58,7 @@ class CompiledDecoders:
             out = np.empty(bit_count, np.uint8)
             soft = _given(soft, np.float32, bit_count)
             checked(loaded().functions.decode_ldpc(ctypes.addressof(checks), address(soft), address(out)))
-            return out[bit_count - room :]
+            return out[bit_count - data_bits :]
 
         return decode
 

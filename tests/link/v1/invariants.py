@@ -70,7 +70,7 @@ class PacketsEnd:
         peer = sender.end.window.peers.all.get(receiver.src_id)
         if peer is None or sender.end.window.mode == "off":
             return
-        lost = peer.lost - {number for _, number in peer.urges} if peer.lost and peer.newest >= 0 else ()
+        lost = peer.lost - {number for _, number in peer.urgent} if peer.lost and peer.newest >= 0 else ()
         for number in lost:
             assert not waited_for(sender.end, number), (
                 f"packet {number} of robot {sender.src_id} counts as lost at robot {receiver.src_id} and is not urgent"

@@ -75,7 +75,7 @@ def test_the_sending_thread_need_not_look_after_every_packet_and_credit() -> Non
     assert message is not None
     two.end.receive(AirPacket(message), now)
     due = two.end.next_departure(credited=True)
-    assert not two.end.urged, "a message alone lets nothing leave"
+    assert not two.end.urgent, "a message alone lets nothing leave"
     assert due is not None
     assert due > now, "its report may wait"
     assert one.end.next_departure() is None, "its credit is used"
@@ -87,9 +87,9 @@ def test_the_sending_thread_need_not_look_after_every_packet_and_credit() -> Non
     hello = one.slot(now)
     assert hello is not None
     two.end.receive(AirPacket(hello), now)
-    assert two.end.urged, "it asks for the row"
+    assert two.end.urgent, "it asks for the row"
     two.slot(now)
-    assert not two.end.urged
+    assert not two.end.urgent
 
 
 def test_reports_become_rare_while_nothing_is_lost_and_frequent_again_after_a_loss() -> None:

@@ -300,10 +300,10 @@ def test_a_receiver_that_waits_for_what_is_over_is_told_so_by_a_repair() -> None
     sender.peers.report(9, 2, (1 << 64) - 1 ^ 0b10, settled=False, loss=0.0, now=0.2)
     assert sender.next(0.2) is None  # all that is alive has arrived: there is nothing to combine
     sender.sent(3, b"new", b"packet 3", (Lifetime(),), 0.3)
-    assert sender.peers.over(0.3) == 1
+    assert sender.peers.given_up(0.3) == 1
     repair = sender.tell(1, 0.3)
     assert isinstance(repair, Repair)
-    assert sender.peers.over(0.3) == -1
+    assert sender.peers.given_up(0.3) == -1
     assert (window_numbers(repair.number, repair.mask), repair.oldest) == ([3], True)
     sender.peers.report(9, 3, (1 << 64) - 1, settled=True, loss=0.0, now=0.4)
     assert sender.next(0.4) is None
@@ -398,5 +398,5 @@ def test_what_peers_lacked_and_need_no_more_is_forgotten(shares: bool) -> None:
             sender.peers.report(src_id, number, (1 << 64) - 2, settled=True, loss=0.2, now=number / 10 + 0.05)
         sender.next(number / 10 + 0.06)
     peers = sender.peers
-    kept = sum(len(peer.lost) + len(peer.urges) for peer in peers.all.values())
+    kept = sum(len(peer.lost) + len(peer.urgent) for peer in peers.all.values())
     assert len(peers._resend) + kept < 200

@@ -179,7 +179,7 @@ def test_a_peer_is_told_what_is_over_beside_one_that_lacks_much_that_is_older() 
         sender.peers.report(2, 64, 0, settled=False, loss=0.1, now=now)  # it was out of range
         sender.peers.report(3, 300, everything ^ 1 << 20, settled=True, loss=0.1, now=now)
         sender.sent(sender.packets.newest + 1, b"", b"", (), now + 0.3)
-        over = sender.peers.over(now + 0.3, 0.2)
+        over = sender.peers.given_up(now + 0.3, 0.2)
         repair = sender.tell(over, now + 0.3) if over >= 0 else sender.urgent(now + 0.3)
         if isinstance(repair, Repair):
             covered.update(range(repair.number - repair.mask.bit_length() + 1, repair.number + 1))
