@@ -78,6 +78,8 @@ class PictureCounter(DataModel):  # type: ignore[misc]
     """Cards that say what they wait for, likewise."""
     old = String("")
     """Cards that show what was received some time ago, likewise."""
+    ago = String("")
+    """How long ago that was, '' where it is new."""
     said = String("")
     """State and alarms, which a screen reader says when they change."""
 
@@ -172,7 +174,8 @@ class LivePage:
         empty = set(_empty_cards(snapshot, radio))
         waits = empty & (_FIRST if snapshot.phase == "waiting" else _FIRST - {"pdr"})
         self._counter.empty, self._counter.waits = " ".join(sorted(empty - waits)), " ".join(sorted(waits))
-        self._counter.old = "constellation spectrum" if snapshot.old else ""
+        self._counter.old = "constellation spectrum latency" if snapshot.old else ""
+        self._counter.ago = f"{snapshot.silent_s:.0f} s" if snapshot.old else ""
         self._counter.said = ". ".join((state_text(snapshot), *snapshot.alarms))
         self._counter.drawn += 1
 
@@ -399,7 +402,8 @@ class LivePage:
             if name == "pdr":
                 plot.hspan(y=GOOD, line_color=_SOFT, line_dash="dotted")
             plots.append(plot)
-        for plot in [plot for plot in plots if plot.name in ("loss", "pdr", "age")]:
+        since_start = [plot for plot in plots if plot.below[0].axis_label == "time [s]" and plot is not strip]
+        for plot in since_start:
             plot.vspan("t", source=sources["changes"], line_color=_SOFT, line_dash="dashed")
         channel = column(
             *(self._silence, self._noise, self._snr, self._offset, self._loss, self._html["note"]),

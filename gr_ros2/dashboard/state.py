@@ -54,7 +54,7 @@ PACKETS_SHOWN = 12
 _ROBOTS = 64
 """Most robots heard that are remembered."""
 _ENOUGH = 3
-"""Fewest messages in the last seconds from which a share is taken."""
+"""Fewest messages or packets in the last seconds from which a share is taken."""
 
 _CHANGES = 100
 """Most changes of the channel that are remembered."""
@@ -141,7 +141,7 @@ class DashboardState:
         self._name = name
         self._duration_s = duration_s
         self._ledger = ledger
-        self._history = int(HISTORY_S / tick_s)
+        self._history, self._least_span_s = int(HISTORY_S / tick_s), tick_s / 2
         self._start: float | None = None
         self._sources: dict[int, _SourceWindow] = {}
         self._topics: dict[Key, _Topic] = {}
@@ -260,7 +260,7 @@ class DashboardState:
         with self._lock:
             over = self._phase in ("ended", "failed")
             here, missing = self._understood.totals(now)[0], self._missed.totals(now)[1]
-            lost_now = missing / (here + missing) if here else None
+            lost_now = missing / (here + missing) if here + missing >= _ENOUGH else None
             start = now if self._start is None else self._start
             elapsed = max(now - start, 0.0)
             keys = sorted(self._topics)
@@ -367,10 +367,10 @@ class DashboardState:
         )
 
     def _remember_air(self, elapsed: float, snr_db: float | None, lost: float | None) -> None:
-        """Add what the air was used for to its history. A clock that stands still, as simulated time does, adds
-        nothing."""
+        """Add what the air was used for to its history. A clock that hardly moves, as simulated time may, adds
+        nothing: a single packet would take most of so short a time."""
         span = elapsed - (self._air[-1][0] if self._air else 0.0)
-        if span > 0:
+        if span >= self._least_span_s:
             spent = (self._spent[kind] / span for kind in get_args(AirKind))
             self._air.append((elapsed, *(nan if value is None else value for value in (snr_db, lost)), *spent))
             self._spent.clear()
@@ -450,6 +450,7 @@ class DashboardState:
     def _begin(self, now: float) -> None:
         if self._start is None:
             self._start = now
+            self._spent.clear()
             if self._phase == "waiting":
                 self._phase = "running"
 

@@ -357,8 +357,28 @@ def test_lost_packets_are_told_apart_from_lost_messages_with_marks_and_gaps() ->
         shown = state.tick(10.0 + step / 4, snr_db=20.0)
     assert shown.old
     assert shown.lost_now is None
+    assert shown.air is not None
+    assert np.nanmin(shown.air.lost[shown.air.t > 10]) > 0.1, "the last packets that came do not say that none is lost"
     assert np.isnan(shown.air.snr_db[-1]), "a value of a packet long ago is none of now"
     assert shown.state == "down"
+
+
+def test_no_more_air_is_used_than_there_is_when_a_page_begins() -> None:
+    state = DashboardState(REGISTRY, NAMES, 64, airtime=lambda _size, _mcs: 0.02)
+    feed = Feed(packet_len=64)
+    feed.submit(0, at(0, 0), 0.0)
+    data = feed.sender.next_packet(0.0)
+    assert data is not None
+    for step in range(100):
+        state.sender_event(SRC, data._replace(now=step / 20 - 5.0))  # hellos before the first message
+    live = Feed(state, packet_len=64)
+    for step in range(100):
+        live.submit(0, at(step, 0), step / 100)
+        live.fly(step / 100, most=1)
+        shown = state.tick(step / 100)
+    assert shown.air is not None
+    assert 0 < len(shown.air.t) < 10
+    assert max(map(max, shown.air.busy.values())) < 2.5
 
 
 def test_a_dead_link_comes_before_a_late_computer_and_after_the_run_its_share_decides() -> None:

@@ -23,6 +23,7 @@ const show = () => {
     }
     name();
 };
+const date = () => { for (const head of document.querySelectorAll(".card h2")) head.dataset.ago = pulse.ago; };
 const say = () => { document.getElementById("said").textContent = pulse.said; };
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -35,10 +36,12 @@ const paint = () => {
 pulse.connect(pulse.properties.empty.change, show);
 pulse.connect(pulse.properties.waits.change, show);
 pulse.connect(pulse.properties.old.change, show);
+pulse.connect(pulse.properties.ago.change, date);
 pulse.connect(pulse.properties.said.change, say);
 pause.connect(pause.properties.active.change, name);
 dark.addEventListener("change", paint);
 show();
+date();
 say();
 paint();
 for (const fold of document.querySelectorAll("details")) {  // as this viewer has left it, also when the next run is shown
