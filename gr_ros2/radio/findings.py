@@ -31,6 +31,7 @@ _FORMAT = {
     "entry_bounds": "not readable: set the same packet_len",
     "entry_kind": "not readable: set the same packet_len",
 }
+_KEYS = ("no_key", "not_sealed", "wrong_key")
 _ENERGY = ("energy", "bursts_in")
 _NO_PACKETS = ("malformed", "too_long")
 _TUNED = re.compile(r"sends at (\S+) Hz, receives at (\S+) Hz")
@@ -173,6 +174,7 @@ def heard_nobody(stats: Mapping[str, Any]) -> list[str]:
     found = []
     for reason, count in stats["sink"]["rejected"].items():
         meaning = LOCKED.get(reason) or _FORMAT.get(reason, reason)
+        meaning += "; copy one key file to both ends" if reason in _KEYS else ""
         found.append(f"{count} packets refused: {meaning}")
     early = stats["sink"]["dropped"].get("early", 0)
     if early:
@@ -184,13 +186,13 @@ def heard_nobody(stats: Mapping[str, Any]) -> list[str]:
         found.append(
             f"{damaged} bursts found, with errors: too weak, overlapped, or of another phy, options or packet_len"
         )
-    counters = {**stats["front_end"]["passed"], **stats["front_end"]["lost"]}
+    counters = _counters(stats)
     no_packets = sum(counters.get(name, 0) for name in _NO_PACKETS)
     if no_packets:
         found.append(f"{no_packets} frames that are no packets: another baud rate, framing or packet_len")
     if foreign := stats["packets"]["foreign"] + counters.get("foreign", 0):
         found.append(f"{foreign} frames of others: another network, callsign or address")
-    energy = sum(counters.get(name, 0) for name in _ENERGY)
+    energy = signals(stats)
     if energy and not found:
         found.append(
             f"a signal was there {energy} times, and no packet in it: the other end has another phy, sample_rate or "
@@ -201,6 +203,15 @@ def heard_nobody(stats: Mapping[str, Any]) -> list[str]:
     return found or [
         "nothing: no signal and no bytes. Is the other end switched on, and are frequency and cable right?"
     ]
+
+
+def signals(stats: Mapping[str, Any]) -> int:
+    """How often the front end had a signal, whatever it was."""
+    return sum(_counters(stats).get(name, 0) for name in _ENERGY)
+
+
+def _counters(stats: Mapping[str, Any]) -> dict[str, int]:
+    return {**stats["front_end"]["passed"], **stats["front_end"]["lost"]}
 
 
 def compared(config: LinkConfig, other: LinkConfig) -> list[str]:

@@ -1,6 +1,7 @@
-"""Why most of what arrives is of no use: what the other ends have set differently, without being told to check.
+"""Why much of what arrives is of no use: what the other ends have set differently, without being told to check.
 
-Invariant: others are asked only while most of what arrives cannot be used, and at most once in ``LOOK_S``.
+Invariant: others are asked at most once in ``LOOK_S``, and only while most of what arrives cannot be used, or packets
+that came whole cannot be.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from typing import Any
 
-from gr_ros2.radio.findings import differences, heard_nobody
+from gr_ros2.radio.findings import differences, heard_nobody, signals
 
 LOOK_S = 5.0
 """s over which packets are counted: ten of a slow radio."""
 _FEW = 10
 """Useless packets and bursts in that time that say nothing yet."""
+_NO_SETTING = ("crc", "tag", "replayed", "not_stored", "same_id")
+"""Reasons to refuse a packet that other settings do not cause. Any other packet came as it was sent."""
 
 
 class Mismatch:
@@ -28,25 +31,30 @@ class Mismatch:
     def __init__(self, own: Mapping[str, Any], ask: Callable[[int], Mapping[str, Any]]) -> None:
         self._own, self._ask = own, ask
         self._looked = -inf
-        self._before = 0, 0
+        self._before = 0, 0, 0, 0
         self._lines: list[str] = []
         self._asked: set[int] = set()
 
     def lines(self, stats: Mapping[str, Any], robots: Sequence[int], now: float) -> list[str]:
-        """One line for each difference that explains why most of what arrives cannot be used; mostly none.
+        """One line for each difference that explains why much of what arrives cannot be used; mostly none.
 
         :param stats: of the link
         :param robots: those that are heard
         """
         if now < self._looked + LOOK_S:
             return self._lines
-        refused = sum(stats["sink"]["rejected"].values())
+        rejected = stats["sink"]["rejected"]
+        refused = sum(rejected.values()) + stats["sink"]["dropped"].get("early", 0)
+        unreadable = sum(count for reason, count in rejected.items() if reason not in _NO_SETTING)
         useless, useful = refused + stats["packets"]["damaged"], stats["packets"]["in"] - refused
-        more_useless, more_useful = useless - self._before[0], useful - self._before[1]
-        self._looked, self._before = now, (useless, useful)
-        if more_useless < _FEW:
-            self._lines = self._lines if more_useless else []
-        elif more_useless > more_useful:
+        counts = useless, useful, unreadable, signals(stats)
+        useless, useful, unreadable, heard = (new - old for new, old in zip(counts, self._before, strict=True))
+        self._looked, self._before = now, counts
+        if not robots:
+            useless = max(useless, heard)
+        if useless < _FEW:
+            self._lines = self._lines if useless else []
+        elif useless > useful or unreadable >= _FEW:
             self._lines = self._found(stats, robots)
         else:
             self._lines = []
@@ -59,9 +67,9 @@ class Mismatch:
             if other is None and robot not in self._asked:
                 self._asked.add(robot)  # the answer is on its way
             elif other is None:
-                silent.append(f"of robot {robot}, most is of no use")  # its answer is in what cannot be used
+                silent.append(f"of robot {robot}, much is of no use")  # its answer is in what cannot be used
             else:
                 lines += [f"robot {robot}: {line}" for line in differences(self._own, other)]
         whose = silent if robots else ["no other robot is understood"]
-        signs = [re.sub("^[0-9]+ ", "", line) for line in heard_nobody(stats) if not line.startswith("nothing")]
+        signs = [re.sub("^[0-9]+ | [0-9]+ times", "", line) for line in heard_nobody(stats) if line[:7] != "nothing"]
         return lines + [f"{who}: {'; '.join(signs)} (here packet_len is {self._own['packet_len']})" for who in whose]

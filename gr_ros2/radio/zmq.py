@@ -64,6 +64,8 @@ _LOCKED_S = 0.001
 """``timing_error_s`` in lock step, where the medium process tells when a burst began and begins it when asked."""
 MAX_SENDERS = 256
 """Largest number of senders whose burst numbers are followed. Beyond it, the one heard longest ago is forgotten."""
+MOST_SAMPLES = 1 << 20
+"""Samples of the longest burst that is accepted, whatever another end has set."""
 _MAX_PORT = 65535
 _log = logging.getLogger(__name__)
 
@@ -181,7 +183,7 @@ class ZmqFrontEnd(FrontEnd):
             raise
         self._sockets.remove(subscriber)  # its thread closes it
         told = None if self._medium_clock is None else self._told
-        arrivals = _Arrivals(subscriber, phy.sample_rate, self.options.burst_queue, self._counters, told)
+        arrivals = _Arrivals(subscriber, phy, self.options.burst_queue, self._counters, told)
         self._source = _BurstSubscriber(arrivals, self._medium_clock)
 
     @property
@@ -235,7 +237,7 @@ class ZmqFrontEnd(FrontEnd):
         socket = self._context.socket(kind)
         self._sockets.append(socket)
         addresses = (self.options.bind, *self.options.connect)
-        prepare(socket, self.options.burst_queue, 2 * self.phy.airtime_samples(), addresses)
+        prepare(socket, self.options.burst_queue, self.phy.airtime_samples(), addresses)
         return socket
 
 
@@ -243,7 +245,7 @@ def prepare(socket: Any, most: int, samples: int, addresses: Iterable[str]) -> N
     """Set up a socket for bursts.
 
     :param most: bursts that may wait to be sent
-    :param samples: of the longest message
+    :param samples: of the longest burst here
     :param addresses: to which it will be bound or connected
     """
     socket.linger = 0
@@ -258,8 +260,10 @@ def prepare(socket: Any, most: int, samples: int, addresses: Iterable[str]) -> N
     socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
     socket.setsockopt(zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS)
     socket.setsockopt(zmq.IPV6, any("[" in address for address in addresses))
-    # One burst is one message. A larger message does not come from this front end.
-    socket.setsockopt(zmq.MAXMSGSIZE, HEADER.size + samples * SAMPLE.itemsize)
+    # One burst is one message. ZeroMQ closes the connection of a larger one and says nothing, so bursts of an end with
+    # another packet_len or other options have to pass: the receiver counts them as damaged.
+    most_samples = max(2 * samples, MOST_SAMPLES)
+    socket.setsockopt(zmq.MAXMSGSIZE, HEADER.size + most_samples * SAMPLE.itemsize)
 
 
 def _let_go(context: Any, sockets: list[Any]) -> None:
@@ -328,19 +332,21 @@ class _Arrivals:
     """Received bursts that wait for the flowgraph.
 
     Invariants: one thread empties the socket, checks and counts each message, and never waits for the flowgraph; at
-    most ``most`` bursts wait, in the order of their arrival; the thread ends, and closes the socket, with the context.
+    most ``most`` bursts wait, in the order of their arrival, each no longer than twice the longest packet here; the
+    thread ends, and closes the socket, with the context.
     """
 
     def __init__(
         self,
         socket: Any,
-        sample_rate: float,
+        phy: Phy,
         most: int,
         counters: Counter[str],
         told: Callable[[int, float], None] | None = None,
     ) -> None:
         self._socket = socket
-        self._sample_rate = sample_rate
+        self._sample_rate = phy.sample_rate
+        self._longest = 2 * phy.airtime_samples()
         self._most = most
         self._senders: dict[int, int] = {}
         self._counters = counters
@@ -404,7 +410,7 @@ class _Arrivals:
             self._count("malformed", "a burst has samples that are no finite numbers")
             return None
         self._follow(sender, number)
-        return at, samples
+        return at, samples if len(samples) <= self._longest else samples[: self._longest].copy()
 
     def _follow(self, sender: int, number: int) -> None:
         before = self._senders.pop(sender, None)

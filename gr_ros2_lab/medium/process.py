@@ -223,7 +223,7 @@ class MediumProcess:
         self._stack = ExitStack()
         try:
             context = self._stack.enter_context(zmq.Context())
-            self._links = [_Link(context, robot, 2 * self._longest, self._stack) for robot in config.robots]
+            self._links = [_Link(context, robot, self._longest, self._stack) for robot in config.robots]
             self._poller = zmq.Poller()
             for link in self._links:
                 self._poller.register(link.subscriber, zmq.POLLIN)

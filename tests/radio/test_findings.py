@@ -63,6 +63,23 @@ def test_another_packet_len_is_named(tmp_path: Path) -> None:
     assert "packet_len is 128 there and 64 here" in line
 
 
+def test_both_ends_say_that_packet_len_differs_without_being_asked(tmp_path: Path) -> None:
+    """The longer packets come to an end whose own are a third as long."""
+    psk = {"name": "psk", "sample_rate": RATE}
+    one, two = pair(tmp_path, {"packet_len": 64}, packet_len=220, phy=psk)
+    said: set[str] = set()
+    with one, two:
+
+        def told() -> bool:
+            one.say(*range(5))
+            two.say(*range(5))
+            said.update(*(robot.link.findings() for robot in (one, two)))
+            return len([line for line in said if "packet_len is" in line and "set the same at both ends" in line]) == 2
+
+        wait_for(told, "a line at each end", longest_s=0.25)
+        assert two.link.stats()["packets"]["damaged"]
+
+
 def test_frequencies_that_do_not_meet_are_named() -> None:
     def end(text: str) -> dict[str, Any]:
         return {"packet_len": 64, "phy": 1, "key": 0, "text": f"0.1.0 psk 1e+06, {text}"}
