@@ -39,7 +39,7 @@ LAYERS = {
         {"ros"},
     ),
     LAB: (
-        {"sim"},
+        {"sim", "survey"},
         {"medium", "record"},
         {"run", "report"},
         {"study"},

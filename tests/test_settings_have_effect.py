@@ -298,6 +298,7 @@ effects(
 )
 effects(
     "Channel of a scenario",
+    trace=Elsewhere("lab/medium/test_trace.py::test_levels_follow_the_trace"),
     carrier_hz=reaches("carrier_hz=868e6"),
     decorrelation_m=reaches("decorrelation_m=1", "shadowing_db=6"),
     exponent=reaches("exponent=2"),
@@ -334,6 +335,7 @@ effects(
 )
 effects(
     "Path",
+    trace=Elsewhere("lab/medium/test_trace.py::test_each_path_may_have_a_trace_of_its_own"),
     to=run("paths=[{to: 2, packet_loss: 0.2}]", "paths=[{to: 1, packet_loss: 0.2}]"),
     delay_s=run("paths=[{from: 2, delay_s: 0.3}]", LOSSY, REPORTING),
     **{"from": run("paths=[{from: 1, packet_loss: 0.2}]", "paths=[{from: 2, packet_loss: 0.2}]")},

@@ -54,6 +54,7 @@ COMMANDS: Commands = {
     "medium": ("gr_ros2_lab.cli.medium:medium", "One simulated channel for several links with front end zmq."),
     "doctor": ("gr_ros2.cli.doctor:doctor", "What this machine has and lacks for a link, and what mends it."),
     "plan": ("gr_ros2_lab.cli.plan:plan", "Does this traffic fit this radio? A forecast, and what to change."),
+    "survey": ("gr_ros2_lab.cli.survey:survey", "Where a running link is good: a table and a figure over place."),
     "replay": ("gr_ros2_lab.cli.replay:replay", "A bag through a link into a bag: what arrives, and when."),
     "losses": ("gr_ros2_lab.cli.losses:losses", "How many packets a radio loses at which SNR, measured."),
     "sweep": ("gr_ros2_lab.cli.sweep:sweep", "One scenario at many settings, on all cores or a Dask cluster."),

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import Any, Protocol
@@ -104,6 +105,8 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         self._said: set[str] = set()
         self._heard: dict[int, float] = {}
         """When a packet of each robot was taken last, s."""
+        self._packets: Counter[int] = Counter()
+        """Packets of each robot that were taken."""
         self.handled = 0
         """Number of PDUs that this block has finished with, whatever the result."""
         self.message_port_register_in(PDUS)
@@ -167,6 +170,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
             stats, topics, windows = self._end.received, self.outputs.stats(), self.outputs.windows()
             counted = {
                 "packets": stats.packets,
+                "packets_of": dict(self._packets),
                 "handled": self.handled,
                 "rejected": dict(stats.rejected),
                 "dropped": dict(stats.dropped),
@@ -248,6 +252,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
                     self._log.debug("rx %s", describe(event, self.registry))
                 if isinstance(event, Received):
                     self._heard[event.packet.src_id] = self._clock()
+                    self._packets[event.packet.src_id] += 1
                 elif isinstance(event, Announced):
                     topics = self.outputs.take(event)
                     if calls is not None:

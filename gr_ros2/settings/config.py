@@ -333,8 +333,22 @@ class ChannelConfig:
         return bool(self.packet_loss or self.burst_loss or self.outages)
 
 
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class MeasuredChannel(ChannelConfig):
+    """A channel that may have been measured."""
+
+    trace: str = ""
+    """file of a channel that was measured, which says SNR, losses or capacity over time, or over place
+    (docs/how-to/measured-channels.md); '' = none"""
+
+    @property
+    def on_the_way(self) -> ChannelConfig:
+        """What happens on the way, without what levels follow from."""
+        return ChannelConfig(**{item.name: getattr(self, item.name) for item in fields(ChannelConfig)})
+
+
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, populate_by_name=True))
-class PathConfig(ChannelConfig):
+class PathConfig(MeasuredChannel):
     """The channel from one robot to another, where it is not that of all."""
 
     from_: Annotated[RobotId | None, Field(alias="from", title="From")] = None
@@ -360,7 +374,7 @@ class Transceiver:
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(**STRICT, populate_by_name=True))
-class ScenarioChannel(Transceiver, ChannelConfig):
+class ScenarioChannel(Transceiver, MeasuredChannel):
     """The channel of a scenario, which may follow from where the robots are (docs/explanation/medium.md)."""
 
     from_: Annotated[Literal["settings", "positions"], Field(alias="from", title="From")] = "settings"
@@ -417,11 +431,6 @@ class ScenarioChannel(Transceiver, ChannelConfig):
         """Whether the levels follow from where the robots are."""
         return self.from_ == "positions"
 
-    @property
-    def on_the_way(self) -> ChannelConfig:
-        """What happens on the way, without what levels follow from."""
-        return ChannelConfig(**{item.name: getattr(self, item.name) for item in fields(ChannelConfig)})
-
     def levels(self, robot: Transceiver) -> tuple[float, float]:
         """Transmit power of a robot in dBm, and noise figure of its receiver in dB."""
         power, figure = robot.tx_power_dbm, robot.noise_figure_db
@@ -430,6 +439,8 @@ class ScenarioChannel(Transceiver, ChannelConfig):
     @model_validator(mode="after")
     def _one_origin(self) -> ScenarioChannel:
         refuse_without_effect(self)
+        if self.trace and self.from_positions:
+            raise ValueError(f"trace = {self.trace!r}: levels follow from positions; leave it out, or from")
         return self
 
 

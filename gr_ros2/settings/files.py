@@ -1,8 +1,8 @@
 """YAML files of settings: reads one file, finds its registries, and replaces settings given on the command line.
 
-Invariants: a relative registry path in a file is relative to that file, one on the command line to the current
-directory; overrides apply in their order; only the form is checked here, since the settings classes check their own
-ranges.
+Invariants: a relative path of a registry or trace in a file is relative to that file, one on the command line to the
+current directory; overrides apply in their order; only the form is checked here, since the settings classes check their
+own ranges.
 """
 
 from __future__ import annotations
@@ -50,12 +50,23 @@ def settled(values: Mapping[str, Any], directory: Path, overrides: Sequence[str]
     for name in _FILES:
         if isinstance(values.get(name), str) and values[name]:
             values[name] = str(directory / Path(values[name]).expanduser())
+    if isinstance(values.get("channel"), Mapping):
+        values["channel"] = _with_trace(values["channel"], directory)
+    if isinstance(values.get("paths"), list):
+        values["paths"] = [_with_trace(path, directory) for path in values["paths"]]
     for override in overrides:
         keys, value = parse_override(override)
         if keys == ("registry",):
             value = find_registry(str(value), Path())
         _replace(values, keys, value, override)
     return values
+
+
+def _with_trace(channel: Any, directory: Path) -> Any:
+    """The settings of a channel with the file of its trace seen from a directory."""
+    if not isinstance(channel, Mapping) or not isinstance(channel.get("trace"), str) or not channel["trace"]:
+        return channel
+    return {**channel, "trace": str(directory / Path(channel["trace"]).expanduser())}
 
 
 def find_registry(name: str, directory: Path) -> str:

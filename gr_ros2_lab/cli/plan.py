@@ -102,6 +102,8 @@ def _tell(planner: Planner, advise: bool) -> None:
             f"The robots drive their own ways here; gr-ros2 run says how well they do task {task!r} over this link.",
             soft_wrap=True,
         )
+    if (survey := planner.survey) is not None:
+        console.print(f"The channel is that of {survey.name}: {survey.words()}.", soft_wrap=True)
     if (half_m := planner.range_m(0.5)) is not None:
         console.print(
             f"The link ends at {half_m:.0f} m: half of the packets arrive there, and {_MOST:.0%} of them up to "

@@ -8,6 +8,7 @@ not received is counted by its reason in ``lost``; equal calls give equal recept
 from __future__ import annotations
 
 import heapq
+import random
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,7 +25,7 @@ from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import AirPacket
 from gr_ros2.link.losses import PduLosses
-from gr_ros2.settings.config import ChannelConfig, replaced
+from gr_ros2.settings.config import ChannelConfig, MeasuredChannel, replaced
 
 Ints = NDArray[np.int_]
 
@@ -41,6 +42,12 @@ class RadioPath:
     receiver: int
     channel: ChannelConfig
     delay_s: float = 0.0
+
+    @property
+    def bare(self) -> RadioPath:
+        """The same without what levels follow from."""
+        channel = self.channel
+        return replace(self, channel=channel.on_the_way) if isinstance(channel, MeasuredChannel) else self
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +93,70 @@ class Hearers:
         return levels
 
 
+class Measured(ABC):
+    """What was measured of whole packets between two robots."""
+
+    @abstractmethod
+    def loss(self, now: float) -> float:
+        """Share of the packets that are lost at a time in s after the run began, 0..1."""
+
+    def leaves(self, now: float, size: int) -> float | None:
+        """When a packet that comes at a time has passed, s after the run began, where capacity was measured; None if it
+        finds no room.
+
+        :param size: bytes
+        """
+        del size
+        return now
+
+
+class Way:
+    """What becomes of whole packets from one robot to another.
+
+    :param dropped: counts packets lost, by reason
+    :param measured: None where nothing was measured of them
+    """
+
+    def __init__(self, path: RadioPath, dropped: Counter[str], measured: Measured | None) -> None:
+        self._losses = PduLosses(path.channel) if path.channel.loses_packets else None
+        if self._losses is not None:
+            self._losses.dropped = dropped
+        self._delay_s, self._dropped, self._measured = path.delay_s, dropped, measured
+        self._random = random.Random(f"trace {path.channel.seed}")
+
+    def delay_s(self, now: float, size: int) -> float | None:
+        """s by which a packet is delayed; None if it is lost.
+
+        :param now: s after the run began
+        :param size: bytes
+        """
+        if self._losses is not None and not self._losses.passes(now):
+            return None
+        if self._measured is None:
+            return self._delay_s
+        lost = self._random.random() < self._measured.loss(now)
+        leaves = None if lost else self._measured.leaves(now, size)
+        if leaves is None:
+            self._dropped["trace" if lost else "trace_queue"] += 1
+            return None
+        return leaves - now + self._delay_s
+
+
 class Surroundings(ABC):
     """Who hears whom, and how well, as a function of time.
 
     :ivar robots: how many there are
-    :ivar moves: whether levels change with time. All channels then differ in their seeds alone
+    :ivar moves: what levels follow from that change with time, as an error names it; '' where they do not
+    :ivar alike: whether all channels differ in their seeds alone
     :ivar passes: whether no path drops or delays whole packets
+    :ivar surveyed: whether levels were measured, so that forecasts count what is lost by them
     """
 
     robots: int
-    moves: bool
+    moves = ""
+    alike = False
     passes: bool
+    surveyed = False
 
     def begin(self, now: float) -> None:  # noqa: B027 - most do not move
         """A run begins at a time in s, on a clock that went before: robots move from now on."""
@@ -116,6 +176,10 @@ class Surroundings(ABC):
     def path(self, sender: int, receiver: int) -> RadioPath:
         """What lies between two robots."""
 
+    def measured(self, sender: int, receiver: int) -> Measured | None:  # noqa: ARG002 - most know nothing
+        """What was measured of whole packets between two robots."""
+        return None
+
     @abstractmethod
     def reached(self, sender: int) -> list[int]:
         """The robots that may ever hear this one."""
@@ -130,8 +194,6 @@ class FixedPaths(Surroundings):
 
     :param paths: for every robot those to the robots that can hear it. Robots below their noise are best left out
     """
-
-    moves = False
 
     def __init__(self, paths: Sequence[Sequence[RadioPath]]) -> None:
         self.robots = len(paths)
@@ -266,14 +328,14 @@ class Medium(ABC):
         self._sent: Counter[int] = Counter()
         self._recent: deque[Transmission] = deque()
         self._longest = 0.0
-        self._ways: dict[tuple[int, int], tuple[PduLosses | None, float]] = {}
-        """What drops whole packets from a sender to a receiver, and by how many s it delays the others."""
+        self._ways: dict[tuple[int, int], Way] = {}
         self._begin_s = 0.0
 
     def begin(self, now: float) -> None:
         """A run begins at a time in s, on a clock that went before: robots move, and outages count, from now on."""
         self._begin_s = now
         self.around.begin(now)
+        self._ways.clear()
 
     def change(self, sender: int, **settings: Any) -> None:
         """Change settings of the channels of a robot that sends."""
@@ -332,8 +394,8 @@ class Medium(ABC):
         for reception in received:
             receiver, sent, at, packet, snr_db, sinr_db = reception
             pair = sent.sender, receiver
-            losses, delay_s = self.way(pair)
-            if losses is not None and not losses.passes(at - self._begin_s):
+            delay_s = self.way(pair).delay_s(at - self._begin_s, len(sent.data))
+            if delay_s is None:
                 continue
             if delay_s:
                 at += delay_s
@@ -343,13 +405,8 @@ class Medium(ABC):
         for at, receptions in later.items():
             heapq.heappush(self._due, (at, next(self._order), receptions))
 
-    def way(self, pair: tuple[int, int]) -> tuple[PduLosses | None, float]:
-        """What drops whole packets from one robot to another, and by how many s it delays the others."""
-        if (known := self._ways.get(pair)) is not None:
-            return known
-        path = self.around.path(*pair)
-        losses = PduLosses(path.channel) if path.channel.loses_packets else None
-        if losses is not None:
-            losses.dropped = self.lost.dropped[pair]
-        way = self._ways[pair] = losses, path.delay_s
+    def way(self, pair: tuple[int, int]) -> Way:
+        """What becomes of whole packets from one robot to another."""
+        if (way := self._ways.get(pair)) is None:
+            way = self._ways[pair] = Way(self.around.path(*pair), self.lost.dropped[pair], self.around.measured(*pair))
         return way

@@ -33,7 +33,7 @@ def make_medium(
         return SampleMedium(around, phys, shared=shared, seed=seed)
     if around.moves:
         raise ConfigError(
-            f"channel.from = 'positions': phy {phys[0].name} runs on {phys[0].runs_on()}, whose channel stands still; "
+            f"{around.moves}: phy {phys[0].name} runs on {phys[0].runs_on()}, whose channel stands still; "
             "set time to packets, or take a receiver of this package"
         )
     if shared:

@@ -73,7 +73,7 @@ class _Reach:
         self.fading: dict[int, RayleighFading] = {}
         self.clear: dict[int, Floats] = {}
         ids = heard.ids.tolist()
-        channels = [around.path(sender, receiver).channel for receiver in (ids[:1] if around.moves else ids)]
+        channels = [around.path(sender, receiver).channel for receiver in (ids[:1] if around.alike else ids)]
         for channel in set(channels):
             phy.check_channel(channel)
         bare = [replaced(channel, **_BARE) for channel in channels]
@@ -198,7 +198,7 @@ class PacketMedium(Medium):
             return self._fixed(reach)
         if not reach.mcs_table and reach.fades:
             raise ConfigError(
-                "channel.doppler_hz: on a channel that fades and is shared or follows positions, packets of a fixed "
+                "channel.doppler_hz: on a channel that fades and is shared, or whose levels change, packets of a fixed "
                 "rate are not simulated at packets; set time to samples"
             )
         if reach.fading:

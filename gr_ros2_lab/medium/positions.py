@@ -44,7 +44,8 @@ class Positions(Surroundings):
     :param paths: for every robot those to the robots that may ever hear it, as in :class:`FixedPaths`
     """
 
-    moves = True
+    moves = "channel.from = 'positions'"
+    alike = True
 
     def __init__(
         self,
@@ -130,15 +131,21 @@ class Positions(Surroundings):
         ways = self._places[ids] - self._places[sender]
         within = np.abs(ways).max(1, initial=0.0) <= self.reach_m
         ids, ways = ids[within], ways[within]
-        apart = np.hypot(*ways.T)
+        snr_db = self._snr_db(sender, ids, np.hypot(*ways.T))
+        heard = snr_db >= LEAST_DB
+        shift_hz = doppler_hz(ways, self._velocities[ids] - self._velocities[sender], self._channel.carrier_hz)
+        return Hearers(ids[heard], np.minimum(snr_db[heard], MOST_DB), shift_hz[heard], self.robots)
+
+    def _snr_db(self, sender: int, ids: Ints, apart: Floats) -> Floats:
+        """The level of a robot at others, dB.
+
+        :param apart: how far they are, m
+        """
         loss_db = _loss_db(self._channel, self._world, self._places[sender], self._places[ids])
         if self._shadowing is not None:
             one, other = self._ends(self._shadowing, np.append(ids, sender))
             loss_db = loss_db + self._shadowing.between((one[sender], other[sender]), (one[ids], other[ids]), apart)
-        snr_db = snr_over_db(-loss_db, self._power[sender], self._figure[ids], self._bandwidth)
-        heard = snr_db >= LEAST_DB
-        shift_hz = doppler_hz(ways, self._velocities[ids] - self._velocities[sender], self._channel.carrier_hz)
-        return Hearers(ids[heard], np.minimum(snr_db[heard], MOST_DB), shift_hz[heard], self.robots)
+        return snr_over_db(-loss_db, self._power[sender], self._figure[ids], self._bandwidth)
 
     def _ends(self, shadowing: Shadowing, robots: Ints) -> tuple[Any, Any]:
         """What the field of the shadowing has of places, with those of some robots up to date."""

@@ -57,7 +57,8 @@ from gr_ros2.settings.files import read_settings
 from gr_ros2.wire import BROADCAST
 from gr_ros2_lab.medium.base import FixedPaths, Surroundings, Transmission
 from gr_ros2_lab.medium.gains import all_paths, at_gains
-from gr_ros2_lab.medium.positions import Positions
+from gr_ros2_lab.medium.measured import measured_channel
+from gr_ros2_lab.medium.positions import Motion, Positions
 from gr_ros2_lab.medium.samples import SampleMedium
 
 STEP_S = 0.002
@@ -80,7 +81,7 @@ class MediumRobot(Transceiver):
     bind: OwnAddress
     """address at which the link hears: ``connect`` of its front end"""
     position: tuple[float, float] | None = None
-    """where it is, x and y in m; needed where levels follow from positions"""
+    """where it is, x and y in m; needed where levels follow from positions or a survey"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -114,8 +115,11 @@ class MediumConfig:
             raise ValueError("phy.sample_rate = auto: a medium needs one, the same as the links")
         if isinstance(self.gains_db, tuple) and [len(row) for row in self.gains_db] != [count] * count:
             raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
-        if self.channel.from_positions != all(placed) or (any(placed) and not all(placed)):
-            raise ValueError("robots: position is for all robots together with channel.from: positions")
+        told = self.channel.from_positions or bool(self.channel.trace)
+        if (self.channel.from_positions and not all(placed)) or (any(placed) and not (all(placed) and told)):
+            raise ValueError("robots: position is for all robots together with channel.from: positions, or a survey")
+        if self.channel.trace and self.gains_db is not None:
+            raise ValueError("gains_db: levels follow from the trace; leave one of them out")
         if self.channel.from_positions and self.gains_db is not None:
             raise ValueError("gains_db: levels follow from positions; leave it out, or set channel.from: settings")
         if self.channel.loses_packets:
@@ -133,12 +137,19 @@ class MediumConfig:
         levels, bandwidth = [self.channel.levels(robot) for robot in self.robots], float(self.phy.sample_rate)
         paths = all_paths(self.channel, len(self.robots), leveled=self.gains_db is not None)
         paths = at_gains(paths, self.gains_db, levels, bandwidth)
+        if (measured := measured_channel(self.channel, paths, lambda _: self._stand(), samples=True)) is not None:
+            return measured
         if not self.channel.from_positions:
             return FixedPaths(paths)
-        places = np.array([robot.position for robot in self.robots], float)
         powers, figures = zip(*levels, strict=True)
-        still = np.zeros_like(places)
-        return Positions(self.channel, lambda _: (places, still), bandwidth, powers, figures, paths=paths)
+        return Positions(self.channel, self._stand(), bandwidth, powers, figures, paths=paths)
+
+    def _stand(self) -> Motion:
+        places = [robot.position for robot in self.robots]
+        if None in places:
+            raise ConfigError("robots: the trace is a survey, so each needs its position")
+        there = np.array(places, float)
+        return lambda _: (there, np.zeros_like(there))
 
 
 def load_medium(path: str | Path, overrides: Sequence[str] = ()) -> MediumConfig:

@@ -185,9 +185,12 @@ class SampleMedium(Medium):
         heard = self.hearers(sent)
         rows = (heard.ids.tolist(), heard.snr_db.tolist(), heard.shift_hz.tolist())
         for receiver, snr_db, shift_hz in zip(*rows, strict=True):
-            losses, delay_s = self.way((sender, receiver)) if elsewhere else (None, 0.0)
-            if losses is not None and not losses.passes(sent.end - self._begin_s):
-                continue
+            delay_s = 0.0
+            if elsewhere:
+                crossing = self.way((sender, receiver)).delay_s(sent.end - self._begin_s, len(sent.data))
+                if crossing is None:
+                    continue
+                delay_s = crossing
             channel = self.around.path(sender, receiver).channel
             phy.check_channel(channel)
             amplitude = _amplitude(channel, snr_db)

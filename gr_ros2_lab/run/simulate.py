@@ -179,8 +179,8 @@ def simulate(
     overhead_s: float = 0.0,
 ) -> Simulated:
     """Forecast a scenario, see :func:`coupled`. Only those settings of the channel that lose whole packets have an
-    effect, and packets that overlap are lost. The messages of a robot count as delivered at the first robot that
-    hears it.
+    effect, or that were measured, and packets that overlap are lost. The messages of a robot count as delivered at the
+    first robot that hears it.
 
     :param registry: None takes the scenario's
     :param phy: None makes the scenario's
@@ -246,7 +246,7 @@ class Simulation:
     :param messages: those that each robot that sends is offered, in time order; None takes the scenario's source
     :param task: offers them instead, and moves the robots
     :param codec: of all messages; None makes one
-    :param ideal: the PHY loses nothing
+    :param ideal: the PHY loses nothing, unless its levels were measured
     """
 
     def __init__(
@@ -266,7 +266,8 @@ class Simulation:
         self.around = around = surroundings(scenario, phy.sample_rate, task)
         shared, phys = scenario.duplex == "half", [phy] * len(self.robots)
         if ideal:
-            self.medium: Medium = PacketMedium(around, phys, shared=shared, ideal=True)
+            lossless = not around.surveyed
+            self.medium: Medium = PacketMedium(around, phys, shared=shared, seed=scenario.seed, ideal=lossless)
         else:
             heard = {receiver for number in range(len(self.robots)) for receiver in around.reached(number)}
             answered = any(self.robots[number].endpoint.answers for number in heard)

@@ -27,14 +27,23 @@ class RecordedMotion:
     """The robots of a recording, of which some have odometry.
 
     :param namespaces: of the robots, in their order. One that is None, or that the recording has no odometry of, takes
-        that of a namespace nobody else has; where there is none, it stands where the first robot set out
+        that of a namespace nobody else has; where there is none, it stands
     :param speed: of the playback
     :param topics: absolute names; their first message is t = 0
+    :param stands: where, m; None: where the first robot set out
     :raises ConfigError: for a recording without odometry of the first robot
     :raises BagError: for one that cannot be read
     """
 
-    def __init__(self, path: Path, namespaces: Sequence[str | None], *, speed: float, topics: Collection[str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        namespaces: Sequence[str | None],
+        *,
+        speed: float,
+        topics: Collection[str],
+        stands: Floats | None = None,
+    ) -> None:
         known = bag_contents(path).topics
         odometry = [name for name, topic in known.items() if topic.info.type_name == ODOMETRY]
         chosen = [_of(namespace, odometry) for namespace in namespaces]
@@ -56,7 +65,7 @@ class RecordedMotion:
         self._tracks = {name: np.array(track).T for name, track in rows.items()}
         for track in self._tracks.values():
             track[0] = (track[0] - (first or 0)) * 1e-9 / speed
-        self._start = self._tracks[chosen[0]][1:, 0]
+        self._start = self._tracks[chosen[0]][1:, 0] if stands is None else stands
 
     def at(self, now: float) -> tuple[Floats, Floats]:
         """Places in m and velocities in m/s of all robots, each of shape (robots, 2)."""

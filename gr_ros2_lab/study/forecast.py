@@ -36,6 +36,7 @@ from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry, Topic, options_of
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.loss_table import LossCurve
+from gr_ros2_lab.medium.measured import SurveyedPlaces
 from gr_ros2_lab.medium.positions import Positions
 from gr_ros2_lab.report.explain import air_line
 from gr_ros2_lab.run.load import make_phy, source_names
@@ -43,6 +44,7 @@ from gr_ros2_lab.run.robot_settings import senders_of
 from gr_ros2_lab.run.robots import surroundings
 from gr_ros2_lab.run.scenario import Scenario, changed
 from gr_ros2_lab.run.simulate import Simulated, coupled, offered_by, simulate
+from gr_ros2_lab.survey.table import Survey
 
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
@@ -312,13 +314,18 @@ class Planner:
 
         None where levels do not follow from positions.
         """
-        if not self.scenario.channel.from_positions:
-            return None
         around = surroundings(self._whole, self.phy.sample_rate)
-        assert isinstance(around, Positions)
+        if not isinstance(around, Positions) or not self.phy.has_samples:
+            return None
         curve = LossCurve(self.phy.on_mcs(0), ChannelConfig())
         snrs_db = np.arange(curve.low_db, curve.high_db, 0.1)
         return around.range_m(float(snrs_db[np.argmax(curve.pdr(snrs_db) >= pdr)]))
+
+    @property
+    def survey(self) -> Survey | None:
+        """What says the channel between places; None where nothing was measured there."""
+        around = surroundings(self._whole, self.phy.sample_rate)
+        return around.survey if isinstance(around, SurveyedPlaces) else None
 
     def advice(
         self, lengths: bool = True, tell: Callable[[int, int], object] = lambda _done, _of: None

@@ -56,6 +56,10 @@ ONLY_PARSED = {
     ): "needs a serial line; tests/radio/test_ptt.py",
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml"): "needs a USRP",
     ("docs/how-to/radios.md", "gr-ros2 link robot.yaml --check"): "the same; tests/cli/test_status.py",
+    (
+        "docs/how-to/measured-channels.md",
+        "gr-ros2 survey survey.csv --pose odom --base 3.5,-2",
+    ): "needs a robot that drives; tests/cli/test_survey.py",
     **{
         ("docs/how-to/radios.md", f"gr-ros2 {words}"): "needs a running link; tests/cli/test_status.py"
         for words in (
@@ -266,6 +270,10 @@ def fill(folder: Path) -> None:
     shutil.copy(ROOT / "gr_ros2_lab/scenarios/demo.yaml", folder / "my_scenario.yaml")
     shutil.copy(ROOT / "gr_ros2/examples/link-sim.yaml", folder / "my_link.yaml")
     shutil.copy(ROOT / "gr_ros2/registries/table4.csv", folder / "table4.csv")
+    rows = [f"{t},{0.5 if 3 < t < 6 else 0}" for t in range(10)]
+    (folder / "drive.csv").write_text("\n".join(["t_s,loss", *rows]))
+    places = [f"{x},0,0,0,{60 - x},{x},{50 - x / 2}" for x in range(1, 40)]
+    (folder / "survey.csv").write_text("\n".join(["x_m,y_m,their_x_m,their_y_m,packets,lost,snr_db", *places]))
     for path in (ROOT / "gr_ros2/examples").glob("link-*.yaml"):
         shutil.copy(path, folder)
 
