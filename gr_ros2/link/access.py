@@ -27,11 +27,12 @@ class Access(Protocol):
     def departure(self, now: float) -> float:
         """When the next packet may begin."""
 
-    def block(self, weight: int = 1) -> bytes | None:
+    def block(self, weight: int = 1, *, fills: bool = False) -> bytes | None:
         """The bytes behind the header of the packet that begins at the departure. None: nothing may begin there after
         all; ask for the departure again.
 
         :param weight: packets to send while others send one, 1 to 16: more where there is much to relay
+        :param fills: whether it has video, which fills what others leave: more packets, within limits
         """
 
     def hear(self, src_id: int, block: Any, began: float, *, trusted: bool = True, checked: bool = False) -> None:

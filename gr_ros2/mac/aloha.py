@@ -59,7 +59,7 @@ class Aloha:
             self._next = now + self.lead_s + max(self._airtime, self._rng.expovariate(1 / self._every))
         return self._next
 
-    def block(self, weight: int = 1) -> bytes | None:  # noqa: ARG002
+    def block(self, weight: int = 1, *, fills: bool = False) -> bytes | None:  # noqa: ARG002
         """No bytes: ALOHA says nothing to others."""
         self._next = None
         return b""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from fuzz.loop import work
 from gr_ros2.core.errors import EntryBoundsError
-from gr_ros2.mac.slots import CHOICE, HEARD, NEWCOMER, QUIET, Slots
+from gr_ros2.mac.slots import CHOICE, FILLED, HEARD, NEWCOMER, QUIET, Slots
 from gr_ros2.wire.mac_block import NOBODY, Block, read_block
 
 SLOT = 0.0145
@@ -73,6 +74,67 @@ def test_no_slot_is_taken_that_a_neighbour_has_announced_or_expects_to_receive_i
     free = [slot for slot in range(394, 425) if made._free(slot)]
     assert 399 + 7 not in free
     assert not any(393 <= slot < 425 and 0x0F0F0F0F >> (slot - 400) & 1 for slot in free if slot >= 400)
+
+
+def cell(count: int, slots: int, fills: Callable[[int, int], bool]) -> list[tuple[int, int]]:
+    """Slot and robot of each packet that nothing collides with, in a cell whose robots all hear each other.
+
+    :param fills: whether a robot has video in a slot
+    """
+    robots = [robot(src_id, seed=src_id, period_s=0.0) for src_id in range(count)]
+    sent, now = [], SLOT / 2
+    for slot in range(1, slots):
+        now = slot * SLOT
+        packets = []
+        for one in robots:
+            if one.departure(now) < now + SLOT / 2 and (data := one.block(fills=fills(one.src_id, slot))) is not None:
+                packets.append((one.src_id, read_block(data)[0]))
+        if len(packets) == 1:
+            ((src_id, block),) = packets
+            sent.append((slot, src_id))
+            for other in robots:
+                other.hear(src_id, block, slot * SLOT)
+    return sent
+
+
+def share(sent: list[tuple[int, int]], src_id: int, begin: int, end: int) -> float:
+    """Packets of a robot in each hundred slots."""
+    return sum(begin <= slot < end and who == src_id for slot, who in sent) / (end - begin) * 100
+
+
+@pytest.mark.parametrize("count", [2, 4, 10])
+def test_video_gets_more_slots_and_no_other_turn_comes_one_and_a_half_times_as_late(count: int) -> None:
+    sent = cell(count, 4000, lambda src_id, slot: src_id == 0 and 2000 <= slot < 3000)
+    for src_id in range(1, count):
+        even, beside, after = (share(sent, src_id, *span) for span in ((1000, 2000), (2300, 3000), (3300, 4000)))
+        assert even / 1.55 < beside
+        assert after > 0.95 * even
+    even, filled, after = (share(sent, 0, *span) for span in ((1000, 2000), (2300, 3000), (3300, 4000)))
+    extra = int(FILLED * (count + 1))
+    assert filled > 0.95 * 100 * (1 + extra) / (count + 1 + extra) > 1.3 * even
+    assert after < 1.1 * even
+
+
+def test_video_does_not_vie_with_who_relays_much() -> None:
+    made = robot(period_s=0.0)
+    begin, _ = send(made, 1.0)
+    weights = []
+    for _ in range(60):
+        hear(made, 1, made.clock.slot(begin + SLOT / 2) + 1, Block(0, (3, 3), 17, (5, NOBODY), 0, weight=16))
+        begin = made.departure(begin + SLOT / 2)
+        if (data := made.block(fills=True)) is not None:
+            weights.append(read_block(data)[0].weight)
+    assert 1 < max(weights) <= 1 + int(FILLED * 3)
+
+
+@pytest.mark.parametrize("cameras", [2, 3, 10])
+def test_several_robots_with_video_share_what_it_may_take(cameras: int) -> None:
+    sent = cell(10, 6000, lambda src_id, slot: src_id < cameras and slot >= 1000)
+    shares = [share(sent, src_id, 3000, 6000) for src_id in range(10)]
+    assert min(shares) > 100 / 11 / 1.6
+    if cameras < 10:
+        assert min(shares[:cameras]) > 1.2 * max(shares[cameras:])
+    assert max(shares) < 2.2 * min(shares[:cameras])
 
 
 def test_a_robot_with_weight_sends_as_often_and_says_so() -> None:

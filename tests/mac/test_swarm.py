@@ -184,7 +184,7 @@ class Timetable:
             self._next = next(self._slots)
         return at
 
-    def block(self, weight: int = 1) -> bytes | None:  # noqa: ARG002
+    def block(self, weight: int = 1, *, fills: bool = False) -> bytes | None:  # noqa: ARG002
         self._next = next(self._slots)
         return b""
 
@@ -206,7 +206,7 @@ class NonPersistent:
     def departure(self, now: float) -> float:  # noqa: ARG002
         return self._at
 
-    def block(self, weight: int = 1) -> bytes | None:  # noqa: ARG002
+    def block(self, weight: int = 1, *, fills: bool = False) -> bytes | None:  # noqa: ARG002
         if self._decided:
             self._air[0] = max(self._air[0], self._at + AIRTIME)
         elif self._at >= self._air[0]:

@@ -290,7 +290,7 @@ class EndpointV1:
         if now < begins - access.lead_s - _EARLY_S:
             return False
         relaying = self._receiving.relaying
-        block = access.block(1 if relaying is None else relaying.gains.weight)
+        block = access.block(1 if relaying is None else relaying.gains.weight, fills=self.frames.fill(now))
         self._sending.hellos.named = access.named
         self._writer.block, self._writer.leave_at = block or b"", max(begins, now)
         return block is not None

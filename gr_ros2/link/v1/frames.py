@@ -29,6 +29,8 @@ _LEAST_FREE = 0.1
 """Part of the channel that coded topics may count on; else they would never learn that more is free."""
 SILENT_S, REPORTS = 0.5, 4
 """A robot is silent when no report has come for so many s, and for so many of its mean times between two."""
+FILLS_S = 1.0
+"""s for which a frame says that more will come."""
 _FEW_S = 0.3
 """s of a window at least, and at least one packet, so that the first ones do not stand for a rate."""
 
@@ -86,6 +88,8 @@ class SentFrames:
         self._ages: dict[int, float] = {}
         self._others: deque[tuple[float, int]] = deque()
         self._sum = 0
+        self._submitted = -inf
+        """When the newest frame came, s."""
 
     def begin(self, topic_id: int, output: str = "") -> None:
         """Send frames of a topic from now on."""
@@ -120,7 +124,12 @@ class SentFrames:
             if before.keys == message.keys and now - before.left_at > LONG_S:
                 before.lifetime.end()
         self.sent[topic_id].append(message)
+        self._submitted = now
         return True
+
+    def fill(self, now: float) -> bool:
+        """Whether frames have been coming lately, which fill what others leave of the channel."""
+        return now - self._submitted < FILLS_S
 
     def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
         """A message is not coded."""

@@ -47,3 +47,23 @@ def test_what_is_shown_are_pictures() -> None:
     shown = [event for _, _, event in found.events() if isinstance(event, Delivered) and event.topic_id == 0]
     assert len(shown) > 20
     assert {read(IMAGE, event.message).encoding for event in shown} == {"rgb8"}
+
+
+def test_in_slots_a_camera_takes_the_air_that_is_free_and_makes_nobody_much_older() -> None:
+    """Scenario ``cameras``, beside the same robots without the camera. With as many slots as the others it would have
+    25 kbit/s."""
+
+    def ages(rate: float) -> tuple[dict[str, float], Simulated]:
+        scenario = load_scenario("cameras", (f"sim.camera_rate={rate}",), duration_s=12.0)
+        found = simulate(scenario)
+        odometry = [topic for topic in found.topics if topic.topic.endswith("/odom")]
+        return {topic.topic: topic.age_s.mean for topic in odometry if topic.age_s.mean is not None}, found
+
+    beside, found = ages(10)
+    alone, _ = ages(0)
+    assert len(alone) == 4
+    for topic, age in beside.items():
+        assert age < 1.5 * alone[topic], topic
+    (frames,) = [made for made in found.frames.values() if made["frames"]]
+    assert frames["frames"] > 100
+    assert 8e-3 * frames["bytes"] / found.duration_s > 50

@@ -41,7 +41,7 @@ class Greedy:
         self.now = now
         return now
 
-    def block(self, weight: int = 1) -> bytes:  # noqa: ARG002
+    def block(self, weight: int = 1, *, fills: bool = False) -> bytes:  # noqa: ARG002
         slot = self.victim.clock.slot(self.now)
         first, second = [*self.victim._mine, slot + 20, slot + 40][:2]
         ahead = max(first - slot, 1), max(second - first, 1)
