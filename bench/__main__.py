@@ -26,6 +26,7 @@ BENCHMARKS = {
     "port": "bench.port",
     "live": "bench.live",
     "live_image": "bench.live_image",
+    "radios": "bench.radios",
     "constants": "bench.constants",
     "direct": "bench.runs",
     "fast": "bench.runs",

@@ -25,6 +25,7 @@ from click.testing import CliRunner
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.codecs.messages import CLOUD
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.factory import Start, make_endpoint
 from gr_ros2.link.air import Air as RadioFacts
@@ -53,6 +54,7 @@ from gr_ros2_lab.run.scenario import load_scenario
 from gr_ros2_lab.run.simulate import simulate
 from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
+from tests.codecs import scenes
 from tests.experiments import (
     GRAPH,
     drawn,
@@ -229,6 +231,7 @@ effects(
     camera=Elsewhere("codecs/test_frames.py::test_the_options_of_a_camera_say_what_comes_out"),
     depth_image=Elsewhere("codecs/test_frames.py::test_depth_comes_out_as_depth"),
     cloud=Elsewhere("codecs/test_whole.py::test_cells_come_out_as_they_were_said_to"),
+    via=Elsewhere("radio/test_two_radios.py::test_via_says_what_leaves_over_all_radios"),
     depth=run(OPTION + "odom.depth=1", OPTION + "odom={queue: auto}"),
     reliability=run(OPTION + "odom.reliability=best_effort", LOSSY, REPORTING, scenario="paper-ofdm-paced"),
     durability=run(OPTION + "odom.durability=transient_local", "repeat_s=0.5"),
@@ -434,6 +437,15 @@ effects(
     **{"as": differs(published, publish_topics={"odom": {"as": "/here"}})},
 )
 effects(
+    "One of several radios",
+    name=Elsewhere("radio/test_two_radios.py::test_each_radio_has_a_name_a_phy_a_front_end_and_airtime_of_its_own"),
+    phy=Elsewhere("radio/test_two_radios.py::test_each_radio_has_a_name_a_phy_a_front_end_and_airtime_of_its_own"),
+    front_end=Elsewhere(
+        "radio/test_two_radios.py::test_each_radio_has_a_name_a_phy_a_front_end_and_airtime_of_its_own"
+    ),
+    airtime=Elsewhere("radio/test_two_radios.py::test_each_radio_has_a_name_a_phy_a_front_end_and_airtime_of_its_own"),
+)
+effects(
     "Link",
     name=differs(linked, name="another"),
     channel=Elsewhere("radio/test_radio.py::test_a_channel_that_is_given_can_be_changed_while_it_runs"),
@@ -442,6 +454,7 @@ effects(
     medium=differs(linked, medium="slots"),
     relay=lambda: (linked(medium="slots"), linked(medium="slots", relay="gain")),
     front_end=Elsewhere("radio/test_devices.py::test_every_packet_goes_out_as_one_ended_burst_and_comes_back"),
+    radios=Elsewhere("radio/test_two_radios.py::test_two_like_radios_share_the_load_and_every_message_comes_once"),
     transmit=differs(linked, transmit=False),
     open=Elsewhere("radio/test_permission.py::test_a_radio_asks_first"),
     record=Elsewhere("radio/test_radio.py::test_it_records_what_it_receives_and_finishes_it_without_being_closed"),
@@ -846,16 +859,19 @@ CHANGED: dict[str, tuple[dict[str, Any], Any]] = {
     "max_rate": ({"queue": "latest"}, 2.0),
     "keep_s": ({}, 5.0),
     "camera": ({}, CameraOptions(off=True)),
+    "cloud": ({}, CloudOptions(voxel=0.1)),
     "depth_image": ({"camera": CameraOptions(off=True), "depth_image": DepthOptions(mode="10")}, DepthOptions()),
 }
 """Options of a topic that runs, and the value that one takes."""
 
 
-def optioned(base: Mapping[str, Any], **changed: Any) -> list[bytes]:
-    """What an end sends of two topics that want more than there is, of which the options of one change."""
+def optioned(kind: str, base: Mapping[str, Any], **changed: Any) -> list[bytes]:
+    """What an end sends of two topics of a type that want more than there is, of which the options of one change."""
     options = SendOptions(**{"queue": "fifo", **base})
-    rows = Registry([Topic(n, name, PICTURES[0], options) for n, name in enumerate(("goal", "scan"))])
-    end = link_end(rows, packet_rate=20.0, repeat_s=0.5, compression=False)
+    rows = Registry([Topic(n, name, kind, options) for n, name in enumerate(("goal", "scan"))])
+    clouds = kind == CLOUD
+    end = link_end(rows, packet_rate=20.0, repeat_s=0.5, compression=clouds)
+    payload = scenes.cloud(scenes.street(rings=2, columns=8)) if clouds else None
     sent, topic_id = [], 0
     for step in range(300):
         now = step * 0.01
@@ -863,7 +879,7 @@ def optioned(base: Mapping[str, Any], **changed: Any) -> list[bytes]:
             topic_id = end.messages.change(0, replace(options, **changed))[1].topic_id
         if step < 200 and step % 10 == 0:
             for topic in (topic_id, 1):
-                end.messages.submit(topic, b"message %3d of %d" % (step, topic) * 12, now)
+                end.messages.submit(topic, payload or b"message %3d of %d" % (step, topic) * 12, now)
         while (packet := end.next_packet(now)) is not None:
             sent.append(packet.data)
     return sent
@@ -872,8 +888,9 @@ def optioned(base: Mapping[str, Any], **changed: Any) -> list[bytes]:
 @pytest.mark.parametrize("option", LIVE_OPTIONS)
 def test_an_option_that_can_change_has_its_effect_then(option: str) -> None:
     base, value = CHANGED[option]
-    assert optioned(base) == optioned(base)
-    assert optioned(base, **{option: value}) != optioned(base)
+    kind = CLOUD if option == "cloud" else PICTURES[0]
+    assert optioned(kind, base) == optioned(kind, base)
+    assert optioned(kind, base, **{option: value}) != optioned(kind, base)
 
 
 OF_A_GRAPH = {

@@ -251,14 +251,19 @@ def _key_frame(running: RobotLink, src_id: int, topic_id: int) -> None:
 
 
 def _opening(running: Any) -> str:
-    phy, front_end, source = running.phy, running.front_end, running.source
+    radios = " and ".join(_on(one) for one in running.radios)
+    return f"robot {running.source.src_id} on {radios}; Ctrl-C ends it"
+
+
+def _on(one: Any) -> str:
+    phy, front_end = one.phy, one.front_end
     rate = f" at {phy.sample_rate:,.0f} samples/s" if phy.has_samples else ""
     every = f", one packet per {front_end.airtime() * 1e3:.3g} ms" if front_end.airtime() else ""
     runs_on = f", runs on {phy.runs_on()}" if phy.runs_on() else ""
-    options = running.config.front_end_options
+    options = one.own.front_end_options
     on_air = f", sends {front_end.on_air(options)}" if front_end.asks(options) else ""
-    on_air = on_air if running.sends else ", only receives"
-    return f"robot {source.src_id} on {front_end.name}: {phy.name}{rate}{every}{on_air}{runs_on}; Ctrl-C ends it"
+    on_air = on_air if one.sends else ", only receives"
+    return f"{one.name}: {phy.name}{rate}{every}{on_air}{runs_on}"
 
 
 def _show(console: Console, running: Any, duration: float | None) -> None:

@@ -147,7 +147,7 @@ def check(settings: LinkConfig, duration: float | None, against: Path | None = N
         if not apart:
             console.print(f"{against} matches", soft_wrap=True)
     with opened(settings) as link:
-        own = about(settings, link.phy)
+        own = about(settings, [one.phy for one in link.radios])
         key = f"{own['key']:08x} (seal {settings.seal})" if settings.key else "none"
         console.print(
             f"this end: robot {link.source.src_id}, gr-ros2 {own['text']}, front end {link.front_end.name}, "

@@ -34,8 +34,27 @@ def tables(stats: Stats) -> Group:
     :param stats: from :meth:`gr_ros2.radio.robot_link.RobotLink.stats`
     """
     return Group(
-        _heading(stats), peer_table(stats["peers"]), _topic_table(stats), *_made(stats), *_air(stats), *_troubles(stats)
+        _heading(stats),
+        peer_table(stats["peers"]),
+        _topic_table(stats),
+        *_made(stats),
+        *radio_words(stats),
+        *_air(stats),
+        *_troubles(stats),
     )
+
+
+def radio_words(stats: Stats) -> list[str]:
+    """What each of several radios does, in a line; one radio needs none."""
+    lines = []
+    for name, radio in stats.get("radios", {}).items():
+        state = "carries" if radio["carries"] else "stands by" if radio["present"] else "gone"
+        heard = ", ".join(f"robot {robot} {share:.0%}" for robot, share in radio["heard"].items())
+        lines.append(
+            f"radio {name} ({radio['phy']['name']}, {radio['phy']['airtime_s'] * 1e3:.3g} ms a packet): {state}; "
+            f"{radio['sent']} packets and {radio['copied']} copies sent; heard: {heard or 'nobody'}"
+        )
+    return lines
 
 
 def _heading(stats: Stats) -> str:

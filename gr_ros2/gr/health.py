@@ -108,7 +108,8 @@ class LinkHealth:
         """Of all robots, and of each."""
 
     def judge(self, stats: Stats, now: float) -> list[Status]:
-        """The status of receiver, transmitter, front end (if it counts anything) and every topic received.
+        """The status of receiver, transmitter, front end (if it counts anything), each of several radios, and every
+        topic received.
 
         :param stats: statistics of a ``RobotLink``
         :param now: s, monotonic
@@ -130,7 +131,7 @@ class LinkHealth:
         receiver.warn("times that the state file could not be written", snapshot.state_unsaved, unsaved)
         receiver.warn("messages not published", snapshot.unpublished, 0 if first else before.unpublished)
         transmitter.warn("messages lost on the ROS graph", snapshot.lost_on_graph, 0 if first else before.lost_on_graph)
-        return [receiver, transmitter, *front_end, *topics]
+        return [receiver, transmitter, *front_end, *self._radios(stats), *topics]
 
     def _watch(self) -> Watch:
         return Watch(2 * self._config.period_s)
@@ -217,6 +218,23 @@ class LinkHealth:
             dropped = sum(topic["refused"].values()) + topic[Fate.LOST_ON_GRAPH]
             status.values[f"{name} (sent, dropped)"] = f"{topic['sent']}, {dropped}"
         return status
+
+    def _radios(self, stats: Stats) -> list[Status]:
+        """Each of several radios: a warning where its device is gone, or a robot is hardly heard over it."""
+        found = []
+        for name, radio in stats.get("radios", {}).items():
+            status = Status(f"{self._name}: radio {name}")
+            if not radio["present"]:
+                status.level, status.problems = Level.WARN, ["the device is gone"]
+            for robot, share in radio["heard"].items():
+                status.values[f"heard of robot {robot}"] = f"{share:.2f}"
+                if radio["present"] and share < 0.5:
+                    status.level = Level.WARN
+                    status.problems.append(f"robot {robot} is hardly heard over it")
+            status.values |= {name: str(radio[name]) for name in ("sent", "copied", "skipped", "came", "copies")}
+            status.values["carries"] = str(radio["carries"])
+            found.append(status)
+        return found
 
     def _front_end(self, snapshot: _Snapshot, before: Mapping[str, int]) -> list[Status]:
         """The counters of the front end, with a warning of new losses. Empty if it counts nothing."""

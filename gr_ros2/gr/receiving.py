@@ -28,6 +28,7 @@ from gr_ros2.gr.loops import LOOP_GUARD
 from gr_ros2.gr.outputs import Outputs
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.link import AirPacket, Delivered, Received, ReceiverEvent, Rejected
+from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import Announced
 from gr_ros2.link.fates import Fate
@@ -35,7 +36,7 @@ from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.phy.pdus import PDUS, PduPort, packets_of
+from gr_ros2.phy.pdus import PduPort, packets_of, take_messages
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import replaced
 from gr_ros2.settings.registry import Registry, Topic
@@ -63,8 +64,8 @@ class Services(Protocol):
 class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
     """Reassembles packets into messages and publishes them on a ROS graph.
 
-    Message port: `pdus` in (PMT pair of anything and a u8vector). The first message of each sender and topic creates a
-    publisher.
+    Message port: `pdus` in (PMT pair of anything and a u8vector), with several radios also `pdus_2` and so on. The
+    first message of each sender and topic creates a publisher.
 
     :param registry: the topics of other robots that announce none, with configured options
     :param end: the robot's endpoint
@@ -72,6 +73,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
     :param observer: called with every ReceiverEvent, in order; with Delivered after the message was published. An
         observer that raises is not called again
     :param clock: s, monotonic
+    :param bond: the radios, where it receives over several
     :raises ConfigError: when it would publish what a robot of this process sends
     """
 
@@ -87,6 +89,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         *,
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
+        bond: Bond | None = None,
     ) -> None:
         super().__init__("ros2_sink", None, None)
         self.config, self.registry = config, registry
@@ -109,8 +112,8 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         """Packets of each robot that were taken."""
         self.handled = 0
         """Number of PDUs that this block has finished with, whatever the result."""
-        self.message_port_register_in(PDUS)
-        self.set_msg_handler(PDUS, self._handle)
+        self._bond = bond
+        take_messages(self, "pdus", "_handle", 1 if bond is None else len(bond.carries))
         PduPort.readable_by(self)
         self.middleware = graph
         """The robot's participant on the ROS graph."""
@@ -211,13 +214,13 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
             self._types.close()
             self._types = None
 
-    def _handle(self, message: Any) -> None:
+    def _handle(self, message: Any, radio: int = 0) -> None:
         packets, problem = packets_of(message)
         try:
             if problem:
                 self._failures.note(problem, f"ros2_sink: a message that is no PDU of bytes ({problem}) was dropped")
             else:
-                self._take([piece for packet in packets for piece in self._cut(packet)])
+                self._take([piece for packet in packets for piece in self._cut(packet)], radio)
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
         self.handled += max(len(packets), 1)
@@ -231,11 +234,18 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         self._failures.note("joined", f"{what}; a TCP socket joins packets, a UDP socket does not")
         return [packet._replace(data=data[start : start + most]) for start in range(0, len(data), most)]
 
-    def _take(self, packets: Iterable[AirPacket]) -> None:
+    def _take(self, packets: Iterable[AirPacket], radio: int) -> None:
         events: list[ReceiverEvent] = []
         with self._lock:
             for packet in packets:
-                events += self._end.receive(packet, self._clock())
+                if self._bond is None:
+                    events += self._end.receive(packet, self._clock())
+                elif self._bond.arrive(radio, packet.data):
+                    caused = self._end.receive(packet, self._clock())
+                    self._bond.note(caused)
+                    events += caused
+            if self._bond is not None and (asks := self._bond.asks()):
+                self._end.pace.credit(asks)
             if self._timer_idle and self._end.next_timeout() is not None:
                 self.outputs.due.notify_all()
             if self._end.answers:
@@ -286,6 +296,8 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
                 if not self._running:
                     return
                 events = self._end.handle_timeout(self._clock())
+                if self._bond is not None:
+                    self._bond.note(events)
                 if not events:
                     at = self._end.next_timeout()
                     if outputs.opening:

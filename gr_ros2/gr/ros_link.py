@@ -28,13 +28,16 @@ from gr_ros2.gr.subscriptions import OpenSubscriptions
 from gr_ros2.link.air import Air
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
+from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.mac import GUARD_S, access_of
 from gr_ros2.middleware import Middleware, join
+from gr_ros2.phy.pdus import port_of
 from gr_ros2.settings.config import airtime_from, replaced
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import MAX_TOPICS, Registry, check_outputs
-from gr_ros2.settings.robot import RobotConfig, robot_from
+from gr_ros2.settings.robot import ONE_RADIO, RobotConfig, robot_from
 
 
 class LinkSendingBlock(SendingBlock):
@@ -88,6 +91,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     """A block that sends and one that receives, as one. Message ports: `pdus` in and out, `credit` in, as in
     :class:`SendingBlock` and :class:`ReceivingBlock`.
 
+    :param radios: over how many radios it sends and receives
     :ivar end: its endpoint; of a robot that receives its own packets, the one that receives
     :ivar calls: the services that cross the link; None where it goes one way, or topics leave no room for calls
     """
@@ -97,20 +101,21 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     end: LiveEnd[Any]
     calls: LiveCalls | None = None
 
-    def __init__(self, config: RobotConfig) -> None:
+    def __init__(self, config: RobotConfig, radios: int = 1) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
-        self.config = config
+        self.config, self._radios = config, range(radios)
 
     def _connect(self) -> None:
         """Connect the ports with the two blocks."""
-        for port in ("pdus", "credit"):
-            self.message_port_register_hier_in(port)
-        self.message_port_register_hier_out("pdus")
-        if self.config.receives:
-            self.msg_connect(self, "pdus", self.sink, "pdus")
-        self.msg_connect(self, "credit", self.source, "credit")
-        if self.config.direction != "receive":
-            self.msg_connect(self.source, "pdus", self, "pdus")
+        for pdus, credit in [(port_of("pdus", radio), port_of("credit", radio)) for radio in self._radios]:
+            for port in (pdus, credit):
+                self.message_port_register_hier_in(port)
+            self.message_port_register_hier_out(pdus)
+            if self.config.receives:
+                self.msg_connect(self, pdus, self.sink, pdus)
+            self.msg_connect(self, credit, self.source, credit)
+            if self.config.direction != "receive":
+                self.msg_connect(self.source, pdus, self, pdus)
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
@@ -129,6 +134,7 @@ class RosLink(LinkBlock):
     :param middleware: an open Middleware for both directions; None: opened as the settings say
     :param observer, clock, backpressure: see :class:`SendingBlock`
     :param registry: the topics that the robots know beforehand; None: as the settings say
+    :param bond: its radios, where there are several
     :raises ConfigError: for settings that contradict each other
     """
 
@@ -146,8 +152,9 @@ class RosLink(LinkBlock):
         clock: Callable[[], float] = time.monotonic,
         backpressure: bool = False,
         registry: Registry | None = None,
+        bond: Bond | None = None,
     ) -> None:
-        super().__init__(config)
+        super().__init__(config, 1 if bond is None else len(bond.carries))
         known = registry if registry is not None else read_registry(config.registry)
         topics = known if config.sends else Registry.empty()
         calls = config.direction == "both" and not loops_back and (len(topics) < MAX_TOPICS or bool(topics.services))
@@ -158,7 +165,7 @@ class RosLink(LinkBlock):
 
         make = partial(make_endpoint, config, topics, air=air, start=self._start)
 
-        common: dict[str, Any] = {"observer": observer, "clock": clock}
+        common: dict[str, Any] = {"observer": observer, "clock": clock, "bond": bond}
         sending = self.end = LiveEnd(lambda events: make(observer=events, calls=calls))
         if loops_back:
             self.end = LiveEnd(lambda events: make(observer=events, loops_back=True))
@@ -217,6 +224,9 @@ def make_link(
     :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
     config = robot_from(**values)
+    for name, options in config.options.items():
+        if options.via != AUTO:
+            raise ConfigError(f"topics.{name}.via = {options.via!r}: {ONE_RADIO}; leave it out")
     limits = airtime_from(airtime_limit)
     limits.check_seal(encrypts=bool(config.key) and config.seal == "encrypt")
     shares = medium != "exclusive"

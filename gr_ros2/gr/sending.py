@@ -1,5 +1,7 @@
 """The half of a link's block that sends: ROS topics in, packets out on message port `pdus`.
 
+With several radios, each has ports of its own, and a :class:`Bond` says over which of them a packet leaves.
+
 Invariants: this block is a thin shell. All behaviour is in the link's engine, which one lock protects. One pump thread
 composes each packet just before it leaves. A callback of the middleware blocks only with ``backpressure``. Every
 dropped message is counted by name.
@@ -23,16 +25,18 @@ from gr_ros2.gr.pmts import PduMaker
 from gr_ros2.gr.readable import debug_logger, describe
 from gr_ros2.gr.subscriptions import Subscriptions
 from gr_ros2.link import AirPacket, Ended, Refused, SenderEvent, SentPacket
+from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
-from gr_ros2.phy.pdus import CREDIT, PduPort, credited
+from gr_ros2.phy.pdus import PduPort, credited, port_of, take_messages
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import replaced
-from gr_ros2.settings.fields import Auto
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import Registry
 from gr_ros2.settings.robot import RobotConfig
+from gr_ros2.wire import QOS_LATENCY
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 32
@@ -43,11 +47,11 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
     """Subscribes to topics of a ROS graph and emits their messages as packets.
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
-    optional. From the first `credit` message on, packets wait for credits. A credit is a pair: an integer, so many
-    packets may leave; and a real number, the time in s of this block's clock since when the air is free for them.
-    Messages that wait all the same wait for the computer. Infinity says that the packets were held back until now, so
-    that the time since the last one is not the pace of the PHY. An integer alone says nothing of the air, and any other
-    message lets one packet leave.
+    optional; with several radios also `pdus_2`, `credit_2` and so on. From the first `credit` message on, packets wait
+    for credits. A credit is a pair: an integer, so many packets may leave; and a real number, the time in s of this
+    block's clock since when the air is free for them. Messages that wait all the same wait for the computer. Infinity
+    says that the packets were held back until now, so that the time since the last one is not the pace of the PHY. An
+    integer alone says nothing of the air, and any other message lets one packet leave.
 
     The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` ends both.
 
@@ -58,6 +62,7 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
         block. An observer that raises is not called again
     :param clock: s, monotonic
     :param backpressure: holds the middleware back instead of dropping when a queue is full (bags)
+    :param bond: the radios, where it sends over several
     """
 
     _subscribes: type[Subscriptions] = Subscriptions
@@ -72,6 +77,7 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
         observer: LinkObserver | None = None,
         clock: Callable[[], float] = time.monotonic,
         backpressure: bool = False,
+        bond: Bond | None = None,
     ) -> None:
         super().__init__("ros2_source", None, None)
         self.config = config
@@ -94,9 +100,10 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
         self.composed = self.emitted = 0
         """Number of packets composed, and number of PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
-        self._port = PduPort(self)
-        self.message_port_register_in(CREDIT)
-        self.set_msg_handler(CREDIT, self._credit)
+        self._bond = bond
+        radios = 1 if bond is None else len(bond.carries)
+        self._ports = [PduPort(self, port_of("pdus", radio)) for radio in range(radios)]
+        take_messages(self, "credit", "_credit", radios)
         self.middleware = graph
         """The robot's participant on the ROS graph."""
         self._backpressure = backpressure
@@ -159,7 +166,8 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
             self._end.pace.use_credit()
 
     def start(self) -> bool:
-        self._unread = not self._port.find_readers()
+        readers = [port.find_readers() for port in self._ports]
+        self._unread = not all(readers)
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
         self.live.looked = self.clock()
@@ -232,12 +240,15 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
             self._work.notify_all()
             self._space.notify_all()
 
-    def _credit(self, message: Any) -> None:
+    def _credit(self, message: Any, radio: int = 0) -> None:
         packets, since = credited(message)
+        packets = max(0, packets)
         if self._backpressure and since != inf:
             since = None  # whoever waits for room in a queue wants nothing dropped
         with self._lock:
-            self._end.pace.credit(max(0, packets), since)
+            if self._bond is not None:
+                packets = self._bond.ask(radio, packets)
+            self._end.pace.credit(packets, since)
             self.live.wake(credited=True)
 
     def _pump(self) -> None:
@@ -272,18 +283,42 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
         if self.config.debug:
             for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.subscriptions.registry))
-        adaptive = bool(self._end.mcs_table)
-        on_air = [AirPacket(sent.data, None, sent.leave_at, sent.mcs if adaptive else None) for sent in packets]
-        if self._port.bundles:
-            self._port.send(on_air)
+        if self._bond is None:
+            self._hand_over(packets, self._ports[0])
         else:
-            wall = time.time()
-            for sent, packet in zip(packets, on_air, strict=True):
-                self._port.send_pdu(self._pdus.pdu(sent.packet, packet, wall))
+            for port, share in zip(self._ports, self._shared_out(self._bond, packets), strict=True):
+                self._hand_over(share, port)
         self.emitted += len(packets)
         if self._unread:
             with self._lock:
                 self._counters["unread"] += len(packets)
+
+    def _hand_over(self, packets: list[SentPacket], port: PduPort) -> None:
+        adaptive = bool(self._end.mcs_table)
+        on_air = [AirPacket(sent.data, None, sent.leave_at, sent.mcs if adaptive else None) for sent in packets]
+        if port.bundles:
+            port.send(on_air)
+        else:
+            wall = time.time()
+            for sent, packet in zip(packets, on_air, strict=True):
+                port.send_pdu(self._pdus.pdu(sent.packet, packet, wall))
+
+    def _shared_out(self, bond: Bond, packets: list[SentPacket]) -> list[list[SentPacket]]:
+        """The packets that leave over each radio, in order."""
+        shares: list[list[SentPacket]] = [[] for _ in self._ports]
+        with self._lock:
+            for sent in packets:
+                for radio in bond.leave(everywhere=self._everywhere(sent)):
+                    shares[radio].append(sent)
+        return shares
+
+    def _everywhere(self, sent: SentPacket) -> bool:
+        """Whether a packet leaves over all radios."""
+        if sent.kind in ("hello", "report"):
+            return True
+        registry = self.subscriptions.registry
+        via = {registry[entry.topic_id].options.via for entry in sent.entries if entry.topic_id < len(registry)}
+        return "all" in via or (sent.packet.qos == QOS_LATENCY and AUTO in via)
 
     def _observe(self, event: SenderEvent) -> None:
         if isinstance(event, Refused):

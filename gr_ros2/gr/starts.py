@@ -6,12 +6,13 @@ import os
 from pathlib import Path
 
 
-def account_of(state: str, robot_id: int) -> Path:
+def account_of(state: str, robot_id: int, radio: int = 0) -> Path:
     """The file of a robot's airtime account, beside its state file.
 
     :param state: its state file, '' = the usual one
+    :param radio: which of its radios, from 0 on
     """
-    return state_file(state, robot_id).with_suffix(".airtime")
+    return state_file(state, robot_id).with_suffix(f".{radio + 1}.airtime" if radio else ".airtime")
 
 
 def state_file(state: str, robot_id: int) -> Path:

@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from functools import partialmethod
 from math import isfinite, nan
 from struct import Struct
+from types import SimpleNamespace
 from typing import Any, ClassVar
 from weakref import WeakSet
 
@@ -25,6 +27,28 @@ from gr_ros2.link.events import AirPacket
 
 PDUS, CREDIT = pmt.intern("pdus"), pmt.intern("credit")
 """The message ports of the blocks: packets, and the credits that request them."""
+
+
+def port_of(name: str, radio: int) -> str:
+    """The message port of a block for one of several radios: that of the first has no number."""
+    return f"{name}_{radio + 1}" if radio else name
+
+
+def take_messages(block: Any, name: str, handler: str, radios: int) -> None:
+    """Have a block handle the messages for each of its radios: those of the first by its method of that name, those of
+    others by a method that hands on their number as ``radio``.
+
+    :param name: of the ports, see :func:`port_of`
+    """
+    for radio in range(radios):
+        method = port_of(handler, radio)
+        if not hasattr(block, method):
+            own = partialmethod(getattr(type(block), handler), radio=radio)
+            setattr(type(block), method, own)
+        port = pmt.intern(port_of(name, radio))
+        block.message_port_register_in(port)
+        block.set_msg_handler(port, SimpleNamespace(__name__=method))  # GNU Radio looks the method up by this name
+
 
 _BUNDLE = pmt.intern("bundle")
 _MCS, _SNR_DB, _RECEIVED_AT, _BEGINS_AT, _LEAVE_AT = (
@@ -156,14 +180,16 @@ class PduPort:
     """Message port `pdus` out of a Python block.
 
     :param block: the block
+    :param name: of the port, where the block has several
     """
 
     _readers: ClassVar[WeakSet[Any]] = WeakSet()
     """The blocks that understand bundles."""
     _lock: ClassVar[threading.Lock] = threading.Lock()
 
-    def __init__(self, block: Any) -> None:
-        block.message_port_register_out(PDUS)
+    def __init__(self, block: Any, name: str = "pdus") -> None:
+        self._port = pmt.intern(name)
+        block.message_port_register_out(self._port)
         self._subscribers = block.message_subscribers
         self._publish = block.message_port_pub  # stored: each look-up would pass through two proxies
         self.bundles = False
@@ -183,7 +209,7 @@ class PduPort:
         with self._lock:
             known = {block.alias() for block in self._readers}
         readers = set()
-        rest = self._subscribers(PDUS)
+        rest = self._subscribers(self._port)
         while pmt.is_pair(rest):
             readers.add(pmt.symbol_to_string(pmt.car(pmt.car(rest))))
             rest = pmt.cdr(rest)
@@ -193,14 +219,14 @@ class PduPort:
     def send(self, packets: Sequence[AirPacket]) -> None:
         """Send packets: to readers that do not understand bundles, only packets that were received."""
         if self.bundles and len(packets) > 1:
-            self._publish(PDUS, pmt.cons(_BUNDLE, u8vector(b"".join(map(_bundled, packets)))))
+            self._publish(self._port, pmt.cons(_BUNDLE, u8vector(b"".join(map(_bundled, packets)))))
         else:
             for packet in packets:
-                self._publish(PDUS, pdu_heard(packet))
+                self._publish(self._port, pdu_heard(packet))
 
     def send_pdu(self, pdu: Any) -> None:
         """Send one packet as a PDU with metadata."""
-        self._publish(PDUS, pdu)
+        self._publish(self._port, pdu)
 
 
 def credit_of(packets: int, since: float) -> Any:

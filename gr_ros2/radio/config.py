@@ -7,21 +7,93 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, NamedTuple
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import MIDDLEWARE
-from gr_ros2.phy import PHY
+from gr_ros2.phy import PHY, Phy, configured
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.permission import check_band
-from gr_ros2.settings.config import STRICT, AirConfig, ChannelConfig, DiagnosticsConfig, Text, build
+from gr_ros2.settings.airtime import AirtimeConfig, by_name
+from gr_ros2.settings.config import STRICT, AirConfig, ChannelConfig, DiagnosticsConfig, PhyConfig, Text, build
+from gr_ros2.settings.effect import ActsWhere
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import read_settings
-from gr_ros2.settings.robot import RobotConfig
+from gr_ros2.settings.robot import ONE_RADIO, RobotConfig
 from gr_ros2.wire import FORMATS
+
+
+def _by_name(given: Any) -> Any:
+    return given if given == AUTO else by_name(given)
+
+
+_MOST_RADIOS = 4
+"""Radios of one robot: more than anybody has carried."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RadioConfig:
+    """One of several radios of a robot."""
+
+    name: str = ""
+    """what status and log call it; '' = the name of its front end"""
+    phy: PhyConfig | Auto = AUTO
+    """its physical layer; auto = the link's"""
+    front_end: dict[str, Any]
+    """``name`` of its front end, and that front end's settings"""
+    airtime: Annotated[AirtimeConfig | Auto, BeforeValidator(_by_name)] = AUTO
+    """how much it may send, with an account of its own: settings, or the name of a band; auto = as the link says"""
+
+    @property
+    def called(self) -> str:
+        """What status and log call it."""
+        return self.name or self.front_end_name
+
+    @property
+    def front_end_name(self) -> str:
+        """Name of the front end in ``FRONT_ENDS``."""
+        return str(self.front_end["name"])
+
+    @property
+    def front_end_options(self) -> dict[str, Any]:
+        """The settings of the front end."""
+        return {key: value for key, value in self.front_end.items() if key != "name"}
+
+
+class OwnRadio(NamedTuple):
+    """A radio with all that it has of the link."""
+
+    called: str
+    phy: PhyConfig
+    front_end_name: str
+    front_end_options: dict[str, Any]
+    airtime: AirtimeConfig
+
+    def made_phy(self, packet_len: int) -> Phy:
+        """Its PHY, for packets of so many bytes.
+
+        :raises ConfigError: for a wrong setting
+        """
+        rate = self.phy.sample_rate
+        return configured(self.phy, packet_len, 0.0 if rate == AUTO else rate)
+
+    def check(self, where: str) -> None:
+        """:raises ValueError: for what no radio can be"""
+        for key, name, table in (
+            (f"{where}phy.name", self.phy.name, PHY),
+            (f"{where}front_end.name", self.front_end_name, FRONT_ENDS),
+        ):
+            if name not in table:
+                raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
+        rate = self.phy.sample_rate
+        if rate == AUTO and PHY.load(self.phy.name).has_samples:
+            raise ValueError(
+                f"{where}phy.sample_rate = auto: a link needs one; set it to what the radio can do, samples/s"
+            )
+        check_band(self.airtime, self.front_end_options, 0.0 if rate == AUTO else rate)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -32,6 +104,8 @@ class LinkConfig(AirConfig, RobotConfig):
     """what errors and the status line call it; the file's name unless it is set"""
     front_end: dict[str, Any] = Field(default_factory=lambda: {"name": "sim"})
     """``name``, a name of ``gr_ros2.radio.FRONT_ENDS``, and that front end's settings (docs/how-to/radios.md)"""
+    radios: tuple[RadioConfig, ...] = ()
+    """several radios in place of ``front_end`` (docs/how-to/two-radios.md)"""
     transmit: bool | Auto = AUTO
     """whether it sends: a radio needs true, auto = yes without a radio"""
     open: Annotated[bool, Field(title="Without a key")] = False
@@ -43,36 +117,75 @@ class LinkConfig(AirConfig, RobotConfig):
     diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
     """what the link says on ``/diagnostics`` (docs/how-to/ros2.md)"""
 
+    conditions: ClassVar[Any] = (
+        ActsWhere(("topics.*.via",), lambda link: bool(link.radios), f"{ONE_RADIO}; set radios, or leave it out"),
+    )
+
     @model_validator(mode="after")
     def _known(self) -> LinkConfig:
-        if "name" not in self.front_end:
-            raise ValueError(f"front_end.name is missing; known are {', '.join(FRONT_ENDS)}")
-        for key, name, table in (
-            ("graph.middleware", self.graph.middleware, MIDDLEWARE),
-            ("phy.name", self.phy.name, PHY),
-            ("front_end.name", self.front_end_name, FRONT_ENDS),
-        ):
-            if name not in table:
-                raise ValueError(f"{key} = {name!r}: no such {table.family}; known are {', '.join(table)}")
-        if self.phy.sample_rate == AUTO and PHY.load(self.phy.name).has_samples:
-            raise ValueError("phy.sample_rate = auto: a link needs one; set it to what the radio can do, samples/s")
+        for where, front_end in [
+            ("", self.front_end),
+            *((f"radios.{n}.", r.front_end) for n, r in enumerate(self.radios)),
+        ]:
+            if "name" not in front_end:
+                raise ValueError(f"{where}front_end.name is missing; known are {', '.join(FRONT_ENDS)}")
+        if self.radios:
+            self._several()
+        if self.graph.middleware not in MIDDLEWARE:
+            raise ValueError(
+                f"graph.middleware = {self.graph.middleware!r}: no such {MIDDLEWARE.family}; known are "
+                f"{', '.join(MIDDLEWARE)}"
+            )
+        for number, own in enumerate(self.own_radios):
+            own.check(f"radios.{number}." if self.radios else "")
         if self.airtime.rule is not None and self.packet_rate == 0:
             raise ValueError("packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out")
         self.airtime.check_seal(encrypts=bool(self.key) and self.seal == "encrypt")
         if self.packet_len < (least := FORMATS[1].min_packet_len):
             raise ValueError(f"packet_len = {self.packet_len}: a link needs at least {least}")
-        check_band(self.airtime, self.front_end, 0.0 if self.phy.sample_rate == AUTO else self.phy.sample_rate)
         return self
+
+    def _several(self) -> None:
+        """:raises ValueError: for what several radios cannot have"""
+        names = [radio.called for radio in self.radios]
+        if len(names) < 2 or len(names) > _MOST_RADIOS:
+            raise ValueError(f"radios: {len(names)} of 2 to {_MOST_RADIOS}; one alone is front_end")
+        if len(set(names)) < len(names):
+            raise ValueError(f"radios: two are called {max(names, key=names.count)!r}; give each a name of its own")
+        if self.front_end != {"name": "sim"}:
+            raise ValueError("front_end: with radios, each has its own; leave it out")
+        if self.medium != "exclusive":
+            raise ValueError(
+                f"medium = {self.medium!r}: slots are those of one channel, and several radios have one each; leave "
+                "radios or medium out"
+            )
+        if self.record:
+            raise ValueError("record: several radios have no signal in common; leave it out")
+
+    @property
+    def own_radios(self) -> tuple[OwnRadio, ...]:
+        """Its radios: those of ``radios``, or the one of ``front_end``."""
+        radios = self.radios or (RadioConfig(front_end=self.front_end),)
+        return tuple(
+            OwnRadio(
+                radio.called,
+                self.phy if radio.phy == AUTO else radio.phy,
+                radio.front_end_name,
+                radio.front_end_options,
+                self.airtime if radio.airtime == AUTO else radio.airtime,
+            )
+            for radio in radios
+        )
 
     @property
     def front_end_name(self) -> str:
-        """Name of the front end in ``FRONT_ENDS``."""
-        return str(self.front_end["name"])
+        """Name of the front end in ``FRONT_ENDS``; of several radios, that of the first."""
+        return self.own_radios[0].front_end_name
 
     @property
     def front_end_options(self) -> dict[str, Any]:
-        """The settings of the front end."""
-        return {key: value for key, value in self.front_end.items() if key != "name"}
+        """The settings of that front end."""
+        return self.own_radios[0].front_end_options
 
 
 def link_from(values: Mapping[str, Any], where: str = "") -> LinkConfig:

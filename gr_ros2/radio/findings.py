@@ -19,9 +19,8 @@ from gr_ros2 import __version__
 from gr_ros2.gr.health import LOCKED
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.link.endpoint import OpenEndpoint
-from gr_ros2.phy import Phy, configured
+from gr_ros2.phy import Phy
 from gr_ros2.radio.config import LinkConfig
-from gr_ros2.settings.fields import AUTO
 from gr_ros2.state.keys import read_key_file
 
 _FORMAT = {
@@ -40,16 +39,23 @@ _SAME_FREQUENCY = 1e-4
 """Relative difference below which two frequencies are the same: clocks may be 100 ppm apart."""
 
 
-def about(config: LinkConfig, phy: Phy) -> dict[str, Any]:
-    """What this end tells those who ask: ``packet_len``, numbers for settings of the PHY and for the key, a text."""
-    options = {"name": phy.name, "options": repr(phy.options), "rate": phy.sample_rate if phy.has_samples else 0}
-    digest = zlib.crc32(json.dumps(options, sort_keys=True).encode())
+def about(config: LinkConfig, phys: Sequence[Phy]) -> dict[str, Any]:
+    """What this end tells those who ask: ``packet_len``, numbers for settings of the PHY and for the key, a text.
+
+    :param phys: that of each radio
+    """
+    options = [
+        {"name": phy.name, "options": repr(phy.options), "rate": phy.sample_rate if phy.has_samples else 0}
+        for phy in phys
+    ]
+    digest = zlib.crc32(json.dumps(options if phys[1:] else options[0], sort_keys=True).encode())
     key = int.from_bytes(hashlib.sha256(read_key_file(config.key)[0]).digest()[:4], "big") if config.key else 0
-    rate = f" {phy.sample_rate:g}" if phy.has_samples else ""
-    sends = config.front_end.get("frequency")
-    receives = config.front_end.get("frequency_rx", sends)
-    tuned = "" if sends is None else f", sends at {sends} Hz, receives at {receives} Hz"
-    text = f"{__version__} {phy.name}{rate}{tuned}"
+    names = ", ".join(f"{phy.name} {phy.sample_rate:g}" if phy.has_samples else phy.name for phy in phys)
+    front_end = config.own_radios[0].front_end_options
+    sends = front_end.get("frequency")
+    receives = front_end.get("frequency_rx", sends)
+    tuned = "" if sends is None or phys[1:] else f", sends at {sends} Hz, receives at {receives} Hz"
+    text = f"{__version__} {names}{tuned}"
     return {"packet_len": config.packet_len, "phy": digest, "key": key, "text": text}
 
 
@@ -216,10 +222,7 @@ def _counters(stats: Mapping[str, Any]) -> dict[str, int]:
 
 def compared(config: LinkConfig, other: LinkConfig) -> list[str]:
     """What does not match between the settings of this end and those of another one, which need not be heard."""
-    described = []
-    for each in (config, other):
-        rate = each.phy.sample_rate
-        described.append(about(each, configured(each.phy, each.packet_len, 0.0 if rate == AUTO else rate)))
+    described = [about(each, [own.made_phy(each.packet_len) for own in each.own_radios]) for each in (config, other)]
     found = differences(*described)
     if config.robot_id == other.robot_id:
         found.append(f"both are robot {config.robot_id}; set another robot at one")

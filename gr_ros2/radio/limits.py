@@ -23,7 +23,14 @@ from gr_ros2.state.airtime import AirtimeFile
 
 
 def open_limit(
-    airtime: AirtimeConfig, longest: float, now: float, *, robot_id: int | Auto, state: str, closing: ExitStack
+    airtime: AirtimeConfig,
+    longest: float,
+    now: float,
+    *,
+    robot_id: int | Auto,
+    state: str,
+    radio: int = 0,
+    closing: ExitStack,
 ) -> AirtimeLimit | None:
     """What limits the airtime, with what earlier starts of this robot have sent; None where nothing does.
 
@@ -31,6 +38,7 @@ def open_limit(
     :param now: s, monotonic
     :param robot_id: the robot whose account it is
     :param state: its state file, beside which the account is; '' = the usual one
+    :param radio: which of its radios, each of which has an account
     :param closing: lets go of the account
     :raises ConfigError: for an account without a robot, that another link uses or that cannot be read; for a packet
         that can never be sent
@@ -39,7 +47,7 @@ def open_limit(
         return None
     if robot_id == AUTO:
         raise ConfigError("airtime_limit: whose account is it? set robot_id to that of the robot's link")
-    file = AirtimeFile(account_of(state, robot_id))
+    file = AirtimeFile(account_of(state, robot_id, radio))
     closing.callback(file.close)
     return AirtimeLimit(airtime.rule, longest, now=now, spent=file.spent, save=file.save)
 

@@ -45,6 +45,7 @@ class Radio(PacketPath, HierBlock):
     :param listens: whether each packet waits until nobody else is heard
     :param admits: whether a packet may be sent at all, by its bytes; None: every one
     :param changeable: add a channel that can be changed while running, if the front end has no radio
+    :param on_ready: called with whether the device takes packets, whenever that has changed, as far as it can be asked
     :param instrumented: add parts for a dashboard: a channel that can be changed, and taps for spectrum and
         constellation
     :param shows: have two further ports for a window, where the PHY has samples: the received signal, a complex
@@ -63,6 +64,7 @@ class Radio(PacketPath, HierBlock):
         limit: AirtimeLimit | None = None,
         listens: bool = False,
         admits: Callable[[bytes], bool] | None = None,
+        on_ready: Callable[[bool], None] | None = None,
         changeable: bool = False,
         instrumented: bool = False,
         shows: bool = False,
@@ -97,7 +99,7 @@ class Radio(PacketPath, HierBlock):
             limit=limit,
             timed=front_end.clock_offset is not None,
             listens=_Listener(front_end) if listens else None,
-            ready=front_end.ready,
+            ready=front_end.ready if front_end.ready is None or on_ready is None else _Ready(front_end.ready, on_ready),
             admits=admits,
             clock=front_end.clock,
         )
@@ -204,6 +206,20 @@ class Radio(PacketPath, HierBlock):
     @property
     def _medium(self) -> str:
         return f"front_end {self.front_end.name}"
+
+
+class _Ready:
+    """Whether a device takes packets, which somebody learns whenever it has changed."""
+
+    def __init__(self, ready: Callable[[], bool], changed: Callable[[bool], None]) -> None:
+        self._ready, self._changed, self._was = ready, changed, True
+
+    def __call__(self) -> bool:
+        ready = self._ready()
+        if ready != self._was:
+            self._was = ready
+            self._changed(ready)
+        return ready
 
 
 class _Listener:

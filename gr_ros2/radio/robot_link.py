@@ -1,4 +1,5 @@
-"""One robot's end of a link as a flowgraph: from its ROS graph to the air and back, until it is stopped.
+"""One robot's end of a link as a flowgraph: from its ROS graph to the air and back, over one radio or several, until it
+is stopped.
 
 Invariants: neither direction waits for the other. Packets leave at the pace of the air, and each is composed just
 before it leaves. A robot ignores its own packets, except from a front end that loops back. `stop` releases everything
@@ -11,37 +12,35 @@ import logging
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import cached_property, partial
+from functools import partial
 from math import inf
 from typing import Any
 
-from gr_ros2.core.errors import RadioError
+from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.watch import Watch
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
-from gr_ros2.link.airtime_limit import AirtimeLimit
+from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import without_table
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
-from gr_ros2.phy import configured
+from gr_ros2.phy import Phy
 from gr_ros2.phy.flowgraph import Flowgraph
-from gr_ros2.radio import FRONT_ENDS
+from gr_ros2.phy.pdus import port_of
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
 from gr_ros2.radio.findings import about, doubled, introduce, outrun, peers, ping, same_id, unheard
 from gr_ros2.radio.front_end import FrontEnd
-from gr_ros2.radio.limits import open_limit
 from gr_ros2.radio.mismatch import Mismatch
-from gr_ros2.radio.permission import permitted
+from gr_ros2.radio.one_radio import OneRadio, together
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.ros_side import RosSide
 from gr_ros2.radio.switch import TransmitSwitch
 from gr_ros2.radio.waiting import foreign, shortcut
-from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
 
-_STOP_S, _RETRY_S = 10.0, 1.0
-"""s that a flowgraph may take to stop when its device has vanished, and s between two attempts to open it."""
+_STOP_S = 10.0
+"""s that a flowgraph may take to stop when its device has vanished."""
 STALLED_S = 10.0
 """s after which a thread that sends counts as stuck: longer than a busy computer makes it wait."""
 _log = logging.getLogger(__name__)
@@ -77,55 +76,57 @@ class RobotLink(Flowgraph):
         super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
         self._started: float | None = None
-        self._instrumented = instrumented
-        self._made_front_end, self._block = front_end, block
-        self._retry_at = inf
-        """When a device that has vanished is tried again, s; infinite while there is one."""
-        self._interruptions = self._passed_before = 0
-        self._worked = False
-        """Whether the front end has worked once; if not, nothing has vanished."""
         self._outrun: dict[str, int] = {}
-        self._watches = Watch(), Watch()
+        self._watch = Watch()
+        self.bond: Bond | None = None
+        """Its radios, where there are several."""
         self._stack = ExitStack()
         self._observers = Observers[LinkObserver](() if observer is None else (observer,))
         try:
-            self._open(middleware, self._observers if observer is not None else None)
+            self.radios = [
+                OneRadio(
+                    config,
+                    own,
+                    number,
+                    front_end=front_end,
+                    instrumented=instrumented,
+                    on_ready=partial(self._note_present, number),
+                    closing=self._stack,
+                )
+                for number, own in enumerate(config.own_radios)
+            ]
+            self._open(middleware, self._observers if observer is not None else None, block)
         except BaseException:
             self._stack.close()
             raise
 
-    def _open(self, middleware: Middleware | None, observer: LinkObserver | None) -> None:
-        config = self.config
-        rate = config.phy.sample_rate
-        self.phy = configured(config.phy, config.packet_len, 0.0 if rate == AUTO else rate)
-        self.sends = config.direction != "receive"
-        """Whether it may send at all."""
-        if self._made_front_end is None:
-            kind: type[FrontEnd] = FRONT_ENDS.load(config.front_end_name)
-            guarded = bool(config.key) or config.open
-            self.sends = self.sends and permitted(config.transmit, kind, config.front_end_options, guarded=guarded)
-            self._made_front_end = partial(kind, **config.front_end_options)
-        self._open_radio()
-        self._stack.callback(self._close_radio)
+    def _open(
+        self, middleware: Middleware | None, observer: LinkObserver | None, block: Callable[..., LinkBlock]
+    ) -> None:
+        config, radios = self.config, self.radios
         self._clock = self.front_end.clock
+        if len(radios) > 1:
+            self.bond = Bond([radio.front_end.airtime() for radio in radios])
+            if any(radio.phy.mcs_table for radio in radios):
+                raise ConfigError("radios: with several, each has one rate; set rate: fixed in the options of its phy")
         self._ros = RosSide(
             config,
-            self.phy,
-            self.front_end,
-            sends=self.sends,
+            radios,
+            bond=self.bond,
             middleware=middleware,
             observer=observer,
             clock=self._clock,
-            block=self._block,
+            block=block,
             stack=self._stack,
         )
         self.node_name, graph = self._ros.node_name, self._ros.graph
         link = self._ros.link
         self.source, self.sink, self.end, self.calls = link.source, link.sink, link.end, link.calls
-        self._connect_radio()
-        if self.phy.has_airtime:  # without, nothing sets a pace
+        for number in range(len(radios)):
+            self._connect_radio(number)
+        if all(radio.phy.has_airtime for radio in radios):  # without, nothing sets a pace
             self.source.use_credit()
-        told = about(config, self.phy)
+        told = about(config, [radio.phy for radio in radios])
         if hasattr(self.end.endpoint, "questions"):  # the paper's robots ask nothing
             introduce(self.end, told, lambda: self.radio.snr_db, self._clock())
         self._mismatch = Mismatch(told, self.ping)
@@ -137,90 +138,96 @@ class RobotLink(Flowgraph):
             self._diagnostics = Diagnostics(config.diagnostics, graph, self.node_name, self.stats, clock=self._clock)
             self._stack.callback(self._diagnostics.stop)
 
-    def _open_radio(self) -> None:
-        """Open the front end, and make the radio around it.
+    @property
+    def radio(self) -> Radio:
+        """The radio; of several, the first."""
+        return self.radios[0].radio
 
-        :raises RadioError: when it cannot be opened
-        """
-        assert self._made_front_end is not None
-        self.front_end = self._made_front_end(self.phy, transmits=self.sends)
-        try:
-            self.radio = Radio(
-                self.phy,
-                self.front_end,
-                channel=self.config.channel,
-                record=self.config.record,
-                limit=self._limit,
-                listens=self.config.airtime.listen_before_send and self.sends,
-                instrumented=self._instrumented,
-            )
-        except BaseException:
-            self.front_end.close()
-            raise
+    @property
+    def front_end(self) -> FrontEnd:
+        """The front end of that radio."""
+        return self.radios[0].front_end
 
-    def _close_radio(self) -> None:
-        self.radio.close()
+    @property
+    def phy(self) -> Phy:
+        """Its PHY."""
+        return self.radios[0].phy
 
-    def _connect_radio(self) -> None:
-        """Connect the radio with the blocks of ROS."""
-        link = self._ros.link
-        if self.sends:
-            self.msg_connect(link, "pdus", self.radio, "pdus")
-            if self.phy.has_airtime:
-                self.msg_connect(self.radio, "credit", link, "credit")
-            self.front_end.follow(self._at_rest)
+    @property
+    def sends(self) -> bool:
+        """Whether it may send at all."""
+        return any(radio.sends for radio in self.radios)
+
+    def _connect_radio(self, number: int) -> None:
+        """Connect a radio with the blocks of ROS."""
+        link, one = self._ros.link, self.radios[number]
+        pdus, credit = port_of("pdus", number), port_of("credit", number)
+        if one.sends:
+            self.msg_connect(link, pdus, one.radio, "pdus")
+            if one.phy.has_airtime:
+                self.msg_connect(one.radio, "credit", link, credit)
+            if self.bond is None:
+                one.front_end.follow(self._at_rest)
         if self.config.receives:
-            self.msg_connect(self.radio, "pdus", link, "pdus")
+            self.msg_connect(one.radio, "pdus", link, pdus)
 
-    def _lose(self, error: RadioError) -> None:
-        """The device has vanished: close it, and wait for it. The rest of the link keeps its state."""
+    def _lose(self, one: OneRadio, error: RadioError) -> None:
+        """The device of a radio has vanished: close it, and wait for it. The rest of the link keeps its state."""
         _log.warning("%s; waiting for it", error)
-        self._interruptions += 1
+        self._note_present(self.radios.index(one), False)
         stopping = threading.Thread(target=super().stop, daemon=True)
         stopping.start()
         stopping.join(_STOP_S)
         if stopping.is_alive():  # the driver does not return; a new process is needed
             raise error
-        self._passed_before += self.radio.counts().passed
-        self.disconnect_messages()
-        self.disconnect_all()
-        self.radio.close()
-        self._retry_at = self._clock() + _RETRY_S
+        self._connect_anew(lambda: one.lose(self._clock()))
+        if self.bond is not None:
+            super().start()
 
-    def _retry(self) -> None:
-        """Open the device again, if it is there."""
-        if self._clock() < self._retry_at:
+    def _retry(self, one: OneRadio) -> None:
+        """Open the device of a radio again, if it is there."""
+        if self._clock() < one.retry_at:
             return
-        transmits = self.radio.gate.account()["transmits"]
         try:
-            self._open_radio()
+            one.retry(self._clock())
         except RadioError as error:
             _log.debug("link %s: %s", self.config.name, error)
-            self._retry_at = self._clock() + _RETRY_S
             return
-        self._retry_at = inf
-        if not transmits:
-            self.radio.transmit(on=False)
-        self._connect_radio()
+        super().stop()
+        self._connect_anew(lambda: None)
         super().start()
-        _log.warning("link %s: front end %s is back", self.config.name, self.front_end.name)
+        self._note_present(self.radios.index(one), True, anew=True)
+        _log.warning("link %s: front end %s is back", self.config.name, one.front_end.name)
 
-    @cached_property
-    def _limit(self) -> AirtimeLimit | None:
-        """What limits the airtime, with what earlier starts of this robot have sent."""
-        if not self.sends:
-            return None
-        config, longest, now = self.config, self.front_end.airtime(), self.front_end.clock()
-        return open_limit(
-            config.airtime, longest, now, robot_id=config.robot_id, state=config.state, closing=self._stack
-        )
+    def _connect_anew(self, change: Callable[[], None]) -> None:
+        """Connect the radios that are there, after a change. The flowgraph does not run."""
+        self.disconnect_messages()
+        self.disconnect_all()
+        change()
+        for number, one in enumerate(self.radios):
+            if one.retry_at == inf:
+                self._connect_radio(number)
+
+    def _note_present(self, number: int, present: bool, *, anew: bool = False) -> None:
+        """The device of one of several radios has vanished, or is there again."""
+        if self.bond is None:
+            return
+        with self.end.lock:
+            if present:
+                self.bond.come_back(number, anew=anew)
+            else:
+                self.bond.vanish(number)
+            if asks := self.bond.asks():
+                self.end.endpoint.pace.credit(asks)
+                self.end.wake()
 
     def transmit(self, *, on: bool) -> None:
         """Switch sending off, at once for all packets that have not reached the device, or on again.
 
         :raises ConfigError: where it only receives
         """
-        self.radio.transmit(on=on)
+        for one in self.radios:
+            one.radio.transmit(on=on)
         _log.warning("link %s: sending is %s", self.config.name, "on" if on else "off")
 
     def _at_rest(self) -> int | None:
@@ -243,15 +250,18 @@ class RobotLink(Flowgraph):
         self._started = self._clock()
         if self.remark:
             _log.info("link %s: %s", self.config.name, self.remark)
-        self.phy.prefer_latency()
+        for one in self.radios:
+            one.phy.prefer_latency()
         if self._diagnostics is not None:
             self._diagnostics.start()
 
     def stop(self) -> None:
         """Stop, leave the ROS graph and close the front end. Idempotent. A stopped link cannot start again."""
         if self._running:
-            self.radio.drain()
-        self._retry_at = inf
+            for one in self.radios:
+                one.radio.drain()
+        for one in self.radios:
+            one.retry_at = inf
         super().stop()
         # A device is released with its blocks. The flowgraph would keep them as long as it exists itself.
         self.disconnect_all()
@@ -265,28 +275,46 @@ class RobotLink(Flowgraph):
         :raises RadioError: when a device that cannot come back gives or takes no more samples, which GNU Radio does not
             report; when its driver does not stop; when a thread that sends does not go on
         """
-        if self._retry_at < inf:
-            self._retry()
+        for one in self.radios:
+            if one.retry_at < inf:
+                self._retry(one)
         if not self._running:
             return
-        now, pacing, sending = self._clock(), *self._watches
-        for thread, watch, told_s in (
-            ("sending thread", sending, self.source.stalled_s(now)),
-            ("thread that paces packets", pacing, self.radio.gate.stalled_s()),
-        ):
-            stalled_s = inf if told_s == inf else watch.age(told_s, now)  # infinite: it has ended
-            if stalled_s > STALLED_S:
-                raise RadioError(
-                    f"link {self.config.name}: the {thread} has not gone on for {stalled_s:.0f} s; start the link "
-                    "again, and report what it was doing (py-spy dump)"
-                )
-        try:
-            self.front_end.check(now)
-            self._worked = True
-        except RadioError as error:
-            if not (self.front_end.may_return and self._worked):
-                raise
-            self._lose(error)
+        now = self._clock()
+        self._goes_on("sending thread", self._watch, self.source.stalled_s(now), now)
+        for one in self.radios:
+            if one.retry_at < inf or one.gone:
+                continue
+            self._goes_on("thread that paces packets", one.pacing, one.radio.gate.stalled_s(), now)
+            try:
+                one.check(now)
+            except RadioError as error:
+                if one.open_again:
+                    self._lose(one, error)
+                elif self.bond is None:
+                    raise
+                else:
+                    self._give_up(one, error)
+
+    def _goes_on(self, what: str, watch: Watch, told_s: float, now: float) -> None:
+        """:raises RadioError: if a thread has not gone on for long"""
+        stalled_s = inf if told_s == inf else watch.age(told_s, now)  # infinite: it has ended
+        if stalled_s > STALLED_S:
+            raise RadioError(
+                f"link {self.config.name}: the {what} has not gone on for {stalled_s:.0f} s; start the link "
+                "again, and report what it was doing (py-spy dump)"
+            )
+
+    def _give_up(self, one: OneRadio, error: RadioError) -> None:
+        """One of several radios has vanished, and cannot be opened again in this process.
+
+        :raises RadioError: where none is left
+        """
+        one.gone = True
+        if all(radio.gone for radio in self.radios):
+            raise error
+        self._note_present(self.radios.index(one), False)
+        _log.warning("%s; the link goes on without it; start it again when the device is there", error)
 
     def ping(self, robot: int, *, anew: bool = False) -> dict[str, Any]:
         """Ask another robot, which answers at once; returns what has come of all questions to it so far.
@@ -347,8 +375,10 @@ class RobotLink(Flowgraph):
     def stats(self) -> dict[str, Any]:
         """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
         end, and :meth:`incomplete`."""
-        phy, counts, front_end = self.phy, self.radio.counts(), self.front_end.counters()
-        vanished = {"interruptions": self._interruptions} if self._interruptions else {}
+        each = [one.stats() for one in self.radios]
+        for stats in each:
+            stats["phy"].update(self.source.rate())
+            stats["packets"]["in"] = self.sink.handled
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
@@ -356,28 +386,6 @@ class RobotLink(Flowgraph):
             "sink": self.sink.stats(),
             "peers": peers(self.end, self._clock()),
             "calls": {} if self.calls is None else self.calls.stats(),
-            "packets": {
-                "out": self._passed_before + counts.passed,
-                "backlog": counts.backlog,
-                "refused": self.radio.refused,
-                "in": self.sink.handled,
-                "damaged": self.radio.damaged,
-                "foreign": self.radio.foreign,
-                "dropped": dict(counts.losses),
-            },
-            "phy": {
-                "name": phy.name,
-                "sample_rate": phy.sample_rate if phy.has_samples else None,
-                "airtime_s": self.front_end.airtime(),
-                "snr_db": self.radio.snr_db,
-                "rssi_dbm": self.front_end.rssi_dbm,
-                **self.source.rate(),
-            },
-            "front_end": {
-                "name": self.front_end.name,
-                "passed": front_end.passed,
-                "lost": {**front_end.lost, **vanished, **self.radio.recorded()},
-            },
-            "airtime": self.radio.gate.account(),
+            **(each[0] if self.bond is None else together(self.bond, self.radios, each)),
             "incomplete": self.incomplete(),
         }

@@ -6,7 +6,7 @@ Invariant: everything that is opened here is closed by the stack it was entered 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 
@@ -16,18 +16,19 @@ from gr_ros2.link.access import Access
 from gr_ros2.link.air import Air
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
+from gr_ros2.link.bond import Bond
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.mac import Slots, access_of
 from gr_ros2.middleware import Middleware, join
-from gr_ros2.phy import Phy
 from gr_ros2.radio.config import LinkConfig
-from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.one_radio import OneRadio
 
 
 class RosSide:
     """A robot's participant on its ROS graph, and its block.
 
-    :param sends: whether the robot may send
+    :param radios: its radios
+    :param bond: see :class:`gr_ros2.gr.ros_link.RosLink`
     :param middleware: an open Middleware for both directions, which the caller closes; None: opened here
     :param observer, clock: see :class:`gr_ros2.gr.ros_link.RosLink`
     :param block: makes the block between the graph and the radio, as :class:`RosLink` does
@@ -41,22 +42,25 @@ class RosSide:
     def __init__(
         self,
         config: LinkConfig,
-        phy: Phy,
-        front_end: FrontEnd,
+        radios: Sequence[OneRadio],
         *,
-        sends: bool,
+        bond: Bond | None,
         middleware: Middleware | None,
         observer: LinkObserver | None,
         clock: Callable[[], float],
         block: Callable[..., LinkBlock],
         stack: ExitStack,
     ) -> None:
+        sends = any(radio.sends for radio in radios)
+        front_ends = [radio.front_end for radio in radios]
+        front_end = min(front_ends, key=lambda each: each.airtime())
+        loops_back = any(each.loops_back for each in front_ends)
         self._medium, self._front_end = config.medium, front_end
         self.node_name = f"gr_ros2_link_{config.robot_id}"
         """The node name that ``ros2 node list`` shows."""
         self.shares = config.medium != "exclusive"
         """Whether other robots send on its channel."""
-        if self.shares and front_end.loops_back:
+        if self.shares and loops_back:
             raise ConfigError(
                 f"medium = {config.medium!r}: front_end {front_end.name} reaches no other robot; leave it out, or set "
                 "another front_end"
@@ -64,22 +68,23 @@ class RosSide:
         self.slots: Slots | None = None
         self.graph = middleware or stack.enter_context(join(config.graph, self.node_name))
         air = Air(
-            hears=sends and config.receives and not front_end.loops_back,
-            half_duplex=self.shares or getattr(front_end.options, "half_duplex", False),
-            any_length=phy.any_length,
-            mcs_table=phy.mcs_table,
+            hears=sends and config.receives and not loops_back,
+            half_duplex=self.shares or all(getattr(each.options, "half_duplex", False) for each in front_ends),
+            any_length=all(radio.phy.any_length for radio in radios),
+            mcs_table=radios[0].phy.mcs_table,
             airtime_s=front_end.airtime(),
-            airtime_share=sustained(config.airtime.rule),
+            airtime_share=max(sustained(radio.own.airtime.rule) for radio in radios),
             access=self._access if sends else lambda _: None,
             relay=config.relay == "gain",
         )
         self.link = block(
             config if sends else replace(config, topics={}),
             air=air,
-            loops_back=front_end.loops_back,
+            loops_back=loops_back,
             middleware=self.graph,
             observer=observer,
             clock=clock,
+            **({} if bond is None else {"bond": bond}),
         )
         stack.callback(self.link.close)
 

@@ -163,9 +163,10 @@ class AirtimeConfig:
         return rule if rule.duty_cycle < 1 or rule.max_burst_s else None
 
 
-def _by_name(given: Any) -> Any:
+def by_name(given: Any) -> Any:
+    """The settings of a band that is given by its name alone."""
     return {"band": given} if isinstance(given, str) else given
 
 
-Airtime = Annotated[AirtimeConfig, BeforeValidator(_by_name)]
+Airtime = Annotated[AirtimeConfig, BeforeValidator(by_name)]
 """The settings, or the name of a band alone."""

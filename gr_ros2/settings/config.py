@@ -215,6 +215,9 @@ class SendOptions:
     are never kept"""
     to: RobotId | Auto = AUTO
     """robot for which it is; auto = all"""
+    via: Literal["best", "all"] | Auto = AUTO
+    """of several radios: all = over each, best = over the fastest that is heard; auto = all for class latency, else
+    best"""
     codec: str = AUTO
     """auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)"""
     quantize: str = ""

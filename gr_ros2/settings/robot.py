@@ -39,6 +39,8 @@ from gr_ros2.settings.topic_choice import LEAVES_OUT, checked_words, topics_of
 from gr_ros2.state.keys import checked_key_file
 from gr_ros2.wire import BROADCAST
 
+ONE_RADIO = "a robot with one radio sends everything over that"
+"""Why ``via`` does nothing there."""
 _ALIASED = ConfigDict(**STRICT, populate_by_name=True)
 Age = Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")]
 

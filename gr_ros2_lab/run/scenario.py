@@ -36,7 +36,7 @@ from gr_ros2.settings.effect import ActsWhere, refuse_without_effect
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.files import read_settings
 from gr_ros2.settings.registry import Registry, check_outputs
-from gr_ros2.settings.robot import RobotConfig
+from gr_ros2.settings.robot import ONE_RADIO, RobotConfig
 from gr_ros2.wire import BROADCAST, FORMATS, Format
 from gr_ros2_lab.run.builtin import SCENARIO_DIR, builtin_scenarios
 from gr_ros2_lab.run.robot_settings import RobotSettings, ScenarioRobot, settings_of_all
@@ -104,6 +104,7 @@ class Scenario(Experiment, Traffic, AirConfig):
             lambda scenario: scenario.source != "sim",
             "the simulator plays no recording; leave it out, or set source: bag:PATH",
         ),
+        ActsWhere(("robots.*.topics.*.via",), lambda _: False, f"{ONE_RADIO}; leave it out"),
         ActsWhere(("robots.*.state",), lambda _: False, "a run counts no starts of its robots; leave it out"),
         ActsWhere(
             ("controller",),

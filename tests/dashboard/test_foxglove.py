@@ -55,12 +55,15 @@ def server() -> Any:
 
 
 class Client:
-    """A client that subscribes to every topic."""
+    """A client that subscribes to every topic, and again to those of which nothing comes: the SDK tells of a channel
+    slightly before it takes subscriptions of it."""
 
     def __init__(self, port: int) -> None:
         self.channels: dict[int, Any] = {}
         self.seen: list[tuple[str, bytes]] = []
-        self._port = port
+        self._port, self._asked = port, 0
+        self._of: dict[int, int] = {}
+        """The channel of each subscription."""
 
     def watch(self, until: Callable[[], bool], work: Callable[[], None] = lambda: None) -> None:
         """Take part until something is so; ``work`` is done at each look."""
@@ -76,6 +79,11 @@ class Client:
             if done:
                 await self._take(connection, waiting.result())
                 waiting = asyncio.ensure_future(_read(connection))
+            else:
+                heard = {topic for topic, _ in self.seen}
+                await self._ask(
+                    connection, [n for n, channel in self.channels.items() if channel["topic"] not in heard]
+                )
         waiting.cancel()
         connection.close()
 
@@ -84,12 +92,18 @@ class Client:
         if isinstance(message, bytes):
             if message[0] == 1:
                 (number,) = struct.unpack_from("<I", message, 1)
-                self.seen.append((self.channels[number]["topic"], message[13:]))
+                self.seen.append((self.channels[self._of[number]]["topic"], message[13:]))
             return
         said = json.loads(message)
         for channel in said.get("channels", ()) if said["op"] == "advertise" else ():
             self.channels[channel["id"]] = channel
-            asked = {"id": channel["id"], "channelId": channel["id"]}
+            await self._ask(connection, [channel["id"]])
+
+    async def _ask(self, connection: Any, numbers: list[int]) -> None:
+        for number in numbers:
+            self._asked += 1
+            self._of[self._asked] = number
+            asked = {"id": self._asked, "channelId": number}
             await connection.write_message(json.dumps({"op": "subscribe", "subscriptions": [asked]}))
 
 
@@ -211,8 +225,10 @@ def test_a_live_link_is_seen_by_both_names(tmp_path: Path) -> None:
                     publisher.publish(said)
 
             wanted = {("/rx_robot_1/tf", said), ("/robot_2/tf", said)}
-            client.watch(lambda: wanted <= set(client.seen), work)
-        observers.run_ended(None)
+            try:
+                client.watch(lambda: wanted <= set(client.seen), work)
+            finally:
+                observers.run_ended(None)
         assert observers.incomplete() == []
 
 

@@ -183,7 +183,7 @@ def test_every_yaml_is_accepted(block: Block, tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_text(block.text)
     values = yaml.safe_load(block.text)
-    if "front_end" in values:
+    if "front_end" in values or "radios" in values:
         assert link_from({"name": "trial", **values})
     elif "scenario" in values:
         assert load_sweep(path)

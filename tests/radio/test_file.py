@@ -31,8 +31,8 @@ def sent_recording(path: Path, phy: str = "psk", count: int = 10) -> list[bytes]
         said = robot.say(*range(count))
         wait_for(lambda: robot.silent, "all to be sent")
         samples = robot.link.source.stats()["packets"] * robot.link.phy.airtime_samples()
-        wait_for(lambda: robot.link.front_end.sink.nitems_read(0) == samples, "all to be written")
-    assert Path(f"{path}.sigmf-data").stat().st_size == 8 * samples
+        wait_for(lambda: robot.link.front_end.sink.nitems_read(0) >= samples, "all to be written")
+    assert Path(f"{path}.sigmf-data").stat().st_size >= 8 * samples  # another hello may have left
     return said
 
 

@@ -48,7 +48,7 @@ def test_ends_that_match_say_so_with_figures(tmp_path: Path) -> None:
         wait_for(lambda: one.link.ping(2)["answered"] >= 3, "answers")
         told = one.link.ping(2)
         (peer,) = one.link.stats()["peers"]
-    assert differences(about(one.link.config, one.link.phy), told["about"]) == []
+    assert differences(about(one.link.config, [one.link.phy]), told["about"]) == []
     assert abs(told["clock_s"]) < 1.0
     assert (peer["robot"], peer["sealed"], peer["silent"]) == (2, True, False)
     assert "answered" in in_words(told)
@@ -59,7 +59,7 @@ def test_another_packet_len_is_named(tmp_path: Path) -> None:
     one, two = pair(tmp_path, {"packet_len": 128}, phy={"name": "psk", "sample_rate": RATE})
     with one, two:
         wait_for(lambda: (one.link.ping(2)["about"] or {}).get("packet_len") == 128, "what the other end is")
-        (line,) = differences(about(one.link.config, one.link.phy), one.link.ping(2)["about"])
+        (line,) = differences(about(one.link.config, [one.link.phy]), one.link.ping(2)["about"])
     assert "packet_len is 128 there and 64 here" in line
 
 

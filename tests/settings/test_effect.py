@@ -88,6 +88,18 @@ IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
         "set source: bag:PATH",
     ),
     (Scenario, "robots.*.state"): ({"robots": [{}, {"state": "robot.json"}]}, {}, {}, "leave it out"),
+    (Scenario, "robots.*.topics.*.via"): (
+        {"robots": [{}, {"topics": {"odom": {"via": "all"}}}]},
+        {},
+        {},
+        "leave it out",
+    ),
+    (LinkConfig, "topics.*.via"): (
+        {"topics": {"odom": {"via": "all"}}},
+        {},
+        {"radios": [{"name": name, "front_end": {"name": "sim"}} for name in ("one", "two")]},
+        "set radios",
+    ),
     (Scenario, "controller"): (
         {"controller": "ros"},
         {},
@@ -127,7 +139,7 @@ for cls, values in ((CameraOptions, CAMERA), (DepthOptions, DEPTH)):
         IDLE[cls, name] = ({name: value}, {"off": True}, {}, "leave off out")
 for name, value in {"range": 30.0, "keep": "rgb", "fit": True}.items():
     IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
-NEVER = {(Scenario, "robots.*.state")}
+NEVER = {(Scenario, "robots.*.state"), (Scenario, "robots.*.topics.*.via")}
 """Nothing makes them act."""
 
 

@@ -1,0 +1,192 @@
+"""Two radios under one endpoint: what two like ones carry beside one, and what is late or lost when one falls silent.
+
+Both robots run in this process. Their radios are modems of 100 kbit/s, whose datagrams pass wires of this module that
+can be cut: then nothing comes through, and nobody is told.
+"""
+
+from __future__ import annotations
+
+import random
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from bench.live import DOMAINS
+from bench.rows import Row
+from gr_ros2.middleware import Qos
+from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.radio.config import link_from
+from gr_ros2.radio.robot_link import RobotLink
+
+REPEATS, MEASURED_S = 3, 8.0
+BIT_RATES = {"left": 100_000, "right": 100_000}
+COMMANDS_HZ, ODOM_HZ = 20.0, 20.0
+_TWIST, _BYTES = "geometry_msgs/msg/Twist", "std_msgs/msg/String"
+_CDR = bytes((0, 1, 0, 0))
+
+
+def radios() -> list[Row]:
+    """Throughput of two radios over that of one, and pauses and losses when one of two is cut."""
+    ratios, pauses = [], [_pause() for _ in range(REPEATS)]
+    for _ in range(REPEATS):
+        one, two = _throughput(("left",)), _throughput(("left", "right"))
+        ratios.append(two / one)
+    command, odometry, lost = (max(values) for values in zip(*pauses, strict=True))
+    return [
+        Row("two like radios: throughput over that of one", median(ratios), "", "≥", 1.8, "{:.2f}"),
+        Row("one of two cut: longest pause of commands", command * 1e3, "ms", "≤", 200, note="one each 50 ms"),
+        Row("one of two cut: longest pause of odometry", odometry * 1e3, "ms", note="one each 50 ms"),
+        Row("one of two cut: reliable messages lost", lost, "", "=", 0),
+    ]
+
+
+class _Wire:
+    """Carries datagrams from one port to another until it is cut."""
+
+    def __init__(self, there: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self.port, self.cut, self._there = self._socket.getsockname()[1], False, there
+        self._over = False
+        self._thread = threading.Thread(target=self._carry, daemon=True)
+        self._thread.start()
+
+    def _carry(self) -> None:
+        while not self._over:
+            if select.select([self._socket], [], [], 0.05)[0]:
+                data = self._socket.recv(65536)
+                if not self.cut:
+                    self._socket.sendto(data, ("127.0.0.1", self._there))
+
+    def close(self) -> None:
+        self._over = True
+        self._thread.join()
+        self._socket.close()
+
+
+class _Pair:
+    """Robot 1, which sends, and robot 2, with what it hears and when."""
+
+    def __init__(self, links: list[RobotLink], near: MemoryMiddleware, wires: dict[str, list[_Wire]]) -> None:
+        self.links, self.near, self.wires = links, near, wires
+        self.heard: dict[str, list[tuple[float, bytes]]] = {"cmd_vel": [], "odom": [], "data": []}
+
+
+@contextmanager
+def _pair(names: tuple[str, ...]) -> Iterator[_Pair]:
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        ports = {(number, name): _free_port() for number in (1, 2) for name in names}
+        wires: dict[str, list[_Wire]] = {name: [] for name in names}
+        links = []
+        for number in (1, 2):
+            each: list[dict[str, Any]] = []
+            for name in names:
+                wire = _Wire(ports[3 - number, name])
+                stack.callback(wire.close)
+                wires[name].append(wire)
+                listen, to = str(ports[number, name]), [f"127.0.0.1:{wire.port}"]
+                phy = {"name": "modem", "options": {"bit_rate": BIT_RATES[name]}}
+                each.append({"name": name, "phy": phy, "front_end": {"name": "udp", "listen": listen, "send_to": to}})
+            radio = {"radios": each} if len(each) > 1 else {"phy": each[0]["phy"], "front_end": each[0]["front_end"]}
+            graph = {"middleware": "memory", "domain_id": DOMAINS[number - 1]}
+            own = {"robot": f"/robot_{number}", "graph": graph, "state": str(Path(folder) / str(number))}
+            links.append(RobotLink(link_from({**own, **radio, "compression": False})))
+        near, far = (MemoryMiddleware(domain_id=domain) for domain in DOMAINS)
+        pair = _Pair(links, near, wires)
+        for graph_ in (near, far):
+            stack.callback(graph_.close)
+        for topic, kept in pair.heard.items():
+            type_name = _TWIST if topic == "cmd_vel" else _BYTES
+            take = kept.append
+            far.subscribe(
+                f"/rx_robot_1/{topic}",
+                type_name,
+                Qos("reliable", "volatile", 0),
+                lambda payload, take=take: take((time.monotonic(), payload)),
+            )
+        for link in links:
+            stack.enter_context(link)
+        yield pair
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        port: int = one.getsockname()[1]
+        return port
+
+
+def _text(number: int, length: int) -> bytes:
+    """A std_msgs/String that begins with a number; the rest nobody can compress."""
+    body = b"%08d" % number + random.Random(number).randbytes(length - 9).replace(b"\0", b"\1") + b"\0"
+    return _CDR + struct.pack("<I", length) + body
+
+
+def _throughput(names: tuple[str, ...]) -> float:
+    """Bytes/s that robot 2 gets of a topic that always waits."""
+    with _pair(names) as pair:
+        data = pair.near.advertise("/robot_1/data", _BYTES, Qos("reliable", "volatile", 50))
+        number, end = 0, time.monotonic() + 3.0 + MEASURED_S
+        while (now := time.monotonic()) < end:
+            if sum(pair.links[0].end.endpoint.messages.queued().values()) < 20:
+                data.publish(_text(number, 1000))
+                number += 1
+            else:
+                time.sleep(0.005)
+        came = [payload for at, payload in pair.heard["data"] if now - MEASURED_S <= at]
+        if number < 20 or len(came) < 10:
+            raise SystemExit(f"bench radios: {len(came)} of {number} messages over {' and '.join(names)}")
+        return sum(map(len, came)) / MEASURED_S
+
+
+def _pause() -> tuple[float, float, int]:
+    """Longest pauses of commands and of odometry around the time at which one of two radios is cut, s, and how many
+    reliable messages did not come at all."""
+    with _pair(("left", "right")) as pair:
+        command = pair.near.advertise("/robot_1/cmd_vel", _TWIST, Qos("reliable", "volatile", 1))
+        odometry = pair.near.advertise("/robot_1/odom", _BYTES, Qos("best_effort", "volatile", 1))
+        data = pair.near.advertise("/robot_1/data", _BYTES, Qos("reliable", "volatile", 0))
+        _wait_for_topics(pair, command.publish, odometry.publish, data.publish)
+        begin, step, cut_at = time.monotonic(), 0, 6.0
+        said = set()
+        while (now := time.monotonic() - begin) < cut_at + MEASURED_S:
+            if now >= cut_at:
+                for wire in pair.wires["left"]:
+                    wire.cut = True
+            command.publish(_CDR + random.Random(step).randbytes(48))
+            odometry.publish(_text(step, 300))
+            if step % 10 == 0:
+                said.add(message := _text(step, 400))
+                data.publish(message)
+            step += 1
+            time.sleep(max(0.0, begin + step / COMMANDS_HZ - time.monotonic()))
+        patience = time.monotonic() + 30
+        while (lost := said - {payload for _, payload in pair.heard["data"]}) and time.monotonic() < patience:
+            time.sleep(0.05)
+        longest = []
+        for topic in ("cmd_vel", "odom"):
+            times = [at - begin for at, _ in pair.heard[topic] if at - begin > cut_at - 1]
+            if len(times) < MEASURED_S * COMMANDS_HZ / 2:
+                raise SystemExit(f"bench radios: {len(times)} messages of {topic} came")
+            longest.append(max(after - before for before, after in pairwise(times)))
+        return longest[0], longest[1], len(lost)
+
+
+def _wait_for_topics(pair: _Pair, *publish: Callable[[bytes], None]) -> None:
+    """Publish until the link has found every topic on the graph."""
+    patience = time.monotonic() + 30
+    while sum(topic["submitted"] > 0 for topic in pair.links[0].source.stats()["topics"].values()) < len(publish):
+        if time.monotonic() > patience:
+            raise SystemExit("bench radios: the link does not find its topics")
+        for each in publish:
+            each(_text(0, 48))
+        time.sleep(0.1)
