@@ -145,6 +145,7 @@ class Inbox:
         self.decoder.newest = first - 1
         self.first, self._give_up_s, self._heard = first, give_up_s, inf
         self._most = settings.max_source_bytes
+        self._reassembly = Reassembly(bounds.fragments)
         self.order = Order(
             self.decoder,
             first,
@@ -154,9 +155,9 @@ class Inbox:
             room=room,
             quiet_s=quiet_s,
             patience_s=patience_s,
+            incomplete=self._reassembly.oldest,
             brings=brings,
         )
-        self._reassembly = Reassembly(bounds.fragments)
         of = src_id, boot
         self.reports: Reporter = (
             SharedReporter(of, self.decoder, self.order, self._reassembly, settings)

@@ -68,6 +68,11 @@ def nobody(_since: float) -> bool:
     return False
 
 
+def nothing(_topic_id: int) -> tuple[int, int] | None:
+    """No message is incomplete."""
+    return None
+
+
 ALL = 255
 """A place behind all messages that began in a packet."""
 
@@ -84,6 +89,7 @@ class Order:
     :param quiet_s: s after which what others say of a sender counts
     :param patience_s: s for which a message waits for those before it that others may bring, from when one of those
         was met
+    :param incomplete: the order of the oldest message of a topic of which a part is missing
     :param brings: whether a robot that is heard still repairs something that was missing at this time, s: it may bring
         these, so they are waited for as long again
     :ivar contents: which topics missing packets can have carried
@@ -108,6 +114,7 @@ class Order:
         room: int,
         quiet_s: float = inf,
         patience_s: float = inf,
+        incomplete: Callable[[int], tuple[int, int] | None] = nothing,
         brings: Callable[[float], bool] = nobody,
     ) -> None:
         self.told = False
@@ -123,7 +130,7 @@ class Order:
         """By topic: no missing packet before this number can have carried something of it."""
         self._decoder = decoder
         self._hold_s, self._quiet_s, self._patience_s, self._brings = hold_s, quiet_s, patience_s, brings
-        self._sure, self._fits = sure, fits
+        self._sure, self._fits, self._incomplete = sure, fits, incomplete
         self._dead = first
         """The sender does not repair packets before this number any more."""
         self._void: set[int] = set()
@@ -181,16 +188,22 @@ class Order:
         return False
 
     def passes(self, ready: Ready) -> bool:
-        """Whether a message comes out at once; notes that it does."""
+        """Whether a message comes out at once; notes that it does. One that came over others did not bring the packet
+        in which it began, which others may have begun or ended in before it."""
         reached = self.reached.get(ready.topic_id, (-1, 0))
-        if ready.order[0] > self.low and ready.order > reached:
+        if (ready.order[0] > self.low or ready.over is not None) and ready.order > reached:
             return False
         self.reached[ready.topic_id] = max(reached, ready.order)
         return True
 
     def up_to(self, topic_id: int) -> tuple[int, int]:
         """All messages of a topic up to this one are here, or are given up."""
-        return max((self._pass(topic_id) - 1, ALL), self.reached.get(topic_id, (-1, 0)))
+        here = self._pass(topic_id) - 1, ALL
+        part = self._incomplete(topic_id)
+        if part is not None and part <= here:  # it goes on in a packet that is missing
+            begin, place = part
+            here = (begin, place - 1) if place > 0 else (begin - 1, ALL)
+        return max(here, self.reached.get(topic_id, (-1, 0)))
 
     def before(self, ready: Ready) -> tuple[int, int] | None:
         """Number and place of the message after which one that came out follows, as far as that is known."""
@@ -236,7 +249,7 @@ class Order:
                 line.sort(key=lambda ready: ready.order)
                 while line:
                     ready = line[0]
-                    if waits and ready.order[0] > passed and not (quiet and self._follows(ready, passed, now)):
+                    if waits and not self._next(ready, passed) and not (quiet and self._follows(ready, now)):
                         break
                     due.append(line.pop(0))
                     self.reached[topic_id] = max(self.reached.get(topic_id, ready.order), ready.order)
@@ -244,9 +257,15 @@ class Order:
                     self.held -= len(ready.payload) + _COST
         return due
 
-    def _follows(self, ready: Ready, passed: int, now: float) -> bool:
+    def _next(self, ready: Ready, passed: int) -> bool:
+        """Whether nothing before a message is missing, where no packet before ``passed`` is."""
+        if ready.over is None or ready.order[0] != passed:
+            return ready.order[0] <= passed
+        return ready.after is not None and ready.after <= self.up_to(ready.topic_id)
+
+    def _follows(self, ready: Ready, now: float) -> bool:
         """Whether a message comes out that waits for others to bring those before it."""
-        here = max((passed - 1, ALL), self.reached.get(ready.topic_id, (-1, 0)))
+        here = self.up_to(ready.topic_id)
         if ready.order <= here or (ready.after is not None and ready.after <= here):
             return True
         if ready.over is None or now < self._since[ready.topic_id] + self._patience_s:

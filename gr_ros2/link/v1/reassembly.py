@@ -174,6 +174,13 @@ class Reassembly:
                 ended.append(self._release(partial))
         return ended
 
+    def oldest(self, topic_id: int) -> tuple[int, int] | None:
+        """The packet in which the oldest incomplete message of a topic began, and its place there; None for none."""
+        begins = self._begins.get(topic_id, [])
+        while begins and (topic_id, begins[0]) not in self._partials:
+            heappop(begins)
+        return (begins[0], self._partials[topic_id, begins[0]].place) if begins else None
+
     def clear(self) -> list[PartialMessage]:
         """Give up everything."""
         ended = list(self._partials.values())

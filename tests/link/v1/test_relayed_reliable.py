@@ -9,7 +9,7 @@ from math import inf
 import pytest
 
 from gr_ros2.link.v1.decoder import RepairDecoder
-from gr_ros2.link.v1.order import Order, Ready
+from gr_ros2.link.v1.order import ALL, Order, Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Robot, registry
@@ -246,6 +246,40 @@ def test_who_still_repairs_what_was_missing_has_its_time_again() -> None:
     assert not order.settle(219.0)
     assert order.settle(220.0)
     assert since == [100.0, 160.0]
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_message_over_others_overtakes_none_that_began_or_ends_in_a_missing_packet(quiet: bool) -> None:
+    """It did not bring the packet in which it began: one before it may stand there, or go on there."""
+    decoder, part = RepairDecoder(60, lambda _: True, 1000), [None, (2, 1)]
+    order = Order(
+        decoder,
+        1,
+        1.0,
+        sure=10_000,
+        fits=lambda _: True,
+        room=60,
+        quiet_s=0.0 if quiet else inf,
+        incomplete=lambda topic_id: part[topic_id - 1],
+    )
+    decoder.begin(1)
+    decoder.source(1, b"")
+    decoder.source(2, b"")
+    assert order.up_to(1) == (2, ALL)
+    assert order.up_to(2) == (2, 0)
+    order.heard = 0.0
+
+    def come(topic_id: int, at: tuple[int, int], after: tuple[int, int]) -> list[Ready]:
+        ready = Ready(topic_id, at, b"", -1, False, False, 1, 3, after=after)
+        assert not order.passes(ready)
+        order.wait(ready, 1.0)
+        return order.settle(1.0)
+
+    assert not come(1, (3, 2), (3, 0))
+    assert [ready.order for ready in come(1, (3, 0), (2, 4))] == [(3, 0), (3, 2)]
+    assert not come(2, (3, 2), (2, 1))
+    part[1] = None
+    assert [ready.order for ready in order.settle(2.0)] == [(3, 2)]
 
 
 def test_it_is_known_since_when_the_packet_that_is_repaired_first_is_missing() -> None:
