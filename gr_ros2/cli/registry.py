@@ -6,9 +6,10 @@ import csv
 import io
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
@@ -77,20 +78,34 @@ class SharedGraph(Completed):
         return map(CompletionItem, _SHARED)
 
 
+def shared_graph(whose: str) -> Callable[[Any], Any]:
+    """The options that name the graph of a robot: ``middleware`` and ``domain_id``.
+
+    :param whose: help of the first
+    """
+
+    def options(command: Any) -> Any:
+        domain = click.option(
+            "--domain-id",
+            default=AUTO,
+            type=OrAuto(click.IntRange(0, 232)),
+            help="ROS domain; default auto: ROS_DOMAIN_ID.",
+        )
+        kind: dict[str, Any] = {
+            "default": DEFAULT_MIDDLEWARE,
+            "show_default": True,
+            "type": SharedGraph(),
+            "metavar": "NAME",
+        }
+        return click.option("--middleware", help=whose, **kind)(domain(command))
+
+    return options
+
+
 @click.command("from-graph")
 @_namespace
 @_topics
-@click.option(
-    "--middleware",
-    default=DEFAULT_MIDDLEWARE,
-    show_default=True,
-    type=SharedGraph(),
-    metavar="NAME",
-    help=f"Whose graph: {', '.join(_SHARED)}.",
-)
-@click.option(
-    "--domain-id", default=AUTO, type=OrAuto(click.IntRange(0, 232)), help="ROS domain; default auto: ROS_DOMAIN_ID."
-)
+@shared_graph(f"Whose graph: {', '.join(_SHARED)}.")
 @click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0, 600), help="Seconds to look around.")
 @click.option("--services", is_flag=True, help="Services and actions too, for links of version 1.")
 @_out

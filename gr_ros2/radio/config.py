@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
@@ -17,18 +17,13 @@ from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.phy import PHY, Phy, configured
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.permission import check_band
-from gr_ros2.settings.airtime import AirtimeConfig, by_name
+from gr_ros2.settings.airtime import Airtime, AirtimeConfig
 from gr_ros2.settings.config import STRICT, AirConfig, ChannelConfig, DiagnosticsConfig, PhyConfig, Text, build
 from gr_ros2.settings.effect import ActsWhere
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import read_settings
 from gr_ros2.settings.robot import ONE_RADIO, RobotConfig
 from gr_ros2.wire import FORMATS
-
-
-def _by_name(given: Any) -> Any:
-    return given if given == AUTO else by_name(given)
-
 
 _MOST_RADIOS = 4
 """Radios of one robot: more than anybody has carried."""
@@ -44,13 +39,20 @@ class RadioConfig:
     """its physical layer; auto = the link's"""
     front_end: dict[str, Any]
     """``name`` of its front end, and that front end's settings"""
-    airtime: Annotated[AirtimeConfig | Auto, BeforeValidator(_by_name)] = AUTO
+    airtime: Airtime | Auto = AUTO
     """how much it may send, with an account of its own: settings, or the name of a band; auto = as the link says"""
 
-    @property
-    def called(self) -> str:
-        """What status and log call it."""
-        return self.name or self.front_end_name
+
+class OwnRadio(NamedTuple):
+    """A radio with all that it has of the link.
+
+    :param called: what status and log call it
+    """
+
+    called: str
+    phy: PhyConfig
+    front_end: Mapping[str, Any]
+    airtime: AirtimeConfig
 
     @property
     def front_end_name(self) -> str:
@@ -61,16 +63,6 @@ class RadioConfig:
     def front_end_options(self) -> dict[str, Any]:
         """The settings of the front end."""
         return {key: value for key, value in self.front_end.items() if key != "name"}
-
-
-class OwnRadio(NamedTuple):
-    """A radio with all that it has of the link."""
-
-    called: str
-    phy: PhyConfig
-    front_end_name: str
-    front_end_options: dict[str, Any]
-    airtime: AirtimeConfig
 
     def made_phy(self, packet_len: int) -> Phy:
         """Its PHY, for packets of so many bytes.
@@ -147,7 +139,7 @@ class LinkConfig(AirConfig, RobotConfig):
 
     def _several(self) -> None:
         """:raises ValueError: for what several radios cannot have"""
-        names = [radio.called for radio in self.radios]
+        names = [own.called for own in self.own_radios]
         if len(names) < 2 or len(names) > _MOST_RADIOS:
             raise ValueError(f"radios: {len(names)} of 2 to {_MOST_RADIOS}; one alone is front_end")
         if len(set(names)) < len(names):
@@ -168,10 +160,9 @@ class LinkConfig(AirConfig, RobotConfig):
         radios = self.radios or (RadioConfig(front_end=self.front_end),)
         return tuple(
             OwnRadio(
-                radio.called,
+                radio.name or str(radio.front_end["name"]),
                 self.phy if radio.phy == AUTO else radio.phy,
-                radio.front_end_name,
-                radio.front_end_options,
+                radio.front_end,
                 self.airtime if radio.airtime == AUTO else radio.airtime,
             )
             for radio in radios

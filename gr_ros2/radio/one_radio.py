@@ -174,16 +174,9 @@ def together(bond: Bond, radios: Sequence[OneRadio], each: Sequence[Mapping[str,
 
     :param each: what each says
     """
-    counted = {name: sum(stats["packets"][name] for stats in each) for name in ("out", "backlog", "refused")}
-    counted |= {name: sum(stats["packets"][name] for stats in each) for name in ("damaged", "foreign")}
-    counted["in"] = each[0]["packets"]["in"]
-    dropped: Counter[str] = Counter()
-    for stats in each:
-        dropped.update(stats["packets"]["dropped"])
-    limited = max((stats["airtime"] for stats in each), key=lambda account: account.get("waits_s", -1.0))
-    refused: Counter[str] = Counter()
-    for stats in each:
-        refused.update(stats["airtime"]["refused"])
+    packets, accounts = ([stats[part] for stats in each] for part in ("packets", "airtime"))
+    counted = {name: _sum(packets, name) for name in ("out", "backlog", "refused", "damaged", "foreign")}
+    tightest = max(accounts, key=lambda account: account.get("waits_s", -1.0))
     parts = {
         part: {
             f"{radio.name}: {name}": count
@@ -203,14 +196,23 @@ def together(bond: Bond, radios: Sequence[OneRadio], each: Sequence[Mapping[str,
         for number, (radio, stats) in enumerate(zip(radios, each, strict=True))
     }
     return {
-        "packets": {**counted, "dropped": dict(dropped)},
+        "packets": {**counted, "in": packets[0]["in"], "dropped": _merged(packets, "dropped")},
         "phy": each[bond.carries.index(True)]["phy"],
         "front_end": {"name": " and ".join(own), **parts},
         "airtime": {
-            **limited,
-            "transmits": any(stats["airtime"]["transmits"] for stats in each),
-            "sent_s": sum(stats["airtime"]["sent_s"] for stats in each),
-            "refused": dict(refused),
+            **tightest,
+            "transmits": any(account["transmits"] for account in accounts),
+            "sent_s": _sum(accounts, "sent_s"),
+            "refused": _merged(accounts, "refused"),
         },
         "radios": own,
     }
+
+
+def _sum(parts: Sequence[Mapping[str, Any]], name: str) -> Any:
+    return sum(part[name] for part in parts)
+
+
+def _merged(parts: Sequence[Mapping[str, Any]], name: str) -> dict[str, int]:
+    """Counts by reason, of all parts together."""
+    return dict(sum((Counter(part[name]) for part in parts), Counter()))

@@ -379,6 +379,10 @@ class RobotLink(Flowgraph):
         for stats in each:
             stats["phy"].update(self.source.rate())
             stats["packets"]["in"] = self.sink.handled
+        radios = each[0]
+        if self.bond is not None:
+            with self.end.lock:  # packets change it
+                radios = together(self.bond, self.radios, each)
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
@@ -386,6 +390,6 @@ class RobotLink(Flowgraph):
             "sink": self.sink.stats(),
             "peers": peers(self.end, self._clock()),
             "calls": {} if self.calls is None else self.calls.stats(),
-            **(each[0] if self.bond is None else together(self.bond, self.radios, each)),
+            **radios,
             "incomplete": self.incomplete(),
         }

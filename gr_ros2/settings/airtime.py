@@ -163,10 +163,9 @@ class AirtimeConfig:
         return rule if rule.duty_cycle < 1 or rule.max_burst_s else None
 
 
-def by_name(given: Any) -> Any:
-    """The settings of a band that is given by its name alone."""
+def _by_name(given: Any) -> Any:
     return {"band": given} if isinstance(given, str) else given
 
 
-Airtime = Annotated[AirtimeConfig, BeforeValidator(by_name)]
+Airtime = Annotated[AirtimeConfig, BeforeValidator(_by_name)]
 """The settings, or the name of a band alone."""

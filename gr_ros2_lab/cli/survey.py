@@ -14,8 +14,7 @@ import numpy as np
 
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import OrAuto
-from gr_ros2.cli.registry import SharedGraph
+from gr_ros2.cli.registry import shared_graph
 from gr_ros2.cli.status import find_link, pid_option, status_of
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.files import write_text, write_whole
@@ -23,8 +22,7 @@ from gr_ros2.core.watch import wait_until
 from gr_ros2.middleware import Middleware, Qos, join_graph
 from gr_ros2.middleware.type_definitions import DAMAGED
 from gr_ros2.observe.positions import humble_types
-from gr_ros2.settings.config import DEFAULT_MIDDLEWARE
-from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.fields import Auto
 from gr_ros2.wire import BROADCAST
 from gr_ros2_lab.report.survey_figure import GridPicture, survey_figure
 from gr_ros2_lab.survey.geojson import geojson
@@ -77,20 +75,7 @@ class NumberPair(click.ParamType):
 @click.option("--map", "grid", metavar="TOPIC", default="/map", show_default=True, help="Map below the figure.")
 @click.option("--every", type=click.FloatRange(0.1, 60), default=0.5, show_default=True, help="Seconds of one row.")
 @click.option("--duration", type=click.FloatRange(0, min_open=True), help="Seconds; default until Ctrl-C.")
-@click.option(
-    "--middleware",
-    default=DEFAULT_MIDDLEWARE,
-    show_default=True,
-    type=SharedGraph(),
-    metavar="NAME",
-    help="Of the robot's graph.",
-)
-@click.option(
-    "--domain-id",
-    default=AUTO,
-    type=OrAuto(click.IntRange(0, 232)),
-    help="Its ROS domain; default auto: ROS_DOMAIN_ID.",
-)
+@shared_graph("Of the robot's graph.")
 @pid_option
 def survey(
     *,
@@ -200,7 +185,7 @@ class _Drive:
                     row = self.recorder.look(status_of(self._pid), now)
                 if now >= kept + _KEEP_S:
                     kept = now
-                    write_whole(file, self.recorder.rows, lambda rows, path: write_table(path, rows))
+                    write_whole(file, self.recorder.rows, write_table)
                 if row is not None and now >= said + LOG_S:
                     said = now
                     console.print(_line(row), soft_wrap=True)
@@ -240,7 +225,7 @@ def _show(file: Path, rows: list[SurveyRow], picture: GridPicture | None, origin
     """Write what follows from the rows, and say what they tell."""
     console = make_console()
     made = Survey(str(file), rows)
-    write_whole(file, rows, lambda content, path: write_table(path, content))
+    write_whole(file, rows, write_table)
     drawn = file.with_suffix(".png")
     write_whole(drawn, survey_figure(made, rows, picture), lambda figure, path: figure.savefig(path, format="png"))
     written = [str(file), str(drawn)]

@@ -29,7 +29,7 @@ class TracedPaths(FixedPaths):
 
     def __init__(self, paths: Paths, traces: dict[tuple[int, int], ChannelTrace], *, levels: bool) -> None:
         super().__init__(paths)
-        self._traces, self._count_levels, self._begin_s = traces, levels, 0.0
+        self._traces, self._counts_levels, self._begin_s = traces, levels, 0.0
         with_snr = levels and any(trace.snr_db is not None for trace in traces.values())
         self.moves = "channel.trace" if with_snr else ""
         self.surveyed = with_snr
@@ -56,12 +56,12 @@ class TracedPaths(FixedPaths):
 
     def _acts(self, trace: ChannelTrace) -> bool:
         """Whether a trace loses or delays whole packets."""
-        by_level = self._count_levels and trace.snr_db is not None
+        by_level = self._counts_levels and trace.snr_db is not None
         return trace.capacity is not None or (trace.loss is not None and not by_level)
 
     def _levels_of(self, sender: int) -> TraceLevels:
         paths = [self.path(sender, receiver) for receiver in self.reached(sender)]
-        told = [(path, self._traces.get((sender, path.receiver)) if self._count_levels else None) for path in paths]
+        told = [(path, self._traces.get((sender, path.receiver)) if self._counts_levels else None) for path in paths]
         return TraceLevels(told, self.robots, LEAST_DB)
 
 

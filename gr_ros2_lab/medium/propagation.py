@@ -13,12 +13,11 @@ import numpy as np
 
 from gr_ros2.core.arrays import Floats
 from gr_ros2.settings.config import ScenarioChannel
+from gr_ros2_lab.survey.fit import NEAR_M
 
 LIGHT_M_S = 299_792_458.0
 THERMAL_DBM_HZ = -174.0
 """Noise of a resistor at 290 K, dBm in a band of 1 Hz."""
-NEAR_M = 1.0
-"""Distance from which on the models hold; nearer robots count as this far apart."""
 _WAVES = 128
 """Sinusoids of which shadowing is made. With 128 the standard deviation of a field over 500 m x 500 m is the set one
 within 4 % (one sigma), as measured over 200 fields."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from multiprocessing import get_context
 from statistics import fmean
@@ -35,6 +35,7 @@ from gr_ros2.settings.config import ChannelConfig, SendOptions, replaced
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry, Topic, options_of
 from gr_ros2.settings.robot import RobotConfig
+from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.medium.loss_table import LossCurve
 from gr_ros2_lab.medium.measured import SurveyedPlaces
 from gr_ros2_lab.medium.positions import Positions
@@ -291,7 +292,8 @@ class Planner:
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process: without what was found here so far."""
-        return {**vars(self), "_remembering": None, "_now": None, "_begun": None}
+        kept = {name: value for name, value in vars(self).items() if name != "_around"}
+        return {**kept, "_remembering": None, "_now": None, "_begun": None}
 
     def begin(self) -> None:
         """Have other processes try all changes from the first :meth:`forecast` on, for :meth:`advice`."""
@@ -314,7 +316,7 @@ class Planner:
 
         None where levels do not follow from positions.
         """
-        around = surroundings(self._whole, self.phy.sample_rate)
+        around = self._around
         if not isinstance(around, Positions) or not self.phy.has_samples:
             return None
         curve = LossCurve(self.phy.on_mcs(0), ChannelConfig())
@@ -324,8 +326,11 @@ class Planner:
     @property
     def survey(self) -> Survey | None:
         """What says the channel between places; None where nothing was measured there."""
-        around = surroundings(self._whole, self.phy.sample_rate)
-        return around.survey if isinstance(around, SurveyedPlaces) else None
+        return self._around.survey if isinstance(self._around, SurveyedPlaces) else None
+
+    @cached_property
+    def _around(self) -> Surroundings:
+        return surroundings(self._whole, self.phy.sample_rate)
 
     def advice(
         self, lengths: bool = True, tell: Callable[[int, int], object] = lambda _done, _of: None

@@ -23,7 +23,7 @@ from gr_ros2_lab.survey.numbers import read_numbers
 
 CELL_M = 1.0
 """Edge of the cells in which rows become one point, m."""
-NEAR_M = 2.0
+SPREAD_M = 2.0
 """Standard deviation of the weight of a point over its distance, m: GPS is as exact."""
 _FIT_WEIGHT = 0.05
 """Weight of the fit beside the points around a place, each of weight 1 at most."""
@@ -75,7 +75,7 @@ NEEDED = ("x_m", "y_m", "their_x_m", "their_y_m", "packets", "lost")
 _MAY_LACK = ("latitude", "longitude", "snr_db", "age_s")
 
 
-def write_table(path: Path, rows: Iterable[SurveyRow]) -> None:
+def write_table(rows: Iterable[SurveyRow], path: Path) -> None:
     """Write rows as CSV."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -220,6 +220,6 @@ def _around(ends: Floats, values: Floats, here: Floats, there: Floats) -> Floats
     for number, other in enumerate(there):
         pair, back = np.concatenate((here, other)), np.concatenate((other, here))
         squares = np.minimum(((ends - pair) ** 2).sum(1), ((ends - back) ** 2).sum(1))
-        weights = np.exp(-squares / (2 * NEAR_M**2))
+        weights = np.exp(-squares / (2 * SPREAD_M**2))
         found[number] = (weights * values).sum() / (weights.sum() + _FIT_WEIGHT)
     return found

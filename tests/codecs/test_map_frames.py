@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pytest
@@ -36,6 +36,25 @@ def distinct(robot: Robot) -> list[bytes]:
 def sent_bytes(robot: Robot) -> int:
     """Bytes of maps that have left so far."""
     return sum(len(event.data) for event in robot.events if isinstance(event, SentPacket) and event.kind == "new")
+
+
+def costs_of(air: Air, robot: Robot, messages: Iterable[bytes], each_s: float) -> list[int]:
+    """Bytes that leave after each of some messages of a topic, one every so many s."""
+    costs = []
+    for message in messages:
+        robot.submit(0, message, air.now)
+        before = sent_bytes(robot)
+        air.run(air.now + each_s)
+        costs.append(sent_bytes(robot) - before)
+    return costs
+
+
+def joined(air: Air, kbit_s: float) -> Robot:
+    """A robot that comes late, 6 s after it has come."""
+    late = Robot(3, None, kbit_s)
+    air.robots.append(late)
+    air.run(air.now + 6)
+    return late
 
 
 @pytest.mark.parametrize("bad", [0, 3])
@@ -144,18 +163,10 @@ def test_a_latched_message_that_grows_costs_what_is_new(loss: float) -> None:
     messages, topic = PATHS, Topic(0, "plan", "nav_msgs/msg/Path", SendOptions(durability="transient_local"))
     planner, follower = Robot(1, Registry([topic]), 256), Robot(2, None, 256)
     air = Air(planner, follower, loss=loss)
-    costs = []
-    for message in messages:
-        planner.submit(0, message, air.now)
-        before = sent_bytes(planner)
-        air.run(air.now + 4)
-        costs.append(sent_bytes(planner) - before)
+    costs = costs_of(air, planner, messages, 4)
     assert distinct(follower) == messages
     assert max(costs[1:]) < costs[0] / 2
-    late = Robot(3, None, 256)
-    air.robots.append(late)
-    air.run(air.now + 6)
-    assert distinct(late) == messages[-1:]
+    assert distinct(joined(air, 256)) == messages[-1:]
     assert not follower.failed
 
 
@@ -164,19 +175,12 @@ def test_a_latched_cloud_that_grows_costs_what_is_new() -> None:
     clouds = [scenes.cloud(points[: 16 + 4 * n], number=n) for n in range(4)]
     topic = Topic(0, "points", CLOUD, SendOptions(durability="transient_local"))
     mapper, follower = Robot(1, Registry([topic]), 1000), Robot(2, None, 1000)
-    air, costs = Air(mapper, follower), []
-    for cloud in clouds:
-        mapper.submit(0, cloud, air.now)
-        before = sent_bytes(mapper)
-        air.run(air.now + 3)
-        costs.append(sent_bytes(mapper) - before)
+    air = Air(mapper, follower)
+    costs = costs_of(air, mapper, clouds, 3)
     assert distinct(follower) == clouds
     assert costs[0] < len(Zstd(level=9).compress(clouds[0], least=0)), "all of it, as any cloud"
     assert max(costs[1:]) < costs[0]
-    late = Robot(3, None, 1000)
-    air.robots.append(late)
-    air.run(air.now + 6)
-    assert distinct(late) == clouds[-1:]
+    assert distinct(joined(air, 1000)) == clouds[-1:]
 
 
 def test_a_path_that_is_not_latched_or_has_a_codec_is_a_message_as_any() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ pytest.importorskip("zmq", reason="needs pyzmq")
 from gr_ros2.codecs.grid import updated
 from gr_ros2.codecs.messages import GRID, GRID_UPDATE
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.radio.robot_link import RobotLink
 from tests.codecs import scenes
 from tests.domains import domain
 from tests.middleware.support import LATCHED
@@ -26,24 +29,32 @@ def box(value: int) -> bytes:
     return scenes.write(GRID_UPDATE, header=header, x=3, y=2, width=5, height=4, data=cells)
 
 
-def test_a_growing_map_crosses_as_what_changes_and_whole_to_a_late_robot(tmp_path: Path) -> None:
-    maps = list(scenes.exploring(5))
+@contextmanager
+def listened_to(folder: Path) -> Iterator[tuple[MemoryMiddleware, RobotLink, dict[int, list[bytes]]]]:
+    """The graph and the link of robot 1, and what comes of its map at robot 2, and at robot 3, whose link is not there
+    yet."""
     heard: dict[int, list[bytes]] = {2: [], 3: []}
     with (
         MemoryMiddleware(domain_id=domain(1)) as near,
         MemoryMiddleware(domain_id=domain(2)) as second,
         MemoryMiddleware(domain_id=domain(3)) as third,
-        robot(1, tmp_path, 2, 3) as one,
-        robot(2, tmp_path, 1),
+        robot(1, folder, 2, 3) as one,
+        robot(2, folder, 1),
     ):
         second.subscribe("/rx_robot_1/map", GRID, LATCHED, heard[2].append)
         third.subscribe("/rx_robot_1/map", GRID, LATCHED, heard[3].append)
+        yield near, one.link, heard
+
+
+def test_a_growing_map_crosses_as_what_changes_and_whole_to_a_late_robot(tmp_path: Path) -> None:
+    maps = list(scenes.exploring(5))
+    with listened_to(tmp_path) as (near, one, heard):
         mapper = near.advertise("/robot_1/map", GRID, LATCHED)
         for number, message in enumerate(maps):
             mapper.publish(message)
             wait_for(lambda number=number: len(heard[2]) == number + 1, "a map")
         assert heard[2] == maps
-        topic = one.link.source.stats()["topics"]["/robot_1/map"]
+        topic = one.source.stats()["topics"]["/robot_1/map"]
         assert topic["frames"]["frames"] == len(maps)
         with robot(3, tmp_path, 1):
             wait_for(lambda: heard[3], "the late robot")
@@ -53,16 +64,7 @@ def test_a_growing_map_crosses_as_what_changes_and_whole_to_a_late_robot(tmp_pat
 
 def test_maps_of_two_nodes_and_what_changes_of_one_reach_who_is_there_and_who_comes_late(tmp_path: Path) -> None:
     own, others = list(scenes.exploring(4)), list(scenes.exploring(2, 300))
-    heard: dict[int, list[bytes]] = {2: [], 3: []}
-    with (
-        MemoryMiddleware(domain_id=domain(1)) as near,
-        MemoryMiddleware(domain_id=domain(2)) as second,
-        MemoryMiddleware(domain_id=domain(3)) as third,
-        robot(1, tmp_path, 2, 3) as one,
-        robot(2, tmp_path, 1),
-    ):
-        second.subscribe("/rx_robot_1/map", GRID, LATCHED, heard[2].append)
-        third.subscribe("/rx_robot_1/map", GRID, LATCHED, heard[3].append)
+    with listened_to(tmp_path) as (near, one, heard):
         mapper, boxes = (
             near.advertise("/robot_1/map", GRID, LATCHED),
             near.advertise("/robot_1/map_updates", GRID_UPDATE, LATCHED),
@@ -73,7 +75,7 @@ def test_maps_of_two_nodes_and_what_changes_of_one_reach_who_is_there_and_who_co
         changed = updated(own[0], box(7))
         wait_for(lambda: heard[2][-1] == changed, "the map with a box that has changed")
         other = near.advertise("/robot_1/map", GRID, LATCHED)
-        topics = one.link.source.stats
+        topics = one.source.stats
         for number in (1, 2, 3):
             mapper.publish(own[number])
             wait_for(lambda number=number: own[number] in heard[2], "a map")

@@ -82,7 +82,7 @@ def test_a_drive_with_a_known_path_loss_returns_its_exponent(rows: list[SurveyRo
 
 
 def test_a_scenario_with_the_survey_as_its_channel_repeats_the_losses(rows: list[SurveyRow], tmp_path: Path) -> None:
-    write_table(tmp_path / "survey.csv", rows)
+    write_table(rows, tmp_path / "survey.csv")
     again = driven(scenario({"trace": str(tmp_path / "survey.csv")}))
     assert lost(again) == pytest.approx(lost(rows), abs=0.04)
     windows = [(t, t + 15.0) for t in range(0, 90, 15)]
@@ -93,7 +93,7 @@ def test_a_scenario_with_the_survey_as_its_channel_repeats_the_losses(rows: list
 
 def test_holes_are_filled_by_the_path_loss(rows: list[SurveyRow], tmp_path: Path) -> None:
     """Another drive, through other places: the levels are those of the true path loss."""
-    write_table(tmp_path / "survey.csv", rows)
+    write_table(rows, tmp_path / "survey.csv")
     truth, told = (
         surroundings(scenario(channel, seed=8), 1e5) for channel in (FAR, {"trace": str(tmp_path / "survey.csv")})
     )
@@ -104,7 +104,7 @@ def test_holes_are_filled_by_the_path_loss(rows: list[SurveyRow], tmp_path: Path
 
 
 def test_a_plan_takes_the_survey_and_says_the_error_of_its_fit(rows: list[SurveyRow], tmp_path: Path) -> None:
-    write_table(tmp_path / "survey.csv", rows)
+    write_table(rows, tmp_path / "survey.csv")
     planner = Planner(scenario({"trace": str(tmp_path / "survey.csv")}, duration_s=30))
     (topic,) = planner.forecast().topics
     assert topic.result.pdr is not None
@@ -124,7 +124,7 @@ def row(x: float, **values: Any) -> SurveyRow:
 
 def test_losses_count_where_the_phy_has_no_level(tmp_path: Path) -> None:
     """Nothing crosses from 30 m on; a radio that knows no SNR has measured it."""
-    write_table(tmp_path / "survey.csv", [row(float(x), lost=90.0 if x >= 30 else 0.0) for x in range(1, 60)])
+    write_table([row(float(x), lost=90.0 if x >= 30 else 0.0) for x in range(1, 60)], tmp_path / "survey.csv")
     survey = Survey("survey", read_table(tmp_path / "survey.csv"))
     here = np.zeros(2)
     assert survey.loss_between(here, np.array([10.0, 0.0])) < 0.1
@@ -203,5 +203,5 @@ def test_rows_are_what_was_heard(tmp_path: Path) -> None:
     (made,) = recorder.finish()
     assert (made.robot, made.snr_db, made.rate_hz, made.age_s, made.loss) == (4, 12.0, 8.0, 0.2, 0.2)
     assert (made.their_x_m, made.their_y_m) == (0.0, 0.0), "it stands where this one set out"
-    write_table(tmp_path / "one.csv", [replace(made, latitude=48.5, longitude=9.25)])
+    write_table([replace(made, latitude=48.5, longitude=9.25)], tmp_path / "one.csv")
     assert read_table(tmp_path / "one.csv")[0].latitude == 48.5
