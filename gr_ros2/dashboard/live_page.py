@@ -31,6 +31,7 @@ from bokeh.models import (
     Range1d,
     Slider,
     Toggle,
+    VSpan,
 )
 from bokeh.plotting import figure
 from jinja2 import Environment, FileSystemLoader
@@ -402,9 +403,10 @@ class LivePage:
             if name == "pdr":
                 plot.hspan(y=GOOD, line_color=_SOFT, line_dash="dotted")
             plots.append(plot)
+        mark = VSpan(x="t", line_color=_SOFT, line_dash="dashed")
         since_start = [plot for plot in plots if plot.below[0].axis_label == "time [s]" and plot is not strip]
         for plot in since_start:
-            plot.vspan("t", source=sources["changes"], line_color=_SOFT, line_dash="dashed")
+            plot.add_glyph(sources["changes"], mark)
         channel = column(
             *(self._silence, self._noise, self._snr, self._offset, self._loss, self._html["note"]),
             name="channel",

@@ -111,6 +111,13 @@ class LinkConfig(AirConfig, RobotConfig):
 
     conditions: ClassVar[Any] = (
         ActsWhere(("topics.*.via",), lambda link: bool(link.radios), f"{ONE_RADIO}; set radios, or leave it out"),
+        ActsWhere(("front_end",), lambda link: not link.radios, "with radios, each has its own; leave it out"),
+        ActsWhere(
+            ("medium",),
+            lambda link: not link.radios,
+            "slots are those of one channel, and several radios have one each; leave radios or medium out",
+        ),
+        ActsWhere(("record",), lambda link: not link.radios, "several radios have no signal in common; leave it out"),
     )
 
     @model_validator(mode="after")
@@ -144,15 +151,6 @@ class LinkConfig(AirConfig, RobotConfig):
             raise ValueError(f"radios: {len(names)} of 2 to {_MOST_RADIOS}; one alone is front_end")
         if len(set(names)) < len(names):
             raise ValueError(f"radios: two are called {max(names, key=names.count)!r}; give each a name of its own")
-        if self.front_end != {"name": "sim"}:
-            raise ValueError("front_end: with radios, each has its own; leave it out")
-        if self.medium != "exclusive":
-            raise ValueError(
-                f"medium = {self.medium!r}: slots are those of one channel, and several radios have one each; leave "
-                "radios or medium out"
-            )
-        if self.record:
-            raise ValueError("record: several radios have no signal in common; leave it out")
 
     @property
     def own_radios(self) -> tuple[OwnRadio, ...]:

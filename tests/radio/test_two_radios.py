@@ -142,7 +142,7 @@ def test_a_radio_that_is_pulled_and_plugged_in_carries_again(tmp_path: Path, clo
     [
         ({"radios": [{"front_end": {"name": "sim"}}]}, "1 of 2 to 4; one alone is front_end"),
         ({"radios": [{"front_end": {"name": "sim"}}] * 2}, "two are called 'sim'; give each a name of its own"),
-        ({"front_end": {"name": "udp"}}, "front_end: with radios, each has its own"),
+        ({"front_end": {"name": "udp"}}, "front_end = {'name': 'udp'}: with radios, each has its own"),
         ({"medium": "slots"}, "several radios have one each"),
         ({"radios": [], "topics": {"odom": {"via": "all"}}}, "topics.odom.via = 'all': a robot with one radio"),
         ({"record": "samples"}, "several radios have no signal in common"),

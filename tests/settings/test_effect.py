@@ -38,6 +38,7 @@ BASE: Mapping[type[Any], Mapping[str, Any]] = {
     MediumConfig: {"phy": {"sample_rate": 1e6}, "robots": ROBOTS},
 }
 TWO = {"time": "packets"}
+TWO_RADIOS = [{"name": name, "front_end": {"name": "sim"}} for name in ("one", "two")]
 PLACED = {"channel": {"from": "positions"}}
 COMPRESSES = "set compression: true, or leave it out"
 CAMERA: dict[str, Any] = {"size": "full", "fps": 5.0, "output": "FFMPEGPacket"}
@@ -97,9 +98,12 @@ IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
     (LinkConfig, "topics.*.via"): (
         {"topics": {"odom": {"via": "all"}}},
         {},
-        {"radios": [{"name": name, "front_end": {"name": "sim"}} for name in ("one", "two")]},
+        {"radios": TWO_RADIOS},
         "set radios",
     ),
+    (LinkConfig, "front_end"): ({"front_end": {"name": "udp"}}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave it out"),
+    (LinkConfig, "medium"): ({"medium": "slots"}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave radios or medium out"),
+    (LinkConfig, "record"): ({"record": "heard"}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave it out"),
     (Scenario, "controller"): (
         {"controller": "ros"},
         {},
