@@ -247,6 +247,12 @@ class FrameSender:
             self._end(before.topic_id, sent.chains.values(), "the topic's options changed before the air was free")
             self._frames.end(before.topic_id)
 
+    def stop(self, topic_id: int) -> None:
+        """Send no further frame of a topic, until it is added again; then a key frame comes first."""
+        self._updates.pop(topic_id, None)
+        if (sent := self._sent.pop(topic_id, None)) is not None:
+            self._end(topic_id, sent.chains.values(), "nobody wanted the topic any more")
+
     def forget(self, topic_id: int) -> None:
         """Send no message of a topic so far to those who come."""
         if topic_id in self._sent and (sent := self._sent[topic_id]).is_map:

@@ -158,6 +158,10 @@ class OpenMessages(MessageSide, Protocol):
     def forget_kept(self, topic_id: int) -> None:
         """Send no message of a topic so far to robots that join late, because its publisher has changed its type."""
 
+    def stop(self, topic_id: int) -> None:
+        """Send nothing of a topic that waits, as nobody wants it any more. A message that has left in part leaves
+        whole."""
+
     def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
         """Code messages of a type by its definition, which was not known before, or another one.
 
@@ -271,6 +275,21 @@ class Questions(Protocol):
         """
 
 
+class AirMeter(Protocol):
+    """How much of the air an end uses.
+
+    :ivar on: whether it counts
+    """
+
+    on: bool
+
+    def free(self, now: float) -> float:
+        """bytes/s of further messages that fit beside what is sent; infinite where the air has no known rate."""
+
+    def cost(self, size: float) -> float:
+        """bytes that a message of so many bytes takes."""
+
+
 class Endpoint(PacketSide, Protocol):
     """An end, the same for every version of the wire format."""
 
@@ -335,6 +354,10 @@ class OpenEndpoint(Endpoint, Protocol):
 
     def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:
         """The topics of a robot by topic id, as far as it has announced them."""
+
+    @property
+    def used_air(self) -> AirMeter:
+        """How much of the air it uses."""
 
     @property
     def questions(self) -> Questions:

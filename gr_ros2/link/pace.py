@@ -96,6 +96,11 @@ class Pace:
         """
         return 1 / self._rate if self._rate else self._median
 
+    @property
+    def spacing(self) -> float:
+        """s from one packet to the next as the configured rate has it; 0 without one."""
+        return 1 / self._rate if self._rate else 0.0
+
     def sure_interval(self, now: float) -> float:
         """The same, but 0 where it was measured too seldom, or too long ago, to drop a message because of it."""
         recent_s = max(_RECENT_S, _INTERVALS * self._median)

@@ -37,6 +37,7 @@ from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.sending import SendingSide
+from gr_ros2.link.v1.used_air import UsedAir
 from gr_ros2.link.v1.writer import PacketWriter, room_of
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.table import AnnouncedTopic
@@ -68,6 +69,7 @@ class EndpointV1:
     :ivar pace: when packets may leave
     :ivar window: the packets that are worth repairing
     :ivar frames: its coded topics
+    :ivar used_air: how much of the air it uses
     :ivar neighbours: the robots that are heard
     :ivar pings: its questions to other robots, and its answers
     """
@@ -177,15 +179,19 @@ class EndpointV1:
             )
             messages.relayed_left, relaying.found = relaying.left, messages.found
         self.pings = self._sending.pings
+        self.used_air = UsedAir(
+            pace,
+            room=room,
+            turn_s=settings.turn_s,
+            any_length=settings.any_length,
+            share=settings.airtime_share,
+        )
         self.frames = SentFrames(
             messages.sent,
             messages,
             window.packets,
             window.peers,
-            pace,
-            room=room,
-            turn_s=settings.turn_s,
-            any_length=settings.any_length,
+            self.used_air,
             neighbours=neighbours.all,
             relayed=settings.relay,
         )
@@ -280,8 +286,8 @@ class EndpointV1:
         if sent is None:
             return None
         self.pace.left(now, waiting=True)
-        if self.frames.sent:
-            self.frames.left(sent, now)
+        if self.used_air.on:
+            self.used_air.left(sent, now)
         return sent
 
     def _may_begin(self, access: Access, now: float) -> bool:

@@ -7,32 +7,25 @@ frames costs nothing but its count.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from math import inf
 from typing import Protocol
 
-from gr_ros2.link.events import SentPacket
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.frames import LONG_S, FrameState
-from gr_ros2.link.pace import Pace
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbour
-from gr_ros2.link.v1.packing import ENTRY
 from gr_ros2.link.v1.peers import Peer, Peers
 from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.link.v1.sent_topics import SentTopic, SentTopics
-from gr_ros2.wire.v1 import Part
+from gr_ros2.link.v1.used_air import UsedAir
 
-WINDOW, WINDOW_S = 32, 2.0
-"""Packets, and s at least, over which the rate that other topics leave free is a mean."""
 _LEAST_FREE = 0.1
 """Part of the channel that coded topics may count on; else they would never learn that more is free."""
 SILENT_S, REPORTS = 0.5, 4
 """A robot is silent when no report has come for so many s, and for so many of its mean times between two."""
 FILLS_S = 1.0
 """s for which a frame says that more will come."""
-_FEW_S = 0.3
-"""s of a window at least, and at least one packet, so that the first ones do not stand for a rate."""
 
 
 class Outlet(Protocol):
@@ -59,10 +52,8 @@ class SentFrames:
     """The coded topics of one sender.
 
     :param packets, peers: what has left, and what reports tell of it
-    :param room: bytes of the longest body
-    :param turn_s: tells s from one packet to the next, 0 = not known
+    :param used: what of the air is used
     :param neighbours: the robots that are heard
-    :param any_length: whether packets are only as long as they need
     :param relayed: see :class:`gr_ros2.link.frames.FrameSide`
     :ivar sent: frames of each coded topic that have begun to leave or wait, until all who report have them
     """
@@ -73,21 +64,16 @@ class SentFrames:
         outlet: Outlet,
         packets: SentPackets,
         peers: Peers,
-        pace: Pace,
+        used: UsedAir,
         *,
-        room: int,
-        turn_s: Callable[[], float],
-        any_length: bool,
         neighbours: Mapping[int, Neighbour],
         relayed: bool,
     ) -> None:
         self.relayed = relayed
-        self._topics, self._outlet, self._packets, self._peers, self._pace = topics, outlet, packets, peers, pace
-        self._room, self._turn_s, self._any_length, self._neighbours = room, turn_s, any_length, neighbours
+        self._topics, self._outlet, self._packets, self._peers = topics, outlet, packets, peers
+        self._used, self._neighbours = used, neighbours
         self.sent: dict[int, deque[Message]] = {}
         self._ages: dict[int, float] = {}
-        self._others: deque[tuple[float, int]] = deque()
-        self._sum = 0
         self._submitted = -inf
         """When the newest frame came, s."""
 
@@ -95,6 +81,7 @@ class SentFrames:
         """Send frames of a topic from now on."""
         self._topics[topic_id].become_frames(output)
         self.sent.setdefault(topic_id, deque())
+        self._used.leave_out(topic_id)
         self._ages.setdefault(topic_id, 0.0)
         self._outlet.tabulate()
 
@@ -144,31 +131,10 @@ class SentFrames:
         if (neighbour := self._neighbours.get(src_id)) is not None:
             neighbour.lost_frames.add(topic_id)
 
-    def left(self, sent: SentPacket, now: float) -> None:
-        """A packet has left; told only once a topic is coded."""
-        others = len(sent.data) if self._any_length else self._room
-        if sent.kind == "new":
-            entries = [entry for entry in sent.packet.entries if isinstance(entry, Part)]
-            others = sum(len(part.payload) + ENTRY for part in entries if part.topic_id not in self.sent)
-        self._others.append((now, others))
-        self._sum += others
-        window_s = max(WINDOW_S, WINDOW * self._turn(now))
-        while self._others[0][0] < now - window_s:
-            self._sum -= self._others.popleft()[1]
-
     def _free(self, now: float) -> float:
         """bytes/s that other topics leave."""
-        turn_s = self._turn(now)
-        if not turn_s:
-            return inf
-        capacity = self._room / turn_s
-        if not self._others:
-            return capacity
-        return max(_LEAST_FREE * capacity, capacity - self._sum / max(now - self._others[0][0], _FEW_S, turn_s))
-
-    def _turn(self, now: float) -> float:
-        """s from one packet to the next, 0 = not known."""
-        return max(self._turn_s(), self._pace.sure_interval(now))
+        capacity = self._used.capacity(now)
+        return max(_LEAST_FREE * capacity, capacity - self._used.rate(now))
 
     @property
     def _reporting(self) -> list[Peer]:

@@ -244,6 +244,15 @@ class Outbox:
     def forget_kept(self, topic_id: int) -> None:
         self.kept.forget(topic_id)
 
+    def stop(self, topic_id: int) -> None:
+        queue = self.sent[topic_id].queue
+        waiting = [message for message in queue if not message.started]
+        for message in waiting:
+            queue.remove(message)
+        why = "nobody wanted the topic any more before it could start"
+        self.drop([Dropped(message, Fate.SUPERSEDED, why) for message in waiting])
+        self.kept.forget(topic_id)
+
     def queue(self, topic_id: int) -> tuple[QueuePolicy, float]:
         queue = self.sent[topic_id].queue
         return queue.policy, queue.deadline_s
