@@ -15,6 +15,9 @@ NO_DEADLINE = 0.0
 MAX_DEADLINE_S = 6553.5
 """The longest deadline that a request can carry."""
 
+OF_LINK = 240
+"""In place of a service: the link of the robot itself, which is asked for topics (:mod:`gr_ros2.calls.wish_frames`)."""
+
 _REQUEST, _REPLY = 0, 1
 _HEAD = Struct(">BBQI")
 _TAIL = Struct(">BH")
@@ -28,7 +31,7 @@ class CallFrame:
     :param dst_id: robot for which it is, 0..254
     :param dst_boot: start of that robot for which it is: any other start drops it
     :param number: number of the call among those of the robot that calls, from 1
-    :param service_id: topic id of the service in the table of the robot that is called; -1 in a reply
+    :param service_id: topic id of the service in the table of the robot that is called, or ``OF_LINK``; -1 in a reply
     :param deadline_s: s that the caller waits for the reply, to 0.1 s, 0..6553.5; ``NO_DEADLINE`` without limit
     :param payload: CDR message with encapsulation header
     """
@@ -52,7 +55,7 @@ def write_frame(frame: CallFrame) -> bytes:
     :raises EncodeError: a field out of range
     """
     fits = 0 <= frame.dst_id < 255 and 0 <= frame.dst_boot < 1 << 64 and 0 < frame.number < 1 << 32
-    if not fits or not -1 <= frame.service_id < 240 or not 0 <= frame.deadline_s <= MAX_DEADLINE_S:
+    if not fits or not -1 <= frame.service_id <= OF_LINK or not 0 <= frame.deadline_s <= MAX_DEADLINE_S:
         raise EncodeError(f"a field of {frame} is out of range")
     kind = _REQUEST if frame.is_request else _REPLY
     head = _HEAD.pack(kind, frame.dst_id, frame.dst_boot, frame.number)
@@ -78,6 +81,6 @@ def read_frame(data: bytes) -> CallFrame:
     if len(data) < _HEAD.size + _TAIL.size:
         raise EntryBoundsError(f"a request ends at byte {len(data)}")
     service_id, tenths = _TAIL.unpack_from(data, _HEAD.size)
-    if service_id >= 240:
+    if service_id > OF_LINK:
         raise EntryKindError(f"service {service_id} in a request")
     return CallFrame(dst_id, dst_boot, number, data[_HEAD.size + _TAIL.size :], service_id, tenths / _DEADLINES_PER_S)

@@ -18,7 +18,7 @@ numbers = {
 requests = st.builds(
     CallFrame,
     **numbers,
-    service_id=st.integers(0, 239),
+    service_id=st.integers(0, 240),
     deadline_s=st.integers(0, 65535).map(lambda tenths: tenths / 10),
 )
 replies = st.builds(CallFrame, **numbers)
@@ -55,7 +55,7 @@ def test_a_short_deadline_is_not_taken_for_none() -> None:
     [
         CallFrame(255, 1, 1, b""),
         CallFrame(1, 1, 0, b""),
-        CallFrame(1, 1, 1, b"", 240),
+        CallFrame(1, 1, 1, b"", 241),
         CallFrame(1, 1, 1, b"", 1, 6553.6),
         CallFrame(1, -1, 1, b""),
     ],
@@ -74,7 +74,7 @@ def test_what_does_not_fit_is_not_written(frame: CallFrame) -> None:
         ("0202000000000000000100000001", EntryKindError),
         ("01ff000000000000000100000001", EntryKindError),
         ("0102000000000000000100000000", EntryKindError),
-        ("0002000000000000000100000001f00000", EntryKindError),
+        ("0002000000000000000100000001f10000", EntryKindError),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(data: str, error: type[WireError]) -> None:

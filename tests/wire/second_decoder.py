@@ -7,6 +7,7 @@ has, and joins messages. It exists to find out whether the page says enough.
 from __future__ import annotations
 
 import hmac
+import struct
 from functools import cache
 from hashlib import sha256
 
@@ -500,3 +501,45 @@ def delivered(received: list[bytes]) -> list[bytes]:
         if not new or crc32(message) != crc32(new[-1]):
             new.append(message)
     return new
+
+
+def read_call(data: bytes) -> dict[str, object]:
+    """A frame of a call."""
+    head = {"robot": data[1], "start": int.from_bytes(data[2:10], "big"), "number": int.from_bytes(data[10:14], "big")}
+    if data[0] == 1:
+        return {**head, "payload": data[14:]}
+    assert data[0] == 0
+    return {**head, "service": data[14], "deadline": int.from_bytes(data[15:17], "big") / 10, "payload": data[17:]}
+
+
+def read_wish(data: bytes) -> dict[str, object]:
+    """What a link is asked; ValueError where it is to be refused."""
+    if data == b"\0":
+        return {"kind": "list"}
+    if not data or data[0] not in (1, 2):
+        raise ValueError("kind")
+    name = data[1 if data[0] == 2 else 7 :].decode()
+    if not 0 < len(name.encode()) < 256 or not name.isprintable():
+        raise ValueError("name")
+    if data[0] == 2:
+        return {"kind": "give up", "name": name}
+    rate, for_s = struct.unpack(">fH", data[1:7])
+    if not 0 <= rate <= 1e6 or not for_s:
+        raise ValueError("rate or time")
+    return {"kind": "want", "name": name, "rate": rate, "for_s": for_s}
+
+
+def read_wish_answer(data: bytes) -> dict[str, object]:
+    """What became of a wish."""
+    return dict(zip(("outcome", "rate", "cost", "free"), struct.unpack(">Bfff", data), strict=True))
+
+
+def read_offers(data: bytes) -> list[dict[str, object]]:
+    """What a robot offers."""
+    rows: list[dict[str, object]] = []
+    while data:
+        flags, rate, size, names, kinds = struct.unpack(">BffBB", data[:11])
+        name, kind, data = data[11 : 11 + names], data[11 + names : 11 + names + kinds], data[11 + names + kinds :]
+        row = {"name": name.decode(), "type_name": kind.decode(), "rate": rate, "size": size}
+        rows.append({**row, "wanted": bool(flags & 1), "fits": bool(flags & 2)})
+    return rows

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from runpy import run_path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
+from gr_ros2.calls.wish_frames import read_answer, read_offers, read_request
 from gr_ros2.core.errors import WireError
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.announced import AnnouncedTopics
@@ -247,6 +249,27 @@ def test_tables() -> None:
         data = bytes.fromhex(case["hex"])
         assert read_table(data) == tuple(AnnouncedTopic(**row) for row in case["rows"])
         assert second.read_table(data) == case["rows"]
+
+
+def test_wishes() -> None:
+    case = VECTORS["wishes"]
+    for number, asked in enumerate(case["requests"], 1):
+        frame = second.read_call(bytes.fromhex(asked["hex"]))
+        assert (frame["robot"], frame["number"], frame["service"], frame["deadline"]) == (2, number, 240, 30.0)
+        told = {key: value for key, value in asked.items() if key != "hex"}
+        assert second.read_wish(cast("bytes", frame["payload"])) == told
+        assert read_request(cast("bytes", frame["payload"]))
+    for answer in case["answers"]:
+        payload = cast("bytes", second.read_call(bytes.fromhex(answer["hex"]))["payload"])
+        assert second.read_wish_answer(payload) == {key: value for key, value in answer.items() if key != "hex"}
+        assert read_answer(payload).outcome == answer["outcome"]
+    offers = bytes.fromhex(case["offers"]["hex"])
+    assert second.read_offers(offers) == [asdict(row) for row in read_offers(offers)] == case["offers"]["rows"]
+    for text in case["refused"]:
+        with pytest.raises(ValueError):
+            second.read_wish(bytes.fromhex(text))
+        with pytest.raises(WireError):
+            read_request(bytes.fromhex(text))
 
 
 def test_rows_add_up_to_a_table() -> None:
