@@ -392,6 +392,7 @@ effects(
     graph=run("robots.0.graph.namespace=/robot_2"),
     registry=run("registry=odom.csv", "topics=[odom]"),
     services=Elsewhere("radio/test_found_services.py::test_services_can_be_left_to_the_robot"),
+    offer=Elsewhere("radio/test_asked_from_afar.py::test_who_may_ask_and_how_often_is_up_to_the_sender"),
     commands=run("commands=[]", OPTION + "cmd_vel={qos: auto}"),
     packet_len=run("packet_len=300"),
     key=run("key=fleet.key"),
@@ -751,6 +752,8 @@ def other(setting: Setting) -> Any:
         return "somewhere"
     if setting.name == "to":
         return 7
+    if setting.name == "offer":
+        return {"scan": {}}
     if isinstance(setting.default, bool):
         return not setting.default
     if isinstance(setting.default, tuple | dict):
@@ -773,7 +776,7 @@ OF_LINKS = [
     *("key", "seal", "state", "services", "commands", "beacon_s", "repair", "expected_loss", "hold_s", "max_age_s"),
     *(f"topics.odom.{name}" for name in ("queue", "deadline_s", "weight", "max_rate", "max_age_s", "keep_s", "to")),
     *("topics.odom.instance", "topics.odom.camera", "topics.odom.depth_image"),
-    *("publish.topics.odom.deadline_s", "publish.topics.odom.max_age_s", "compression"),
+    *("publish.topics.odom.deadline_s", "publish.topics.odom.max_age_s", "compression", "offer"),
 ]
 """Settings of a robot that the paper's blocks do not have."""
 

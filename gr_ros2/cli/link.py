@@ -9,13 +9,15 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import click
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from rich.console import Console
 from rich.live import Live
 
+from gr_ros2.calls.wish_frames import MOST_RATE
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option, foxglove_option, foxglove_server
@@ -23,7 +25,7 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import BackendName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.ping import check
-from gr_ros2.cli.status import PING, SET, STATUS, airtime_words, tables
+from gr_ros2.cli.status import OFFERS, PING, SET, STATUS, WANT, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.guard import Guard
@@ -171,6 +173,17 @@ class _Asked:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class _Wish:
+    """What is done about a topic of another robot."""
+
+    robot: RobotId
+    topic: str
+    how: Literal["want", "give_up", "look"]
+    rate: Annotated[float, Field(ge=0, le=MOST_RATE, allow_inf_nan=False)] = 0.0
+    for_s: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 60.0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class _Changes:
     """Settings to change, each a name and a value."""
 
@@ -190,7 +203,25 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
     def change(asks: Any) -> list[str]:
         return [live.change(name, value) for name, value in build(_Changes, {"changes": asks}, SET).changes]
 
-    return {STATUS: lambda _: {**running.stats(), "findings": running.findings()}, PING: ping, SET: change}
+    def offers(asks: Any) -> dict[str, Any]:
+        asked = build(_Asked, asks, OFFERS)
+        return running.wishes.offers(asked.robot, anew=asked.anew)
+
+    def want(asks: Any) -> dict[str, Any]:
+        wish = build(_Wish, asks, WANT)
+        if wish.how == "want":
+            running.wishes.want(wish.robot, wish.topic, wish.rate, wish.for_s)
+        elif wish.how == "give_up":
+            running.wishes.give_up(wish.robot, wish.topic)
+        return running.wishes.wish(wish.robot, wish.topic)
+
+    return {
+        STATUS: lambda _: {**running.stats(), "findings": running.findings()},
+        PING: ping,
+        SET: change,
+        OFFERS: offers,
+        WANT: want,
+    }
 
 
 def _switch(running: RobotLink, on: bool) -> None:

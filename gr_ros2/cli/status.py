@@ -18,7 +18,7 @@ from gr_ros2.cli.control_socket import request, running_programs
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.settings.files import parse_override
 
-STATUS, PING, SET = "status", "ping", "set"
+STATUS, PING, SET, OFFERS, WANT = "status", "ping", "set", "offers", "want"
 """Questions to the control socket of a link."""
 _EVERY_S = 0.5
 
@@ -39,6 +39,7 @@ def tables(stats: Stats) -> Group:
         _topic_table(stats),
         *_made(stats),
         *radio_words(stats),
+        *_wishes(stats),
         *_air(stats),
         *_troubles(stats),
     )
@@ -114,6 +115,16 @@ def _topic_table(stats: Stats) -> Table | str:
 def _made(stats: Stats) -> list[str]:
     """What becomes of topics that are not sent as they are."""
     return [topic["frames"]["words"] for topic in stats["source"]["topics"].values() if topic["frames"]]
+
+
+def _wishes(stats: Stats) -> list[str]:
+    """What is asked for from afar."""
+    wishes = stats["wishes"]
+    held = [
+        f"robot {wish['robot']} wants {wish['topic']}" + (f" at {wish['rate']:g}/s at most" if wish["rate"] else "")
+        for wish in wishes.get("wanted", ())
+    ]
+    return held + [wish["words"] for wish in wishes.get("wants", ())]
 
 
 def _air(stats: Stats) -> list[str]:

@@ -2,7 +2,8 @@
 
 A service of this robot is announced while a server for it is on the source's graph, and no longer. A service that
 another robot announces gets a server of ours on the sink's graph, for exactly as long as the robot announces it and is
-heard. So a client here finds a server only while there is one over there.
+heard. So a client here finds a server only while there is one over there. The link itself is called too: it is asked
+for topics (:mod:`gr_ros2.gr.wishes`).
 
 Invariants: this class is a thin shell; the engine (:mod:`gr_ros2.calls`) decides, and the lock of the endpoint protects
 it; no endpoint on a graph is made, closed or written to while that lock is held.
@@ -13,12 +14,13 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, OutgoingFrame, Request, Service
+from gr_ros2.calls.frames import OF_LINK
 from gr_ros2.core.errors import ConfigError, GrRos2Error, MiddlewareError
 from gr_ros2.gr.found_topics import FoundTopics
 from gr_ros2.gr.live_end import LiveEnd
@@ -75,12 +77,16 @@ class LiveCalls:
         self._closed = False
         self._own: dict[int, Offer] = {}
         """The services of this robot by id."""
-        self._offered: dict[int, Offer] = {}
-        """The services of this robot whose server is there, by id."""
+        self._offered: dict[int, Offer] = {OF_LINK: Offer("this link", DEADLINE_S)}
+        """The services of this robot whose server is there, by id, and its link."""
+        self.on_link_call: Callable[[int, int, Request], None] = lambda _robot, _boot, _request: None
+        """Called when another robot, of this start, calls the link itself; must return at once."""
+        self.on_met: Callable[[int, int], None] = lambda _robot, _boot: None
+        """Called when a robot of this start is heard for the first time or again; must return at once."""
         self._clients: dict[int, ServiceClient] = {}
         for name, topic in source.subscriptions.services.items():
             self._offer(name, topic)
-        found.offer_with(self._offer_found)
+        found.offer_with(self._offer_found, self._withdraw)
         sink.share(self)
 
     def takes(self, event: ReceiverEvent) -> bool:
@@ -115,7 +121,7 @@ class LiveCalls:
             made, served = self._engine.waiting
             counters = self._engine.counters + self._counters
             refused = {why: n for (topic_id, why), n in self._end.sent.refused.items() if topic_id == self._topic_id}
-            offered = sorted(offer.name for offer in self._offered.values())
+            offered = sorted(offer.name for number, offer in self._offered.items() if number != OF_LINK)
         with self._changing:
             proxies = sorted(
                 self._name(src_id, self._robots[src_id].services[number]) for src_id, number in self._servers
@@ -159,6 +165,15 @@ class LiveCalls:
             )
         self._offer(name, topic)
 
+    def _withdraw(self, name: str) -> None:
+        """Offer a service no more."""
+        for topic_id in [number for number, offer in self._own.items() if offer.name == name]:
+            with self._changing:
+                client = self._clients.pop(topic_id, None)
+            if client is not None:
+                client.close()
+                self._server_changed(topic_id, False)
+
     def _server_changed(self, topic_id: int, there: bool) -> None:
         with self._lock:
             if there:
@@ -187,6 +202,36 @@ class LiveCalls:
                 self._robots[event.src_id] = _Robot(event.boot, {})
         else:
             self._change(event.src_id, here=True)
+        self.on_met(event.src_id, event.boot)
+
+    # ---- the link itself
+
+    def ask(self, robot: int, payload: bytes, take: Callable[[bytes], None], deadline_s: float) -> bool:
+        """Call the link of another robot; returns whether that robot is heard.
+
+        :param take: called with the reply, if one comes in time; must return at once
+        """
+        with self._changing:
+            known = self._robots.get(robot)
+        if known is None or not known.here:
+            return False
+        with self._lock:
+            now = self._clock()
+            self._messages.offer(self._topic_id, offered=True)
+            service = Service(robot, known.boot, OF_LINK, f"link of robot {robot}")
+            self._send(self._engine.call(service, take, payload, deadline_s=deadline_s, now=now), now)
+        return True
+
+    def answer(self, ticket: int, payload: bytes) -> None:
+        """Answer a call of this link."""
+        with self._lock:
+            self._messages.offer(self._topic_id, offered=True)
+        self._reply(ticket, payload)
+
+    def heard(self) -> list[int]:
+        """The robots that are heard."""
+        with self._changing:
+            return sorted(number for number, robot in self._robots.items() if robot.here)
 
     def _change(self, src_id: int, *, services: dict[int, Topic] | None = None, here: bool | None = None) -> None:
         """Make and close servers after a robot was heard, has become silent, or has announced other services."""
@@ -246,7 +291,12 @@ class LiveCalls:
             sender = event.src_id, self._robots[event.src_id].boot
             found = self._engine.receive(sender, event.payload, self._offered, self._clock(), event.age_s)
         try:
-            if isinstance(found, Request):
+            if isinstance(found, Request) and found.service_id == OF_LINK:
+                self.on_link_call(*sender, found)
+            elif isinstance(found, Answer) and found.service_id == OF_LINK:
+                assert callable(found.token)
+                found.token(found.payload)
+            elif isinstance(found, Request):
                 self._clients[found.service_id].call(found.ticket, found.payload)
             elif isinstance(found, Answer):
                 self._servers[found.robot, found.service_id].reply(found.token, found.payload)

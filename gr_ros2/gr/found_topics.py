@@ -1,20 +1,25 @@
 """What a robot finds on its ROS graph: topics and services that no registry names, and types of what it sends.
 
-Invariant: what cannot be sent or offered is said once.
+Invariants: what cannot be sent or offered is said once; what is only to be sent when somebody asks for it (``offer`` of
+the settings) is not subscribed before. One thread at a time changes what is sent.
 """
 
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.gr.offers import OpenTopic
 from gr_ros2.gr.subscriptions import OpenSubscriptions
 from gr_ros2.gr.topic_search import TopicSearch
 from gr_ros2.middleware import Middleware, TopicInfo
 from gr_ros2.middleware.services import OTHER_RMW, ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.settings.registry import DEFAULT_OPTIONS, MAX_TOPICS, NewTopic, Topic, options_of
+from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.registry import DEFAULT_OPTIONS, MAX_TOPICS, NewTopic, Topic, normalize_type, options_of
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.settings.service_rows import ServiceRow, is_service, parts, rows_of
 from gr_ros2.settings.topic_choice import TopicChoice
@@ -25,6 +30,8 @@ class FoundTopics:
 
     :param subscriptions: takes what is found
     :ivar choice: the topics and services that are looked for
+    :ivar offers: what may be asked for, by its name without leading slash. The mapping is replaced as a whole
+    :ivar asked: absolute names of what is sent or offered because somebody has asked for it
     :ivar offered: absolute names of the services, actions and nodes that were found and chosen
     :ivar left_out: what cannot be sent or offered
     :ivar not_offered: services that cannot be called because of the RMW of their nodes; only the first one is logged
@@ -34,25 +41,31 @@ class FoundTopics:
         self, config: RobotConfig, middleware: Middleware, subscriptions: OpenSubscriptions, log: logging.Logger
     ) -> None:
         self.choice = TopicChoice(() if subscriptions.registry else config.words, config.namespace)
+        self.offers: dict[str, OpenTopic] = {}
+        self.asked: set[str] = set()
         self.offered: set[str] = set()
         self.left_out: set[str] = set()
         self.not_offered: set[str] = set()
         self._config, self._middleware, self._subscriptions, self._log = config, middleware, subscriptions, log
+        self._open_to = TopicChoice(tuple(config.offer), config.namespace)
         self._offer: Callable[[str, Topic], None] | None = None
+        self._withdraw: Callable[[str], None] = lambda _: None
+        self._changing = threading.Lock()
         self._full = False
         """Whether a topic was not sent because there are too many. Only the first one is logged."""
         self._searches: list[TopicSearch | TypeSearch] = []
 
-    def offer_with(self, offer: Callable[[str, Topic], None]) -> None:
+    def offer_with(self, offer: Callable[[str, Topic], None], withdraw: Callable[[str], None]) -> None:
         """Look for services too, from the next start on, unless ``services`` of the settings is false.
 
         :param offer: called with the name of each service on the ROS graph and its row, from a thread of the search
+        :param withdraw: called with the name of a service that is offered no more, from the thread that ends it
         """
-        self._offer = offer if self._config.services else None
+        self._offer, self._withdraw = offer if self._config.services else None, withdraw
 
     def start(self) -> None:
         """Look periodically."""
-        if self.choice:
+        if self.choice or self._open_to:
             self._searches.append(TopicSearch(self._middleware, self._found, services=self._offer is not None))
         if self._config.compression and isinstance(self._middleware, ServiceGraph):
             subscriptions = self._subscriptions
@@ -72,9 +85,52 @@ class FoundTopics:
             return [choice.everything]
         return unseen + self._subscriptions.unmatched()
 
+    def begin(self, offered: OpenTopic, rate: float) -> None:
+        """Send something that is offered, or send it with another rate.
+
+        :param rate: messages/s at most; 0 = as they come
+        :raises GrRos2Error: when it cannot be sent
+        """
+        with self._changing:
+            subscriptions, name = self._subscriptions, offered.on_graph
+            sent = subscriptions.subscribed.get(name)
+            if offered.info is None:
+                for row in offered.rows:
+                    if not self._is_offered(row):
+                        self._add_services(offered.name, row, self._config.offer)
+            elif sent is not None and sent.type_name == normalize_type(offered.type_name):
+                subscriptions.use(name, offered.at(rate))
+            else:
+                subscriptions.add(offered.name, offered.info, offered.at(rate))
+            self.asked.add(name)
+
+    def end(self, offered: OpenTopic) -> None:
+        """Send it no more."""
+        with self._changing:
+            names = [name for row in offered.rows for name in parts(row.name, row.kind)] or [offered.on_graph]
+            services = [name for name in names if name in self._subscriptions.services]
+            self._subscriptions.remove(names)
+            self.offered.difference_update(row.name for row in offered.rows)
+            self.asked.discard(offered.on_graph)
+            for name in services:
+                self._withdraw(name)
+
     def _found(self, infos: Sequence[TopicInfo], services: Mapping[str, str]) -> None:
         """Send the topics of the graph that are chosen and not sent yet, or have another type now; likewise the
         services."""
+        uncallable = (
+            self._middleware.uncallable() if services and isinstance(self._middleware, ServiceGraph) else frozenset()
+        )
+        rows = rows_of(services)
+        with self._changing:
+            self._send(infos)
+            self._offer_services(rows, uncallable)
+            if self._open_to:
+                self.offers = self._open(
+                    infos, [row for row in rows if uncallable.isdisjoint(parts(row.name, row.kind))]
+                )
+
+    def _send(self, infos: Sequence[TopicInfo]) -> None:
         published = {(info.topic, info.type_name) for info in infos if info.publishers}
         for info in infos:
             sent = self._subscriptions.subscribed.get(info.topic)
@@ -87,10 +143,9 @@ class FoundTopics:
                 self._subscriptions.add(row_name, info)
             except GrRos2Error as error:
                 self._leave_out(info.topic, f"topic {info.topic} is not sent", error)
-        uncallable = (
-            self._middleware.uncallable() if services and isinstance(self._middleware, ServiceGraph) else frozenset()
-        )
-        for row in rows_of(services):
+
+    def _offer_services(self, rows: Sequence[ServiceRow], uncallable: frozenset[str]) -> None:
+        for row in rows:
             row_name = self.choice.row_name(row.name, hidden=row.of_node)
             if row_name is None or self._is_offered(row) or f"{row.name} {row.kind}" in self.left_out:
                 continue
@@ -100,9 +155,31 @@ class FoundTopics:
                 self.not_offered.add(row.name)
                 continue
             try:
-                self._add_services(row_name, row)
+                self._add_services(row_name, row, self._subscriptions.options)
             except GrRos2Error as error:
                 self._leave_out(f"{row.name} {row.kind}", f"{row.name} ({row.kind}) is not offered", error)
+
+    def _open(self, infos: Sequence[TopicInfo], rows: Sequence[ServiceRow]) -> dict[str, OpenTopic]:
+        """What may be asked for: what ``offer`` chooses and is not sent anyway."""
+        found: dict[str, OpenTopic] = {}
+        sent, subscriptions = self.asked, self._subscriptions
+        for info in infos:
+            name = self._open_to.row_name(info.topic)
+            anyway = self.choice.row_name(info.topic) or (
+                info.topic in subscriptions.subscribed and info.topic not in sent
+            )
+            if name and info.publishers and not anyway and not subscriptions.returns([info.topic]):
+                options = options_of(name, self._config.offer, DEFAULT_OPTIONS)
+                found[name.lstrip("/")] = OpenTopic(name, info.topic, info, options=options)
+        for row in rows:
+            name = self._open_to.row_name(row.name, hidden=row.of_node)
+            anyway = self.choice.row_name(row.name, hidden=row.of_node) or (
+                self._is_offered(row) and row.name not in sent
+            )
+            if name and not anyway and row.name not in {info.topic for info in infos}:
+                before = found.get(name.lstrip("/"), OpenTopic(name, row.name))
+                found[name.lstrip("/")] = replace(before, rows=(*before.rows, row))
+        return found
 
     def _leave_out(self, key: str, what: str, error: GrRos2Error) -> None:
         """Say once what cannot be sent; of what finds no room, only the first."""
@@ -118,9 +195,10 @@ class FoundTopics:
         services = self._subscriptions.services
         return any(name in services for name in names) or self._subscriptions.returns(names)
 
-    def _add_services(self, row_name: str, row: ServiceRow) -> None:
+    def _add_services(self, row_name: str, row: ServiceRow, options: Mapping[str, SendOptions]) -> None:
         """Offer the services of a row to other robots. The topics of an action are sent.
 
+        :param options: of single topics
         :raises ConfigError: for a row that cannot be offered, such as one more than a link carries
         """
         assert self._offer is not None
@@ -128,7 +206,7 @@ class FoundTopics:
         for name, type_name in parts(row.name, row.kind).items():
             if not self.choice.leaves_out(name):
                 part = row_name + name.removeprefix(row.name)
-                rows[name] = part, type_name, options_of(part, self._subscriptions.options, DEFAULT_OPTIONS)
+                rows[name] = part, type_name, options_of(part, options, DEFAULT_OPTIONS)
         if not any(is_service(type_name) for _, type_name, _ in rows.values()):
             raise ConfigError("topics leaves out all its services")
         services = self._subscriptions.add_services(rows)

@@ -25,6 +25,7 @@ from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.receiving import ReceivingBlock
 from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.gr.subscriptions import OpenSubscriptions
+from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.air import Air
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
@@ -94,12 +95,14 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     :param radios: over how many radios it sends and receives
     :ivar end: its endpoint; of a robot that receives its own packets, the one that receives
     :ivar calls: the services that cross the link; None where it goes one way, or topics leave no room for calls
+    :ivar wishes: topics asked for from afar; None likewise
     """
 
     source: SendingBlock
     sink: ReceivingBlock
     end: LiveEnd[Any]
     calls: LiveCalls | None = None
+    wishes: LiveWishes | None = None
 
     def __init__(self, config: RobotConfig, radios: int = 1) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
@@ -119,7 +122,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
-        for part in (self.calls, getattr(self, "source", None), getattr(self, "sink", None)):
+        for part in (self.wishes, self.calls, getattr(self, "source", None), getattr(self, "sink", None)):
             if part is not None:
                 part.close()
 
@@ -158,6 +161,10 @@ class RosLink(LinkBlock):
         known = registry if registry is not None else read_registry(config.registry)
         topics = known if config.sends else Registry.empty()
         calls = config.direction == "both" and not loops_back and (len(topics) < MAX_TOPICS or bool(topics.services))
+        if config.offer and not calls:
+            raise ConfigError(
+                "offer: nobody can ask over this link, which has no room or no way for calls; leave it out"
+            )
         air = air or Air(hears=config.direction == "both")
         self._start = start or start_of(config)
         heard = topics if registry is None else known
@@ -177,6 +184,7 @@ class RosLink(LinkBlock):
             self.sink = ReceivingBlock(config, published, self.end, self._graph, **common)
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
+                self.wishes = LiveWishes(config, self.end, self.calls, self.source.found, self._graph, clock=clock)
         except GrRos2Error:
             self.close()
             raise

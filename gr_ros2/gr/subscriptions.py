@@ -284,13 +284,16 @@ class OpenSubscriptions(Subscriptions):
     def add_services(self, found: Mapping[str, NewTopic]) -> dict[str, Topic]:
         """Announce services, and the topics of actions.
 
-        :param found: by names on the ROS graph
+        :param found: by names on the ROS graph; some may have been announced before
         :return: the services among them, by names on the ROS graph
         :raises ConfigError: for more than a link carries
         """
         with self._live.lock:
-            self.registry = self._messages.add(list(found.values()))
-            added = dict(zip(found, self.registry[-len(found) :], strict=True))
+            known = {(topic.name, topic.type_name) for topic in self.registry}
+            if new := [row for row in found.values() if row[:2] not in known]:
+                self.registry = self._messages.add(new)
+            rows = {(topic.name, topic.type_name): topic for topic in self.registry}
+            added = {name: rows[row[:2]] for name, row in found.items()}
             services = {name: topic for name, topic in added.items() if topic.is_service}
             topics = {name: topic for name, topic in added.items() if topic.is_topic}
             self.services = {**self.services, **services}
@@ -300,13 +303,15 @@ class OpenSubscriptions(Subscriptions):
             self._subscribe(name, topic)
         return services
 
-    def add(self, row_name: str, info: TopicInfo) -> None:
+    def add(self, row_name: str, info: TopicInfo, options: SendOptions | None = None) -> None:
         """Announce a topic of the graph, and subscribe it. It may be sent already, with a type that has no publisher
         any more.
 
+        :param options: None: those of the settings
         :raises ConfigError: for a topic that cannot be sent, such as one more than a link carries
         """
-        options, type_name = options_of(row_name, self.options, DEFAULT_OPTIONS), normalize_type(info.type_name)
+        options = options or options_of(row_name, self.options, DEFAULT_OPTIONS)
+        type_name = normalize_type(info.type_name)
         with self._live.lock:
             before = self.subscribed.get(info.topic)
             known = [topic for topic in self.registry if (topic.name, topic.type_name) == (row_name, type_name)]
@@ -328,6 +333,28 @@ class OpenSubscriptions(Subscriptions):
             self._log.warning("topic %s is %s now, was %s", info.topic, topic.type_name, before.type_name)
             self._unsubscribe(before)
         self._subscribe(info.topic, topic)
+
+    def use(self, name: str, options: SendOptions) -> None:
+        """Use other options of a topic that is sent, by its name on the ROS graph."""
+        with self._live.lock:
+            self._change(self.subscribed[name].topic_id, options)
+            self._live.work.notify()
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Send these no more, by their names on the ROS graph; their topic ids stay theirs."""
+        for name in names:
+            with self._live.lock:
+                topic = self.subscribed.get(name)
+                self.subscribed = {other: kept for other, kept in self.subscribed.items() if other != name}
+                self.services = {other: kept for other, kept in self.services.items() if other != name}
+            if topic is not None:
+                self._unsubscribe(topic)
+                with self._live.lock:
+                    self._messages.stop(self._now(topic.topic_id))
+                    if self.frames is not None:
+                        self.frames.stop(self._now(topic.topic_id))
+                self._log.info("topic %s is not sent any more: nobody wants it", name)
+        self._guard_loops()
 
     def returns(self, names: Iterable[str]) -> bool:
         """Whether a topic or service of the ROS graph has come by radio."""

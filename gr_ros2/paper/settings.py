@@ -34,7 +34,7 @@ _OF_TOPICS = (
 _WITHOUT = (
     *("key", "seal", "state", "services", "commands", "beacon_s", "repair", "expected_loss", "hold_s", "max_age_s"),
     *(f"topics.*.{name}" for name in _OF_TOPICS),
-    *("publish.topics.*.deadline_s", "publish.topics.*.max_age_s"),
+    *("publish.topics.*.deadline_s", "publish.topics.*.max_age_s", "offer"),
 )
 _WHY = "the paper's blocks have no such setting; leave it out"
 

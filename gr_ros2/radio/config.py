@@ -110,7 +110,11 @@ class LinkConfig(AirConfig, RobotConfig):
     """what the link says on ``/diagnostics`` (docs/how-to/ros2.md)"""
 
     conditions: ClassVar[Any] = (
-        ActsWhere(("topics.*.via",), lambda link: bool(link.radios), f"{ONE_RADIO}; set radios, or leave it out"),
+        ActsWhere(
+            ("topics.*.via", "offer.*.via"),
+            lambda link: bool(link.radios),
+            f"{ONE_RADIO}; set radios, or leave it out",
+        ),
         ActsWhere(("front_end",), lambda link: not link.radios, "with radios, each has its own; leave it out"),
         ActsWhere(
             ("medium",),

@@ -19,6 +19,7 @@ from typing import Any
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.watch import Watch
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
+from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import without_table
 from gr_ros2.link.observe import LinkObserver, Observers
@@ -37,6 +38,7 @@ from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.ros_side import RosSide
 from gr_ros2.radio.switch import TransmitSwitch
 from gr_ros2.radio.waiting import foreign, shortcut
+from gr_ros2.radio.wish_service import WishService
 from gr_ros2.settings.registry import Registry
 
 _STOP_S = 10.0
@@ -133,6 +135,9 @@ class RobotLink(Flowgraph):
         if isinstance(graph, ServiceGraph):
             switch = TransmitSwitch(graph, self.node_name, lambda on: self.transmit(on=on))
             self._stack.callback(switch.close)
+            if link.wishes is not None:
+                asking = WishService(graph, self.node_name, link.wishes)
+                self._stack.callback(asking.close)
         self._diagnostics: Diagnostics | None = None
         if config.diagnostics.period_s:
             self._diagnostics = Diagnostics(config.diagnostics, graph, self.node_name, self.stats, clock=self._clock)
@@ -325,6 +330,16 @@ class RobotLink(Flowgraph):
         return {**ping(self.end, robot, self._clock(), anew=anew), **self.source.rate()}
 
     @property
+    def wishes(self) -> LiveWishes:
+        """What is asked for from afar.
+
+        :raises ConfigError: where nobody can be asked
+        """
+        if self._ros.link.wishes is None:
+            raise ConfigError(f"link {self.config.name}: nobody can be asked over it; that needs direction: both")
+        return self._ros.link.wishes
+
+    @property
     def remark(self) -> str:
         """A remark for the person who starts the link; often empty."""
         if self.config.key:
@@ -373,8 +388,8 @@ class RobotLink(Flowgraph):
         return [*self._observers.incomplete(), *self.radio.incomplete()]
 
     def stats(self) -> dict[str, Any]:
-        """A snapshot: both blocks, calls of services, packets to and from the air, the PHY, the counters of the front
-        end, and :meth:`incomplete`."""
+        """A snapshot: both blocks, calls of services, wishes, packets to and from the air, the PHY, the counters of the
+        front end, and :meth:`incomplete`."""
         each = [one.stats() for one in self.radios]
         for stats in each:
             stats["phy"].update(self.source.rate())
@@ -390,6 +405,7 @@ class RobotLink(Flowgraph):
             "sink": self.sink.stats(),
             "peers": peers(self.end, self._clock()),
             "calls": {} if self.calls is None else self.calls.stats(),
+            "wishes": {} if self._ros.link.wishes is None else self._ros.link.wishes.stats(),
             **radios,
             "incomplete": self.incomplete(),
         }

@@ -78,7 +78,7 @@ class RosSide:
             relay=config.relay == "gain",
         )
         self.link = block(
-            config if sends else replace(config, topics={}),
+            config if sends else replace(config, topics={}, offer={}),
             air=air,
             loops_back=loops_back,
             middleware=self.graph,

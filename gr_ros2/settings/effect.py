@@ -47,7 +47,8 @@ def refuse_given(config: Any, settings: Iterable[str], why: str, where: str = ""
     """
     for name in settings:
         for given, value in _given(config, name):
-            raise ValueError(f"{where}{given} = {value!r}: {why}")
+            shown = ", ".join(map(str, value)) if isinstance(value, Mapping) else repr(value)
+            raise ValueError(f"{where}{given} = {shown}: {why}")
 
 
 def conditions_of(cls: type[Any]) -> list[ActsWhere]:

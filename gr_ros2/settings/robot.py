@@ -131,6 +131,11 @@ class RobotConfig:
     )
     """what it sends: names (with * and ?), or a mapping of names to options; auto = every topic of the registry,
     without one of its namespace on the graph; -NAME leaves out; [] = nothing"""
+    offer: Annotated[dict[str, SendOptions], BeforeValidator(topics_of), AfterValidator(_checked_topics)] = Field(
+        default_factory=dict
+    )
+    """what it sends when another robot asks for it, written as `topics`: topics, services and actions of its graph that
+    it does not send anyway; max_rate limits what may be asked for, to says who may"""
     publish: PublishConfig = Field(default_factory=PublishConfig)
     """how what it receives comes out"""
     graph: GraphConfig = Field(default_factory=GraphConfig)
@@ -179,14 +184,19 @@ class RobotConfig:
     """readable log of headers, topic ids and entries"""
     conditions: ClassVar[tuple[ActsWhere, ...]] = (
         ActsWhere(
-            ("seal", "max_age_s", "topics.*.max_age_s", "publish.topics.*.max_age_s"),
+            ("seal", "max_age_s", "topics.*.max_age_s", "offer.*.max_age_s", "publish.topics.*.max_age_s"),
             lambda robot: bool(robot.key),
             "nothing is sealed without a key; set key, or leave it out",
         ),
         ActsWhere(
-            tuple(f"topics.*.{option}" for option in CODING),
+            tuple(f"{part}.*.{option}" for part in ("topics", "offer") for option in CODING),
             lambda robot: robot.compression,
             "no message is coded without compression; set compression: true, or leave it out",
+        ),
+        ActsWhere(
+            ("offer",),
+            lambda robot: robot.direction == "both",
+            "nobody can ask over a link that goes one way; leave it out, or set direction: both",
         ),
         ActsWhere(
             ("expected_loss",),

@@ -104,6 +104,7 @@ class Scenario(Experiment, Traffic, AirConfig):
             lambda scenario: scenario.source != "sim",
             "the simulator plays no recording; leave it out, or set source: bag:PATH",
         ),
+        ActsWhere(("robots.*.offer",), lambda _: False, "nobody asks for topics in a run; leave it out"),
         ActsWhere(("robots.*.topics.*.via",), lambda _: False, f"{ONE_RADIO}; leave it out"),
         ActsWhere(("robots.*.state",), lambda _: False, "a run counts no starts of its robots; leave it out"),
         ActsWhere(

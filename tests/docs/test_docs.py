@@ -18,15 +18,20 @@ import pytest
 import yaml
 
 from gr_ros2.cli import main as command_line
+from gr_ros2.cli.console import console
+from gr_ros2.cli.dashboard import audience
+from gr_ros2.cli.link import _answers
 from gr_ros2.cli.main import LazyGroup, cli
+from gr_ros2.middleware import Qos
 from gr_ros2.radio.config import link_from
 from gr_ros2_lab.medium.process import load_medium
 from gr_ros2_lab.run.scenario import load_scenario, scenario_from
 from gr_ros2_lab.study.sweep.definition import load_sweep
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands
 from tests.once import once
+from tests.radio.calling_robots import Robots
 from tests.radio.sound_server import sound_server_or_skip
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_for
 
 LINK: dict[str, Any] = {
     "robot": "/robot_1",
@@ -256,6 +261,18 @@ def loudspeaker(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     server.stop()
 
 
+@pytest.fixture
+def one_of_two_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A link that hears robot 2, which offers a topic, and that commands find."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    robots = Robots(tmp_path, "", offer=["auto"])
+    with robots.stack, audience(None, console(), "robot 1", answers=_answers(robots.links[1])):
+        robots.graphs[1].advertise("/robot_2/scan", "sensor_msgs/msg/LaserScan", Qos("reliable", "volatile", 1))
+        wait_for(lambda: robots.links[2].source.found.offers, "the topic to be offered")
+        wait_for(lambda: robots.links[1].stats()["peers"], "robot 2 to be heard")
+        yield
+
+
 def fill(folder: Path) -> None:
     demo = ("run", "demo", "--duration", "2", "--no-report", "--set", "time=packets")
     here(*demo, "--out", "clean", folder=folder)
@@ -320,6 +337,8 @@ def test_every_command_runs(
         request.getfixturevalue("undrawn")
     if block.page == "docs/how-to/sound.md":
         request.getfixturevalue("loudspeaker")
+    if block.page == "docs/how-to/asked-from-afar.md":
+        request.getfixturevalue("one_of_two_robots")
     for other in blocks("yaml"):
         place, _, name = other.about.partition("=")
         if other.page == block.page and place == "file":

@@ -150,7 +150,7 @@ def test_of_services_that_cannot_be_called_one_line_says_what_to_set(caplog: pyt
     offered: list[str] = []
     with OfFastDds(domain_id=free_domains(1)[0]) as graph:
         running = Running(topics=["auto"], middleware=graph)
-        running.source.found.offer_with(lambda name, _: offered.append(name))
+        running.source.found.offer_with(lambda name, _: offered.append(name), offered.remove)
         with running:
             wait_for(lambda: len(running.source.found.not_offered) == 2, "both services to be found")
     assert not offered and not running.source.found.offered

@@ -20,12 +20,21 @@ class Robots:
 
     :param row: of the registry; '' for none
     :param topics: words with which both find topics and services on their graphs
+    :param offer: what the second sends when it is asked
     :param channel: impairments at both receivers
     """
 
     def __init__(
-        self, folder: Path, row: str, middleware: str = "memory", *, topics: Sequence[str] = (), **channel: Any
+        self,
+        folder: Path,
+        row: str,
+        middleware: str = "memory",
+        *,
+        topics: Sequence[str] = (),
+        offer: Any = (),
+        **channel: Any,
     ) -> None:
+        self._offer = offer
         self._folder, self._channel, self._middleware, self._topics = folder, channel, middleware, list(topics)
         self._registry = bool(row)
         self._domains = free_domains(2)
@@ -52,6 +61,7 @@ class Robots:
             "state": str(self._folder / f"state-{number}"),
             "robot": f"/robot_{number}",
             "topics": self._topics or ["auto"] * bool(values.get("registry", number == 2 and self._registry)),
+            "offer": self._offer if number == 2 else [],
             "graph": graph,
         }
         link = self.links[number] = RobotLink(link_from({**settings, **values}))

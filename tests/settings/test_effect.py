@@ -95,12 +95,16 @@ IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
         {},
         "leave it out",
     ),
-    (LinkConfig, "topics.*.via"): (
-        {"topics": {"odom": {"via": "all"}}},
-        {},
-        {"radios": TWO_RADIOS},
-        "set radios",
-    ),
+    **{
+        (LinkConfig, f"{part}.*.via"): (
+            {part: {"odom": {"via": "all"}}},
+            {},
+            {"radios": TWO_RADIOS},
+            "set radios",
+        )
+        for part in ("topics", "offer")
+    },
+    (Scenario, "robots.*.offer"): ({"robots": [{}, {"offer": ["scan"]}]}, {}, {}, "leave it out"),
     (LinkConfig, "front_end"): ({"front_end": {"name": "udp"}}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave it out"),
     (LinkConfig, "medium"): ({"medium": "slots"}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave radios or medium out"),
     (LinkConfig, "record"): ({"record": "heard"}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave it out"),
@@ -116,6 +120,7 @@ for cls in (ScenarioRobot, LinkConfig):
         ("seal", {"seal": "authenticate"}),
         ("max_age_s", {"max_age_s": 5.0}),
         ("topics.*.max_age_s", {"topics": {"odom": {"max_age_s": 5.0}}}),
+        ("offer.*.max_age_s", {"offer": {"odom": {"max_age_s": 5.0}}}),
         ("publish.topics.*.max_age_s", {"publish": {"topics": {"odom": {"max_age_s": 5.0}}}}),
     ):
         IDLE[cls, name] = (given, {}, {"key": "fleet.key"}, "set key")
@@ -124,7 +129,9 @@ for cls in (ScenarioRobot, LinkConfig):
         "quantize": {"quantize": "pose=0.1"},
         **BY_TYPE,
     }.items():
-        IDLE[cls, f"topics.*.{option}"] = ({"topics": {"odom": given}}, {"compression": False}, {}, COMPRESSES)
+        for part in ("topics", "offer"):
+            IDLE[cls, f"{part}.*.{option}"] = ({part: {"odom": given}}, {"compression": False}, {}, COMPRESSES)
+    IDLE[cls, "offer"] = ({"offer": ["scan"]}, {"direction": "send"}, {}, "set direction: both")
     IDLE[cls, "expected_loss"] = ({"expected_loss": 0.5}, {"repair": "off"}, {"repair": "idle"}, "set repair to")
     IDLE[cls, "beacon_s"] = ({"beacon_s": 9.0}, {"direction": "send"}, {}, "set direction: both")
 for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
@@ -143,7 +150,7 @@ for cls, values in ((CameraOptions, CAMERA), (DepthOptions, DEPTH)):
         IDLE[cls, name] = ({name: value}, {"off": True}, {}, "leave off out")
 for name, value in {"range": 30.0, "keep": "rgb", "fit": True}.items():
     IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
-NEVER = {(Scenario, "robots.*.state"), (Scenario, "robots.*.topics.*.via")}
+NEVER = {(Scenario, f"robots.*.{name}") for name in ("state", "offer", "topics.*.via")}
 """Nothing makes them act."""
 
 
