@@ -264,6 +264,7 @@ def _live(running: RobotLink) -> LiveRun:
         received_as=running.sink.outputs.heard.name_of,
         announced=running.sink.outputs.heard.announced,
         alarms=running.same_numbers,
+        wishes=running.wishes if running.calls is not None else None,
         wants_key=partial(_key_frame, running),
     )
 

@@ -36,6 +36,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from jinja2 import Environment, FileSystemLoader
 
+from gr_ros2.dashboard.asked_card import AskedCard
 from gr_ros2.dashboard.monitor import RadioView, RunMonitor
 from gr_ros2.dashboard.tables import (
     alarms_html,
@@ -134,6 +135,7 @@ class LivePage:
         self._offset = _slider("offset", "carrier offset [1/1000 of the sample rate]", (-20, 20), 0)
         self._loss = _slider("loss", "packets lost [%]", (0, 100), 0)
         self._silence = Toggle(label=_SENDS, name="silence", button_type="danger", sizing_mode="stretch_width")
+        self._asked = AskedCard(monitor, style)
         self._listen()
         self._build(instance)
         self.draw(monitor.snapshot, monitor.radio)
@@ -172,7 +174,8 @@ class LivePage:
             self._draw_team(snapshot.team)
         self._draw_radio(radio)
         self._show_channel(radio)
-        empty = set(_empty_cards(snapshot, radio))
+        self._asked.draw(self._monitor.asked)
+        empty = set(_empty_cards(snapshot, radio)) | ({"asked"} if self._monitor.asked is None else set())
         waits = empty & (_FIRST if snapshot.phase == "waiting" else _FIRST - {"pdr"})
         self._counter.empty, self._counter.waits = " ".join(sorted(empty - waits)), " ".join(sorted(waits))
         self._counter.old = "constellation spectrum latency" if snapshot.old else ""
@@ -417,7 +420,7 @@ class LivePage:
         document.title = "gr-ros2 · live"
         texts = [text for name, text in self._html.items() if name != "note"]
         with document.models.freeze():  # otherwise the document walks through all models for every root
-            for root in (*plots, channel, self._pause, *texts):
+            for root in (*plots, channel, self._asked.root, self._pause, *texts):
                 document.add_root(root)
         document.template = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=False).get_template(
             "page.html.j2"

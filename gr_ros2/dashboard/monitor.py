@@ -6,9 +6,10 @@ all viewers see it. A setting that the link refuses changes nothing, and the rea
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from threading import Lock
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +22,7 @@ from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.dashboard.windows import RATE_S
 from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.observe.observers import Change, LiveLink, LiveRun
+from gr_ros2.observe.observers import Change, LiveLink, LiveRun, Wishes
 from gr_ros2.observe.result import RunResult
 from gr_ros2.settings.config import ChannelConfig
 
@@ -56,6 +57,18 @@ class RadioView:
     symbols: npt.NDArray[np.complex64] | None = None
 
 
+@dataclass(frozen=True)
+class AskedView:
+    """What is asked for from afar.
+
+    :param offers: what each robot that is heard offers, as far as it was asked and has answered
+    :param lines: the wishes of this robot, and those of others here, one line each
+    """
+
+    offers: Mapping[int, list[dict[str, Any]]]
+    lines: tuple[str, ...]
+
+
 class RunMonitor:
     """A :class:`gr_ros2.observe.observers.RunObserver` that keeps a snapshot for others to draw."""
 
@@ -65,6 +78,8 @@ class RunMonitor:
     def __init__(self) -> None:
         self.snapshot = Snapshot()
         self.radio = RadioView()
+        self.asked: AskedView | None = None
+        """None where nobody can be asked."""
         self.refused = ""
         """Why the last change to the channel was not made; '' if it was."""
         self._run: LiveRun | None = None
@@ -138,6 +153,10 @@ class RunMonitor:
         snr_db = links[0].snr_db if links else None
         late_s = max((_late_s(link.gate_lateness(), now) for link in links), default=0.0)
         snapshot = state.tick(now, queued, snr_db=snr_db, late_s=late_s, told=run.alarms())
+        if run.wishes is not None:
+            told = run.wishes.stats()
+            held = [f"robot {wish['robot']} wants {wish['topic']}" for wish in told["wanted"]]
+            self.asked = AskedView(run.wishes.known(), (*held, *(wish["words"] for wish in told["wants"])))
         self.snapshot = snapshot if run.team is None else replace(snapshot, team=run.team())
         if not links:
             return
@@ -160,6 +179,11 @@ class RunMonitor:
         """The current settings of the channel. After a run, its last settings; None before the first run."""
         run = self._run
         return self.radio.channel if run is None or not run.links else run.links[0].channel
+
+    @property
+    def wishes(self) -> Wishes | None:
+        """What asks other robots; None where nobody can be asked."""
+        return None if self._run is None else self._run.wishes
 
     def set_snr_db(self, snr_db: float | None) -> None:
         """Set the SNR of every link, dB; None = no noise."""

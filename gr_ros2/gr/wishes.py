@@ -92,7 +92,7 @@ class LiveWishes:
         self._held, self._own = HeldWishes(), OwnWishes()
         self._inbox: list[tuple[int, int, Request]] = []
         self._lists: dict[int, _List] = {}
-        self._asks: list[int] = []
+        self._asks: set[int] = set()
         """Robots that are to be asked what they offer."""
         self._told: dict[tuple[int, str], list[tuple[float, Told]]] = {}
         self._sent: dict[str, tuple[OpenTopic, float]] = {}
@@ -169,11 +169,18 @@ class LiveWishes:
         with self._due:
             if anew:
                 self._lists[robot] = _List([])
-                self._asks.append(robot)
+                self._asks.add(robot)
                 self._wake()
             told = self._lists.get(robot, _List([]))
             age_s = None if told.at == -inf else self._clock() - told.at
             return {"robot": robot, "age_s": age_s, "rows": [asdict(row) for row in told.rows]}
+
+    def known(self) -> dict[int, list[dict[str, Any]]]:
+        """What each robot that is heard offers, as far as it was asked and has answered."""
+        heard = self._calls.heard()
+        with self._due:
+            told = {robot: self._lists.get(robot, _List([])) for robot in heard}
+        return {robot: [asdict(row) for row in offers.rows] for robot, offers in told.items()}
 
     def stats(self) -> dict[str, Any]:
         """The wishes of this robot, and those of others here with what is sent for them."""

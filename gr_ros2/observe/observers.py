@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from gr_ros2.core.backlog import Backlog
 from gr_ros2.core.errors import RunError
@@ -85,6 +85,26 @@ class LiveLink(Protocol):
         """Probability from now on that a packet is dropped, 0..1."""
 
 
+class Wishes(Protocol):
+    """What asks other robots for topics: :class:`gr_ros2.gr.wishes.LiveWishes`. It raises a GrRos2Error where it
+    refuses."""
+
+    def known(self) -> Mapping[int, list[dict[str, Any]]]:
+        """What each robot that is heard offers, as far as it was asked and has answered."""
+
+    def offers(self, robot: int, *, anew: bool = False) -> Mapping[str, Any]:
+        """What a robot offers, which is asked now if ``anew``."""
+
+    def want(self, robot: int, name: str, rate: float = 0.0, for_s: float = 60.0) -> None:
+        """Want a topic of a robot, so many messages/s at most, for so many s."""
+
+    def give_up(self, robot: int, name: str) -> None:
+        """Want it no more."""
+
+    def stats(self) -> Mapping[str, Any]:
+        """The wishes of this robot, and those of others here."""
+
+
 class Change(NamedTuple):
     """What somebody has changed during a run.
 
@@ -117,6 +137,7 @@ class LiveRun:
     :param alarms: what is wrong with the robots that are heard, or with what lies between them, one line each
     :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
     :param wants_key: called where somebody has begun to watch a topic of a robot, by their ids, that is sent as frames
+    :param wishes: asks other robots for topics; None where nobody can be asked
     :param changed: told of each change that somebody makes while it runs
     """
 
@@ -136,6 +157,7 @@ class LiveRun:
     alarms: Callable[[], Sequence[str]] = tuple
     heard: frozenset[int] | None = None
     wants_key: Callable[[int, int], None] = lambda _src_id, _topic_id: None
+    wishes: Wishes | None = None
     changed: Callable[[Change], None] = lambda _: None
 
 
