@@ -53,11 +53,11 @@ from gr_ros2.wire.mac_block import (
     write_block,
 )
 
-LISTEN, QUIET, FRAMES = 24, 6, 2
+LISTEN, QUIET, FRAMES = 24, 4, 2
 """Slots for which a robot listens before it enters: two frames of those it hears, since each has announced its slots
 in one, but ``LISTEN`` at most; ``QUIET`` at least, and where nobody is heard. With a ``LISTEN`` of 12, one of 20 whose
 clock has jumped by 1 s may collide with others 5 s later; with a ``QUIET`` of 24, two robots hear each other after 31
-slots instead of 15 (median), 50 from cold after 521 instead of 548."""
+slots instead of 15 (median), 50 from cold after 521 instead of 548. With 3, it is the same as with 4."""
 HEARD = 210
 """Slots for which a robot that was heard counts as heard; more where robots send less than three times in them."""
 FILLED = 0.5
@@ -90,8 +90,11 @@ EASED = 0.97
 VAIN = 4
 """What v is multiplied by after an entry in vain. With 2, v stays near 2 while 50 robots enter from cold, most entries
 collide, and it takes 10 instead of 7.5 s on average; with 3 to 8 it is the same."""
-_FIRST_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 8.0, 4.0, 64.0, 64.0
-"""v at the start, after an entry (with 8 a grid of 5 × 4 is 3 % older), and the most that entries in vain make."""
+_FIRST_RATE, _NAMED_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 1.0, 4.0, 64.0, 64.0
+"""v at the start; of one that was alone and is named by the first robot it hears; after an entry (with 8 a grid of 5 ×
+4 is 3 % older); and the most that entries in vain make. With 8 at the start and 4 for one that is named (and a
+``QUIET`` of 6), the first message of two robots comes after 14 instead of 10 s where packets take half a second
+(``python -m bench first``), 50 robots from cold take as long. With 3 or 2 at the start, it is the same."""
 _NEVER = -1 << 40
 _SWEEP = 64
 _SILENT = 4096
@@ -465,7 +468,7 @@ class Slots:
             other = self._robots.get(name)
             if name == self.src_id:
                 self._confirmed_at = max(self._confirmed_at, slot)
-                self._rate = _ENTRY_RATE
+                self._rate = _NAMED_RATE if self._entered_at is None else _ENTRY_RATE
             elif other is not None and other.named == _NEVER:
                 other.named = self._turn(slot)  # one confirmation is enough
             elif name != NOBODY:

@@ -71,7 +71,7 @@ def test_the_demo_fades_behind_obstacles_and_shows_it(walked: Path) -> None:
 def test_in_slots_all_arrives_and_otherwise_little(walked: Path) -> None:
     slots, team = of(walked, "team")
     assert share(slots) == 1.0
-    assert not any(send.overlapped for send in team.sends)
+    assert not any(send.overlapped for send in team.sends if send.t > 1), "once all are in"
     at_once, team = of(walked, "at-once")
     assert share(at_once) < 0.5 * share(slots)
     assert sum(send.overlapped for send in team.sends) > 0.9 * len(team.sends)

@@ -281,6 +281,17 @@ def test_a_robot_that_was_alone_for_long_sends_soon_once_it_hears_somebody() -> 
     assert block.ahead[0] < 10
 
 
+def test_who_was_alone_and_is_named_by_the_first_robot_it_hears_sends_in_the_next_free_slot() -> None:
+    for seed in range(20):
+        made = robot(5, seed)
+        begin, _ = send(made, 1.0)
+        slot = made.clock.slot(begin + SLOT / 2) + 6
+        made.departure(begin + SLOT)
+        hear(made, 9, slot, Block(0, (1, 200), 1, (5, NOBODY)))
+        begin, _ = send(made, made.clock.begin(slot) + SLOT / 2)
+        assert made.clock.slot(begin + SLOT / 2) == slot + 2, "the other one has announced the first"
+
+
 def test_an_entrant_that_nobody_names_starts_over() -> None:
     made = robot(5)
     hear(made, 1, 60, Block(0, (200, 200), 2, (NOBODY, NOBODY)))
