@@ -5,6 +5,7 @@ clock expects by less than ``TOLERANCE`` moves it by ``GAIN`` of the difference,
 greater difference means that the other robot belongs to another group, or that a clock has jumped:
 
 - *Nobody can have followed this clock yet*: move.
+- *Nobody is heard in these slots, and the other robot hears somebody in its own*: move.
 - *A robot that did not agree before is ahead* (numbers are compared as on a circle): move to its slots, so that one of
   two groups moves and the other stays.
 - *Two robots that agreed before differ by the same, and nobody has agreed since*: this clock has jumped. Move.
@@ -94,12 +95,15 @@ class SlotClock:
         assert self._zero is not None
         return int((now - self._zero) // self.slot_s)
 
-    def heard(self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool = False) -> int | None:
+    def heard(
+        self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool = False, joins: bool = False
+    ) -> int | None:
         """Follow a packet of slot ``number`` mod 256 whose burst began at ``began`` s.
 
         :param trusted: it is no recording. Other packets move nobody who hears a robot that agrees
         :param checked: its trailer has been checked. A packet of which nothing is known only starts a clock that
             stands, which the first one that was checked moves
+        :param joins: it hears others, and this robot hears nobody in its own slots
         :return: its slot as this clock counts, None where it does not agree
         """
         checked = checked or trusted
@@ -122,9 +126,9 @@ class SlotClock:
         if not checked or began < self._stays_until:
             return None
         doubtful = self._doubtful or self._unsaid
-        if not doubtful and not self._moves(src_id, error, began, trusted=trusted):
+        if not (doubtful or joins) and not self._moves(src_id, error, began, trusted=trusted):
             return None
-        if error > 0 and not doubtful:
+        if error > 0 and not (doubtful or joins):
             self._stays_until = began + STAYS * self.slot_s
         self._zero += error * self.slot_s
         self.jumps += 1

@@ -385,7 +385,8 @@ class Slots:
         """Note a burst. Who says nothing about slots cannot be avoided."""
         if block is None or src_id == self.src_id or not (trusted or checked or not self.clock.agreeing(began)):
             return
-        slot = self._placed(src_id, block.slot, began, trusted=trusted, checked=checked)
+        joins = block.heard > 0 and not self._robots
+        slot = self._placed(src_id, block.slot, began, trusted=trusted, checked=checked, joins=joins)
         if slot is None:
             return
         first, second = block.ahead
@@ -436,10 +437,12 @@ class Slots:
             self._leave()
             self._rate = min(self._rate, _ENTRY_RATE)
 
-    def _placed(self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool) -> int | None:
+    def _placed(
+        self, src_id: int, number: int, began: float, *, trusted: bool, checked: bool, joins: bool
+    ) -> int | None:
         """The slot of a packet; None where its sender has other slots."""
         jumps = self.clock.jumps
-        slot = self.clock.heard(src_id, number, began, trusted=trusted, checked=checked)
+        slot = self.clock.heard(src_id, number, began, trusted=trusted, checked=checked, joins=joins)
         if self.clock.jumps > jumps:
             assert slot is not None
             self._elsewhere = dict.fromkeys(self._robots, began)

@@ -292,6 +292,17 @@ def test_who_was_alone_and_is_named_by_the_first_robot_it_hears_sends_in_the_nex
         assert made.clock.slot(begin + SLOT / 2) == slot + 2, "the other one has announced the first"
 
 
+@pytest.mark.parametrize("heard", [0, 1])
+def test_who_hears_nobody_in_its_own_slots_moves_to_those_of_a_robot_that_hears_others(heard: int) -> None:
+    made = robot(5)
+    begin, _ = send(made, 1.0)
+    slot = made.clock.slot(begin + SLOT / 2)
+    behind = Block((slot + 1) % 256, (20, 20), heard, (NOBODY, NOBODY))
+    made.hear(9, behind, made.clock.begin(slot + 1) + SLOT / 2)
+    assert made.clock.jumps == heard
+    assert (set(made._robots) == {9}) == bool(heard)
+
+
 def test_an_entrant_that_nobody_names_starts_over() -> None:
     made = robot(5)
     hear(made, 1, 60, Block(0, (200, 200), 2, (NOBODY, NOBODY)))
