@@ -32,7 +32,12 @@ class Early(NamedTuple):
 
 
 class Appeared(NamedTuple):
-    """Something of a robot came for the first time, or again after long."""
+    """Something of a robot came for the first time, or again after long.
+
+    :param knows: it has said that it has heard this start of this robot
+    """
+
+    knows: bool = False
 
 
 class PeerMet(NamedTuple):

@@ -106,8 +106,14 @@ class Hellos:
         """Whether hellos are still frequent."""
         return bool(self._starting)
 
-    def met(self, now: float) -> None:
-        """A start of a robot is heard for the first time: send it hellos, several because any of them may be lost."""
+    def met(self, now: float, *, knows: bool = False) -> None:
+        """A start of a robot is heard for the first time: send it hellos, several because any of them may be lost.
+
+        :param knows: it has opened a packet of this robot, so it has a hello
+        """
+        if knows and self._settings.slower > 1:
+            self._eager = EAGER
+            return
         self._starting = deque(now + after * self._settings.slower for after in STARTING_S[1:])
         self._eager = EAGER
         self.answer(now)

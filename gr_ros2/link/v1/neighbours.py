@@ -91,6 +91,8 @@ class Neighbour:
     """Whether it can prove when it sealed a packet: it hears this robot, and packets are sealed."""
     appeared_at: int = 0
     """How many packets had been opened when it appeared."""
+    knows: bool = False
+    """Whether it has said that it has heard this start of this robot, on a channel that others share."""
     silent: bool = False
     """Whether nothing of it has come for long."""
     repair_ids: dict[int, int] = field(default_factory=dict)

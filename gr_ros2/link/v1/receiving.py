@@ -212,6 +212,8 @@ class ReceivingSide:
         trusted = opened is not None and opened.trusted
         checked = opened is not None and (trusted or self.neighbours.proves_soon(opened.neighbour))
         access.hear(header.src_id, block, arrival.at, trusted=trusted, checked=checked)
+        if opened is not None and block is not None and self._settings.src_id in block.names:
+            opened.neighbour.knows = True
         if self.relaying is not None and trusted:
             self.relaying.heard(header.src_id, block, now)
 
@@ -294,7 +296,7 @@ class ReceivingSide:
             self._facts.append(PeerLeft(opened.replaced.src_id, ended=True))
             if self.relaying is not None:
                 self.relaying.started(opened.replaced, now)
-        self._facts.append(Appeared())
+        self._facts.append(Appeared(opened.neighbour.knows))
 
     def _meet(self, neighbour: Neighbour, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""

@@ -182,8 +182,8 @@ class SendingSide:
                 self.urgent = self.urgent or urgent or self.reports.requests.lacking
             case Reported(robot, number, report):
                 self._reported(robot, number, report, now)
-            case Appeared():
-                self._appeared(now)
+            case Appeared(knows):
+                self._appeared(now, knows=knows)
             case PeerMet(robot, proven, wanted):
                 self._window.peers.meet(robot, now)
                 if proven is not None:
@@ -225,13 +225,16 @@ class SendingSide:
         if self._rate is not None:
             self._rate.forget(robot)
 
-    def _appeared(self, now: float) -> None:
-        """A robot is heard for the first time, or again: kept messages are repeated soon, and hellos sent."""
+    def _appeared(self, now: float, *, knows: bool) -> None:
+        """A robot is heard for the first time, or again: kept messages are repeated soon, and hellos sent.
+
+        :param knows: it has heard this robot already
+        """
         if self._repeats > 1:
             self._repeats = 1
             self._plan_repeat(now)
         if self.settings.hears:
-            self.hellos.met(now)
+            self.hellos.met(now, knows=knows)
         if self.settings.shares and self.settings.slower > 1 and self._started:
             self._messages.kept.asked(TABLE_TOPIC, now)  # it lacks the table, and would say so some turns later
 
