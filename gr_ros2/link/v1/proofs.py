@@ -18,6 +18,10 @@ _ECHOES = 64
 """Hellos of this robot that can be echoed, and proofs kept of each other robot."""
 
 
+Start = tuple[int, int]
+"""A robot, and the boot number of one start of it."""
+
+
 class OwnHellos:
     """The newest hellos of this robot, by which others prove that they hear it.
 
@@ -28,12 +32,35 @@ class OwnHellos:
         self._own = own
         self._left: dict[bytes, float] = {}
         """When they left, by their ends."""
+        self._proving: dict[bytes, frozenset[Start]] = {}
+        """The starts of others of which each of them says that they were heard."""
+        self._told: dict[Start, float] = {}
+        """When the burst of the newest of them that says so began, s."""
 
-    def said(self, data: bytes, now: float) -> None:
-        """A hello leaves: from now on, other robots can prove that they have heard it."""
-        self._left[data[-ECHO_LEN:]] = now
+    def said(self, data: bytes, now: float, proving: frozenset[Start] = frozenset(), at: float | None = None) -> None:
+        """A hello leaves: from now on, other robots can prove that they have heard it.
+
+        :param proving: the starts of others of which it says that they were heard
+        :param at: when its burst begins, s; None for now
+        """
+        self._left[data[-ECHO_LEN:]], self._proving[data[-ECHO_LEN:]] = now, proving
+        self._told.update(dict.fromkeys(proving, now if at is None else at))
         if len(self._left) > _ECHOES:
-            del self._left[next(iter(self._left))]
+            oldest = next(iter(self._left))
+            del self._left[oldest], self._proving[oldest]
+        if len(self._told) > _ECHOES:
+            del self._told[next(iter(self._told))]
+
+    def knows(self, start: Start, entries: Sequence[EntryV1], since: float) -> bool:
+        """Whether a start of another robot has got the proof that it was heard, or could not have it yet.
+
+        :param entries: of its newest hello
+        :param since: what began after this time in s, it could not know of when it wrote this hello
+        """
+        if self._told.get(start, -inf) > since:
+            return True
+        echoes = [entry.echo for entry in entries if isinstance(entry, Heard) and entry.src_id == self._own]
+        return any(start in self._proving.get(echo, ()) for echo in echoes)
 
     def proofs(self, number: int, entries: Sequence[EntryV1], before: float) -> list[tuple[int, float]]:
         """What entries prove: packets of their sender above a number were sealed after a time in s.

@@ -273,7 +273,7 @@ class ReceivingSide:
         inbox = neighbour.inbox
         if repair.clear:
             neighbour.echo = arrival.data[-ECHO_LEN:], self._sent.newest
-            if neighbour.hello.capabilities & WANTS_PROOF:
+            if neighbour.hello.capabilities & WANTS_PROOF and not self._answered(neighbour, entries, now):
                 self._facts.append(ProofWanted())
         if not opened.trusted:
             if not repair.clear:
@@ -297,6 +297,14 @@ class ReceivingSide:
             if self.relaying is not None:
                 self.relaying.started(opened.replaced, now)
         self._facts.append(Appeared(opened.neighbour.knows))
+
+    def _answered(self, neighbour: Neighbour, entries: Sequence[EntryV1], now: float) -> bool:
+        """Whether a robot whose hello says that it lacks a proof means other robots, or an answer is under way."""
+        if self._access is None or self._settings.slower <= 1:
+            return False
+        began = neighbour.inbox.began
+        since = 2 * began - now - self._access.lead_s  # another packet took as long, and this one was written before
+        return self.neighbours.own_hellos.knows((neighbour.src_id, neighbour.boot), entries, since)
 
     def _meet(self, neighbour: Neighbour, now: float) -> None:
         """A robot is heard for the first time, or is heard again."""

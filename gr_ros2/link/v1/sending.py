@@ -301,7 +301,9 @@ class SendingSide:
             kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
         sent = self._writer.control(entries, "hello", now, clear=isinstance(entries[0], Hello))
-        self._neighbours.own_hellos.said(sent.data, now)
+        proving = [entry.src_id for entry in entries if isinstance(entry, Heard)]
+        starts = frozenset((src_id, self._neighbours.all[src_id].boot) for src_id in proving)
+        self._neighbours.own_hellos.said(sent.data, now, starts, self._writer.leave_at)
         for entry in entries:
             if isinstance(entry, Heard):
                 since, wanted = self._neighbours.since(entry.src_id)
