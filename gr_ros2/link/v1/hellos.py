@@ -138,7 +138,8 @@ class Hellos:
         if late < 0 or idle or self._answering:
             return late >= 0
         if self._starting:
-            rests = self.rests > 0 and self.named and self._settings.slower > 1 and self._hears_others
+            slower = self._settings.slower
+            rests = slower > 1 and self._rests and late <= SELDOM_S * slower
             return late >= latency * LATENCY_S and not rests
         return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
 
@@ -155,6 +156,14 @@ class Hellos:
     def _period(self) -> float:
         """s from one hello to the next."""
         return min(max(OFTEN_S, self._settings.packet_len / HELLO_BYTES_S), SELDOM_S) * self._settings.slower
+
+    @property
+    def _rests(self) -> bool:
+        """Whether messages go before hellos on a slow channel: always where all that are heard have heard this robot,
+        and prove it."""
+        heard = [neighbour for neighbour in self._neighbours.all.values() if not neighbour.silent]
+        met = all(neighbour.knows and neighbour.proven for neighbour in heard)
+        return bool(heard) and (met or (self.rests > 0 and self.named))
 
     @property
     def _calm(self) -> bool:
