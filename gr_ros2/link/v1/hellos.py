@@ -153,17 +153,17 @@ class Hellos:
         return any(not neighbour.silent for neighbour in self._neighbours.all.values())
 
     @property
-    def _period(self) -> float:
-        """s from one hello to the next."""
-        return min(max(OFTEN_S, self._settings.packet_len / HELLO_BYTES_S), SELDOM_S) * self._settings.slower
-
-    @property
     def _rests(self) -> bool:
         """Whether messages go before hellos on a slow channel: always where all that are heard have heard this robot,
         and prove it."""
         heard = [neighbour for neighbour in self._neighbours.all.values() if not neighbour.silent]
         met = all(neighbour.knows and neighbour.proven for neighbour in heard)
         return bool(heard) and (met or (self.rests > 0 and self.named))
+
+    @property
+    def _period(self) -> float:
+        """s from one hello to the next."""
+        return min(max(OFTEN_S, self._settings.packet_len / HELLO_BYTES_S), SELDOM_S) * self._settings.slower
 
     @property
     def _calm(self) -> bool:
@@ -209,6 +209,9 @@ class Hellos:
 
     def _next(self, now: float, *, wants: bool) -> float:
         """When the next hello is due, s."""
+        slow = self._settings.shares and self._settings.slower > 1
+        while slow and self._starting and self._starting[0] <= now:
+            self._starting.popleft()  # messages went first for so long that this hello stands for several
         due = self._starting.popleft() if self._starting else now + self._pause
         if not wants or not self._eager:
             return due
