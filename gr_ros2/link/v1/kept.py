@@ -201,7 +201,10 @@ class KeptMessages:
 
     def _send_rows(self, rows: Collection[_Kept], qos: int, now: float) -> None:
         queue = self._topics[TABLE_TOPIC].queue
-        queue.extend(Message(-1, TABLE_TOPIC, row.payload, qos, now, repeat=True, begin=row.begin) for row in rows)
+        for row in rows:
+            message = Message(-1, TABLE_TOPIC, row.payload, qos, now, repeat=True, begin=row.begin)
+            message.left_at = row.named  # whether it has left before
+            queue.append(message)
         self._stats.repeats += len(rows)
 
     def _of(self, topic_id: int) -> Collection[_Kept]:

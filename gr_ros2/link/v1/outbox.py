@@ -110,7 +110,15 @@ class Outbox:
         """Serial and bytes of the newest frame of each chain of a latched topic, which may be sent again."""
         self.sent = SentTopics(codec, settings.commands, instances)
         self.kept = KeptMessages(self.sent, room, settings, self.stats, self._admit)
-        self.packing = Packing(self.sent, self.stats, self._left, boot=boot, room=room, shares=settings.shares)
+        self.packing = Packing(
+            self.sent,
+            self.stats,
+            self._left,
+            boot=boot,
+            room=room,
+            shares=settings.shares,
+            slow=lambda: settings.shares and settings.slower > 1,
+        )
         self.relayed_left: Callable[[Message, float], None] = lambda _, __: None
         """Called when a message of another robot has left whole."""
         self.custody: Custody | None = None

@@ -28,7 +28,7 @@ from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import ON_AIR, SentTopics
-from gr_ros2.wire import QOS_BULK, QOS_LATENCY
+from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.ages import AGE_STEP_S, age_code
 from gr_ros2.wire.control import WAITED_LEN, Waited
 from gr_ros2.wire.v1 import TABLE_TOPIC, EntryV1, Part, fit
@@ -69,6 +69,7 @@ class Packing:
     :param left: called with a message that has left whole, before its lifetime may end with the next one
     :param shares: whether others send on the same channel: a turn comes seldom then, and long messages take the room
         that others leave in every packet
+    :param slow: tells whether turns come so seldom that messages do not wait for rows of other topics
     :ivar turns: whose turn it is
     """
 
@@ -81,11 +82,12 @@ class Packing:
         boot: int,
         room: int,
         shares: bool = False,
+        slow: Callable[[], bool] = lambda: False,
     ) -> None:
         self.turns = Turns()
         self._topics, self._stats, self._left = topics, stats, left
         self._boot = boot
-        self._shares = shares
+        self._shares, self._slow = shares, slow
         self._short = (1 if shares else LONG) * room
         """Bytes of a message above which others go before it."""
         self._open: dict[int, Sequence[Message]] = {}
@@ -101,6 +103,8 @@ class Packing:
         :return: None if nothing may be sent
         """
         self._open = {}
+        if self._slow():
+            self._arrange_rows()
         for topic_id, topic in self._topics.items():
             if topic.queue and (ready := topic.queue.open(now)):
                 self._open[topic_id] = ready
@@ -161,6 +165,25 @@ class Packing:
     def urgent(self) -> bool:
         """Whether a message of class latency waits. The table of topics does not count: it follows a hello."""
         return any(topic.queue and topic.queue[0].qos == QOS_LATENCY for topic in self._topics.named())
+
+    def _arrange_rows(self) -> None:
+        """Let a row of a topic whose messages wait go before all messages, and the others into what these leave."""
+        table = self._topics.get(TABLE_TOPIC)
+        if table is None or not table.queue:
+            return
+        self.turns.join(TABLE_TOPIC)
+        started = [row for row in table.queue if row.started]
+        rows = started + sorted((row for row in table.queue if not row.started), key=self._later)
+        for place, row in enumerate(rows):
+            again = QOS_LATENCY if row.left_at == inf else QOS_DEFAULT
+            row.qos = QOS_BULK if place or (not row.started and self._later(row)) else again
+        table.queue.clear()
+        table.queue.extend(rows)
+
+    def _later(self, row: Message) -> bool:
+        """Whether no message waits for a row of the table."""
+        topic = self._topics.get(row.payload[1])
+        return topic is None or not topic.queue
 
     def _rank(self, message: Message) -> float:
         return RANK[message.qos] + 0.5 * (len(message.payload) > self._short)
