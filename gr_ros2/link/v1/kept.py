@@ -129,8 +129,14 @@ class KeptMessages:
         """Keep none of the messages of a topic so far."""
         self._kept.pop(topic_id, None)
 
-    def asked(self, topic_id: int, now: float) -> bool:
-        """A robot asks for the kept message of a topic; returns whether that is not too often."""
+    def asked(self, topic_id: int, now: float, *, anew: bool = False) -> bool:
+        """A robot asks for the kept message of a topic; returns whether that is not too often.
+
+        :param anew: it has nothing of it. Otherwise rows of the table that wait may be those that it lacks
+        """
+        slow = self._settings.shares and self._settings.slower > 1
+        if slow and topic_id == TABLE_TOPIC and not anew and self._topics[TABLE_TOPIC].queue:
+            return True
         if not self._of(topic_id):
             return True
         pause = max(PAUSE_S * self._settings.slower, PAUSE * self._took.get(topic_id, 0.0))

@@ -236,7 +236,8 @@ class SendingSide:
         if self.settings.hears:
             self.hellos.met(now, knows=knows)
         if self.settings.shares and self.settings.slower > 1 and self._started:
-            self._messages.kept.asked(TABLE_TOPIC, now)  # it lacks the table, and would say so some turns later
+            # It lacks the table, and would say so some turns later.
+            self._messages.kept.asked(TABLE_TOPIC, now, anew=True)
 
     def reconfigure(self, settings: Settings, now: float) -> None:
         """Use other settings from now on."""
