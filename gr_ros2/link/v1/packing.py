@@ -162,6 +162,12 @@ class Packing:
         return table is not None and len(table.queue) > 0 and table.queue[0].qos == QOS_BULK
 
     @property
+    def awaits_row(self) -> bool:
+        """Whether the next packet brings a row of the table that messages wait for, where turns are rare."""
+        table = self._topics.get(TABLE_TOPIC)
+        return self._slow() and table is not None and any(row.started or not self._later(row) for row in table.queue)
+
+    @property
     def urgent(self) -> bool:
         """Whether a message of class latency waits. The table of topics does not count: it follows a hello."""
         return any(topic.queue and topic.queue[0].qos == QOS_LATENCY for topic in self._topics.named())

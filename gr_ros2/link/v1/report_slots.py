@@ -47,8 +47,11 @@ class ReportSlots:
         self._unheard = 0
         """New packets since a report became due and found no room."""
 
-    def due(self, now: float) -> list[Reporter]:
-        """The reports that are due; on a shared channel as many as may leave, those first that miss something."""
+    def due(self, now: float, *, last: bool = False) -> list[Reporter]:
+        """The reports that are due; on a shared channel as many as may leave, those first that miss something.
+
+        :param last: they keep no room free
+        """
         due = []
         for neighbour in self._neighbours:
             inbox = neighbour.inbox
@@ -62,7 +65,8 @@ class ReportSlots:
             del due[int(self._allowed / REPORT_LEN) :]
             size = sum(report.size for report in due)
             self._allowed -= size
-            self.reserved = self._mask_len + size + LENGTH_LEN * bool(due)
+            mask_len = min(self._mask_len, 1 + self._writer.newest // 8)  # that of the longest window so far
+            self.reserved = mask_len + (size + LENGTH_LEN * bool(due)) * (not last)
         return due
 
     @property

@@ -105,7 +105,7 @@ class SendingSide:
             self._repeat(now)
         if messages.sent.deadlines:
             messages.expire(now, self._pace.sure_interval(now))
-        due = reports.due(now)
+        due = reports.due(now, last=packing.awaits_row)
         if due and reports.overdue:
             return reports.packet(due, now)
         first = self._window.pressing and not packing.urgent

@@ -82,6 +82,11 @@ class PacketWriter:
         # An end without an id only listens and closes no packet. Its id makes no key.
         self._trailer = Checksum(boot) if settings.src_id == NOBODY else keys.own(settings.src_id, boot)
 
+    @property
+    def newest(self) -> int:
+        """The number of the newest source packet."""
+        return self._window.packets.newest
+
     def source(
         self,
         entries: list[EntryV1],
