@@ -16,6 +16,11 @@ from gr_ros2.wire.v1 import EntryV1
 
 REPORTS, AT_ONCE = 0.05, 8
 """On a channel that many share: most of the bytes of all packets that reports take, and most reports in one packet."""
+FIRST = 4
+"""Reports that may leave at once after the start, on a slow channel. Without them, where packets take half a second,
+what each of three robots with a key has sent before another one had proven itself is missing there until a report
+comes after 15 s: all have heard each other after 37 instead of 28 s (median), nine in ten after 64 instead of 41. 2:
+31 and 62 s; 8: as 4."""
 WAITS_S = 10.0
 """s after which a report that only confirms goes before newer ones of what is missed. Of two neighbours of which one
 always misses something, the other is never told otherwise what has arrived, and repairs it for ever."""
@@ -40,7 +45,7 @@ class ReportSlots:
         self._neighbours = neighbours if settings.hears else ()
         self._writer = writer
         self._settings, self._packet_len, self._shares = settings, settings.packet_len, settings.shares
-        self._allowed = 0.0
+        self._allowed = float(FIRST * REPORT_LEN * (settings.slower > 1))
         """Bytes of reports that may leave on a shared channel."""
         self._mask_len = MASK_LEN if settings.repair != "off" else 0
         self.reserved = 0
