@@ -52,6 +52,7 @@ BENCHMARKS = {
     "sweep": "bench.sweep",
     "mac": "bench.mac",
     "cells": "bench.mac",
+    "first": "bench.mac",
     "hidden": "bench.mac",
     "changes": "bench.mac",
     "scale": "bench.mac",
@@ -65,7 +66,7 @@ BENCHMARKS = {
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
-    *("gate", "rate_rules", "cells", "hidden", "changes", "scale", "crowd", "energy", "cameras", "clouds"),
+    *("gate", "rate_rules", "cells", "first", "hidden", "changes", "scale", "crowd", "energy", "cameras", "clouds"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

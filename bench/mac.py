@@ -19,11 +19,13 @@ from typing import NamedTuple
 from bench.mac_rivals import Csma, Sotdma
 from bench.rows import Row
 from bench.swarm import HearingGraph, Swarm, SwarmConfig, fully_meshed
+from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.mac import Aloha, Slots
 from gr_ros2_lab.run.load import make_phy
 from gr_ros2_lab.run.scenario import load_scenario
 from gr_ros2_lab.run.simulate import Simulation, offered_by
 from gr_ros2_lab.run.task_run import TaskRun
+from tests.link.v1.test_medium_access import Sound
 
 AIRTIME_S, GUARD_S = 1 / 75, 0.001
 SLOT_S = AIRTIME_S + GUARD_S
@@ -32,6 +34,9 @@ LENGTHS_S = (0.004, 0.02, 0.1, 0.2, 0.4, 1.0)
 SEEDS = (1, 2, 3)
 MANY_SEEDS = range(1, 13)
 """Where chance decides when groups of robots find common slots."""
+SOUND_S, APART_S, GIVEN_UP_S = 0.53, 3.0, 150.0
+"""s that a packet of preset ``sound`` takes; within which the robots are switched on; after which they are given up."""
+FIRST_SEEDS = range(48)
 Graph = list[set[int]]
 
 
@@ -220,6 +225,51 @@ def cells() -> list[Row]:
     return rows + lengths()
 
 
+class First(NamedTuple):
+    """s from the start of the first robot until a message has come out at any other one, and at each of each."""
+
+    any: float
+    all: float
+
+
+def first_messages(robots: int, mode: SealMode, seed: int) -> First:
+    """Whole endpoints that are switched on within ``APART_S``, on a channel of packets as of preset ``sound``."""
+    rng = random.Random(seed)
+    on = sorted(rng.uniform(0, APART_S) for _ in range(robots))
+    sound = Sound(SOUND_S, *(at - on[0] for at in rng.sample(on, robots)), mode=mode, seed=seed)
+    heard: dict[tuple[int, int], float] = {}
+
+    def all_heard() -> bool:
+        for one in sound.robots:
+            for other in {robot.src_id for robot in sound.robots} - {one.src_id}:
+                if (one.src_id, other) not in heard and one.delivered(other):
+                    heard[one.src_id, other] = sound.now
+        return len(heard) == robots * (robots - 1)
+
+    sound.run(GIVEN_UP_S, until=all_heard)
+    times = [*heard.values(), *[math.inf] * (robots * (robots - 1) - len(heard))]
+    return First(min(times), max(times))
+
+
+def first() -> list[Row]:
+    """The first messages where a packet takes half a second and is composed .4 s ahead: medians over many seeds."""
+    rows, modes = [], {"none": "", "encrypt": " with a key"}
+    with ProcessPoolExecutor() as pool:
+        for robots in (2, 3):
+            for mode, words in modes.items():
+                ran = list(pool.map(first_messages, repeat(robots), repeat(mode), FIRST_SEEDS))
+                what, count = f"{robots} robots{words}, packets of {SOUND_S:g} s", len(ran)
+                late = sorted(one.all for one in ran)[math.floor(0.9 * count)]
+                most = 15 if robots == 2 or mode == "none" else 0
+                any_s = median(one.any for one in ran)
+                rows.append(Row(f"{what}: first message", any_s, "s", "≤" if most else None, most, "{:.1f}"))
+                note = f"nine in ten after {late:.0f} s"
+                rows.append(
+                    Row(f"{what}: from each to all", median(one.all for one in ran), "s", form="{:.1f}", note=note)
+                )
+    return rows
+
+
 def hidden() -> list[Row]:
     """Share of receptions that collide."""
     rows = []
@@ -358,4 +408,4 @@ def whole() -> list[Row]:
 
 def mac() -> list[Row]:
     """All of it."""
-    return [*cells(), *hidden(), *changes(), *scale(), *crowd(), *energy(), *whole()]
+    return [*cells(), *first(), *hidden(), *changes(), *scale(), *crowd(), *energy(), *whole()]
