@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
@@ -29,14 +30,15 @@ from gr_ros2_lab.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.report.explain import explanation, lateness_lines
 from gr_ros2_lab.report.headline import headline, topics_grid
-from gr_ros2_lab.report.repetitions import repetition_grid
+from gr_ros2_lab.report.repetitions import repetition_grid, repetition_summary
 from gr_ros2_lab.report.table import (
+    MOST_PATHS,
     as_table,
     hops_grid,
     ledger_grid,
     notes,
     packets_line,
-    pairs_grid,
+    pairs_grids,
     paper_grid,
     paper_results,
     summary_grid,
@@ -52,12 +54,15 @@ Next:  gr-ros2 demo --dashboard    the same live in a browser, with sliders for 
        gr-ros2 doctor              what this machine has and lacks for a link of your own
        gr-ros2 link --help         your own robot's topics, live"""
 
+_WIDEST = 1000
+"""Columns that no table needs."""
+
 _options = [
     click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),
     click.option("--seed", type=int, help="Seed of robots, channel and sender."),
     click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
     click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),
-    click.option("--details", is_flag=True, help="All tables, paths and sentences of the report, here too."),
+    click.option("--details", is_flag=True, help="The tables and sentences of the report, here too."),
     click.option("--no-report", is_flag=True, help="No report; `gr-ros2 report FOLDER` makes it later."),
     pictures_option,
     set_option(Scenario),
@@ -133,11 +138,11 @@ def _run(
             results = runner.run_repetitions(scenario, out, lambda: _advance(bar, scenario, next(turns)), seen)
     drawn = None if no_report else pictures  # None: nothing at all
     if scenario.repetitions == 1:
-        _details(console, scenario, outcome) if details else _headline(console, scenario, outcome)
+        _headline(console, scenario, outcome, details=details)
         _report_run(console, outcome, scenario.name, out, drawn)
         results = [outcome.result]
     else:
-        _report_repetitions(console, scenario, results, out, drawn)
+        _report_repetitions(console, scenario, results, out, drawn, details=details)
     return FAILED if any(result.incomplete for result in results) else 0
 
 
@@ -188,13 +193,13 @@ def _report_run(console: Console, outcome: Outcome, name: str, out: Path, drawn:
 
 
 def _report_repetitions(
-    console: Console, scenario: Scenario, results: Sequence[Result], out: Path, drawn: bool | None
+    console: Console, scenario: Scenario, results: Sequence[Result], out: Path, drawn: bool | None, *, details: bool
 ) -> None:
     if len(results) < scenario.repetitions:
         console.print(f"stopped after {len(results)} of {scenario.repetitions} runs")
     if not results:
         return
-    console.print(as_table(repetition_grid(results)))
+    console.print(as_table((repetition_grid if details else repetition_summary)(results)))
     for number, result in enumerate(results):
         for line in result.incomplete:
             console.print(f"rep-{number}: {line}", soft_wrap=True)
@@ -219,39 +224,46 @@ def _bar(console: Console) -> Progress:
     )
 
 
-def _headline(console: Console, scenario: Scenario, outcome: Outcome) -> None:
-    """What came of it, in few lines."""
+def _headline(console: Console, scenario: Scenario, outcome: Outcome, *, details: bool) -> None:
+    """What came of it, in few lines; the tables, the paths and all else behind it if asked for."""
     result = outcome.result
+    first = headline(result, outcome.trace)
     late = len(lateness_lines(result))
-    for place, line in enumerate(headline(result, outcome.trace)):
+    for place, line in enumerate(first):
         style = "bold red" if place < late else "bold" if place == late else None
         console.print(line, style=style, soft_wrap=True)
-    if (grid := topics_grid(result)) is not None:
+    if not details and (grid := topics_grid(result)) is not None:
         console.print(as_table(grid))
+    if details:
+        _details(console, outcome, set(first))
     for line in _radio(scenario, result):
         console.print(line, soft_wrap=True)
 
 
-def _details(console: Console, scenario: Scenario, outcome: Outcome) -> None:
-    """What came of it first, then the tables, then why."""
-    result = outcome.result
-    late = lateness_lines(result)
-    for line in late:  # first, since all that follows depends on it
-        console.print(line, style="bold red", soft_wrap=True)
-    arrived, *reasons = explanation(result, outcome.trace)[len(late) :]
-    console.print(f"{arrived}\n", style="bold", soft_wrap=True)
+def _details(console: Console, outcome: Outcome, said: Container[str]) -> None:
+    result, paths = outcome.result, list(outcome.trace.paths())
+    console.print()
     if paper_results([result]):
         console.print(as_table(paper_grid([result])))
-    pairs = pairs_grid(result)
-    tables = [summary_grid([result]), ledger_grid(result)] if pairs is None else [pairs]
+    tables = pairs_grids(result) or [summary_grid([result]), ledger_grid(result)]
     for grid in (*tables, team_grid(result), hops_grid(result)):
-        if grid is not None:
-            console.print(as_table(grid))
-    for path in outcome.trace.paths():
+        if grid is None:
+            continue
+        table = as_table(grid)
+        width = Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum
+        if grid.one_line and width > console.width:
+            console.print(f"{grid.title}: see the report, or widen the terminal to {width} columns")
+        else:
+            console.print(table)
+        console.print()
+    if len(paths) > MOST_PATHS:
+        console.print(f"{len(paths)} paths: see the report")
+    for path in paths if len(paths) <= MOST_PATHS else ():
         title = f"{path.topic} sent (dots), {path.published_as} received (x), m"
         console.print(Text.from_ansi(path_text(path.sent, path.received, title)), soft_wrap=True)
-    for line in (*notes(result), *reasons, packets_line(result), *_radio(scenario, result)):
-        console.print(line, soft_wrap=True)
+    for line in (*notes(result), *explanation(result, outcome.trace), packets_line(result)):
+        if line not in said:
+            console.print(line, soft_wrap=True)
 
 
 def _radio(scenario: Scenario, result: Result) -> Iterator[str]:

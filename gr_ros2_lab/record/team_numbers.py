@@ -48,7 +48,7 @@ def team_numbers(result: Result) -> dict[str, float | None]:
         "pair_pdr": each.total() / sent if sent else None,
         "pair_age_mean_s": sum(ages) / len(ages) if ages else None,
         "pair_age_peak_s": max(peaks, default=None),
-        "pairs_unheard": float(len(pairs) - len(ages)),
+        "pairs_unheard": float(sum(not topic.delivered for topic in pairs)),
         "relayed": sum(map(relayed, pairs)) / each.total() if each.total() else None,
         "jain": jain(each.values()),
         "air_use": sum(airtimes.values()) / span if airtimes and span else None,

@@ -17,7 +17,7 @@ from gr_ros2.link.lateness import LATE_S
 from gr_ros2_lab.record.result import Result, air_uses
 from gr_ros2_lab.record.team_numbers import airtime_of_senders, ledger_of, team_pairs
 from gr_ros2_lab.record.trace import Ints, Packets, Trace
-from gr_ros2_lab.report.table import milliseconds
+from gr_ros2_lab.report.table import ends, milliseconds
 
 _KINDS = {"new": "new messages", "repair": "repair", "report": "reports", "hello": "hellos"}
 _BEHIND = 0.01
@@ -92,6 +92,9 @@ def _capacity(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
         return
     needed = sum((m.fate != Fate.TOO_LARGE).sum() * _entries_per_message(packets, m.topic) for m in trace.messages())
     needed *= len(packets.times()[0]) / len(packets.packet)  # entries share packets
+    # The trace is that of one receiver. Its own messages are taken to be as long as those of the others.
+    sent = {(topic.src_id, topic.topic): topic.sent for _, topics in ends(result) for topic in topics}
+    needed *= sum(sent.values()) / (sum(topic.sent for topic in result.topics) or 1)
     share = needed * airtime / result.duration_s / result.phy.get("channels", 1)
     if share > 1:
         yield f"The messages do not fit: all of them would have needed {share:.1f} times the air that there is."
@@ -104,9 +107,9 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
     here = np.flatnonzero(~np.isnan(t_received))
     came = len(here)
     passed = int(here[-1]) + 1 if came else 0  # later packets may still be on their way
-    text = f"Of {len(t_sent):,} packets with messages, {came:,} ({percent(came / len(t_sent))}) arrived"
+    text = f"Of {len(t_sent):,} packets with messages, {came:,} ({percent(came / len(t_sent))}) arrived{_where(result)}"
     if passed - came:
-        text += f", {passed - came:,} were lost on the way"
+        text += f", {passed - came:,} lost on the way"
     if len(t_sent) - passed:
         text += f", {len(t_sent) - passed:,} left after the last that arrived (lost, or in the PHY at the end)"
     yield text + "."
@@ -193,7 +196,7 @@ def _in_flight(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
         "had not left the source's queue": waiting,
     }
     if parts := [f"{count:,} {what}" for what, count in where.items() if count]:
-        yield f"Of the messages in flight at the end, {', '.join(parts)}."
+        yield f"Of the messages in flight at the end{_where(result)}, {', '.join(parts)}."
 
 
 def _trend(result: Result, trace: Trace) -> Iterator[str]:
@@ -207,9 +210,14 @@ def _trend(result: Result, trace: Trace) -> Iterator[str]:
     first, last = float(np.median(latency[:tenth])), float(np.median(latency[-tenth:]))
     if last - first > _BEHIND * result.duration_s:
         yield (
-            f"The link fell behind: the median latency was {seconds(first)} among the first tenth of the deliveries "
-            f"and {seconds(last)} among the last."
+            f"The link fell behind: the median latency{_where(result)} was {seconds(first)} among the first tenth of "
+            f"the deliveries and {seconds(last)} among the last."
         )
+
+
+def _where(result: Result) -> str:
+    """Which receiver the trace is of, where there are several."""
+    return f" at {next(ends(result))[0]}" if result.receivers else ""
 
 
 def lateness_lines(result: Result) -> list[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -28,10 +29,28 @@ _SENT, _RECEIVED = "#1f5fbf", "#d62728"
 
 _MOST_INSIDE, _COLUMNS = 12, 3
 """Number of curves whose names find room inside the axes; those of more stand below, in so many columns."""
+_IN_A_COLUMN, _PANEL_COLUMNS = 6, 4
+"""Most axes over the whole width; those of more stand in so many columns."""
 _RASTER_ABOVE = 20_000
 """Number of points above which a line is stored as a bitmap in the SVG. Otherwise the file would become too large."""
 _DPI = 150
 """Dots per inch of a PNG."""
+
+
+def panels(count: int, *, same_scale: bool = False) -> tuple[Figure, list[Axes]]:
+    """A figure with so many axes over one time: below each other, of many in columns, so that it fits a page.
+
+    :param same_scale: whether all have one scale upwards, too
+    """
+    columns = 1 if count <= _IN_A_COLUMN else _PANEL_COLUMNS
+    rows = max(-(-count // columns), 1)
+    figure = Figure(figsize=(8.0, 1.2 + max(1.25 * rows, 2.4)), layout="constrained")
+    every = figure.subplots(rows, columns, sharex=True, sharey=same_scale, squeeze=False)
+    for axes in every[-1]:
+        axes.set_xlabel("time [s]")
+    for axes in every.flat[max(count, 1) :]:
+        axes.remove()
+    return figure, list(every.flat[: max(count, 1)])
 
 
 def path_figure(sent: npt.ArrayLike, received: npt.ArrayLike, sent_name: str, received_name: str) -> Figure:

@@ -25,11 +25,13 @@ _TOPICS = 6
 def headline(result: Result, trace: Trace) -> list[str]:
     """The lines without the table: the computer's lateness, what the robots achieved, and what was worst and why."""
     pairs, grid = team_pairs(result), topics_grid(result)
-    lines = [*lateness_lines(result), *change_lines(result), *_tasks(result), _delivered(pairs), *_ages(pairs)]
-    lines += _hopeless(result, pairs)
+    lines = [*lateness_lines(result), *change_lines(result), *_tasks(result), _delivered(pairs), *faults(result)]
+    lines += [*_ages(result), *_hopeless(result, pairs)]
     if grid is None:
         lines += _worst(result)
-    lines += [*why(result, trace), *air_lines(result), *faults(result)]
+    if ledger_of(pairs)[Fate.IN_FLIGHT] + sum(topic.delivered for topic in pairs) < sum(topic.sent for topic in pairs):
+        lines += _lost_packets(result)
+    lines += [*why(result, trace), *air_lines(result)]
     return lines[: MOST_LINES - _OTHERS - (0 if grid is None else 1 + len(grid.sections[0]))]
 
 
@@ -53,9 +55,13 @@ def topics_grid(result: Result) -> Grid | None:
 
 def _tasks(result: Result) -> Iterator[str]:
     for name, value in result.task.items():
+        if name == "met":  # a share only where there are several runs
+            yield "The robots have met." if value else "The robots have not met."
+            continue
         label = TEAM_VALUES.get(name, name).removesuffix("]").split(" [")
         unit = f" {label[1]}" if len(label) > 1 else ""
-        yield f"{label[0].capitalize()}: {number(value, '{:.3g}' + unit)}."
+        known = f"not known after {seconds(result.duration_s)}" if value is None else f"{value:.3g}{unit}"
+        yield f"{label[0].capitalize()}: {known}."
 
 
 def _delivered(pairs: Sequence[TopicResult]) -> str:
@@ -71,19 +77,28 @@ def _delivered(pairs: Sequence[TopicResult]) -> str:
     return f"Delivered: {here:,} of {sent:,} messages{of} ({percent(here / sent)}{repaired}){lost}."
 
 
-def _ages(pairs: Sequence[TopicResult]) -> Iterator[str]:
-    aged = [topic for topic in pairs if topic.age_s.mean is not None and topic.sent > 1]
-    ages = [topic.age_s.mean for topic in aged if topic.age_s.mean is not None]
-    oldest = max(aged, key=lambda topic: topic.age_s.peak or 0.0, default=None)
-    if oldest is not None and oldest.age_s.peak is not None:
-        mean = f"{seconds(sum(ages) / len(ages))} old in the mean of all topics, " if len(aged) > 1 else ""
-        yield f"What a receiver knew was {mean}at most {seconds(oldest.age_s.peak)} ({oldest.topic})."
+def _ages(result: Result) -> Iterator[str]:
+    aged = [(peak, name, topic) for name, topic in by_receiver(result) if (peak := topic.age_s.peak) and topic.sent > 1]
+    ages = [topic.age_s.mean for *_, topic in aged if topic.age_s.mean is not None]
+    if ages:
+        peak, name, _ = max(aged, key=lambda one: one[0])
+        mean = f"{seconds(sum(ages) / len(ages))} old in the mean{' of all topics' if len(ages) > 1 else ''}, "
+        yield f"What a receiver knew was {mean}at most {seconds(peak)} ({name})."
 
 
 def _worst(result: Result) -> Iterator[str]:
     worst = sorted((topic.pdr, name, topic) for name, topic in by_receiver(result) if topic.pdr is not None)
     for pdr, name, topic in [worst[0]] if worst and worst[0][0] < 1 else []:
         yield f"Worst: {name}, {topic.delivered} of {topic.sent} ({percent(pdr)}): {_lost(topic.ledger)}."
+
+
+def _lost_packets(result: Result) -> Iterator[str]:
+    """How many packets did not arrive. Where robots relay, many do not hear each other, and need not."""
+    counts = [result.packets, *(receiver.packets for receiver in result.receivers)]
+    sent, received = (sum(count.get(name, 0) for count in counts) for name in ("sent", "received"))
+    if received < sent and result.config.get("relay", "off") == "off":
+        where = ", at all receivers together" if result.receivers else ""
+        yield f"On the way {percent(1 - received / sent)} of {sent:,} packets were lost{where}."
 
 
 def _hopeless(result: Result, pairs: Sequence[TopicResult]) -> Iterator[str]:

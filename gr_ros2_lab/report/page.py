@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,14 +32,18 @@ from gr_ros2_lab.record.team import Team, read_team
 from gr_ros2_lab.record.trace import Messages, Trace, read_trace, write_csv
 from gr_ros2_lab.report.explain import explanation
 from gr_ros2_lab.report.figures import air_figure, latency_figure, ledger_figure, path_figure, save_figure
+from gr_ros2_lab.report.headline import headline
 from gr_ros2_lab.report.snr_map import map_of
 from gr_ros2_lab.report.table import (
+    MOST_PATHS,
     PAPER,
     Grid,
     air_grid,
+    ends,
     hops_grid,
     ledger_grid,
     notes,
+    pairs_grids,
     paper_grid,
     paper_results,
     summary_grid,
@@ -119,7 +123,7 @@ class Section:
     sentences: Sequence[str] = ()
     grids: Sequence[Grid] = ()
     pictures: Sequence[Picture] = ()
-    details: Mapping[str, str] = field(default_factory=dict)
+    details: Mapping[str, str | Grid] = field(default_factory=dict)
 
 
 def read_runs(directories: Iterable[str | Path]) -> list[Run]:
@@ -162,8 +166,10 @@ def _write_report(runs: Sequence[Run], out: Path, drawn: Drawings, tables: bool)
     results = [replace(run.result, scenario=run.label) for run in runs]
     joint = [drawn.save(latency_figure(latencies(runs)), "latency", _LATENCY)] if several else []
     papers = [paper_grid(results)] if paper_results([run.result for run in runs]) else []
-    sections = [Section(grids=[*papers, summary_grid(results)], pictures=joint)]
-    sections += [_run_section(run, drawn, f"{stem(run.label)}_" if several else "", several) for run in runs]
+    few = [result for result in results if several and not pairs_grids(result)]
+    sections = [Section(grids=[*papers, *([summary_grid(few)] if few else ())], pictures=joint)] if several else []
+    for run in runs:
+        sections += _run_sections(run, drawn, f"{stem(run.label)}_" if several else "", papers, several)
     title = ", ".join(run.label for run in runs)
     lead = f"{len(runs)} runs" if several else lead_of(runs[0])
     return render_page(out / REPORT_FILE, title, lead, sections, write_summary(runs, out) if tables else [])
@@ -235,43 +241,62 @@ def lead_of(run: Run) -> str:
     return " · ".join(parts)
 
 
-_GRIDS: tuple[Callable[[Result], Grid | None], ...] = (team_grid, hops_grid, ledger_grid, air_grid)
 _LATENCY = "End-to-end latency: share of the delivered messages that took at most so long"
 
 
-def _run_section(run: Run, out: Drawings, prefix: str, several: bool) -> Section:
-    result = run.result
+def _run_sections(run: Run, out: Drawings, prefix: str, papers: list[Grid], several: bool) -> Iterator[Section]:
+    """What came of a run in few lines, why, and what its first receiver got.
+
+    :param papers: the paper's table, which a page of several runs has above
+    """
+    result, pairs = run.result, pairs_grids(run.result)
+    first = headline(result, run.trace)
+    summary, ledger = summary_grid([result]), ledger_grid(result)
+    topics = pairs or ([ledger] if several else [*papers, summary, ledger])
+    yield Section(run.label if several else "", lead_of(run) if several else "", first, topics)
     settings = {
         "All settings": yaml.safe_dump(result.config, sort_keys=False, allow_unicode=True),
         "All counters": yaml.safe_dump(
             {"packets": result.packets, "phy": result.phy, **result.counters}, sort_keys=False, allow_unicode=True
         ),
     }
-    return Section(
-        heading=run.label if several else "What happened",
-        lead=lead_of(run) if several else "",
-        sentences=[*explanation(result, run.trace), *notes(result)],
-        grids=[grid for make in _GRIDS if (grid := make(result)) is not None],
-        pictures=_draw(run, out, prefix),
-        details=settings,
-    )
+    more = [line for line in (*explanation(result, run.trace), *notes(result)) if line not in first]
+    grids = [grid for grid in (team_grid(result), hops_grid(result)) if grid is not None]
+    used = [grid for grid in (air_grid(result),) if grid is not None]
+    happened = Section("" if several else "What happened", "", more, grids, _draw(run, out, prefix))
+    received = _draw_received(run, out, prefix)
+    if not result.receivers:
+        yield replace(happened, grids=grids + used, pictures=[*happened.pictures, *received], details=settings)
+        return
+    every = {f"{grid.title}, of all robots": grid for grid in (summary, ledger) if pairs}
+    yield replace(happened, details=every)
+    at = f"At {next(ends(result))[0]}, of what it could hear"
+    yield Section(f"{run.label}: {at}" if several else at, grids=used, pictures=received, details=settings)
 
 
 def _draw(run: Run, out: Drawings, prefix: str) -> list[Picture]:
-    result, trace = run.result, run.trace
-    topics = run.messages()
-    packets, changes = trace.packets(), [change.t for change in result.changes if change.t is not None]
+    """Where the robots were, and what happened on their channel."""
     pictures = []
-    for place, path in enumerate(trace.paths()):
+    paths = list(run.trace.paths())
+    for place, path in enumerate(paths if len(paths) <= MOST_PATHS else ()):  # those of a team are in one figure
         figure = path_figure(path.sent, path.received, path.topic, path.published_as)
         stem = "path" if not place else f"path{path.topic.replace('/', '_')}"
         caption = f"The path of {path.topic}, sent and received"
         pictures.append(out.save(figure, prefix + stem, caption))
-    if (world := map_of(result)) is not None:
+    if (world := map_of(run.result)) is not None:
         caption = "SNR over the world for a receiver that stands still; white: obstacles; lines: where the robots drove"
         pictures.append(out.save(world, f"{prefix}snr-map", caption))
     if (team := read_team(run.directory)) is not None:
         pictures += _draw_team(team, out, prefix)
+    return pictures
+
+
+def _draw_received(run: Run, out: Drawings, prefix: str) -> list[Picture]:
+    """What the first receiver got."""
+    result, trace = run.result, run.trace
+    topics = run.messages()
+    packets, changes = trace.packets(), [change.t for change in result.changes if change.t is not None]
+    pictures = []
     pictures.append(out.save(latency_figure(latencies([run])), f"{prefix}latency", _LATENCY))
     pictures.append(
         out.save(

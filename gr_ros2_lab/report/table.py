@@ -19,6 +19,8 @@ from gr_ros2_lab.record.result import Result, air_uses
 from gr_ros2_lab.record.team_numbers import TEAM_VALUES, team_numbers, team_pairs
 
 _DASH = "–"
+MOST_PATHS = 2
+"""Most paths of which each is drawn in the terminal, and has a line."""
 PAPER = "the paper"
 """Name of the authors' own run in the tables."""
 
@@ -94,29 +96,47 @@ def team_grid(result: Result) -> Grid | None:
     return Grid("The team", ("Number", "value"), (lines,)) if lines else None
 
 
-def pairs_grid(result: Result) -> Grid | None:
-    """PDR and mean age in s by receiver (lines) and sender (columns), over all topics; None for less than three
-    robots."""
-    pairs: dict[tuple[str, int], list[TopicResult]] = {}
-    own = next((one.get("robot", "") for one in result.config.get("robots", ())), "") or "receiver 1"
-    ends = [(own, result.topics), *((one.name or f"receiver {one.number}", one.topics) for one in result.receivers)]
-    for name, topics in ends:
+def pairs_grids(result: Result) -> list[Grid]:
+    """What was lost, and the mean age, by receiver (lines) and sender (columns), over all topics; [] for less than
+    three senders."""
+    pairs: dict[str, dict[int, list[TopicResult]]] = {}
+    for name, topics in ends(result):
+        pairs[name] = {}
         for topic in topics:
             if topic.sent:
-                pairs.setdefault((name, topic.src_id), []).append(topic)
-    senders = sorted({src_id for _, src_id in pairs})
+                pairs[name].setdefault(topic.src_id, []).append(topic)
+    senders = sorted({src_id for at in pairs.values() for src_id in at})
     if len(senders) < 3:
-        return None
-    lines = tuple((name, *(_pair(pairs.get((name, src_id), ())) for src_id in senders)) for name, _ in ends)
-    return Grid("PDR and mean age [s] of each robot at each other", ("At", *map(str, senders)), (lines,))
+        return []
+    return [
+        Grid(
+            title,
+            ("At", *map(str, senders)),
+            (tuple((name, *(text(at.get(src_id, ())) for src_id in senders)) for name, at in pairs.items()),),
+            one_line=True,
+        )
+        for title, text in (
+            ("Lost of what each robot sent [%]", _lost),
+            ("Mean age of what each robot sent [s]", _mean_age),
+        )
+    ]
 
 
-def _pair(topics: Sequence[TopicResult]) -> str:
+def _lost(topics: Sequence[TopicResult]) -> str:
+    if not topics:
+        return ""
+    lost = 100 - 100 * sum(topic.delivered for topic in topics) / sum(topic.sent for topic in topics)
+    return f"{lost:.0f}" if lost in (0, 100) or 1 <= lost <= 99 else "<1" if lost < 1 else ">99"
+
+
+def _mean_age(topics: Sequence[TopicResult]) -> str:
     if not topics:
         return ""
     ages = [topic.age_s.mean for topic in topics if topic.age_s.mean is not None]
-    share = sum(topic.delivered for topic in topics) / sum(topic.sent for topic in topics)
-    return f"{share:.2f} {sum(ages) / len(ages):.2f}" if ages else f"{share:.2f} {_DASH}"
+    if not ages:
+        return _DASH
+    age = sum(ages) / len(ages)
+    return f"{age:.2f}".removeprefix("0") if age < 0.995 else f"{age:.{1 if age < 9.95 else 0}f}"
 
 
 def hops_grid(result: Result) -> Grid | None:
@@ -167,11 +187,17 @@ def air_grid(result: Result) -> Grid | None:
 
 
 def by_receiver(result: Result) -> Iterator[tuple[str, TopicResult]]:
-    """Every topic with its name in the tables. Topics of further receivers follow those of the first receiver."""
-    yield from ((topic.topic, topic) for topic in result.topics)
-    for receiver in result.receivers:
-        name = receiver.name or f"receiver {receiver.number}"
-        yield from ((f"{topic.topic} at {name}", topic) for topic in receiver.topics)
+    """Every topic with its name in the tables, which has the receiver where there are several."""
+    for name, topics in ends(result):
+        yield from ((f"{topic.topic} at {name}" if result.receivers else topic.topic, topic) for topic in topics)
+
+
+def ends(result: Result) -> Iterator[tuple[str, Sequence[TopicResult]]]:
+    """Every receiver: its name, and the topics that it could receive."""
+    named = any(receiver.name for receiver in result.receivers)
+    own = next((one.get("robot", "") for one in result.config.get("robots", ())), "") if named else ""
+    yield own or "receiver 1", result.topics
+    yield from ((one.name or f"receiver {one.number}", one.topics) for one in result.receivers)
 
 
 def as_table(grid: Grid) -> Table:
@@ -223,6 +249,11 @@ def faults(result: Result) -> list[str]:
 def notes(result: Result) -> list[str]:
     """Remarks for a reader of the tables, one line each: :func:`faults`, and of paths."""
     lines = [_path_note(topic) for topic in result.topics if topic.path_error_m is not None]
+    if len(lines) > MOST_PATHS:
+        rms, name = max((topic.rms_error_m or 0.0, topic.topic) for topic in result.topics)
+        lines = [
+            f"Of {len(lines)} received paths, that of {name} is furthest from where its robot was: {rms:.3f} m (RMS)."
+        ]
     lines += [
         f"{topic.topic}: {topic.left_out_sent} messages sent and {topic.left_out_received} received have no position "
         "(not finite, beyond 1e9 m, or unreadable) and are left out of the path"

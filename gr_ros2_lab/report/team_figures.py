@@ -10,11 +10,12 @@ from matplotlib.patches import Patch
 from gr_ros2.observe.colours import COLOURS, OUTCOME_COLOURS
 from gr_ros2.observe.team import STRIP_S
 from gr_ros2_lab.record.team import Team
+from gr_ros2_lab.report.figures import panels
 
 
 def strip_figure(team: Team) -> Figure:
     """The first seconds of the channel, in which all enter, and the last ones."""
-    figure = Figure(figsize=(8.0, 3.6), layout="constrained")
+    figure = Figure(figsize=(8.0, max(3.6, 1.2 + 0.25 * len(team.robots))), layout="constrained")
     first = team.sends[0].t if team.sends else 0.0
     last = team.sends[-1].t if team.sends else STRIP_S
     for axes, begin in zip(figure.subplots(2, 1), (first, max(first, last - STRIP_S)), strict=True):
@@ -32,21 +33,20 @@ def _strip(axes: Axes, team: Team, begin: float) -> None:
         rows = [place[send.robot] for send in shown]
         widths = [send.airtime_s for send in shown]
         axes.barh(rows, widths, left=[send.t for send in shown], height=0.8, color=colour)
-    axes.set(xlim=(begin, begin + STRIP_S), yticks=range(len(place)), yticklabels=[f"robot {r}" for r in place])
+    axes.set(xlim=(begin, begin + STRIP_S), yticks=range(len(place)))
+    axes.set_yticklabels([f"robot {robot}" for robot in place], fontsize="small" if len(place) <= 8 else "xx-small")
     axes.invert_yaxis()
 
 
 def hearing_figure(team: Team) -> Figure:
     """SNR over time of every pair, one axis for each receiver."""
-    count = len(team.robots)
-    figure = Figure(figsize=(8.0, 1.2 + 1.3 * count), layout="constrained")
-    for axes, one in zip(np.atleast_1d(figure.subplots(count, 1, sharex=True, sharey=True)), team.robots, strict=True):
+    figure, every = panels(len(team.robots), same_scale=True)
+    for axes, one in zip(every, team.robots, strict=True):
         for number, other in enumerate(team.robots):
             if one != other and team.snr_db[one, other]:
                 t, snr = np.array(team.snr_db[one, other]).T
                 axes.plot(t, snr, color=COLOURS[number % len(COLOURS)], label=f"robot {other}")
         axes.set_ylabel(f"robot {one} hears\n[dB]", fontsize="small")
-    axes.set_xlabel("time [s]")
     _legend(figure, team)
     return figure
 

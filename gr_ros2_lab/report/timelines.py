@@ -21,6 +21,7 @@ from gr_ros2.core.arrays import Floats
 from gr_ros2.observe.colours import COLOURS
 from gr_ros2_lab.record.metrics import age_sawtooth
 from gr_ros2_lab.record.trace import Ints, Messages, Packets
+from gr_ros2_lab.report.figures import panels
 
 _BINS = 40
 """Approximate number of intervals into which a run is divided."""
@@ -90,19 +91,18 @@ def delivery_figure(lines: Mapping[str, Deliveries], duration_s: float, changes:
 
 
 def age_figure(
-    panels: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str, float], changes: Sequence[float] = ()
+    topics: Mapping[str, Mapping[str, Messages]], t_end: Mapping[str, float], changes: Sequence[float] = ()
 ) -> Figure:
     """Age of information: a panel per topic with a sawtooth per run.
 
-    :param panels: panel name -> line name -> messages
+    :param topics: panel name -> line name -> messages
     :param t_end: s, end of the observation by line name
     :param changes: s at which somebody changed something
     """
-    names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
-    figure = Figure(figsize=(8.0, 1.2 + max(1.25 * len(panels), 2.4)), layout="constrained")
+    names = list(dict.fromkeys(name for lines in topics.values() for name in lines))
+    figure, every = panels(len(topics))
     figure.suptitle("Age of the newest message delivered", fontsize="large")
-    column = figure.subplots(max(len(panels), 1), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, (panel, lines) in zip(column, panels.items(), strict=False):
+    for axes, (panel, lines) in zip(every, topics.items(), strict=False):
         peaks = []
         for name, messages in lines.items():
             done = messages.delivered
@@ -121,9 +121,9 @@ def age_figure(
         _mark(axes, changes)
         if not peaks:
             axes.text(0.5, 0.5, "nothing was delivered", ha="center", va="center", transform=axes.transAxes)
-    column[-1].set(xlabel="time [s]", xlim=(0, max(t_end.values(), default=1.0) or 1.0))
+    every[-1].set_xlim(0, max(t_end.values(), default=1.0) or 1.0)
     if len(names) > 1:
-        _legend(figure, column[0], names)
+        _legend(figure, every[0], names)
     return figure
 
 
@@ -159,20 +159,22 @@ def airtime_figure(packets: Packets, airtime_s: float, duration_s: float, change
 
 
 def packets_figure(packets: Packets, topics: Sequence[str]) -> Figure:
-    """The first packets one by one: which entries of which topic each carries (above), when it left, and when or
-    whether it arrived (below).
+    """The first packets since messages are submitted, one by one: which entries of which topic each carries (above),
+    when it left, and when or whether it arrived (below).
 
     :param topics: their names in the order of their colours
     """
     figure = Figure(figsize=(11.0, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     t_sent, t_received = packets.times()
+    before = int(np.searchsorted(t_sent, 0.0))
+    t_sent, t_received = t_sent[before:], t_received[before:]
     shown = int(min(np.searchsorted(t_sent, t_sent[0] + _FIRST_S), _FIRST_PACKETS)) if len(t_sent) else 0
     if not shown:
         above.text(0.5, 0.5, "no packet was sent", ha="center", transform=above.transAxes)
         return figure
-    entry = packets.packet < shown
-    number = packets.packet[entry]
+    entry = (packets.packet >= before) & (packets.packet < before + shown)
+    number = packets.packet[entry] - before
     names = list(dict.fromkeys([*topics, *packets.topic.tolist()]))
     codes = np.array([names.index(topic) for topic in packets.topic[entry]])
     heights = np.zeros(shown)
@@ -191,7 +193,7 @@ def packets_figure(packets: Packets, topics: Sequence[str]) -> Figure:
     above.plot(lost, np.full(len(lost), -0.05 * heights.max()), "x", color=_LOST, markersize=4)
     above.set(ylabel="entries of the packet", xlim=(-1, shown), ylim=(-0.1 * heights.max(), heights.max() * 1.05))
     above.set_yticks(np.arange(0, heights.max() + 1, max(1, heights.max() // 5)))
-    above.set_title(f"The first {shown} of {len(t_sent)} packets", loc="left")
+    above.set_title(f"The first {shown} of {len(t_sent):,} packets", loc="left")
     below.add_collection(
         LineCollection(
             [[(at, t_sent[at]), (at, t_received[at])] for at in places[arrived]], colors="0.7", linewidths=0.8

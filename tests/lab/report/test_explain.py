@@ -30,7 +30,7 @@ def test_sentences_are_computed_from_the_run(tmp_path: Path) -> None:
     # 74 packets of 10 ms; the last of them left 3.62 s after the first
     assert air == f"Air in use: {0.74 / 3.63:.0%} of the time, with new messages."
     assert packets == (
-        "Of 74 packets with messages, 58 (78%) arrived, 8 were lost on the way, "
+        "Of 74 packets with messages, 58 (78%) arrived, 8 lost on the way, "
         "8 left after the last that arrived (lost, or in the PHY at the end)."
     )
     assert "of 41 messages that left whole 33 (80%) arrived complete" in fragments

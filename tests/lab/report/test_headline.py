@@ -52,6 +52,30 @@ def test_where_nothing_arrives_the_snr_that_the_radio_needs_is_told(result: Resu
     assert not any("dB" in line for line in headline(replace(deaf, topics=result.topics), trace))
 
 
+def test_who_knew_what_was_oldest_and_how_many_packets_were_lost_is_named() -> None:
+    outcome = run_scenario(load_scenario("team", ("channel.packet_loss=0.4", "repair=off"), duration_s=3))
+    ends = {f"at /robot_{number})." for number in range(1, 5)}
+    lines = headline(outcome.result, outcome.trace)
+    (known,) = (line for line in lines if line.startswith("What a receiver knew"))
+    assert any(known.endswith(end) for end in ends)
+    counts = [outcome.result.packets, *(receiver.packets for receiver in outcome.result.receivers)]
+    sent, received = (sum(count[name] for count in counts) for name in ("sent", "received"))
+    assert f"On the way {1 - received / sent:.0%} of {sent:,} packets were lost, at all receivers together." in lines
+
+
+def test_a_task_without_a_number_and_a_meeting_are_said_in_words(result: Result) -> None:
+    tasks = {"formation_error_m": None, "time_to_meet_s": 15.0, "met": 0.0}
+    lines = headline(replace(result, task=tasks), empty_trace())
+    assert lines[:3] == ["Formation error: not known after 15.0 s.", "Time to meet: 15 s.", "The robots have not met."]
+
+
+def test_what_is_wrong_is_never_cut_off() -> None:
+    outcome = run_scenario(load_scenario("demo", ("time=packets",), duration_s=1))
+    wrong = tuple(f"capture {number} is not complete" for number in range(3))
+    lines = headline(replace(outcome.result, incomplete=wrong), outcome.trace)
+    assert set(wrong) <= set(lines)
+
+
 @pytest.mark.parametrize("name", ["demo", "team", "line"])
 def test_no_run_ends_in_more_lines_than_fit(name: str) -> None:
     outcome = run_scenario(load_scenario(name, ("time=packets",), duration_s=2))

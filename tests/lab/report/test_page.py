@@ -13,7 +13,10 @@ import pyarrow.parquet as pa_parquet
 import pytest
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2_lab.report.headline import headline
 from gr_ros2_lab.report.page import read_runs, write_report
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
 from tests.lab.record.runs import IMU, ODOM, make_run
 
 FIGURES = ("path", "latency", "ledger", "delivery", "age", "airtime", "packets")
@@ -139,6 +142,20 @@ def test_files_of_two_runs_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a" / "result.json").write_text(text.replace("/robot_1/odom", "/robot_2/odom"))
     with pytest.raises(ConfigError, match=r"messages.parquet: /robot_2/odom has 0 messages, .* says 40 and 25"):
         read_runs([tmp_path / "a"])
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_report_of_a_team_begins_as_its_run_ended_and_folds_what_is_long(tmp_path: Path) -> None:
+    outcome = run_scenario(load_scenario("team", duration_s=2.0), tmp_path)
+    text = write_report(read_runs([tmp_path]), tmp_path)[0].read_text()
+    told = [re.sub(r"<[^>]+>", "", item) for item in re.findall(r"<li>.*?</li>", text)]
+    first = headline(outcome.result, outcome.trace)
+    assert [line.replace("&lt;", "<") for line in told[: len(first)]] == first
+    assert len(set(told)) == len(told), "nothing is said twice"
+    open_parts = re.sub(r"<details>.*?</details>", "", text, flags=re.DOTALL)
+    assert "/robot_1/odom at /robot_2" in text
+    assert open_parts.count("<tr>") < 40
+    assert "At /robot_1, of what it could hear" in open_parts
 
 
 @pytest.mark.usefixtures("undrawn")

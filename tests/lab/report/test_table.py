@@ -8,9 +8,18 @@ from dataclasses import replace
 from rich.console import Console
 from rich.table import Table
 
-from gr_ros2.observe.result import LatencyResult
-from gr_ros2_lab.record.result import Result
-from gr_ros2_lab.report.table import as_table, faults, ledger_table, notes, paper_grid, summary_table
+from gr_ros2.observe.result import AgeResult, LatencyResult
+from gr_ros2_lab.record.result import ReceiverResult, Result
+from gr_ros2_lab.report.table import (
+    MOST_PATHS,
+    as_table,
+    faults,
+    ledger_table,
+    notes,
+    pairs_grids,
+    paper_grid,
+    summary_table,
+)
 
 
 def _text(table: Table, width: int = 140) -> str:
@@ -62,6 +71,47 @@ def test_notes_say_what_must_not_be_missed(result: Result) -> None:
     said = [line for line in notes(deaf) if "no table of topics" in line]
     assert [line.split(" arrived")[0][-7:] for line in said] == ["robot 1", "robot 3"]
     assert "set repair: auto" in said[0]
+
+
+def team(result: Result, count: int) -> Result:
+    """Every robot hears what every other one sends; all of robot 1's is lost, and half of a percent of the others'."""
+    odom = result.topics[0]
+    came = {n: 199 if n > 1 else 0 for n in range(1, count + 1)}
+    sent = [
+        replace(
+            odom,
+            topic=f"/robot_{n}/odom",
+            src_id=n,
+            sent=200,
+            delivered=delivered,
+            pdr=delivered / 200,
+            ledger={"delivered": delivered, "given_up": 200 - delivered},
+            age_s=AgeResult(0.123 * n, 2.5),
+        )
+        for n, delivered in came.items()
+    ]
+    ends = [tuple(topic for topic in sent if topic.src_id != n) for n in range(1, count + 1)]
+    receivers = (ReceiverResult(n, topics, f"/robot_{n}") for n, topics in enumerate(ends[1:], 2))
+    return replace(result, topics=ends[0], receivers=tuple(receivers), config={"robots": [{"robot": "/robot_1"}]})
+
+
+def test_twenty_robots_are_two_matrices_that_can_be_read(result: Result) -> None:
+    lost, age = pairs_grids(team(result, 20))
+    assert [len(lines) for grid in (lost, age) for lines in grid.sections] == [20, 20]
+    assert lost.sections[0][1][:4] == ("/robot_2", "100", "", "<1")
+    assert age.sections[0][1][:4] == ("/robot_2", ".12", "", ".37")
+    assert age.sections[0][0][-1] == "2.5"
+    text = _text(as_table(lost), width=110) + _text(as_table(age), width=110)
+    assert "…" not in text
+    assert pairs_grids(result) == []
+
+
+def test_many_paths_have_one_line(result: Result) -> None:
+    many = team(result, MOST_PATHS + 3)
+    far = replace(many, topics=(*many.topics[:-1], replace(many.topics[-1], rms_error_m=9.5)))
+    (line,) = (line for line in notes(far) if "path" in line)
+    assert line.startswith(f"Of {MOST_PATHS + 2} received paths, that of /robot_{MOST_PATHS + 3}/odom is furthest")
+    assert line.endswith("9.500 m (RMS).")
 
 
 def test_the_papers_own_line_stands_above_ours(result: Result) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,14 @@ def test_every_entry_of_the_first_packets_is_drawn(tmp_path: Path) -> None:
     assert len(np.asarray(left.get_xdata())) == len(np.unique(packets.packet[first]))
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == ["/robot_1/odom", "/robot_1/imu", "left", "arrived", "did not arrive"]
+
+
+def test_what_is_announced_before_the_run_is_not_among_the_first_packets(tmp_path: Path) -> None:
+    packets = make_run(tmp_path).trace.packets()
+    later = replace(packets, t_sent=np.where(packets.packet < 2, -2.0, packets.t_sent))
+    (left, *_) = packets_figure(later, ["/robot_1/odom"]).axes[1].lines
+    assert np.asarray(left.get_ydata()).min() >= 0
+    assert len(np.asarray(left.get_xdata())) > 2
 
 
 def test_nothing_can_be_drawn_too(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.record.repetitions import REPETITIONS_FILE, run_folders, summarize
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.report.page import read_runs
-from gr_ros2_lab.report.repetitions import repetition_grid
+from gr_ros2_lab.report.repetitions import repetition_grid, repetition_summary
 from gr_ros2_lab.run.runner import repetitions, run_repetitions
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
 
@@ -92,6 +92,22 @@ def test_a_number_that_some_runs_do_not_have(result: Result) -> None:
     lines = [line for section in repetition_grid([result, silent]).sections for line in section]
     assert ("/robot_1/odom", "PDR", "0.900", "–", "0.900", "0.900") in lines
     assert not [line for line in lines if line[:2] == ("/robot_1/imu", "p50 [ms]")]
+
+
+def test_several_runs_of_a_team_say_its_task_first_in_few_lines(result: Result) -> None:
+    robots = [{"topics": {"auto": {}}, "direction": "both"}] * 3
+    runs = [replace(result, task={"formation_error_m": error}, config={"robots": robots}) for error in (0.2, 0.4)]
+    (lines,) = repetition_summary(runs).sections
+    assert lines[0][0] == "formation error [m]"
+    assert (lines[0][1], *lines[0][3:]) == ("0.3", "0.2", "0.4")
+    assert len(lines) <= 10
+
+
+def test_several_runs_with_many_topics_have_a_line_each(result: Result) -> None:
+    many = tuple(replace(result.topics[0], topic=f"/robot_1/t{n}", pdr=n / 20) for n in range(12))
+    (lines,) = repetition_summary([replace(result, topics=many)] * 2).sections
+    assert [line[0] for line in lines] == [f"/robot_1/t{n}" for n in range(8)]
+    assert lines[0][1] == "0.000 ± 0.000"
 
 
 def test_a_damaged_list_of_repetitions_is_named(tmp_path: Path) -> None:

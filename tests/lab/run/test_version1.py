@@ -96,7 +96,7 @@ def test_every_receiver_has_losses_of_its_own(tmp_path: Path) -> None:
     again = read_result(write_result(result, tmp_path / "result.json"))
     assert again.receivers == result.receivers
     names = [line[0] for line in summary_grid([again]).sections[0]]
-    assert names == ["/robot_1/odom", "/robot_1/odom at receiver 2", "/robot_1/odom at receiver 3"]
+    assert names == [f"/robot_1/odom at receiver {number}" for number in (1, 2, 3)]
     assert [line[0] for line in ledger_grid(again).sections[0]] == names
 
 
