@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 from PyQt5 import Qt
 
 PERIOD_S = 1.0
+WINDOW = 1100, 860
+"""Pixels that the window gets where nobody has resized it before: GRC opens it with 634 by 430."""
 COLUMNS = ("Robot", "", "Topic", "Messages", "Per second", "Latency (ms)")
 
 
@@ -50,6 +52,7 @@ class TopicTable(Qt.QTableWidget):  # type: ignore[misc]
     def __init__(self, flowgraph: Any, links: str) -> None:
         super().__init__(0, len(COLUMNS))
         self._flowgraph, self._links = flowgraph, links.replace(",", " ").split()
+        self._shown = False
         self._before: dict[tuple[int, str, str], tuple[float, int]] = {}
         self.setHorizontalHeaderLabels(COLUMNS)
         self.verticalHeader().hide()
@@ -60,6 +63,16 @@ class TopicTable(Qt.QTableWidget):  # type: ignore[misc]
         self._timer = Qt.QTimer(self)
         self._timer.timeout.connect(self.refresh)
         self._timer.start(round(PERIOD_S * 1000))
+
+    def showEvent(self, event: Any) -> None:
+        """The window has all its parts when the table is first shown in it."""
+        super().showEvent(event)
+        window = self.window()
+        kept = getattr(window, "settings", None)  # GRC's, which have the size at which the window was last closed
+        if not self._shown and not (kept and kept.value("geometry")):
+            screen = Qt.QApplication.primaryScreen().availableGeometry().size()
+            window.resize(window.size().expandedTo(Qt.QSize(*WINDOW)).boundedTo(screen))
+        self._shown = True
 
     def refresh(self) -> None:
         """Show what the links count now."""

@@ -252,7 +252,7 @@ def _details(console: Console, outcome: Outcome, said: Container[str]) -> None:
         table = as_table(grid)
         width = Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum
         if grid.one_line and width > console.width:
-            console.print(f"{grid.title}: see the report, or widen the terminal to {width} columns")
+            console.print(f"{grid.title}: see the report, or widen the terminal to {width} columns", markup=False)
         else:
             console.print(table)
         console.print()

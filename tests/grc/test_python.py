@@ -351,6 +351,12 @@ def test_the_first_example_runs_on_the_play_button_in_a_window_of_its_own(home: 
         wait_for(lambda: colours(pixels) > empty + 100, "blocks to be drawn")
         title = "ROS topics over OFDM"
         keyboard.press(window, F6, lambda: keyboard.window(title), "the flowgraph's window")
+
+        def large() -> bool:
+            shape = re.search(r"Geometry: (\d+)x(\d+)", keyboard.run("getwindowgeometry", keyboard.window(title)))
+            return shape is not None and int(shape[1]) >= 1000 and int(shape[2]) >= 800
+
+        wait_for(large, "a window that has room for all of it")
         with DdsMiddleware(domain_id=domains[1], localhost_only=True) as graph:
             graph.subscribe("/rx_robot_1/odom", ODOM, Qos(depth=0), heard.append)
             wait_for(lambda: len(heard) > 10, "odometry of the simulated robot")
