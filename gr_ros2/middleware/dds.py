@@ -211,14 +211,16 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         names = ros_graph.dds_service(end.name, end.type_name)
         topics = [create_topic(self._participant, *name) for name in names]
         data = [ros_graph.endpoint_user_data(self._others.hash_of(name)) + end.mark for _, name in names]
-        # The writer is first: a reader alone on a topic of requests makes clients of Fast DDS wait for ever.
-        writer = RawWriter(self._participant, topics[end.writes], SERVICE_QOS, data[end.writes])
+        # Writers are first, the spare ones before all: no client of Fast DDS finds as many writers as readers.
+        writes = topics[end.writes], SERVICE_QOS
+        spare = [RawWriter(self._participant, *writes, b"") for _ in range(end.spare_writers)]
+        writer = RawWriter(self._participant, *writes, data[end.writes])
         reader = RawReader(self._participant, topics[end.reads], SERVICE_QOS, data[end.reads])
         for topic in topics:
             delete(topic)  # it lives on in its endpoints
         writer.watch_matches()
         reader.watch_matches()
-        end.reader, end.writer = reader, writer
+        end.reader, end.writers = reader, (writer, *spare)
         with self._lock:
             self._pairs.append(end)
         self._events.attach(reader.entity, (reader.entity, reader.condition, writer.entity), end.service)
@@ -233,7 +235,8 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             self._pairs.remove(end)
         self._events.detach(end.reader.entity)
         end.reader.delete()
-        end.writer.delete()
+        for writer in end.writers:
+            writer.delete()
         self.announce()
 
     def forget_server(self, server: DdsServer) -> None:
@@ -248,11 +251,11 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
                 writers = [publisher.writer.guid for publisher in self._advertised]
                 own = [end for end in self._pairs if not end.node]
                 readers += [end.reader.guid for end in own]
-                writers += [end.writer.guid for end in own]
+                writers += [end.writers[0].guid for end in own]
                 nodes = [ros_graph.NodeEntities(*self._node, readers, writers)]
                 for name in sorted({end.node for end in self._pairs if end.node}):
                     ends = [end for end in self._pairs if end.node == name]
-                    guids = [end.reader.guid for end in ends], [end.writer.guid for end in ends]
+                    guids = [end.reader.guid for end in ends], [end.writers[0].guid for end in ends]
                     nodes.append(ros_graph.NodeEntities(*_split(name), *guids))
             info = ros_graph.participant_entities_info(self._guid, nodes, gid_bytes=self._gid_bytes)
             try:

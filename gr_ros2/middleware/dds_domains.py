@@ -35,8 +35,14 @@ _NODES_ON_LOCALHOST = f'<Peer Address="127.0.0.1" {_NEVER_FORGET}/>'
 """A node of this machine on LOCALHOST does not receive multicast on another interface, and Cyclone DDS 11 ignores its
 packets to 127.0.0.1 there. So it is asked."""
 
-_COMPATIBILITY = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
-"""1.15 is Fast DDS. Its nodes exchange type objects over endpoints that every participant shares. Cyclone DDS 11 cannot
+_COMPATIBILITY = (
+    "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
+    "<Internal><GenerateKeyhash>true</GenerateKeyhash></Internal>"
+)
+"""Without the hash Fast DDS 2 does not understand that an endpoint has gone, and takes it for present until its
+participant leaves. Messages have no keys, so it costs them nothing.
+
+1.15 is Fast DDS. Its nodes exchange type objects over endpoints that every participant shares. Cyclone DDS 11 cannot
 read these objects, asks for them and answers with what it has; then other nodes of Fast DDS, which get that answer too,
 do not match any more (``invalid type object``, ``Inconsistent TypeObject``). Opaque topics need no type information."""
 

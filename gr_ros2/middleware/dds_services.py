@@ -3,11 +3,14 @@
 A request begins with 16 bytes that name it: 8 of the client, and a number of its own. The reply begins with the same.
 The message follows. rmw_fastrtps has neither: there the identity is in inline QoS parameters of the DDS, which the
 library does not give out. So its clients and servers are refused and counted as ``other_rmw:/service``; with the
-middleware ``rclpy`` they take part. A client that finds a server expects an answer: where all nodes have another RMW,
-no server is on the graph.
+middleware ``rclpy`` they take part.
 
-Invariants: a server's reader exists only together with its writer, since a client of Fast DDS that finds a reader alone
-waits for ever; a client says that a server is there only when both its endpoints match those of one server.
+A client that finds a server expects an answer. Where all nodes have another RMW, no server is on the graph. Beside
+nodes of Cyclone DDS a server has a second writer of replies, through which nothing is written: to rmw_fastrtps a server
+is there where requests have as many readers as replies have writers; rmw_cyclonedds looks for a pair of one identity.
+
+Invariants: a server's reader exists only together with its two writers; a client says that a server is there only when
+both its endpoints match those of one server.
 """
 
 from __future__ import annotations
@@ -83,10 +86,12 @@ class _DdsEnd:
     """
 
     reader: RawReader
-    writer: RawWriter
+    writers: tuple[RawWriter, ...]
+    """The first is for messages, and the others for nothing."""
 
     role = ""
     reads, writes = 0, 1
+    spare_writers = 0
 
     def __init__(self, participant: ServiceParticipant, service: str, type_name: str, node: str = "") -> None:
         self.name, self.type_name, self.node = service, type_name, node
@@ -120,6 +125,7 @@ class DdsServer(_DdsEnd, ServiceServer):
     """A server. ``reply`` may be called from any thread."""
 
     role = "service"
+    spare_writers = 1
 
     def __init__(
         self, participant: ServiceParticipant, service: str, type_name: str, on_request: RequestCallback, node: str
@@ -147,7 +153,7 @@ class DdsServer(_DdsEnd, ServiceServer):
             if self._closed:
                 return
             self.reader.matched()  # both reset the status that triggered: otherwise the thread is called again at once
-            self.writer.matched()
+            self.writers[0].matched()
             for sample in self.reader.take():
                 client = self.reader.other(sample.source)
                 if client is not None and not client.is_cyclone:
@@ -164,7 +170,7 @@ class DdsServer(_DdsEnd, ServiceServer):
         assert isinstance(client, bytes)
         if not self._offered and not self._closed:
             return  # its client has left
-        self._write(self.writer, client, payload, "reply of")
+        self._write(self.writers[0], client, payload, "reply of")
 
     def close(self) -> None:
         self._participant.forget_server(self)
@@ -203,7 +209,7 @@ class DdsClient(_DdsEnd, ServiceClient):
                     number, payload = int.from_bytes(parts[0][_NAME:], "little", signed=True), parts[1]
                     self._participant.guarded(self.name, lambda n=number, p=payload: self._on_reply(n, p))  # type: ignore[misc]
             self.reader.matched()
-            self.writer.matched()
+            self.writers[0].matched()
             available = self._find_server()
             if available != self._available:
                 self._available = available
@@ -212,7 +218,7 @@ class DdsClient(_DdsEnd, ServiceClient):
     def call(self, number: int, payload: bytes) -> None:
         if not self._available:
             raise MiddlewareError(f"request of {self.name}: no server is there")
-        self._write(self.writer, self._name + number.to_bytes(8, "little", signed=True), payload, "request of")
+        self._write(self.writers[0], self._name + number.to_bytes(8, "little", signed=True), payload, "request of")
 
     def close(self) -> None:
         self._close()
@@ -220,7 +226,7 @@ class DdsClient(_DdsEnd, ServiceClient):
     def _find_server(self) -> bool:
         """Whether both endpoints match those of a server, as ``rmw_service_server_is_available`` decides."""
         own = self._participant.own_guid
-        readers, writers = ([e for e in end.others() if e.participant != own] for end in (self.writer, self.reader))
+        readers, writers = ([e for e in end.others() if e.participant != own] for end in (self.writers[0], self.reader))
         for reader in readers:
             if not reader.is_cyclone:
                 # What is written reaches every reader, and this one would take the header for a part of the message.

@@ -144,8 +144,8 @@ def test_services_are_announced_with_their_node(graph: DdsMiddleware, monkeypatc
     own = graph.serve("/rx_robot_2/add", ADD, lambda *_: None)
     params = graph.serve("/rx_robot_2/planner/set", ADD, lambda *_: None, "/rx_robot_2/planner")
     assert [tuple(node) for node in told[-1]] == [
-        ("gr_ros2", "/", [own.reader.guid], [own.writer.guid]),
-        ("planner", "/rx_robot_2", [params.reader.guid], [params.writer.guid]),
+        ("gr_ros2", "/", [own.reader.guid], [own.writers[0].guid]),
+        ("planner", "/rx_robot_2", [params.reader.guid], [params.writers[0].guid]),
     ]
     params.close()
     assert len(told[-1]) == 1

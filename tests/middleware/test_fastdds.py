@@ -15,7 +15,7 @@ from gr_ros2.middleware import Qos, ros_graph
 from gr_ros2.middleware.dds import DdsMiddleware
 from tests.compiled import compiled
 from tests.domains import domain
-from tests.middleware.calling import ADD
+from tests.middleware.calling import ADD, Adder, Caller
 from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, Peer, message, same
 from tests.waiting import wait_for
 
@@ -258,6 +258,8 @@ def test_no_service_is_offered_where_every_node_would_wait_in_vain(
     names = (ros_graph.DISCOVERY_TOPIC, ros_graph.DISCOVERY_TYPE)
     with DdsMiddleware(domain_id=domain(2), node_name="link") as another_link:  # no node of ROS
         wait_for(lambda: "/served" in another_link.discover_services(), "the service")
+        before = peer("pub", "", RELIABLE, names=ros_graph.dds_service("/served", ADD)[0])
+        wait_for(lambda: before.matched, "a client to find it")
         node = peer("pub", "", Qos("reliable", "transient_local", 1), names=names)
         wait_for(lambda: "/served" not in another_link.discover_services(), "the service to go")
         gone = {"not_offered:/served", "not_offered:/other"}
@@ -267,12 +269,31 @@ def test_no_service_is_offered_where_every_node_would_wait_in_vain(
         assert [record.levelname for record in said() if record.levelno >= logging.WARNING] == ["WARNING"]
         later = middleware.serve("/later", ADD, lambda *_: None)
         client = peer("pub", "", RELIABLE, names=ros_graph.dds_service("/later", ADD)[0])
+        wait_for(lambda: not before.matched, "the node to learn that the service has gone")
         assert not client.matched
         node.close()
         wait_for(lambda: {"/served", "/later"} <= another_link.discover_services().keys(), "both, without that node")
     server.close()
     other.close()
     later.close()
+
+
+def test_a_client_of_fast_dds_waits_for_our_server_where_one_of_cyclone_is_answered(
+    middleware: DdsMiddleware, peer: Callable[..., Peer]
+) -> None:
+    """rmw_fastrtps calls a server there where its client matches as many readers of requests as writers of replies."""
+    cyclone = Caller(middleware, "/served")
+    with DdsMiddleware(domain_id=domain(2), node_name="link") as link:
+        server = Adder(link, "/served")
+        requests, replies = ros_graph.dds_service("/served", ADD)
+        asks, hears = peer("pub", "", RELIABLE, names=requests), peer("sub", "", RELIABLE, names=replies)
+        wait_for(lambda: (asks.matched, hears.matched) == (1, 2), "Fast DDS to find all of the server")
+        wait_for(lambda: cyclone.there, "the client of Cyclone to find the server")
+        cyclone.call(1)
+        wait_for(lambda: cyclone.got == {1: [1001]}, "its answer")
+        assert (asks.matched, hears.matched) == (1, 2)
+        server.server.close()
+        wait_for(lambda: (asks.matched, hears.matched) == (0, 0), "all of the server to leave")
 
 
 def test_nodes_of_fast_dds_find_each_other_beside_a_link(
