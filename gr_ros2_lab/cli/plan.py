@@ -18,7 +18,7 @@ from gr_ros2.link.fates import ARRIVED, Fate
 from gr_ros2.middleware.bag_files import is_bag
 from gr_ros2_lab.cli.params import SCENARIO
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
-from gr_ros2_lab.study.forecast import Advice, Cut, Effect, Forecast, Planner
+from gr_ros2_lab.study.forecast import Advice, Cut, Effect, Forecast, Planner, prepare_processes
 from gr_ros2_lab.study.traffic import link_values, of_recording, recorded_graph
 
 _WIDTH = 110
@@ -55,6 +55,8 @@ def plan(
     with the messages of a recording (--bag) or of the ROS graph (--graph). A BAG alone, or --graph alone, is planned
     for a link with default settings, which --set changes.
     """
+    if not no_advice:
+        prepare_processes()
     path = None if what is None else Path(what)
     if path is not None and bag is None and is_bag(path):
         path, bag = None, path
@@ -188,7 +190,7 @@ def _verdict(forecast: Forecast) -> str:
         fits = "it fits"
     per_message = _number(forecast.air_bytes_per_message, 1, ".0f")
     air = "of the air" if forecast.allowed == 1 else f"of the {forecast.allowed:.0%} of the air that may be used"
-    alone = f"New messages in packets of their own need {forecast.load:.0%} {air}: {fits}"
+    alone = f"New messages need {forecast.load:.0%} {air}: {fits}"
     return f"{alone}. {per_message} bytes on the air per message delivered."
 
 

@@ -1,8 +1,8 @@
 """Does this traffic fit this radio? A forecast from a simulation of the link, and changes that would improve it.
 
-Invariants: a forecast is a simulation of the same scenario, never a formula; the airtime of a packet is divided among
-its entries in proportion to their bytes, so the shares of the topics add up to the airtime used; each advice contains
-the forecast it is based on.
+Invariants: a forecast is a simulation of the same scenario, never a formula; the airtime of a packet with new messages
+is divided among its entries in proportion to their bytes, so the shares of the topics add up to what these packets
+use; each advice contains the forecast it is based on.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain
-from multiprocessing import get_context
+from multiprocessing import forkserver, get_context
 from statistics import fmean
 from typing import Any, get_args
 
@@ -47,6 +47,7 @@ from gr_ros2_lab.run.scenario import Scenario, changed
 from gr_ros2_lab.run.simulate import Simulated, coupled, offered_by, simulate
 from gr_ros2_lab.survey.table import Survey
 
+_FORKS = get_context("forkserver")
 TRIAL_S = 10.0
 """s of traffic on which changes are tried."""
 OVERHEAD_S = 0.0025
@@ -95,7 +96,7 @@ class TopicForecast:
     :param src_id: of the robot that sends it
     :param load: part of the airtime allowed, to all robots that share it, that all its messages would take, at the mean
         cost of those sent
-    :param share: part of the airtime of the packets that left the source; above 1 is possible where the source is not
+    :param share: part of the airtime that its new messages used; above 1 is possible where the source is not
         paced
     :param rate_hz: messages/s delivered
     """
@@ -197,7 +198,7 @@ class Advice:
 
     :param setting: one or more ``key=value``, with spaces between them
     :param forecast: with the change
-    :param used: airtime used now and with the change, 0..1
+    :param used: airtime used now, and with the change if that is to it as in the first seconds, 0..1
     :param effects: on every topic that sends
     """
 
@@ -371,7 +372,8 @@ class Planner:
             for before, after in zip(now.topics, then.topics, strict=True)
             if before.result.sent
         )
-        return Advice(setting, then, (now.used, then.used), effects)
+        used = self.forecast().used
+        return Advice(setting, then, (used, min(used * then.used / now.used, 1.0) if now.used else then.used), effects)
 
     def _trials(self) -> Iterator[tuple[str, Scenario]]:
         """The first seconds as they are, and with each change; the settings that make it."""
@@ -524,18 +526,19 @@ class Planner:
         shares: Counter[tuple[int, int]] = Counter()
         padded = sent_bytes = 0
         senders: dict[str, Counter[str]] = {}
-        begun, ended = np.inf, 0.0
 
         wire = scenario.wire_format
 
         def share(sent: SentPacket) -> None:
-            nonlocal padded, sent_bytes, begun, ended
+            nonlocal padded, sent_bytes
             own_airtime = phy.airtime(len(sent.data))
-            senders.setdefault(str(sent.src_id), Counter())[sent.kind] += own_airtime  # type: ignore[assignment]
+            if sent.now <= duration:  # what is sent later has all air for itself
+                senders.setdefault(str(sent.src_id), Counter())[sent.kind] += own_airtime  # type: ignore[assignment]
             sent_bytes += len(sent.data)
-            begun, ended = min(begun, sent.now), max(ended, sent.now + own_airtime)
             layout = wire.layout(sent.packet, scenario.packet_len, len(sent.data))
             padded += sum(span.size for span in layout if span.kind == "pad")
+            if sent.kind != "new":
+                return
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:
                 if span.entry is not None:
@@ -582,20 +585,19 @@ class Planner:
             )
         delivered = sum(topic.result.delivered for topic in topics)
         spent = [float(kinds.total()) for kinds in senders.values()]
-        span = max(ended - begun, airtime)
         sending = {str(robot.robot_id) for robot in robots}
         return Forecast(
             packet_len=scenario.packet_len,
             airtime_s=airtime,
             capacity=allowed / airtime,
-            used=min((sum(spent) if shared else max(spent, default=0.0)) / span, 1.0),
+            used=min((sum(spent) if shared else max(spent, default=0.0)) / duration, 1.0),
             air_bytes_per_message=sent_bytes / delivered if delivered else None,
             pad=padded / sent_bytes if sent_bytes else 0.0,
             allowed=allowed,
             shared=shared,
             topics=tuple(topics),
             air=_air(run),
-            in_use=air_line(senders, span, sending, shared=shared) if senders else "",
+            in_use=air_line(senders, duration, sending, shared=shared) if senders else "",
         )
 
 
@@ -651,13 +653,19 @@ def _on_all_processors(
     if processors < 2:
         yield from map(work, scenarios)
         return
-    pool = ProcessPoolExecutor(processors, get_context("forkserver"), _begin_process, (work,))
+    pool = ProcessPoolExecutor(processors, _FORKS, _begin_process, (work,))
     try:
         yield from pool.map(_process, scenarios)
     except BrokenProcessPool as error:
         raise RunError("a process that made a forecast was ended; free memory, and try again") from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def prepare_processes() -> None:
+    """Begin to load what other processes need, which takes a second, while this one goes on."""
+    _FORKS.set_forkserver_preload([__name__])
+    forkserver.ensure_running()
 
 
 def _begin_process(work: Callable[[Scenario], Forecast]) -> None:

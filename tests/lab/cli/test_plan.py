@@ -102,7 +102,7 @@ OVERLOADED = ["plan", "six-topics-paced", "--duration", "4"]
 def test_cuts_are_what_an_engineer_says_with_the_load_after_each(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(OVERLOADED) == 0
     out = capsys.readouterr().out
-    before = int(re.search(r"New messages in packets of their own need (\d+)% of the air: it does not fit", out)[1])  # type: ignore[index]
+    before = int(re.search(r"New messages need (\d+)% of the air: it does not fit", out)[1])  # type: ignore[index]
     cuts = re.findall(r"^  (?:drop|limit) /robot_1/\w+(?: to [\d.]+ Hz)?: new messages need (\d+)%$", out, re.MULTILINE)
     loads = [before, *map(int, cuts)]
     assert loads == sorted(loads, reverse=True)
@@ -110,7 +110,7 @@ def test_cuts_are_what_an_engineer_says_with_the_load_after_each(capsys: pytest.
     assert "packet_len" not in out
     settings = shlex.split(re.search(r"^As settings: (.*)$", out, re.MULTILINE)[1])  # type: ignore[index]
     assert run([*OVERLOADED, *settings]) == 0
-    assert f"New messages in packets of their own need {loads[-1]}% of the air: it fits." in capsys.readouterr().out
+    assert f"New messages need {loads[-1]}% of the air: it fits." in capsys.readouterr().out
 
 
 def test_a_bag_alone_or_over_a_link_is_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
