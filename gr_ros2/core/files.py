@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
@@ -66,6 +67,19 @@ def make_folder(path: Path) -> Path:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from error
     return path
+
+
+def check_folder(path: Path) -> None:
+    """Whether files can be written there later; nothing is left.
+
+    :raises ConfigError: they cannot
+    """
+    there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+    try:
+        with TemporaryDirectory(dir=there):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from error
 
 
 def sync(path: Path) -> None:

@@ -9,7 +9,7 @@ import click
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import set_option
-from gr_ros2_lab.cli.params import SCENARIO, written_line
+from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, written_line
 from gr_ros2_lab.report.compare import write_comparison
 from gr_ros2_lab.report.table import as_table
 from gr_ros2_lab.run.scenario import Scenario
@@ -18,7 +18,7 @@ from gr_ros2_lab.study.ablation import Variant, run_variants, worth_grid
 
 @click.command()
 @click.argument("scenario", type=SCENARIO)
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/ablate-NAME-TIME.")
+@click.option("--out", type=OUT_FOLDER, help="Folder for results; default results/ablate-NAME-TIME.")
 @click.option("--seed", type=int, help="Seed of robots, channel and sender.")
 @click.option("--duration", type=float, help="Seconds of each run during which messages are sent.")
 @set_option(Scenario)

@@ -9,7 +9,7 @@ import click
 
 from gr_ros2.cli.console import console
 from gr_ros2.core.errors import ConfigError
-from gr_ros2_lab.cli.params import pictures_option, written_line
+from gr_ros2_lab.cli.params import OUT_FOLDER, pictures_option, written_line
 from gr_ros2_lab.report.compare import compare_grid, lateness_of, write_comparison
 from gr_ros2_lab.report.page import read_runs
 from gr_ros2_lab.report.table import as_table
@@ -18,7 +18,7 @@ from gr_ros2_lab.report.table import as_table
 @click.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR DIR...", type=click.Path(path_type=Path))
 @pictures_option
-@click.option("--out", type=click.Path(path_type=Path), help="Folder to write; default results/compare-TIME.")
+@click.option("--out", type=OUT_FOLDER, help="Folder to write; default results/compare-TIME.")
 def compare(directories: tuple[Path, ...], out: Path | None, pictures: bool) -> None:
     """Print what differs between the runs in these folders, side by side; write compare.html and a table."""
     runs = read_runs(directories)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 
 from gr_ros2.cli.params import Completed
+from gr_ros2.core.files import check_folder
 from gr_ros2_lab.run.builtin import builtin_scenarios
 
 
@@ -25,6 +28,18 @@ class ScenarioName(Completed):
 
 
 SCENARIO = ScenarioName()
+
+
+class OutFolder(click.Path):
+    """A folder that is written to at the end of what may take hours, so it is tried at once."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        check_folder(path)
+        return path
+
+
+OUT_FOLDER = OutFolder(path_type=Path)
 
 
 pictures_option = click.option(

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import OrAuto
 from gr_ros2.core.errors import ConfigError
+from gr_ros2_lab.cli.params import OUT_FOLDER
 from gr_ros2_lab.report.table import as_table
 
 _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
@@ -21,7 +22,7 @@ _TEAM = {"packet_len": 96, "loss": (0.05,), "load": (2.0, 4.0)}
 @click.command()
 @click.option("--short", is_flag=True, help="5 s a contender, at load 200 % and loss 5 % unless told otherwise.")
 @click.option("--robots", type=int, metavar="N", help="2 to 10 robots on one channel, all to all; default one to one.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/race-TIME.")
+@click.option("--out", type=OUT_FOLDER, help="Folder for results; default results/race-TIME.")
 @click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20,40, of a team 5.")
 @click.option(
     "--load", metavar="PERCENT,...", help="Of the channel by messages as they are; 50,200, of a team 200,400."

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import click
 
-from gr_ros2_lab.cli.params import pictures_option, written_line
+from gr_ros2_lab.cli.params import OUT_FOLDER, pictures_option, written_line
 from gr_ros2_lab.report.page import read_runs, write_report
 
 
 @click.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...", type=click.Path(path_type=Path))
 @pictures_option
-@click.option("--out", type=click.Path(path_type=Path), help="Folder to write; default: DIR, or results/report-TIME.")
+@click.option("--out", type=OUT_FOLDER, help="Folder to write; default: DIR, or results/report-TIME.")
 def report(directories: tuple[Path, ...], out: Path | None, pictures: bool) -> None:
     """Write report.html of the runs in these folders; of several runs also a table (CSV, Parquet).
 

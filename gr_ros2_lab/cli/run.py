@@ -24,7 +24,7 @@ from gr_ros2.codecs import CODECS
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.observe.observers import RunObserver
 from gr_ros2.settings.fields import AUTO
-from gr_ros2_lab.cli.params import SCENARIO, pictures_option
+from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, pictures_option
 from gr_ros2_lab.cli.terminal import path_text
 from gr_ros2_lab.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2_lab.record.result import Result
@@ -58,7 +58,7 @@ _WIDEST = 1000
 """Columns that no table needs."""
 
 _options = [
-    click.option("--out", type=click.Path(path_type=Path), help="Folder for results; default results/NAME-TIME."),
+    click.option("--out", type=OUT_FOLDER, help="Folder for results; default results/NAME-TIME."),
     click.option("--seed", type=int, help="Seed of robots, channel and sender."),
     click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
     click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),

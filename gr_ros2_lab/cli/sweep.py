@@ -14,6 +14,7 @@ from gr_ros2.cli.ending import INTERRUPTED
 from gr_ros2.cli.params import set_option
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import BackendMissingError, RunError
+from gr_ros2_lab.cli.params import OUT_FOLDER
 from gr_ros2_lab.report.table import as_table
 from gr_ros2_lab.run.scenario import Scenario
 from gr_ros2_lab.study.sweep.definition import builtin_sweeps, load_sweep, read_sweep
@@ -27,7 +28,7 @@ _ESTIMATE_S = 3600.0
 
 @click.command()
 @click.argument("sweep", required=False)
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the sweep; default results/sweep-NAME.")
+@click.option("--out", type=OUT_FOLDER, help="Folder of the sweep; default results/sweep-NAME.")
 @click.option("--scheduler", metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, not on this machine.")
 @click.option("--workers", type=click.IntRange(1), help="Processes on this machine; default one per core.")
 @click.option("--fresh", is_flag=True, help="Run everything again, also what is finished.")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.core.files import make_folder, replacing, write_text, write_whole
+from gr_ros2.core.files import check_folder, make_folder, replacing, write_text, write_whole
 
 
 @pytest.mark.parametrize("durable", [False, True])
@@ -45,4 +45,8 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
     with pytest.raises(ConfigError, match=r"plain/x: cannot be written .*; choose another folder"):
         make_folder(tmp_path / "plain" / "x")
+    for path in (tmp_path / "plain", tmp_path / "plain" / "x" / "y", Path("/proc/x")):
+        with pytest.raises(ConfigError, match=r"cannot be written .*; choose another folder"):
+            check_folder(path)
+    check_folder(tmp_path / "a" / "b")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "plain"]

@@ -35,6 +35,15 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("words", [["sweep"], ["run"], ["race", "--duration"], ["compare"], ["report"], ["ablate"]])
+def test_a_folder_that_cannot_be_written_is_named_before_all_else(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "plain").write_text("")
+    assert run([words[0], "--out", str(tmp_path / "plain" / "x"), *words[1:], "nonsense"]) == BAD_INPUT
+    assert "plain/x: cannot be written (Not a directory); choose another folder" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error:constrained_layout not applied")  # by the long paths of the registries
 def test_a_sweep_from_end_to_end_on_two_processes(
