@@ -29,7 +29,7 @@ class Fate(str, Enum):
     CANNOT_COMPLETE = "cannot_complete", "source", "#661100", "not begun, since they would have missed their deadline"
     ABANDONED = "abandoned", "source", "#332288", "given up half sent, since they would have missed their deadline"
     LOST_FRAGMENTS = "lost_fragments", "link", "#d62728", "lost because a fragment did not arrive"
-    GIVEN_UP = "given_up", "link", "#aa3377", "given up, since repair did not bring back what was lost in time"
+    GIVEN_UP = "given_up", "link", "#aa3377", "given up, since what was lost of them did not come again in time"
     OVERTAKEN = "overtaken", "sink", "#ccbb44", "complete only after a newer one of their topic was delivered"
     EXPIRED = "expired", "sink", "#b565a7", "given up incomplete after the reassembly timeout"
     MEMORY = "memory", "sink", "#7f7f7f", "given up incomplete when the sink's memory was full"

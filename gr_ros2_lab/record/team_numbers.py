@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable
+from typing import Any
 
 from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.result import Result, relayed
@@ -42,7 +43,7 @@ def team_numbers(result: Result) -> dict[str, float | None]:
     for topic in pairs:
         each[topic.src_id] += topic.delivered
     sent = sum(topic.sent for topic in pairs)
-    span = result.phy.get("air_span_s")
+    span = air_span_s(result)
     airtimes = {src_id: sum(kinds.values()) for src_id, kinds in airtime_of_senders(result).items()}
     return {
         "pair_pdr": each.total() / sent if sent else None,
@@ -78,5 +79,13 @@ def jain(counts: Collection[int]) -> float | None:
 
 def airtime_of_senders(result: Result) -> dict[str, dict[str, float]]:
     """s of airtime by source id and kind of packet, of every robot that any receiver of the run could hear."""
-    phys = [result.phy, *(receiver.phy for receiver in result.receivers)]
-    return {src_id: kinds for phy in phys for src_id, kinds in (phy.get("airtime_of_senders_s") or {}).items()}
+    return {src_id: kinds for phy in _phys(result) for src_id, kinds in (phy.get("airtime_of_senders_s") or {}).items()}
+
+
+def air_span_s(result: Result) -> float:
+    """s from the first packet that any receiver of the run could hear to the end of the last one; 0 for none."""
+    return max(phy.get("air_span_s") or 0.0 for phy in _phys(result))
+
+
+def _phys(result: Result) -> list[dict[str, Any]]:
+    return [result.phy, *(receiver.phy for receiver in result.receivers)]

@@ -15,7 +15,7 @@ import numpy as np
 from gr_ros2.link.fates import FATES, Fate, fate_order
 from gr_ros2.link.lateness import LATE_S
 from gr_ros2_lab.record.result import Result, air_uses
-from gr_ros2_lab.record.team_numbers import airtime_of_senders, ledger_of, team_pairs
+from gr_ros2_lab.record.team_numbers import air_span_s, airtime_of_senders, ledger_of, team_pairs
 from gr_ros2_lab.record.trace import Ints, Packets, Trace
 from gr_ros2_lab.report.table import ends, milliseconds
 
@@ -126,7 +126,7 @@ def _packets(result: Result, packets: Packets) -> Iterator[str]:
 def air_lines(result: Result) -> Iterator[str]:
     """Which part of the time the air was in use, and for what."""
     senders = airtime_of_senders(result)
-    span = result.phy.get("air_span_s")
+    span = air_span_s(result)
     if senders and span:
         sending = {str(topic.src_id) for topic in result.topics}
         yield air_line(senders, span, sending, shared=result.config.get("duplex") == "half")

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.record.team_numbers import airtime_of_senders, team_numbers
+from gr_ros2_lab.report.explain import percent
 from gr_ros2_lab.report.headline import MOST_LINES, headline, topics_grid
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
@@ -37,6 +39,11 @@ def test_a_team_says_its_task_all_its_robots_and_what_was_worst() -> None:
     assert len(lines) <= MOST_LINES - 3
     all_sent = sum(t.sent for end in (outcome.result, *outcome.result.receivers) for t in end.topics)
     assert f" of {all_sent:,} messages of 4 robots" in lines[1]
+    used = team_numbers(outcome.result)["air_use"]
+    assert used is not None
+    assert any(line.startswith(f"Air in use: {percent(used)} of the time") for line in lines)
+    assert airtime_of_senders(outcome.result).keys() == {"1", "2", "3", "4"}
+    assert not any("since repair" in line for line in lines), "it is off"
 
 
 def test_where_nothing_arrives_the_snr_that_the_radio_needs_is_told(result: Result) -> None:
