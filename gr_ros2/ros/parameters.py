@@ -47,7 +47,7 @@ def parameters(settings: Any, prefix: str = "") -> Iterator[Parameter]:
         name, value = f"{prefix}{setting.name}", getattr(settings, setting.attribute)
         if is_dataclass(value):
             yield from parameters(value, f"{name}.")
-        elif name == "topics":
+        elif name in ("topics", "offer"):
             yield _parameter(name, list(value), setting)
             for word, options in value.items():
                 yield from _set_options(options, f"{name}.{word}.")

@@ -6,7 +6,7 @@ Invariant: a default is never refused, and neither is a value that equals it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any
 
 from gr_ros2.settings.fields import settings_of
@@ -47,8 +47,8 @@ def refuse_given(config: Any, settings: Iterable[str], why: str, where: str = ""
     """
     for name in settings:
         for given, value in _given(config, name):
-            shown = ", ".join(map(str, value)) if isinstance(value, Mapping) else repr(value)
-            raise ValueError(f"{where}{given} = {shown}: {why}")
+            names = isinstance(value, Mapping) and all(map(is_dataclass, value.values()))
+            raise ValueError(f"{where}{given} = {', '.join(value) if names else repr(value)}: {why}")
 
 
 def conditions_of(cls: type[Any]) -> list[ActsWhere]:
