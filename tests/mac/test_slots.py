@@ -155,9 +155,9 @@ def test_frames_have_a_slot_for_each_newcomer_until_it_is_none_any_more() -> Non
     made = robot()
     for other in range(16):
         hear(made, 10 + other, 70 + other, Block(0, (300, 300), 16, (5, NOBODY)))
-    assert made._frame(90, made._loads(90)) == 17 + 16
+    assert made._frame(90, made._loads(90)) == 17 + 1 + 16
     late = 70 + NEWCOMER
-    assert made._frame(late + 8, made._loads(late + 8)) == 17 + 8
+    assert made._frame(late + 8, made._loads(late + 8)) == 17 + 1 + 8
     assert made._frame(late + 16, made._loads(late + 16)) == 17 + 1
 
 
