@@ -1,4 +1,4 @@
-"""The front end `audio` over a real sound server, whose loudspeakers are its microphones."""
+"""The front end `audio` over real sound servers, whose loudspeakers are their microphones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gr_ros2.radio.audio_card import look_again
 from gr_ros2.radio.permission import permitted
 from tests.middleware.support import message
 from tests.radio.robots import Robot
-from tests.radio.sound_server import SoundServer, sound_server_or_skip
+from tests.radio.sound_server import PipeWire, PulseAudio, SoundServer, sound_server_or_skip
 from tests.radio.test_ptt import Rigctld
 from tests.waiting import wait_for
 
@@ -31,9 +31,9 @@ PHY = {"name": "psk", "sample_rate": 24_000, "options": {"fec": "cc"}}
 SOUND = {"name": "audio", "device": "pulse", "centre_hz": 11_000}
 
 
-@pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SoundServer]:
-    started = sound_server_or_skip(tmp_path)
+@pytest.fixture(params=[PulseAudio, PipeWire])
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[SoundServer]:
+    started = sound_server_or_skip(tmp_path, request.param)
     for name, value in started.env.items():
         monkeypatch.setenv(name, value)
     look_again()
