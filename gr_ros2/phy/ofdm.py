@@ -67,7 +67,7 @@ class OfdmOptions(BurstOptions):
 class OfdmPhy(BurstPhy):
     """OFDM, for channels with echoes: by default FFT 64, cyclic prefix 16, 48 data carriers, BPSK, CRC-32 per frame.
 
-    Carrier offset up to four carriers, clocks within 100 ppm.
+    Carrier offset up to four carriers, clocks within 300 ppm, and a movement in air of 1 m/s.
 
     :param options: see :class:`OfdmOptions`
     :raises ConfigError: for an option that is unknown or out of range

@@ -27,6 +27,8 @@ _TURN = 0.4
 _DOUBT = 1e-3
 """Share of the power sent: if the uncertainty is below this, symbols are not decided again for a better estimate."""
 _TINY = 1e-20
+UNSTEADY = 1e-3
+"""Samples by which what is measured of the timing is off at least."""
 
 
 class ChannelState(NamedTuple):
@@ -121,10 +123,10 @@ class ChannelEstimator:
 
     def decide(
         self, rows: Complexes, channel: ChannelState, points: Points, used: NDArray[np.bool_], rounds: int = 2
-    ) -> tuple[ChannelState, NDArray[np.float32], Samples, float]:
+    ) -> tuple[ChannelState, NDArray[np.float32], Samples, float, float]:
         """Likelihoods of constellation points for some symbols, with a channel estimate improved by these symbols.
 
-        Also returns the delay of the symbols in samples.
+        Also returns the delay of the symbols in samples, and its variance.
 
         :param used: symbols by data carriers: which of them carry a point
         :param rounds: most rounds of decision and estimation
@@ -144,7 +146,7 @@ class ChannelEstimator:
             energy[:, self.data] = _put(squared, used)
             turns = rows * (gains * model).conj()
             turn = self._tone(turns.sum(axis=1))
-            more = self._late(turn @ turns)
+            more, firm = self._late(turn @ turns)
             late += more
             rows = rows * turn[:, None] * self.advance(more)
             weight = np.minimum(channel.weight, _MEMORY)
@@ -153,7 +155,8 @@ class ChannelEstimator:
             if np.vdot(expected, expected).real > (1 - _DOUBT) * squared.sum():
                 break
         likely, seen = self._weigh(rows, gains, noise, points, used)
-        return ChannelState(gains, total, noise), likely, seen, late
+        variance = noise / (2 * firm) + UNSTEADY**2
+        return ChannelState(gains, total, noise), likely, seen, late, variance
 
     def _weigh(
         self, rows: Complexes, gains: NDArray[np.complex128], noise: float, points: Points, used: NDArray[np.bool_]
@@ -181,10 +184,12 @@ class ChannelEstimator:
         phase = float(np.angle((turns * back).sum()))
         return np.asarray(back * np.exp(-1j * phase), np.complex64)
 
-    def _late(self, turns: NDArray[np.complex128]) -> float:
-        """Delay of symbols in samples, from the phase slope over their carriers."""
-        slope = float(self.carriers @ turns.imag) / max(float(self.carriers**2 @ np.abs(turns.real)), _TINY)
-        return -slope * self._size / (2 * np.pi)
+    def _late(self, turns: NDArray[np.complex128]) -> tuple[float, float]:
+        """Delay of symbols in samples, from the phase slope over their carriers, and what its variance is the noise
+        over twice of."""
+        places = 2 * np.pi / self._size * self.carriers
+        firm = max(float(places**2 @ np.abs(turns.real)), _TINY)
+        return -float(places @ turns.imag) / firm, firm
 
 
 def _put(values: NDArray[np.generic], used: NDArray[np.bool_]) -> NDArray[np.generic]:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.fec import Bits, Soft
 from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits, mcs_mark
-from gr_ros2.phy.ofdm_channel import ChannelEstimator, ChannelState, Complexes
+from gr_ros2.phy.ofdm_channel import UNSTEADY, ChannelEstimator, ChannelState, Complexes
 from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, OfdmLayout, constellation
 from gr_ros2.phy.soft import Points
+from gr_ros2.phy.stretch import FRACTIONS, REACH, stretched, weights
 
 _FALSE_ALARM = 1e-3
 """Share of noise samples that are examined closely."""
@@ -31,28 +32,68 @@ _SPREAD_ALARM = 2e-7
 alike. So a burst is found whose energy no single path holds, as in a room."""
 _SHIFTS = (-4, -2, 0, 2, 4)
 """Carrier offsets that are tried, in addition to the fractional offset that the repeated half symbol gives."""
-_CHUNK = 16
-"""Payload symbols decided together; timing and channel are estimated once for each such group."""
-_PACE_GAIN = 0.5
-"""Gain of the timing loop for the rate of change of the timing."""
+_FASTEST = 3.5e-3
+"""How much faster or slower than its receiver's clock a burst may pass: sound from a robot that drives at 1.1 m/s."""
+_DELAY_STEP = 0.4
+"""Samples between two delays of the second sync word that are tried, over the share of carriers that are used."""
+_SURE = 4.0
+"""Deviations by which a pace must differ from 0: where it does not, reading samples as they are is nearer to the
+truth."""
+_CHUNK = 16 * 64
+"""Carriers of the payload symbols decided together; timing and channel are estimated once for each such group."""
+_CLOCKS = 50e-6
+"""Deviation of the rates of two clocks from each other, before anything is known of a burst."""
 _TINY = 1e-20
 _FILL_MARK = 0x555
 """Value added to the number field of a header for each byte that fills up the frame."""
 
 
 class _FramePlace(NamedTuple):
-    """Position of a burst: first sample, carrier offset in radians per sample, and whether its sync words are there."""
+    """Position of a burst: first sample, carrier offset in radians per sample, whether its sync words are there, and by
+    how much its samples are further apart than those of the receiver's clock."""
 
     begin: int
     frequency: float
     found: bool
+    pace: float = 0.0
+    delay: float = 0.0
+    """Samples by which the second sync word is later than a symbol after the first, and its variance."""
+    variance: float = 1.0
 
 
 class _SymbolClock(NamedTuple):
-    """Position of a burst's first sample, and samples by which each symbol is later than the one before."""
+    """When a burst's symbols come: a Kalman filter of their timing and its rate of change.
+
+    :param begin: position of the burst's first sample
+    :param pace: samples by which each symbol is later than the one before
+    :param symbol: the symbol up to which both are known
+    :param variances: of the timing there, of both together, and of the pace
+    """
 
     begin: float
     pace: float
+    symbol: float
+    variances: tuple[float, float, float]
+
+    @classmethod
+    def first(cls, begin: float, delay: float, variance: float, expected: float) -> _SymbolClock:
+        """From the delay of the second sync word.
+
+        :param expected: variance of the pace before anything was measured
+        """
+        share = expected / (expected + variance)
+        # Both words are as late as the channel that they give: their timing is known.
+        return cls(begin - share * delay / 2, share * delay, 0.5, (0.0, 0.0, share * variance))
+
+    def after(self, symbol: float, late: float, variance: float) -> _SymbolClock:
+        """With the timing of later symbols around ``symbol``, which were ``late``."""
+        step = symbol - self.symbol
+        own, both, pace = self.variances
+        own, both = own + step * (2 * both + step * pace), both + step * pace
+        share, turn = own / (own + variance), both / (own + variance)
+        faster = self.pace + turn * late
+        begin = self.begin + share * late + (self.pace - faster) * symbol
+        return _SymbolClock(begin, faster, symbol, ((1 - share) * own, (1 - share) * both, pace - turn * both))
 
 
 class OfdmModem(BurstModem):
@@ -78,6 +119,7 @@ class OfdmModem(BurstModem):
         self._window = self._symbol - self._half
         self._level = 1 - _FALSE_ALARM ** (1 / (self._window - 1)) if threshold is None else threshold
         self._back = self._prefix // 4
+        self._chunk = _CHUNK // self._size
         self.margin = self._prefix
         self.stretch = max(2048, 16 * self._size)
         self._power = layout.power(frames.bits(frames.packet_len))
@@ -129,7 +171,15 @@ class OfdmModem(BurstModem):
         self._repeat = 1 - 2 * int(even[0] % 2)
         """Sign with which the second half of the first sync word repeats the first: its carriers are even or odd."""
         self._even = even
-        self._together = sqrt(1 - _SPREAD_ALARM ** (1 / (len(even) - 1)))
+        self._step = _DELAY_STEP * self._size / len(self._carriers)
+        most = int(_FASTEST * self._symbol / self._step)
+        self._delays = np.arange(-most, most + 1) * self._step
+        """Samples by which the second sync word may be late."""
+        self._places = np.fft.fftfreq(self._size) * 2 * np.pi
+        """Phase by which a sample turns each carrier."""
+        self._advances = np.exp(1j * np.outer(self._delays, self._places)).astype(np.complex64)
+        alarm = _SPREAD_ALARM / len(self._delays)
+        self._together = sqrt(1 - alarm ** (1 / (len(even) - 1)))
         self._whole = words.conj().astype(np.complex64)
         self._energy = float((np.abs(words) ** 2).sum())
 
@@ -198,35 +248,41 @@ class OfdmModem(BurstModem):
             at = int(np.searchsorted(above, best + 1))
         return Search(positions)
 
-    def _head(self, rows: Complexes) -> tuple[ChannelState, int, int]:
-        """Evaluates sync words and header: the channel, the MCS, and the bytes of the packet."""
+    def _head(self, rows: Complexes, clock: _SymbolClock) -> tuple[ChannelState, _SymbolClock, int, int]:
+        """Evaluates sync words and header: the channel, the timing, the MCS, and the bytes of the packet."""
         all_used = np.ones((1, len(self._data)), bool)
         channel = self._channel.first(rows[:2])
-        channel, likely, _, _ = self._channel.decide(rows[2:], channel, self._bpsk, all_used, rounds=1)
-        return channel, *self._said(self._bpsk.soft(likely))
+        channel, likely, _, *late = self._channel.decide(rows[2:], channel, self._bpsk, all_used, rounds=1)
+        return channel, clock.after(HEAD_SYMBOLS - 1, *late), *self._said(self._bpsk.soft(likely))
 
     def read(self, samples: Samples, start: int) -> Reading:
-        begin, frequency, _ = self._place(samples, start)
-        clock = _SymbolClock(float(begin), 0.0)
-        rows = self._rows(samples, clock, frequency, 0, HEAD_SYMBOLS)
+        place = self._place(samples, start)
+        given, first, step = len(samples), start, 1 + place.pace
+        if place.pace:
+            first = place.begin
+            count = min(int((given - first) / step), self.burst_samples) + self._prefix
+            samples = stretched(samples, first - self._prefix * step, place.pace, max(count, 1))
+            place = self._look(samples, self._prefix)
+        expected = (_CLOCKS * self._symbol) ** 2
+        clock = _SymbolClock.first(float(place.begin), place.delay, place.variance, expected)
+        rows = self._rows(samples, clock, place.frequency, 0, HEAD_SYMBOLS)
         snr = self._channel.snr(rows[:2], self._power)
-        channel, mcs, length = self._head(rows)
+        channel, clock, mcs, length = self._head(rows, clock)
         sent = self.rates[mcs]
-        end = start + sent.samples_of(length) - self._back
-        if end > len(samples):
+        end = first + round((sent.samples_of(length) - self._back) * step) + (REACH if step != 1 else 0)
+        if end > given:
             return Reading(length, None, samples[:0], snr, end, mcs)
         count = sent.symbols_of(length) - HEAD_SYMBOLS
         points = sent.points_of(length)
         used = np.arange(count * len(self._data)).reshape(count, -1) < points
         soft, looked = [], []
-        for first in range(0, count, _CHUNK):
-            last = min(count, first + _CHUNK)
-            rows = self._rows(samples, clock, frequency, HEAD_SYMBOLS + first, last - first)
-            channel, likely, seen, late = self._channel.decide(rows, channel, sent.constellation, used[first:last])
+        for at in range(0, count, self._chunk):
+            last = min(count, at + self._chunk)
+            rows = self._rows(samples, clock, place.frequency, HEAD_SYMBOLS + at, last - at)
+            channel, likely, seen, *late = self._channel.decide(rows, channel, sent.constellation, used[at:last])
             soft.append(sent.constellation.soft(likely))
             looked.append(seen)
-            pace = clock.pace + _PACE_GAIN * late / _CHUNK
-            clock = _SymbolClock(clock.begin + late + (clock.pace - pace) * (HEAD_SYMBOLS + last), pace)
+            clock = clock.after(HEAD_SYMBOLS + (at + last - 1) / 2, *late)
         return Reading(length, np.concatenate(soft), np.concatenate(looked), snr, end, mcs)
 
     def points_of(self, packet_len: int) -> int:
@@ -247,7 +303,7 @@ class OfdmModem(BurstModem):
             "size": self._size,
             "prefix": self._prefix,
             "repeat": self._repeat,
-            "chunk": _CHUNK,
+            "chunk": self._chunk,
             "carrier_count": len(self._carriers),
             "data_count": len(self._data),
             "pilot_count": len(self._pilots),
@@ -258,9 +314,15 @@ class OfdmModem(BurstModem):
             "alike": _ALIKE,
             "together": self._together,
             "even_count": len(self._even),
+            "delay_count": len(self._delays),
+            "weight_count": 2 * REACH,
+            "fractions": FRACTIONS,
+            "sure": _SURE,
+            "delay_step": self._step,
             "energy": self._energy,
             "power": self._power,
-            "pace_gain": _PACE_GAIN,
+            "clocks": (_CLOCKS * self._symbol) ** 2,
+            "unsteady": UNSTEADY**2,
             "carriers": self._carriers,
             "data": self._data,
             "pilots": self._pilots,
@@ -270,6 +332,9 @@ class OfdmModem(BurstModem):
             "turns": self._turns,
             "whole": self._whole,
             "points": np.concatenate([each.points for each in constellations]),
+            "advances": self._advances,
+            "delays": self._delays,
+            "weights": weights(),
             "marks": np.concatenate([each.marks.reshape(-1) for each in constellations]),
         }
         soft_bits = max(points * each.bits for points, each in zip(most, constellations, strict=True))
@@ -277,6 +342,19 @@ class OfdmModem(BurstModem):
 
     def _place(self, samples: Samples, at: int) -> _FramePlace:
         """Examine closely a position at which the first half of a symbol is repeated."""
+        place = self._look(samples, at)
+        if not (place.found and place.pace):
+            return place
+        # Again as it passes at the pace of this clock, to find its begin and its carriers.
+        step = 1 + place.pace
+        before, count = 2 * self._prefix, 3 * self._symbol + 2 * self._prefix
+        at = max(0, at)
+        again = self._look(stretched(samples, at - before * step, place.pace, count), before)
+        begin = round(at + (again.begin - before) * step)
+        return _FramePlace(begin, again.frequency, again.found, place.pace)
+
+    def _look(self, samples: Samples, at: int) -> _FramePlace:
+        """The same at the pace of this clock, and how far the burst's own is from it."""
         at = max(0, at)
         window = samples[at : at + self._window + self._half]
         step = self._repeat * np.vdot(window[: -self._half], window[self._half :])
@@ -287,16 +365,20 @@ class OfdmModem(BurstModem):
             return _FramePlace(at, frequency, False)
         part = part * np.exp(-1j * frequency * np.arange(len(part)))
         spectra = np.fft.fft(np.stack((part[: self._size], part[self._symbol :])))
-        shift = _SHIFTS[int(np.argmax(np.abs(self._turns @ (spectra[0].conj() * spectra[1]))))]
+        tried = np.abs(self._turns @ (self._advances * (spectra[0].conj() * spectra[1])).T)
+        row, delayed = divmod(int(np.argmax(tried)), len(self._delays))
+        shift = _SHIFTS[row]
         if shift:
             frequency += 2 * np.pi * shift / self._size
             spectra = np.roll(spectra, -shift, axis=1)
             # A carrier shift leaves the rotation of the carriers between the two symbols.
             spectra[1] *= np.exp(-2j * np.pi * shift * self._symbol / self._size)
         gains = spectra * self._whole
-        products = (gains[1] * gains[0].conj())[self._even]
+        gains[1] *= self._advances[delayed]
         turn = float(np.angle(np.vdot(gains[0], gains[1])))
+        pace, delay, variance = self._pace(gains, turn, float(self._delays[delayed]))
         profile = np.abs(np.fft.ifft(gains[0] + gains[1] * np.exp(-1j * turn)))
+        products = (gains[1] * gains[0].conj())[self._even]
         peak = int(np.argmax(profile))
         power = float(np.vdot(spectra, spectra).real)
         alike = float((profile[peak] * self._size) ** 2) / max(power * self._energy, _TINY)
@@ -309,7 +391,25 @@ class OfdmModem(BurstModem):
             sums = np.cumsum(np.concatenate(([0], np.tile(profile**2, 2))))
             peak = int(np.argmax(sums[self._prefix :][: self._size] - sums[: self._size])) + self._back
         late = (peak + self._half) % self._size - self._half
-        return _FramePlace(first - self._prefix + late, frequency + turn / self._symbol, found)
+        return _FramePlace(first - self._prefix + late, frequency + turn / self._symbol, found, pace, delay, variance)
+
+    def _pace(self, gains: Complexes, turn: float, delay: float) -> tuple[float, float, float]:
+        """How much further apart the samples of a burst are, 0 if that may be noise; the delay of its second sync word,
+        and its variance.
+
+        :param gains: of both words, the second one advanced by ``delay``
+        :param turn: phase between them
+        """
+        products = ((gains[1] * gains[0].conj()) * np.exp(-1j * turn))[self._even]
+        places = self._places[self._even]
+        bottom = max(float((places**2) @ np.abs(products.real)), _TINY)
+        slope = float(places @ products.imag) / bottom
+        rest = products.imag - slope * places * np.abs(products.real)
+        variance = float((places**2) @ rest**2) / bottom**2 + UNSTEADY**2
+        if not abs(slope) < self._step:
+            return 0.0, 0.0, 1.0
+        delay -= slope
+        return delay / self._symbol if delay**2 > _SURE**2 * variance else 0.0, delay, variance
 
     def _rows(
         self, samples: Samples, clock: _SymbolClock, frequency: float, symbol: int, count: int

@@ -13,6 +13,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 import numpy as np
 from gnuradio import blocks, gr
+from scipy.signal import resample_poly
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.burst import BurstReceiver
@@ -189,6 +190,36 @@ def test_a_room_in_which_no_path_holds_a_fifth_of_the_energy(seed: int, compiled
     assert (np.abs(room) ** 2).max() < 0.2
     noise = rng.normal(size=(2, len(sent) + 1199)) * np.sqrt(np.mean(np.abs(sent) ** 2) / 2) * 10 ** (-20 / 20)
     heard = (np.convolve(sent, room) + noise[0] + 1j * noise[1]).astype(np.complex64)
+    receiver = (phy.running_modem if compiled else phy.modem).receiver()
+    came = [found.data for first in range(0, len(heard), 4096) for found in receiver.feed(heard[first : first + 4096])]
+    assert came == said
+
+
+def driven(sent: np.ndarray, pace: float) -> np.ndarray:
+    """The same burst on a clock that is slower by so much, or from a robot that comes nearer as it sounds."""
+    wide = resample_poly(sent, 4, 1, window=("kaiser", 9.0))
+    at = 4 * (1 + pace) * np.arange(int((len(sent) - 2) / (1 + pace)))
+    places = np.arange(len(wide))
+    turned = np.exp(1j * 0.0035 * pace / 2.9e-3 * np.arange(len(at)))  # the carrier is driven, too
+    return np.asarray((np.interp(at, places, wide.real) + 1j * np.interp(at, places, wide.imag)) * turned)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("ppm", [300, -300, 2900, -2900, 3200])
+@pytest.mark.parametrize("size", [256, 512])
+def test_sound_from_a_robot_that_drives_arrives(size: int, ppm: float, compiled: bool) -> None:
+    """In a room whose echoes are as loud as the direct sound, as the presets `sound` and `hall` send it."""
+    phy = OfdmPhy(64, 8e3, fft_len=size, cp_len=size // 2, fec="cc", scramble=True)
+    rng, said = np.random.default_rng(size), packets(64, 4)
+    pause = np.zeros(phy.gap + 900, np.complex64)
+    sent = np.concatenate([part for packet in said for part in (pause, phy.modem.modulate(packet))] + [pause])
+    at = np.arange(size // 2)
+    room = rng.normal(size=(2, len(at))) * 10 ** (-3 * at / size)
+    room = (room[0] + 1j * room[1]) / np.linalg.norm(room)
+    room[0] += 1
+    heard = driven(np.convolve(sent, room), ppm * 1e-6)
+    noise = rng.normal(size=(2, len(heard))) * np.sqrt(np.mean(np.abs(sent) ** 2) / 2) * 10 ** (-20 / 20)
+    heard = (heard + noise[0] + 1j * noise[1]).astype(np.complex64)
     receiver = (phy.running_modem if compiled else phy.modem).receiver()
     came = [found.data for first in range(0, len(heard), 4096) for found in receiver.feed(heard[first : first + 4096])]
     assert came == said

@@ -31,7 +31,7 @@ Samples view(const void* samples, int64_t count) { return {static_cast<const Sam
 
 // Version of this interface and of the parameters in `modem.h`. Increase it with each change, here and in
 // `kernels/library.py`.
-GR_ROS2_API int kernels_version() { return 7; }
+GR_ROS2_API int kernels_version() { return 8; }
 
 // What it was compiled for.
 GR_ROS2_API const char* kernels_target() {

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 _FOLDER = Path(__file__).parent
 _EVERYWHERE, _AVX2 = "_baseline", "_avx2"
 """Names of the variants' files, as setup.py has them: for every processor of the architecture, and for a newer one."""
-VERSION = 7
+VERSION = 8
 """Version of ``abi.cpp``. A library that was built before a change of it is not used."""
 _POINTER, _INT, _LONG = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {

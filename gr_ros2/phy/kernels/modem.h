@@ -92,11 +92,13 @@ class Modem {
 struct OfdmParameters {
     int32_t shortest, longest;
     int32_t mcs_count, counted, size, prefix, repeat, degrees, chunk, carrier_count, data_count, pilot_count,
-        once_count, twice_count, shift_count, even_count;
-    double level, alike, together, energy, power, pair_weight, word_weight_sum, pace_gain, memory, reach, doubt;
+        once_count, twice_count, shift_count, even_count, delay_count, weight_count, fractions;
+    double level, alike, together, energy, power, pair_weight, word_weight_sum, clocks, unsteady, memory, reach, doubt,
+        sure, delay_step;
     const int32_t *frame_bits, *point_counts, *point_bits, *carriers, *data, *pilots, *once, *twice, *shifts;
-    const Sample *words, *known, *turns, *whole, *smooth, *smooth_words, *crosswise, *points;
-    const float* word_weight;
+    const Sample *words, *known, *turns, *whole, *smooth, *smooth_words, *crosswise, *points,
+        *advances;
+    const float *word_weight, *delays, *weights;
     const uint8_t *marks, *headers, *header_mask;
 };
 

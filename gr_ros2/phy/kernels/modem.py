@@ -47,11 +47,12 @@ KERNELS: dict[str, tuple[int, Fields]] = {
         0,
         _fields(
             int32="shortest longest mcs_count counted size prefix repeat degrees chunk carrier_count data_count "
-            "pilot_count once_count twice_count shift_count even_count",
-            float64="level alike together energy power pair_weight word_weight_sum pace_gain memory reach doubt",
+            "pilot_count once_count twice_count shift_count even_count delay_count weight_count fractions",
+            float64="level alike together energy power pair_weight word_weight_sum clocks unsteady memory reach doubt "
+            "sure delay_step",
             int32s="frame_bits point_counts point_bits carriers data pilots once twice shifts",
-            complex64s="words known turns whole smooth smooth_words crosswise points",
-            float32s="word_weight",
+            complex64s="words known turns whole smooth smooth_words crosswise points advances",
+            float32s="word_weight delays weights",
             uint8s="marks headers header_mask",
         ),
     ),

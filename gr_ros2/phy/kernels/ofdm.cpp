@@ -17,10 +17,39 @@ struct Place {
     int64_t begin;
     double frequency;
     bool found;
+    double pace = 0, delay = 0, variance = 1;
 };
 
+struct Lateness {
+    double late, variance;
+};
+
+// When a burst's symbols come: a Kalman filter of their timing and its rate of change.
 struct Clock {
-    double begin, pace;
+    double begin, pace, symbol, own, both, rate;  // the last three: variances
+
+    Clock(const Place& place, double expected) {
+        const double share = expected / (expected + place.variance);
+        begin = static_cast<double>(place.begin) - share * place.delay / 2;
+        pace = share * place.delay;
+        symbol = 0.5;
+        own = both = 0;
+        rate = share * place.variance;
+    }
+
+    void after(double at, Lateness seen) {
+        const double step = at - symbol;
+        own += step * (2 * both + step * rate);
+        both += step * rate;
+        const double share = own / (own + seen.variance), turn = both / (own + seen.variance);
+        const double faster = pace + turn * seen.late;
+        begin += share * seen.late + (pace - faster) * at;
+        pace = faster;
+        symbol = at;
+        rate -= turn * both;
+        own *= 1 - share;
+        both *= 1 - share;
+    }
 };
 
 // What a call works in.
@@ -34,6 +63,7 @@ struct Scratch {
     std::vector<Sample> inverse;                                   // per data carrier
     std::vector<float> sharpness, header;
     std::vector<Sample> tone, straight;                            // per symbol
+    std::vector<Sample> again, burst;                              // at the pace of this clock
     Received seen;
 };
 
@@ -88,9 +118,12 @@ class Ofdm final : public Modem {
           smooth_(copied(p.smooth, static_cast<size_t>(used_) * used_)),
           smooth_words_(copied(p.smooth_words, static_cast<size_t>(used_) * used_)),
           crosswise_(copied(p.crosswise, 2 * p.twice_count)),
+          advances_(copied(p.advances, static_cast<size_t>(p.delay_count) * p.size)),
           headers_(copied(p.headers, static_cast<size_t>(p.mcs_count) * lengths_.count() * kWordBits)),
           header_mask_(copied(p.header_mask, p.data_count)),
           word_weight_(copied(p.word_weight, used_)),
+          delays_(copied(p.delays, p.delay_count)),
+          weights_(copied(p.weights, static_cast<size_t>(p.fractions + 1) * p.weight_count)),
           bpsk_(bpsk()),
           fft_(p.size),
           roots_(kToneSize) {
@@ -104,6 +137,8 @@ class Ofdm final : public Modem {
             points += count;
             marks += count * bits;
         }
+        for (int mcs = 0; mcs < p.mcs_count; mcs++)
+            longest_ = std::max(longest_, symbols({mcs, lengths_.longest()}) * symbol_);
         for (uint8_t bit : headers_) signs_.push_back(bit ? 1.0f : -1.0f);
         for (int carrier : carriers_) bins_.push_back((carrier + p.size) % p.size);
         for (int k = 0; k < kToneSize; k++) roots_[k] = unit(-kTau * k / kToneSize);
@@ -144,7 +179,7 @@ class Ofdm final : public Modem {
                     best = k;
                 }
             }
-            const Place place = look(samples, best, s);
+            const Place place = placed(samples, best, s);
             if (place.found) return {std::max<int64_t>(0, std::min(first, place.begin)), place.begin};
             at = best + 1;
         }
@@ -153,18 +188,31 @@ class Ofdm final : public Modem {
 
     Result read(Samples samples, int64_t start, float* soft, Sample* seen, Report* report) const override {
         Scratch& s = prepared();
-        const Place place = look(samples, start, s);
-        Clock clock{static_cast<double>(place.begin), 0.0};
+        Place place = placed(samples, start, s);
+        const int64_t given = samples.count;
+        int64_t from = start, more = 0;
+        double step = 1;
+        if (place.pace != 0) {
+            from = place.begin;
+            step += place.pace;
+            more = p_.weight_count / 2;
+            const int64_t have = static_cast<int64_t>((given - place.begin) / step);
+            const int64_t count = std::max<int64_t>(1, std::min<int64_t>(have, longest_) + p_.prefix);
+            stretch(samples, place.begin - p_.prefix * step, place.pace, count, s.burst);
+            samples = {s.burst.data(), count};
+            place = look(samples, p_.prefix, s);
+        }
+        Clock clock(place, p_.clocks);
         spectra(samples, clock, place.frequency, 0, kHead, s);
         const float noise = first_estimate(s);
         report->snr = signal_to_noise(s);
-        const Told told = head(s, noise);
+        const Told told = head(s, noise, clock);
         const Constellation& points = rates_[told.mcs].points;
         const int all = points_of(told), count = symbols(told) - kHead;
         report->length = told.length;
         report->mcs = told.mcs;
-        report->end = start + static_cast<int64_t>(symbols(told)) * symbol_ - back_;
-        if (report->end > samples.count) return kCut;
+        report->end = from + std::llrint((static_cast<double>(symbols(told)) * symbol_ - back_) * step) + more;
+        if (report->end > given) return kCut;
         report->points = all;
         report->soft = static_cast<int64_t>(all) * points.bits();
         int done = 0;
@@ -172,13 +220,13 @@ class Ofdm final : public Modem {
             const int rows = std::min(p_.chunk, count - first);
             const int used = std::min(rows * p_.data_count, all - first * p_.data_count);
             spectra(samples, clock, place.frequency, kHead + first, rows, s);
-            const double late = decide(s, 0, rows, noise, points, used, 2);
-            if (!(std::abs(late) < kFar)) return kNoBurst;
+            const Lateness seen_late = decide(s, 0, rows, noise, points, used, 2);
+            if (!(std::abs(seen_late.late) < kFar)) return kNoBurst;
             points.soft(s.seen, used, soft + static_cast<size_t>(done) * points.bits());
             std::copy_n(s.seen.points.begin(), used, seen + done);
             done += used;
-            const double pace = clock.pace + p_.pace_gain * late / p_.chunk;
-            clock = {clock.begin + late + (clock.pace - pace) * (kHead + first + rows), pace};
+            clock.after(kHead + first + (rows - 1) / 2.0, seen_late);
+            if (!std::isfinite(clock.begin)) return kNoBurst;
         }
         return kRead;
     }
@@ -232,9 +280,10 @@ class Ofdm final : public Modem {
     int symbols(Told told) const { return kHead + (points_of(told) + p_.data_count - 1) / p_.data_count; }
 
     // Read the header with the channel estimate of the sync words, and improve that estimate.
-    Told head(Scratch& s, float noise) const {
+    Told head(Scratch& s, float noise, Clock& clock) const {
         std::copy(word_weight_.begin(), word_weight_.end(), s.weight.begin());
-        decide(s, 2, 1, noise, bpsk_, p_.data_count, 1);
+        const Lateness late = decide(s, 2, 1, noise, bpsk_, p_.data_count, 1);
+        if (std::abs(late.late) < kFar) clock.after(kHead - 1, late);
         if (lengths_.fixed()) return {0, lengths_.longest()};
         s.header.resize(p_.data_count);
         bpsk_.soft(s.seen, p_.data_count, s.header.data());
@@ -320,7 +369,37 @@ class Ofdm final : public Modem {
         for (int64_t k = count - half_; k < count; k++) power_out[k + 1] = power += static_cast<double>(square(samples[k]));
     }
 
+    // `count` samples from a place on, each 1 + `pace` after the one before: gr_ros2/phy/stretch.py.
+    void stretch(Samples samples, double first, double pace, int64_t count, std::vector<Sample>& out) const {
+        out.resize(count);
+        const int taps = p_.weight_count;
+        for (int64_t n = 0; n < count; n++) {
+            const double at = first + (1 + pace) * static_cast<double>(n), whole = std::floor(at);
+            const float* weight = &weights_[std::llrint((at - whole) * p_.fractions) * taps];
+            const int64_t base = static_cast<int64_t>(whole) - taps / 2 + 1;
+            const int64_t low = std::max<int64_t>(0, -base), high = std::min<int64_t>(taps, samples.count - base);
+            float re = 0, im = 0;
+            for (int64_t tap = low; tap < high; tap++) {
+                re += weight[tap] * samples.at[base + tap].real();
+                im += weight[tap] * samples.at[base + tap].imag();
+            }
+            out[n] = {re, im};
+        }
+    }
+
     // Look closely at a place where the first half of a symbol is repeated.
+    Place placed(Samples samples, int64_t at, Scratch& s) const {
+        const Place place = look(samples, at, s);
+        if (!place.found || place.pace == 0) return place;
+        const double step = 1 + place.pace;
+        const int64_t before = 2 * p_.prefix, count = 3 * symbol_ + 2 * p_.prefix;
+        at = std::max<int64_t>(0, at);
+        stretch(samples, at - before * step, place.pace, count, s.again);
+        const Place again = look({s.again.data(), count}, before, s);
+        return {at + std::llrint((again.begin - before) * step), again.frequency, again.found, place.pace};
+    }
+
+    // The same at the pace of this clock, and how far the burst's own is from it.
     Place look(Samples samples, int64_t at, Scratch& s) const {
         at = std::max<int64_t>(0, at);
         float re = 0, im = 0;
@@ -342,18 +421,26 @@ class Ofdm final : public Modem {
         fft_.run(one, s.spare.data());
         fft_.run(two, s.spare.data());
         for (int k = 0; k < size; k++) profile[k] = mul_conj(two[k], one[k]);
-        float heights[16] = {};
+        float highest = -1;
+        int delayed = 0, shift = 0;
         for (int row = 0; row < p_.shift_count; row++) {
-            const Sample* expected = &turns_[static_cast<size_t>(row) * size];
-            float a = 0, b = 0;
-            for (int k = 0; k < size; k++) {
-                const Sample p = mul(expected[k], profile[k]);
-                a += p.real();
-                b += p.imag();
+            for (int delay = 0; delay < p_.delay_count; delay++) {
+                const Sample* expected = &turns_[static_cast<size_t>(row) * size];
+                const Sample* advance = &advances_[static_cast<size_t>(delay) * size];
+                float a = 0, b = 0;
+                for (int k = 0; k < size; k++) {
+                    const Sample p = mul(mul(expected[k], advance[k]), profile[k]);
+                    a += p.real();
+                    b += p.imag();
+                }
+                const float height = a * a + b * b;
+                if (height > highest) {
+                    highest = height;
+                    shift = shifts_[row];
+                    delayed = delay;
+                }
             }
-            heights[row] = a * a + b * b;
         }
-        const int shift = shifts_[argmax(heights, p_.shift_count)];
         if (shift) {
             frequency += kTau * shift / size;
             const int left = (shift % size + size) % size;
@@ -368,7 +455,7 @@ class Ofdm final : public Modem {
         for (int k = 0; k < size; k++) {
             power += square(one[k]) + square(two[k]);
             one[k] = mul(one[k], whole_[k]);
-            two[k] = mul(two[k], whole_[size + k]);
+            two[k] = mul(mul(two[k], whole_[size + k]), advances_[static_cast<size_t>(delayed) * size + k]);
             const Sample p = mul_conj(two[k], one[k]);
             re += p.real();
             im += p.imag();
@@ -376,6 +463,8 @@ class Ofdm final : public Modem {
         }
         const double angle = std::atan2(im, re);
         const Sample straight = unit(-angle);
+        Place place{0, 0, false};
+        pace(one, two, straight, delays_[delayed], place);
         // Of the inverse FFT only the magnitude is wanted: the forward one of the conjugate has it.
         for (int k = 0; k < size; k++) profile[k] = std::conj(one[k] + mul(two[k], straight));
         fft_.run(profile, s.spare.data());
@@ -398,7 +487,37 @@ class Ofdm final : public Modem {
             }
         }
         const int late = (peak + half_) % size - half_;
-        return {first - p_.prefix + late, frequency + angle / symbol_, found && std::isfinite(power)};
+        place.begin = first - p_.prefix + late;
+        place.frequency = frequency + angle / symbol_;
+        place.found = found && std::isfinite(power);
+        return place;
+    }
+
+    // How much further apart the samples of a burst are, from the delay of its second sync word.
+    void pace(const Sample* one, const Sample* two, Sample straight, double delay, Place& place) const {
+        double top = 0, bottom = 0, noise = 0;
+        const auto each = [&](auto use) {
+            for (int k = 0; k < p_.size; k++) {
+                if (whole_[k] == Sample()) continue;
+                const Sample p = mul(mul_conj(two[k], one[k]), straight);
+                use(kTau / p_.size * (k < half_ ? k : k - p_.size), std::abs(static_cast<double>(p.real())), p.imag());
+            }
+        };
+        each([&](double turn, double real, double imag) {
+            top += turn * imag;
+            bottom += turn * turn * real;
+        });
+        bottom = std::max(bottom, kTiny);
+        const double slope = top / bottom;
+        each([&](double turn, double real, double imag) {
+            const double rest = turn * (imag - slope * turn * real);
+            noise += rest * rest;
+        });
+        if (!(std::abs(slope) < p_.delay_step)) return;
+        place.delay = delay - slope;
+        place.variance = noise / (bottom * bottom) + p_.unsteady;
+        const bool sure = place.delay * place.delay > p_.sure * p_.sure * place.variance;
+        place.pace = sure ? place.delay / symbol_ : 0;
     }
 
     // Used carriers of some of a burst's symbols, into `rows`.
@@ -473,7 +592,7 @@ class Ofdm final : public Modem {
 
     // Symbols (rows from `row` on) to likelihoods of points, with a channel estimate that they have made better; returns
     // by how many samples they came late.
-    double decide(Scratch& s, int row, int count, float noise, const Constellation& points, int used, int rounds) const {
+    Lateness decide(Scratch& s, int row, int count, float noise, const Constellation& points, int used, int rounds) const {
         Sample* rows = &s.rows[static_cast<size_t>(row) * used_];
         std::copy(s.gains.begin(), s.gains.end(), s.before.begin());
         for (int i = 0; i < count; i++) {
@@ -490,7 +609,7 @@ class Ofdm final : public Modem {
             const Sample straight = s.straight[i];
             for (int c = 0; c < used_; c++) rows[i * used_ + c] = mul(rows[i * used_ + c], straight);
         }
-        double late = 0;
+        double late = 0, firm = kTiny;
         for (int round = 0; round < rounds; round++) {
             weigh(s, rows, noise, points, used);
             points.expect(s.seen, used);
@@ -508,7 +627,7 @@ class Ofdm final : public Modem {
                 s.tone[i] = {re, im};
             }
             tone(s, count);
-            const double more = lateness(s, count);
+            const double more = lateness(s, count, &firm);
             late += more;
             advance(more, s.step.data());
             for (int c = 0; c < used_; c++) {
@@ -531,7 +650,7 @@ class Ofdm final : public Modem {
         }
         std::swap(s.weight, s.total);
         weigh(s, rows, noise, points, used);
-        return late;
+        return {late, noise / (2 * firm) + p_.unsteady};
     }
 
     // What was sent, as far as is known: pilots, and what the points that were received are expected to be.
@@ -616,7 +735,7 @@ class Ofdm final : public Modem {
     }
 
     // Samples by which symbols come late, from by how little their carriers are turned.
-    double lateness(Scratch& s, int count) const {
+    double lateness(Scratch& s, int count, double* firm) const {
         std::fill(s.known.begin(), s.known.end(), Sample());
         for (int i = 0; i < count; i++) {
             const Sample *turns = &s.turns[i * used_], straight = s.straight[i];
@@ -624,21 +743,22 @@ class Ofdm final : public Modem {
         }
         double top = 0, bottom = 0;
         for (int c = 0; c < used_; c++) {
-            const double carrier = carriers_[c];
-            top += carrier * s.known[c].imag();
-            bottom += carrier * carrier * std::abs(s.known[c].real());
+            const double place = kTau / p_.size * carriers_[c];
+            top += place * s.known[c].imag();
+            bottom += place * place * std::abs(s.known[c].real());
         }
-        return -top / std::max(bottom, kTiny) * p_.size / kTau;
+        *firm = std::max(bottom, kTiny);
+        return -top / *firm;
     }
 
     OfdmParameters p_;  // its numbers; arrays are copied below
     Lengths lengths_;   // of the first MCS
-    int symbol_, half_, window_, back_, used_, most_points_ = 0;
+    int symbol_, half_, window_, back_, used_, most_points_ = 0, longest_ = 0;
     std::vector<int32_t> carriers_, data_, pilots_, once_, twice_, shifts_, bins_;
-    std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_;
+    std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_, advances_;
     std::vector<uint8_t> headers_, header_mask_;
     std::vector<float> signs_;
-    std::vector<float> word_weight_;
+    std::vector<float> word_weight_, delays_, weights_;
     std::vector<Mcs> rates_;
     Constellation bpsk_;
     Fft fft_;
