@@ -62,11 +62,14 @@ BENCHMARKS = {
     "relay": "bench.relay",
     "carried": "bench.relay",
     "reliable": "bench.reliable",
+    "sound": "bench.sound",
+    "sound_live": "bench.sound_live",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
     *("gate", "rate_rules", "cells", "first", "hidden", "changes", "scale", "crowd", "energy", "cameras", "clouds"),
+    *("sound", "sound_live"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

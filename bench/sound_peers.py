@@ -1,0 +1,96 @@
+"""Other programs that send data as sound, as what makes sound of texts and texts of sound.
+
+Each is left out where it is not installed: `ggwave` (PyPI), `minimodem` and `direwolf` (Debian).
+"""
+
+from __future__ import annotations
+
+import subprocess
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from shutil import which
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from scipy.io import wavfile
+
+from bench.sound_channels import Wave
+from gr_ros2.radio.audio_bursts import CARD_RATE
+
+_PIECE = 1024
+
+
+class Peer(ABC):
+    """A program, and how it was set."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @abstractmethod
+    def spoken(self, text: str) -> Wave:
+        """The sound of a text."""
+
+    @abstractmethod
+    def heard(self, sound: Wave) -> str:
+        """All that it prints of a sound."""
+
+
+class _Ggwave(Peer):
+    def __init__(self, name: str, protocol: int) -> None:
+        super().__init__(name)
+        self._module: Any = import_module("ggwave")
+        self._module.disableLog()
+        self._protocol = protocol
+
+    def spoken(self, text: str) -> Wave:
+        return np.frombuffer(self._module.encode(text, protocolId=self._protocol, volume=25), np.float32)
+
+    def heard(self, sound: Wave) -> str:
+        own = self._module.init()
+        samples = sound.astype(np.float32)
+        pieces = (samples[at : at + _PIECE].tobytes() for at in range(0, len(samples) - _PIECE, _PIECE))
+        found = [got.decode(errors="replace") for piece in pieces if (got := self._module.decode(own, piece))]
+        self._module.free(own)
+        return "\n".join(found)
+
+
+class _Program(Peer):
+    """One that reads and writes files of sound."""
+
+    def __init__(self, name: str, sends: Sequence[str], takes: Sequence[str], form: str) -> None:
+        super().__init__(name)
+        self._sends, self._takes, self._form = sends, takes, form
+
+    def spoken(self, text: str) -> Wave:
+        with TemporaryDirectory() as folder:
+            words, out = Path(folder) / "text", Path(folder) / "sound.wav"
+            words.write_text(self._form.format(text))
+            command = [word.format(text=words, sound=out) for word in self._sends]
+            subprocess.run(command, stdin=words.open(), check=True, capture_output=True)
+            rate, samples = wavfile.read(out)
+        assert rate == CARD_RATE
+        return samples / np.abs(samples).max()
+
+    def heard(self, sound: Wave) -> str:
+        with TemporaryDirectory() as folder:
+            out = Path(folder) / "sound.wav"
+            wavfile.write(out, CARD_RATE, np.int16(sound / np.abs(sound).max() * 30000))
+            command = [word.format(sound=out) for word in self._takes]
+            return subprocess.run(command, capture_output=True, check=False).stdout.decode(errors="replace")
+
+
+def peers() -> Iterator[Peer]:
+    """Those that are installed."""
+    with suppress(ImportError):
+        yield from (_Ggwave(f"ggwave, {name}", protocol) for name, protocol in (("slowest", 0), ("fastest", 2)))
+    if which("minimodem"):
+        for baud in ("300", "1200"):
+            sends = ("minimodem", "--tx", baud, "-R", str(CARD_RATE), "-f", "{sound}")
+            yield _Program(f"minimodem {baud}", sends, ("minimodem", "--rx", baud, "-q", "-f", "{sound}"), "\n{}\n")
+    if which("gen_packets") and which("atest"):
+        sends = ("gen_packets", "-r", str(CARD_RATE), "-o", "{sound}", "{text}")
+        yield _Program("direwolf 1200", sends, ("atest", "{sound}"), "N0CALL>N0CALL:{}\n")
