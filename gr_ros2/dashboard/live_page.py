@@ -64,8 +64,11 @@ _SENT, _RECEIVED = "#3b82d6", "#d62728"
 _SOFT = "#7a8a9a"
 """Of lines beside them. Words have the page's own grey, see ``page.js``."""
 _DEFAULT_SNR_DB = 20.0
-_FIRST = {"pdr", "loss", "age"}
-"""Cards that say what they wait for. Who observes one end of a link alone never knows how much is delivered."""
+_IN_LEGEND = 6
+"""Most robots that a legend names; of more, the numbers on the map do."""
+_FIRST = {"pdr", "loss", "age", "air"}
+"""Cards that say what they wait for. Who observes one end of a link alone never knows how much is delivered, and a PHY
+may take no air."""
 _SENDS, _SILENT = "stop sending", "sending is off: send again"
 
 
@@ -121,7 +124,7 @@ class LivePage:
                 "loss": "t share",
                 "changes": "t",
                 "strip": "left right robot colour",
-                "places": "x y colour robot",
+                "places": "x y colour robot name",
                 "beliefs": "x y colour",
             }.items()
         }
@@ -171,12 +174,13 @@ class LivePage:
         self._draw_paths(snapshot)
         self._draw_pictures(snapshot)
         if snapshot.team is not None:
-            self._draw_team(snapshot.team)
+            own = {topic.src_id: colour(topic.colour) for topic in reversed(snapshot.topics)}
+            self._draw_team(snapshot.team, own)
         self._draw_radio(radio)
         self._show_channel(radio)
         self._asked.draw(self._monitor.asked)
         empty = set(_empty_cards(snapshot, radio)) | ({"asked"} if self._monitor.asked is None else set())
-        waits = empty & (_FIRST if snapshot.phase == "waiting" else _FIRST - {"pdr"})
+        waits = empty & (_FIRST if snapshot.phase == "waiting" else _FIRST - {"pdr", "air"})
         self._counter.empty, self._counter.waits = " ".join(sorted(empty - waits)), " ".join(sorted(waits))
         self._counter.old = "constellation spectrum latency" if snapshot.old else ""
         self._counter.ago = f"{snapshot.silent_s:.0f} s" if snapshot.old else ""
@@ -257,8 +261,12 @@ class LivePage:
             }
         self._html["seen"].text = "<br>".join(escape(view.words) for view in snapshot.pictures)
 
-    def _draw_team(self, team: TeamView) -> None:
-        """The newest slots of the channel, and for each robot where the others believe it is, with a line to it."""
+    def _draw_team(self, team: TeamView, inks: dict[int, str]) -> None:
+        """The newest slots of the channel, and for each robot where the others believe it is, with a line to it.
+
+        :param inks: colours of the robots whose topics come here: those of the topics
+        """
+        inks = dict.fromkeys(team.robots, _SOFT) | inks
         sends = [send for send in team.sends if send.t > team.now - STRIP_S]
         self._sources["strip"].data = {
             "left": [send.t - team.now for send in sends],
@@ -266,13 +274,14 @@ class LivePage:
             "robot": [float(send.robot) for send in sends],
             "colour": [OUTCOME_COLOURS[send.outcome(len(team.robots))] for send in sends],
         }
-        inks = {robot: colour(number) for number, robot in enumerate(team.robots)}
         self._sources["places"].data = {
             "x": [place[0] for place in team.places.values()],
             "y": [place[1] for place in team.places.values()],
             "colour": [inks[robot] for robot in team.places],
             "robot": [str(robot) for robot in team.places],
+            "name": [f"robot {robot}" for robot in team.places],
         }
+        self._legend.visible = len(team.robots) <= _IN_LEGEND
         known = [
             (team.places[of], believed, inks[of]) for (_, of), believed in team.beliefs.items() if of in team.places
         ]
@@ -334,6 +343,7 @@ class LivePage:
         text = self._monitor.refused
         if not text and channel is not None and radio.changeable and not radio.has_samples:
             text = "This PHY has no samples: only packets can be lost."
+        self._html["note"].visible = bool(text)
         self._html["note"].text = f'<div class="note {"bad" if self._monitor.refused else ""}">{escape(text)}</div>'
 
     # -- making -------------------------------------------------------------------------------------------------
@@ -370,10 +380,7 @@ class LivePage:
             source=sources["air"],
             legend_label=list(AIR_COLOURS),
         )
-        air.legend.orientation, air.legend.padding, air.legend.margin = "horizontal", 0, 0
-        air.add_layout(air.legend[0], "above")
-        air.legend.background_fill_alpha = air.legend.border_line_alpha = 0
-        air.legend.label_text_font_size, air.legend.label_text_color = "10px", _SOFT
+        _legend_above(air)
         snr = _plot("snr", "", "time [s]", "SNR [dB]")
         snr.line("t", "db", source=sources["snr"], color=_SENT, line_width=1.8)
         loss = _plot("loss", "", "time [s]", "lost [%]", y_range=DataRange1d(start=0, max_interval=100))
@@ -382,7 +389,9 @@ class LivePage:
         strip.hbar("robot", left="left", right="right", height=0.8, color="colour", source=sources["strip"])
         beliefs = _plot("beliefs", "", "x [m]", "y [m]", match_aspect=True)
         beliefs.multi_line("x", "y", source=sources["beliefs"], color="colour", line_width=3)
-        beliefs.scatter("x", "y", source=sources["places"], color="colour", line_color="white", size=18)
+        beliefs.scatter(
+            "x", "y", source=sources["places"], color="colour", line_color="white", size=18, legend_field="name"
+        )
         beliefs.text(
             *("x", "y", "robot"),
             source=sources["places"],
@@ -391,6 +400,7 @@ class LivePage:
             text_align="center",
             text_baseline="middle",
         )
+        self._legend = _legend_above(beliefs)
         plots = [map_, camera, error, constellation, spectrum, latency, air, snr, loss, strip, beliefs]
         series: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
             ("pdr", "pdr", "share", {"y_range": Range1d(0, 1.1)}),
@@ -428,13 +438,23 @@ class LivePage:
         document.template_variables["instance"] = instance
         for widget in (self._pause, self._silence, self._noise, self._snr, self._offset, self._loss):
             widget.stylesheets = [self._style]
-        words = [*(axis for plot in plots for axis in plot.axis), air.legend[0]]
+        words = [*(axis for plot in plots for axis in plot.axis), air.legend[0], self._legend]
         readable = CustomJS(
             args={"pulse": self._counter, "pause": self._pause, "words": words},
             code=(_TEMPLATES / "page.js").read_text("utf-8"),
         )
         document.js_on_event(DocumentReady, readable)
         document.js_on_event(ConnectionLost, CustomJS(code="window.viewerLost = true"))
+
+
+def _legend_above(plot: Any) -> Any:
+    """Its legend, in one line."""
+    (legend,) = plot.legend
+    legend.orientation, legend.padding, legend.margin = "horizontal", 0, 0
+    legend.background_fill_alpha = legend.border_line_alpha = 0
+    legend.label_text_font_size, legend.label_text_color = "10px", _SOFT
+    plot.add_layout(legend, "above")
+    return legend
 
 
 def _small(values: Any) -> Any:

@@ -528,7 +528,7 @@ class DashboardState:
 
 def _pdr_now(topic: _Topic, now: float) -> float | None:
     sent = topic.sent_rate.totals(now)[0]
-    return topic.delivered_rate.totals(now)[0] / sent if sent else None
+    return min(topic.delivered_rate.totals(now)[0] / sent, 1.0) if sent else None  # some were sent before
 
 
 def _final_view(place: int, key: Key, final: TopicResult) -> TopicView:

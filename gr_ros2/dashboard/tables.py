@@ -39,7 +39,7 @@ def tiles_html(snapshot: Snapshot) -> str:
     tiles = [
         _tile("phase", phase, snapshot.name or "no run", css=f"phase {snapshot.phase} {snapshot.verdict}"),
         _tile("elapsed", time, "time"),
-        _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, f"main {snapshot.verdict}"),
+        _tile("pdr", _ratio(snapshot.pdr), "delivered / sent", snapshot.pdr, f"main {snapshot.delivery}"),
         _tile("lost", _share(snapshot.lost_now), "packets lost on the way, last 5 s", snapshot.lost_now, received),
         _tile("oldest", _seconds(age), "age" if oldest is None else f"age of {oldest.name}, the oldest", age),
         _tile("busy", _share(busy), "of the air used", busy),
@@ -223,6 +223,8 @@ _GROUPS: tuple[tuple[str, tuple[_Column, ...]], ...] = (
 
 def topics_html(snapshot: Snapshot) -> str:
     """One line per topic, with the ledger as a bar."""
+    if not snapshot.topics:
+        return '<div class="note">waiting for the first message of a topic</div>'
     fates = fate_order([topic.ledger for topic in snapshot.topics])
     groups = "".join(f'<th scope="colgroup" colspan="{len(columns)}">{name}</th>' for name, columns in _GROUPS)
     heads = "".join(f'<th scope="col">{column[1]}</th>' for _, columns in _GROUPS for column in columns)
@@ -252,6 +254,8 @@ def _topic_row(topic: TopicView, fates: list[str]) -> str:
         for fate in fates
         if (count := topic.ledger.get(fate, 0))
     )
+    if (unknown := topic.sent - sum(topic.ledger.values())) > 0:  # only the other end knows
+        bar += f'<i style="flex:{unknown}"></i>'
     return (
         f'<tr data-topic="{escape(topic.name)}"><td class="name"><i style="background:{colour(topic.colour)}"></i>'
         f'{escape(topic.name)}</td>{cells}<td class="first ledger"><div class="bar">{bar}</div></td></tr>'

@@ -243,9 +243,17 @@ class Snapshot:
     @property
     def verdict(self) -> str:
         """The state of the link now, or after the run what its messages say: up, degraded or down."""
-        if self.phase != "ended" or self.pdr is None:
-            return self.state
-        return "up" if self.pdr >= GOOD else "degraded" if self.pdr > 0 else "down"
+        return self.state if self.phase != "ended" else self.delivery or self.state
+
+    @property
+    def delivery(self) -> str:
+        """What the share delivered says: up, degraded or down, however slow the computer is; '' where it is unknown,
+        or has become good again."""
+        if self.pdr is None:
+            return ""
+        if self.state == "down" or not self.pdr:
+            return "down"
+        return "up" if self.pdr >= GOOD else "" if self.state == "up" else "degraded"
 
     @property
     def old(self) -> bool:

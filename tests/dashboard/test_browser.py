@@ -69,7 +69,7 @@ return pale;
 """Texts with less contrast than WCAG 2 asks of small text."""
 HOLES = """
 const rows = new Map();
-for (const card of document.querySelectorAll("#page > .card, .fold > div > .card")) {
+for (const card of document.querySelectorAll("#page > .card, #page > .stack, .fold > div > .card")) {
     if (!card.checkVisibility()) continue;
     const {top, right} = card.getBoundingClientRect();
     rows.set(top, Math.max(rows.get(top) ?? 0, right));

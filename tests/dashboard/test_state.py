@@ -393,3 +393,26 @@ def test_a_dead_link_comes_before_a_late_computer_and_after_the_run_its_share_de
     for delivered, verdict in ((0, "down"), (8, "degraded"), (10, "up")):
         topic = replace(shown.topics[0], sent=10, delivered=delivered, pdr=delivered / 10)
         assert Snapshot(phase="ended", topics=(topic,)).verdict == verdict
+
+
+def test_a_slow_computer_does_not_paint_what_arrives_red() -> None:
+    state = DashboardState(REGISTRY, NAMES, 64)
+    Feed(state, packet_len=64).submit(0, at(0, 0), 0.0)
+    topic, _ = state.tick(0.1).topics
+
+    def said(state: str, delivered: int) -> str:
+        view = replace(topic, sent=100, delivered=delivered, pdr=delivered / 100)
+        return Snapshot(phase="running", state=state, topics=(view,)).delivery
+
+    assert [said(state, 99) for state in ("up", "late", "degraded", "down")] == ["up", "up", "up", "down"]
+    assert [said(state, 80) for state in ("up", "late", "degraded", "down")] == ["", "degraded", "degraded", "down"]
+    assert Snapshot().delivery == ""
+
+
+def test_no_more_than_all_arrives_in_the_last_seconds() -> None:
+    state = DashboardState(REGISTRY, NAMES, 64)
+    feed = Feed(state, packet_len=64)
+    for step in range(40):
+        feed.submit(0, at(step, 0), step / 4)
+    feed.fly(9.9)
+    assert state.tick(12.0).topics[0].pdr_now == 1.0

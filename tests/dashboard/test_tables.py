@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -72,6 +73,14 @@ def test_the_exact_value_stands_beside_the_rounded_one() -> None:
     unknown = Balanced(counters_html(shown, None, None)).values
     assert unknown["backlog"] is unknown["snr"] is None
     assert Balanced(topics_html(shown)).values["sent"] == "20"
+
+
+def test_a_bar_leaves_room_for_what_only_the_other_end_knows() -> None:
+    shown = snapshot()
+    topic = replace(shown.topics[0], sent=500, delivered=0, ledger={"stale": 1})
+    assert 'style="flex:499"' in topics_html(replace(shown, topics=(topic,)))
+    assert "flex:-" not in topics_html(shown)
+    assert "waiting for the first message" in topics_html(Snapshot())
 
 
 def test_a_packet_shows_its_fields_and_what_is_missing() -> None:
