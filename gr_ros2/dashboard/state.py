@@ -148,7 +148,7 @@ class DashboardState:
         self._received: deque[tuple[float, Received | Rejected]] = deque(maxlen=PACKETS_SHOWN + 1)
         self._packets: Counter[str] = Counter()
         self._packets_sent, self._packets_received = Rate(), Rate()
-        self._understood, self._missed = Rate(), Rate()
+        self._understood, self._numbered, self._missed = Rate(), Rate(), Rate()
         """Packets received, and as bytes those that their numbers show to be missing."""
         self._newest: dict[int, int] = {}
         self._changes: deque[float] = deque(maxlen=_CHANGES)
@@ -213,6 +213,8 @@ class DashboardState:
                 if isinstance(event, Received):
                     self._heard(event.packet.src_id, now, packets=1)
                     self._understood.add(now)
+                    if event.packet.numbered:  # others, as repairs and reports, tell only which are missing
+                        self._numbered.add(now)
                     self._missed.add(now, missing_before(event.packet, self._newest))
                 if isinstance(event, Rejected):
                     self._packets[f"rejected_{event.error.kind}"] += 1
@@ -259,8 +261,9 @@ class DashboardState:
         ledger = {} if self._ledger is None else self._ledger()
         with self._lock:
             over = self._phase in ("ended", "failed")
-            here, missing = self._understood.totals(now)[0], self._missed.totals(now)[1]
-            lost_now = missing / (here + missing) if here + missing >= _ENOUGH else None
+            here = self._understood.totals(now)[0]
+            numbered, missing = self._numbered.totals(now)[0], self._missed.totals(now)[1]
+            lost_now = missing / (numbered + missing) if numbered + missing >= _ENOUGH else None
             start = now if self._start is None else self._start
             elapsed = max(now - start, 0.0)
             keys = sorted(self._topics)

@@ -309,6 +309,8 @@ def test_packets_that_stand_at_the_newest_number_are_not_a_turn_ahead() -> None:
         heard += sum(packet.missing for packet in shown)
         assert all(packet.missing < 30 for packet in shown)
     assert heard, "packets were missing"
+    lost_now = state.tick(now).lost_now
+    assert lost_now == pytest.approx(0.3, abs=0.06), "repairs and reports that came do not make it less"
     air = state.tick(now).packets
     assert air["air_repair"] > 0
     assert air["air_new"] + air["air_repair"] + air["air_report"] + air["air_hello"] == air["sent"]
