@@ -48,11 +48,10 @@ from gr_ros2_lab.run import runner
 from gr_ros2_lab.run.outcome import Outcome
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
 
-_NEXT = """
-Next:  gr-ros2 demo --dashboard    the same live in a browser, with sliders for noise and loss
-       gr-ros2 plan demo           the forecast; --set phy.sample_rate=100e3 asks about a slower radio
-       gr-ros2 doctor              what this machine has and lacks for a link of your own
-       gr-ros2 link --help         your own robot's topics, live"""
+_NEXT = (
+    "Next: gr-ros2 demo --dashboard (live, with sliders), plan demo (the forecast), doctor (what this machine has for "
+    "a link of your own), link --help"
+)
 
 _WIDEST = 1000
 """Columns that no table needs."""
