@@ -36,7 +36,7 @@ from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
-from gr_ros2.phy.pdus import PduPort, packets_of, take_messages
+from gr_ros2.phy.pdus import packets_of, take_messages
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import replaced
 from gr_ros2.settings.registry import Registry, Topic
@@ -113,8 +113,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         self.handled = 0
         """Number of PDUs that this block has finished with, whatever the result."""
         self._bond = bond
-        take_messages(self, "pdus", "_handle", 1 if bond is None else len(bond.carries))
-        PduPort.readable_by(self)
+        take_messages(self, "pdus", "_handle", 1 if bond is None else len(bond.carries), called="take")
         self.middleware = graph
         """The robot's participant on the ROS graph."""
         try:
@@ -216,14 +215,19 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
 
     def _handle(self, message: Any, radio: int = 0) -> None:
         packets, problem = packets_of(message)
+        if problem:
+            self._failures.note(problem, f"ros2_sink: a message that is no PDU of bytes ({problem}) was dropped")
+            self.handled += 1
+        else:
+            self.take(packets, radio)
+
+    def take(self, packets: Sequence[AirPacket], radio: int = 0) -> None:
+        """Packets have come from a radio."""
         try:
-            if problem:
-                self._failures.note(problem, f"ros2_sink: a message that is no PDU of bytes ({problem}) was dropped")
-            else:
-                self._take([piece for packet in packets for piece in self._cut(packet)], radio)
+            self._take([piece for packet in packets for piece in self._cut(packet)], radio)
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
-        self.handled += max(len(packets), 1)
+        self.handled += len(packets)
 
     def _cut(self, packet: AirPacket) -> list[AirPacket]:
         """The packets in one PDU: a TCP socket joins them. The trailer of each then says whether it is one."""

@@ -103,7 +103,7 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
         self._bond = bond
         radios = 1 if bond is None else len(bond.carries)
         self._ports = [PduPort(self, port_of("pdus", radio)) for radio in range(radios)]
-        take_messages(self, "credit", "_credit", radios)
+        take_messages(self, "credit", "_credit", radios, called="grant")
         self.middleware = graph
         """The robot's participant on the ROS graph."""
         self._backpressure = backpressure
@@ -241,7 +241,10 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
             self._space.notify_all()
 
     def _credit(self, message: Any, radio: int = 0) -> None:
-        packets, since = credited(message)
+        self.grant(*credited(message), radio)
+
+    def grant(self, packets: int, since: float | None, radio: int = 0) -> None:
+        """So many more packets may leave; see :func:`gr_ros2.phy.pdus.credit_of`."""
         packets = max(0, packets)
         if self._backpressure and since != inf:
             since = None  # whoever waits for room in a queue wants nothing dropped
@@ -296,7 +299,7 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
     def _hand_over(self, packets: list[SentPacket], port: PduPort) -> None:
         adaptive = bool(self._end.mcs_table)
         on_air = [AirPacket(sent.data, None, sent.leave_at, sent.mcs if adaptive else None) for sent in packets]
-        if port.bundles:
+        if port.direct:
             port.send(on_air)
         else:
             wall = time.time()

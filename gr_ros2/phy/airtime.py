@@ -7,17 +7,17 @@ time (`throttle` would let bursts through); the queue is unbounded and counted; 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any
 
-import pmt
 from gnuradio import gr
 
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.airtime_limit import AirtimeLimit
+from gr_ros2.link.events import AirPacket
 from gr_ros2.link.lateness import Lateness
-from gr_ros2.phy.pdus import CREDIT, PDUS, PduPort, credit_of, leave_at_of, mcs_of, octets, packets_of, with_begin
+from gr_ros2.phy.pdus import CreditPort, PduPort, packets_of, take_messages, with_begin
 from gr_ros2.phy.threads import WaitingBlock
 
 
@@ -53,7 +53,7 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         self._clock: AirtimeClock[Any] = AirtimeClock(
             airtime, LEAD_S, ahead, limit, measured=True, timed=timed, listens=listens, ready=ready
         )
-        self._admits = admits
+        self._admits, self._at_once = admits, airtime == 0 and limit is None and admits is None
         self._now = clock
         self._left = 0
         """Packets that have passed or are about to."""
@@ -63,13 +63,9 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         """When its thread began with what it does, or looks again at the latest, s."""
         self.arrived = 0
         """Packets that have come."""
-        self._port = PduPort(self)
-        self.message_port_register_in(PDUS)
-        self.message_port_register_out(CREDIT)
-        self._at_once = airtime == 0 and limit is None and admits is None
-        if self._at_once:
-            PduPort.readable_by(self)
-        self.set_msg_handler(PDUS, self._pass if self._at_once else self._arrive)
+        self._port, self._credits = PduPort(self), CreditPort(self)
+        self.passes_on_to = self._port
+        take_messages(self, "pdus", "_arrive", called="take")
 
     @property
     def backlog(self) -> int:
@@ -121,38 +117,52 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self._port.find_readers()
+        self._credits.find_readers()
         self._looks_at = self._now()
         return super().start()
 
-    def _pass(self, message: Any) -> None:
-        """Let packets that take no time through, as many as come at once."""
-        packets, _ = packets_of(message)
-        with self._changed:
-            now = self._now()
-            for packet in packets:
-                self._clock.offer(packet, now)
-            passed = len(self._clock.due(now))
-            self.arrived += len(packets)
-            self._left += passed
-            self._changed.notify_all()
-        if len(packets) > 1:
-            self._port.send(packets[:passed])
-        elif passed:
-            self.message_port_pub(PDUS, message)
-        self.passed += passed
+    def take(self, packets: Sequence[AirPacket]) -> None:
+        """Packets have come."""
+        for packet in packets:
+            self._offer(packet, packet)
+        self._look()
 
     def _arrive(self, pdu: Any) -> None:
-        airtime = None
-        if self._airtime_of is not None:
-            airtime = self._airtime_of(int(pmt.length(pmt.cdr(pdu))), mcs_of(pdu) or 0)
-        admitted = self._admits is None or self._admits(octets(pmt.cdr(pdu)))
+        packets, problem = packets_of(pdu)
+        if problem:
+            self._clock.refused[problem] += 1
+        for packet in packets:
+            self._offer(packet, packet if self._port.direct else pdu)
+        self._look()
+
+    def _offer(self, packet: AirPacket, passed_on: Any) -> None:
+        airtime = None if self._airtime_of is None else self._airtime_of(len(packet.data), packet.mcs or 0)
+        admitted = self._admits is None or self._admits(packet.data)
         with self._changed:
             if admitted:
-                self._clock.offer(pdu, self._now(), airtime, leave_at_of(pdu))
+                self._clock.offer(passed_on, self._now(), airtime, packet.leave_at)
             else:
                 self._clock.refused["not_sealed"] += 1
             self.arrived += 1
+
+    def _look(self) -> None:
+        """Packets have come: those that take no time pass at once, of others its thread looks when."""
+        passed = []
+        with self._changed:
+            if self._at_once:
+                passed = self._clock.due(self._now())
+                self._left += len(passed)
             self._changed.notify_all()
+        self._pass(passed)
+
+    def _pass(self, passed: list[tuple[float, Any]]) -> None:
+        if self._port.direct:
+            # What takes no time on the air does not begin at a time either.
+            self._port.send([one if self._at_once else one._replace(at=begins_at) for begins_at, one in passed])
+        else:
+            for begins_at, pdu in passed:
+                self._port.send_pdu(pdu if self._at_once else with_begin(pdu, begins_at))
+        self.passed += len(passed)
 
     def run(self) -> None:
         while True:
@@ -161,11 +171,9 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
                     return
                 pdus, credits = self._step()
                 free = inf if self._clock.held else self._clock.free
-            for begins_at, pdu in pdus:
-                self.message_port_pub(PDUS, with_begin(pdu, begins_at))
-            self.passed += len(pdus)
+            self._pass(pdus)
             if credits:
-                self.message_port_pub(CREDIT, credit_of(credits, free))
+                self._credits.grant(credits, free)
 
     def _step(self) -> tuple[list[tuple[float, Any]], int]:
         """What is due; waits until something is due."""

@@ -7,9 +7,8 @@ once, followed by its gap; all behaviour is in the modem.
 from __future__ import annotations
 
 import logging
-from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal
 
@@ -21,12 +20,14 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.link.events import AirPacket
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
-from gr_ros2.phy.burst import BurstModem, BurstReceiver, DemodulatedPacket, Frames, Samples
+from gr_ros2.phy.burst import BurstModem, Frames, Samples
+from gr_ros2.phy.demodulation import Demodulation
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import decoders, fastest, which
-from gr_ros2.phy.pdus import PDUS, PduPort, octets, packets_of
-from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, StreamTimes, whole_and_rest
+from gr_ros2.phy.pdus import PDUS, PduPort
+from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, whole_and_rest
+from gr_ros2.phy.taken_packets import TakesPackets
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
 from gr_ros2.settings.fields import AUTO, Auto
@@ -41,6 +42,8 @@ _POINTS = pmt.intern("points")
 _BUFFER = 1 << 17
 """Samples that may wait behind the modulator. GNU Radio hands over at most half of them at once: so many that modulator
 and receiver have a dozen long packets in a call. With a quarter of it, links carry half of the packets of 1,500 B."""
+_WAKES = pmt.intern("wakes")
+"""The message after which GNU Radio calls a block that has been given packets."""
 _GAP = 32
 """Zero samples after a packet, unless a receiver needs more."""
 
@@ -89,6 +92,11 @@ class BurstPhy(Phy):
     @property
     def any_length(self) -> bool:
         return not self.modem.frames.fixed and not self._padded
+
+    @property
+    def lengths(self) -> range:
+        """Bytes that a packet may have."""
+        return range(1 if self.any_length else self.packet_len, self.packet_len + 1)
 
     def pad_all(self) -> None:
         self._padded = True
@@ -145,43 +153,6 @@ class BurstTransmitter(TransmitterBlock):
         return self._modulator.sent
 
 
-class TakesPackets(KeptAlive):
-    """Mix-in with message port `pdus` in, for a Python block inside a hier block; list it before GNU Radio's class.
-
-    :param lengths: allowed bytes of a packet; any other PDU is dropped and counted
-    :param args: arguments of GNU Radio's class
-    """
-
-    def __init__(self, lengths: range, *args: Any) -> None:
-        super().__init__(*args)
-        self._lengths = lengths
-        self.refused = 0
-        block: Any = self
-        block.message_port_register_in(PDUS)
-        block.set_msg_handler(PDUS, self._take)
-        PduPort.readable_by(self)
-
-    @abstractmethod
-    def take_packets(self, packets: list[AirPacket]) -> None:
-        """Process packets that came together."""
-
-    def _take(self, message: Any) -> None:
-        bare = pmt.is_u8vector(message)
-        packets, problem = ([AirPacket(octets(message))], "") if bare else packets_of(message)
-        good = [packet for packet in packets if len(packet.data) in self._lengths]
-        self._refuse(len(packets) - len(good) + bool(problem))
-        self.take_packets(good)
-
-    def _refuse(self, count: int) -> None:
-        first = bool(count and not self.refused)
-        self.refused += count
-        if first:
-            block: Any = self
-            least, most = self._lengths[0], self._lengths[-1]
-            needed = f"{most}" if least == most else f"{least} to {most}"
-            _log.warning("%s: dropped a PDU that is not %s bytes", block.name(), needed)
-
-
 class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     """Message port `pdus` in, samples out: each packet's burst and gap, tagged with its length if bursts differ in it,
     and with the time at which it begins, as far as that is known (:mod:`gr_ros2.phy.stream_times`).
@@ -191,8 +162,7 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     """
 
     def __init__(self, phy: BurstPhy) -> None:
-        least = 1 if phy.any_length else phy.packet_len
-        super().__init__(range(least, phy.packet_len + 1), f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
+        super().__init__(phy.lengths, f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._tagged = phy.any_length
         self._rates = phy.running_modem.rates
         self._gap = phy.gap
@@ -202,7 +172,7 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         """What has not left yet of a burst that did not fit."""
         self.sent = 0
         """Packets that have left as samples."""
-        self._tag = self.add_item_tag  # stored: each look-up would pass through two proxies
+        self._tag, self._wake = self.add_item_tag, self._post  # stored: each look-up would pass through two proxies
         log_warnings_only([self])
         self.set_min_output_buffer(_BUFFER)
 
@@ -211,6 +181,14 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         for packet in packets:
             mcs = packet.mcs or 0
             self._waiting.append((self._rates[mcs if 0 <= mcs < len(self._rates) else 0], packet))
+
+    def take(self, packets: Sequence[AirPacket]) -> None:
+        super().take(packets)
+        self._wake(PDUS, _WAKES)
+
+    def _take(self, message: Any) -> None:
+        if not pmt.eq(message, _WAKES):
+            super()._take(message)
 
     def work(self, input_items: list[Any], output_items: list[Samples]) -> int:  # noqa: ARG002
         out = output_items[0]
@@ -287,19 +265,19 @@ class BurstSink(ReceiverBlock):
     @property
     def damaged(self) -> int:
         """Bursts found whose CRC-32 was wrong."""
-        return self._demodulator.damaged
+        return self._demodulator.inside.damaged
 
     @property
     def snr_db(self) -> float | None:
         """SNR over the sampled band of the newest packets, dB; None before the first."""
-        return self._demodulator.snr_db
+        return self._demodulator.inside.snr_db
 
     def follow_clock(self, offset: Callable[[], float]) -> None:
-        self._demodulator.times.offset = offset
+        self._demodulator.inside.times.offset = offset
 
     def tap_symbols(self) -> SymbolTap:
         """Make the received constellation points visible."""
-        return SymbolTap(self._demodulator.points)
+        return SymbolTap(self._demodulator.inside.points)
 
 
 class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
@@ -307,74 +285,28 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
 
     def __init__(self, phy: BurstPhy) -> None:
         super().__init__(f"gr_ros2_{phy.name}_demodulator", [np.complex64], None)
-        self._modem = phy.running_modem
-        self._engine: BurstReceiver | None = None
-        self._damaged = 0
-        self._failed = False
-        self._snr_db: float | None = None
-        self._first = 0
-        """Number of the first sample that the engine was fed."""
-        self._lag, self._slack = phy.lag, phy.gap // 2
-        self.times = StreamTimes(phy.sample_rate)
+        self.inside = Demodulation(phy.running_modem, phy.lag, phy.gap, phy.sample_rate)
         self._port = PduPort(self)
         self._shown = False
         """Whether somebody reads the port `points`."""
         self.message_port_register_out(_POINTS)
 
-    @property
-    def damaged(self) -> int:
-        return self._damaged + (self._engine.damaged if self._engine is not None else 0)
-
-    @property
-    def snr_db(self) -> float | None:
-        engine = self._engine
-        return self._snr_db if engine is None else engine.snr_db
-
-    def points(self) -> Samples:
-        """The constellation points of the newest packet; empty before the first."""
-        engine = self._engine
-        return np.empty(0, np.complex64) if engine is None else engine.points
-
     def start(self) -> bool:
         self._port.find_readers()
         self._shown = pmt.is_pair(self.message_subscribers(_POINTS))
-        self._engine = self._modem.receiver()
+        self.inside.start()
         return super().start()
 
     def stop(self) -> bool:
-        self._end_engine()
+        self.inside.stop()
         return super().stop()
 
     def work(self, input_items: list[Samples], output_items: list[Any]) -> int:  # noqa: ARG002
         count = len(input_items[0])
-        self.times.arrived(self.nitems_read(0) + count, self.get_tags_in_window(0, 0, count))
-        self._send(self._packets(input_items[0]))
-        return count
-
-    def _send(self, packets: list[DemodulatedPacket]) -> None:
-        self._port.send([self._on_air(packet) for packet in packets])
+        self.inside.times.arrived(self.inside.fed + count, self.get_tags_in_window(0, 0, count))
+        packets = self.inside.feed(input_items[0])
+        self._port.send(packets)
         if self._shown and packets:
-            self.message_port_pub(_POINTS, pmt.cons(pmt.PMT_NIL, pmt.to_pmt(self.points()[-SYMBOLS_SHOWN:])))
-
-    def _on_air(self, packet: DemodulatedPacket) -> AirPacket:
-        modem = self._modem.rates[packet.mcs]
-        end = self._first + packet.end
-        first = end - self._lag - modem.samples_of(len(packet.data))
-        mcs = packet.mcs if len(self._modem.rates) > 1 else None
-        return AirPacket(packet.data, self.times.at(first, end, self._slack), mcs=mcs, snr_db=packet.snr_db)
-
-    def _packets(self, samples: Samples) -> list[DemodulatedPacket]:
-        assert self._engine is not None
-        try:
-            return self._engine.feed(samples)
-        except Exception as error:  # noqa: BLE001 - an exception from ``work`` would end the block's thread, and all reception
-            if not self._failed:
-                self._failed = True
-                _log.exception("%s: starts again after %s", self.name(), error)
-            self._end_engine()
-            self._engine = self._modem.receiver()
-            self._first = self.nitems_read(0) + len(samples)
-            return []
-
-    def _end_engine(self) -> None:
-        self._damaged, self._snr_db, self._engine = self.damaged, self.snr_db, None
+            points = self.inside.points()[-SYMBOLS_SHOWN:]
+            self.message_port_pub(_POINTS, pmt.cons(pmt.PMT_NIL, pmt.to_pmt(points)))
+        return count

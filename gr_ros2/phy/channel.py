@@ -15,9 +15,10 @@ from typing import Any
 
 from gnuradio import gr
 
+from gr_ros2.link.events import AirPacket
 from gr_ros2.link.losses import PduLosses
 from gr_ros2.phy.base import Phy
-from gr_ros2.phy.pdus import PDUS
+from gr_ros2.phy.pdus import PduPort, packets_of, take_messages
 from gr_ros2.phy.threads import ThreadState
 from gr_ros2.settings.config import ChannelConfig, replaced
 
@@ -114,9 +115,8 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         """s, monotonic: when the run began; outages count from here."""
         self.received = 0
         self._thread_state = ThreadState()
-        self.message_port_register_in(PDUS)
-        self.message_port_register_out(PDUS)
-        self.set_msg_handler(PDUS, self._pass)
+        self._port = self.passes_on_to = PduPort(self)
+        take_messages(self, "pdus", "_arrive", called="take")
 
     @property
     def dropped(self) -> Counter[str]:
@@ -129,6 +129,7 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
 
     def start(self) -> bool:
         self.epoch = time.monotonic()
+        self._port.find_readers()
         self._thread_state.keep()
         return True
 
@@ -136,8 +137,16 @@ class PacketLoss(gr.basic_block):  # type: ignore[misc]
         self._thread_state.release()
         return True
 
-    def _pass(self, pdu: Any) -> None:
-        passes = self._losses.passes(time.monotonic() - self.epoch)
+    def take(self, packets: Sequence[AirPacket]) -> None:
+        """Pass on those packets that are not lost."""
+        self._port.send([packet for packet in packets if self._passes()])
+
+    def _arrive(self, pdu: Any) -> None:
+        if self._port.direct:
+            self.take(packets_of(pdu)[0])
+        elif self._passes():
+            self._port.send_pdu(pdu)
+
+    def _passes(self) -> bool:
         self.received += 1
-        if passes:
-            self.message_port_pub(PDUS, pdu)
+        return self._losses.passes(time.monotonic() - self.epoch)

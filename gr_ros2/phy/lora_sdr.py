@@ -23,9 +23,9 @@ from gnuradio.filter import firdes
 from gr_ros2.core.errors import BackendMissingError
 from gr_ros2.link.events import AirPacket
 from gr_ros2.phy.burst import CRC_LEN, Octets
-from gr_ros2.phy.burst_blocks import TakesPackets
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.pdus import PDUS, pdu_of
+from gr_ros2.phy.taken_packets import TakesPackets
 from gr_ros2.phy.threads import KeptAlive, lift_message_limit
 
 MAX_PAYLOAD = 255

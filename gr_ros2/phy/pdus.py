@@ -1,22 +1,20 @@
-"""Packets in messages: fast conversion of bytes to PDUs and back, and several packets in one message.
+"""Packets between blocks: as PDUs, or as they are, and the fast conversion of bytes to PDUs and back.
 
-Each message between two Python blocks costs as much time as a packet in source or sink. So a block that has several
-packets at once sends them in one message, a *bundle*, if all blocks that read its port understand bundles. These are
-blocks of this package; all other blocks get one PDU per packet.
+A message between two Python blocks costs as much time as a packet in source or sink, and wakes a thread. So where all
+blocks that read a port are of this package, its block calls them, in its own thread, with the packets as they are. All
+other blocks get a PDU per packet.
 
-Invariants: a PDU is a PMT pair of a dictionary and a u8vector; a bundle is a pair of the symbol ``bundle`` and a
-u8vector with the head (``_HEAD_OF``) and the bytes of each packet. Of the metadata of a PDU, blocks of this package
-read ``mcs``, ``snr_db``, ``received_at``, ``begins_at`` and ``leave_at`` only, and a bundle carries the same; the rest
-is for people and other blocks.
+Invariants: a PDU is a PMT pair of a dictionary and a u8vector. Of its metadata, blocks of this package read ``mcs``,
+``snr_db``, ``received_at``, ``begins_at`` and ``leave_at`` only, which are what a packet says that is handed over as it
+is; the rest is for people and other blocks. Nobody sends while it holds a lock.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partialmethod
-from math import isfinite, nan
-from struct import Struct
+from math import isfinite
 from types import SimpleNamespace
 from typing import Any, ClassVar
 from weakref import WeakSet
@@ -34,29 +32,34 @@ def port_of(name: str, radio: int) -> str:
     return f"{name}_{radio + 1}" if radio else name
 
 
-def take_messages(block: Any, name: str, handler: str, radios: int) -> None:
-    """Have a block handle the messages for each of its radios: those of the first by its method of that name, those of
+def take_messages(block: Any, name: str, handler: str, radios: int = 1, *, called: str = "") -> None:
+    """Have a block handle what comes for each of its radios: that of the first by its method of that name, that of
     others by a method that hands on their number as ``radio``.
 
     :param name: of the ports, see :func:`port_of`
+    :param handler: the method that takes messages
+    :param called: the method that blocks of this package call instead, with what their port sends; '' = none
     """
     for radio in range(radios):
-        method = port_of(handler, radio)
-        if not hasattr(block, method):
-            own = partialmethod(getattr(type(block), handler), radio=radio)
-            setattr(type(block), method, own)
-        port = pmt.intern(port_of(name, radio))
-        block.message_port_register_in(port)
-        block.set_msg_handler(port, SimpleNamespace(__name__=method))  # GNU Radio looks the method up by this name
+        port = port_of(name, radio)
+        block.message_port_register_in(pmt.intern(port))
+        handles = SimpleNamespace(__name__=_method(block, handler, radio))
+        block.set_msg_handler(pmt.intern(port), handles)  # GNU Radio looks the method up by this name
+        if called:
+            _OutPort.readable(block, port, _method(block, called, radio))
 
 
-_BUNDLE = pmt.intern("bundle")
+def _method(block: Any, name: str, radio: int) -> str:
+    """The name of a block's method for one of its radios."""
+    own = port_of(name, radio)
+    if not hasattr(block, own):
+        setattr(type(block), own, partialmethod(getattr(type(block), name), radio=radio))
+    return own
+
+
 _MCS, _SNR_DB, _RECEIVED_AT, _BEGINS_AT, _LEAVE_AT = (
     pmt.intern(key) for key in ("mcs", "snr_db", "received_at", "begins_at", "leave_at")
 )
-_HEAD_OF = Struct(">Iddbf")
-"""In a bundle, before each packet: its length in bytes, and ``at``, ``leave_at``, ``mcs`` and ``snr_db`` of
-:class:`gr_ros2.link.events.AirPacket` (NaN for none, -1 for no ``mcs``)."""
 _NO_METADATA = pmt.make_dict()
 _HEAD = b"\n\x00"
 _OFFSET = 8
@@ -130,7 +133,7 @@ def _said(message: Any, key: Any) -> Any:
 
 
 def packets_of(message: Any) -> tuple[list[AirPacket], str]:
-    """The packets of a PDU or bundle and '', or no packets and the reason: ``not_a_pair`` or ``not_u8``."""
+    """The packets of a PDU and '', or no packets and the reason: ``not_a_pair`` or ``not_u8``."""
     if not pmt.is_pair(message):
         return [], "not_a_pair"
     vector = pmt.cdr(message)
@@ -138,8 +141,6 @@ def packets_of(message: Any) -> tuple[list[AirPacket], str]:
         return [], "not_u8"
     data = octets(vector)
     metadata = pmt.car(message)
-    if pmt.eq(metadata, _BUNDLE):
-        return _unbundled(data), ""
     if not pmt.is_dict(metadata) or pmt.eq(metadata, _NO_METADATA):
         return [AirPacket(data)], ""
     received_at = _number(message, _RECEIVED_AT)
@@ -147,59 +148,34 @@ def packets_of(message: Any) -> tuple[list[AirPacket], str]:
     return [AirPacket(data, at, leave_at_of(message), mcs_of(message), _number(message, _SNR_DB))], ""
 
 
-def _unbundled(data: bytes) -> list[AirPacket]:
-    """The packets of a bundle; a packet that is cut off ends it."""
-    packets = []
-    start = _HEAD_OF.size
-    while start <= len(data):
-        length, at, leave_at, mcs, snr_db = _HEAD_OF.unpack_from(data, start - _HEAD_OF.size)
-        end = start + length
-        mcs = None if mcs < 0 else mcs
-        packets.append(AirPacket(data[start:end], _known(at), _known(leave_at), mcs, _known(snr_db)))
-        start = end + _HEAD_OF.size
-    return packets
-
-
-def _known(number: float) -> float | None:
-    return number if isfinite(number) else None
-
-
-def _bundled(packet: AirPacket) -> bytes:
-    data, at, leave_at, mcs, snr_db = packet
-    head = _HEAD_OF.pack(
-        len(data),
-        nan if at is None else at,
-        nan if leave_at is None else leave_at,
-        -1 if mcs is None else mcs,
-        nan if snr_db is None else snr_db,
-    )
-    return head + data
-
-
-class PduPort:
-    """Message port `pdus` out of a Python block.
+class _OutPort:
+    """Message port out of a Python block.
 
     :param block: the block
-    :param name: of the port, where the block has several
+    :param name: of the port
+    :ivar direct: whether all readers are called; known after :meth:`find_readers`
     """
 
     _readers: ClassVar[WeakSet[Any]] = WeakSet()
-    """The blocks that understand bundles."""
+    """The blocks that can be called."""
     _lock: ClassVar[threading.Lock] = threading.Lock()
 
-    def __init__(self, block: Any, name: str = "pdus") -> None:
+    def __init__(self, block: Any, name: str) -> None:
         self._port = pmt.intern(name)
         block.message_port_register_out(self._port)
         self._subscribers = block.message_subscribers
         self._publish = block.message_port_pub  # stored: each look-up would pass through two proxies
-        self.bundles = False
-        """Whether all readers understand bundles."""
+        self._calls: list[Callable[..., None]] = []
+        self.direct = False
 
     @classmethod
-    def readable_by(cls, block: Any) -> None:
-        """A block's port `pdus` in understands bundles; call this in its constructor."""
+    def readable(cls, block: Any, port: str, method: str) -> None:
+        """What is sent to a port of a block may be handed over by a call of a method."""
         with cls._lock:
-            cls._readers.add(block)
+            if block not in cls._readers:
+                cls._readers.add(block)
+                block.called_for = {}
+            block.called_for[port] = method
 
     def find_readers(self) -> bool:
         """Find out who reads this port; call this in the block's ``start``.
@@ -207,34 +183,76 @@ class PduPort:
         :return: whether anybody does
         """
         with self._lock:
-            known = {block.alias() for block in self._readers}
-        readers = set()
+            known = {block.alias(): block for block in self._readers}
+        calls: list[Callable[..., None] | None] = []
         rest = self._subscribers(self._port)
         while pmt.is_pair(rest):
-            readers.add(pmt.symbol_to_string(pmt.car(pmt.car(rest))))
+            reader, port = pmt.car(pmt.car(rest)), pmt.cdr(pmt.car(rest))
+            calls.append(self._call_of(known.get(pmt.symbol_to_string(reader)), pmt.symbol_to_string(port)))
             rest = pmt.cdr(rest)
-        self.bundles = bool(readers) and readers <= known
-        return bool(readers)
+        self._calls = [call for call in calls if call is not None]
+        self.direct = bool(calls) and len(self._calls) == len(calls)
+        return bool(calls)
+
+    @staticmethod
+    def _call_of(block: Any, port: str) -> Callable[..., None] | None:
+        """The method of a block that takes what a port sends; None where only a message can be sent to it.
+
+        What a block passes on to others, it has to get as they need it.
+        """
+        method = None if block is None else block.called_for.get(port)
+        behind: PduPort | None = getattr(block, "passes_on_to", None)
+        if method is None or (behind is not None and not (behind.find_readers() and behind.direct)):
+            return None
+        call: Callable[..., None] = getattr(block, method)
+        return call
+
+
+class PduPort(_OutPort):
+    """Message port `pdus` out of a Python block."""
+
+    def __init__(self, block: Any, name: str = "pdus") -> None:
+        super().__init__(block, name)
 
     def send(self, packets: Sequence[AirPacket]) -> None:
-        """Send packets: to readers that do not understand bundles, only packets that were received."""
-        if self.bundles and len(packets) > 1:
-            self._publish(self._port, pmt.cons(_BUNDLE, u8vector(b"".join(map(_bundled, packets)))))
+        """Send packets: to readers that cannot be called, only packets that were received."""
+        if not packets:
+            return
+        if self.direct:
+            for call in self._calls:
+                call(packets)
         else:
             for packet in packets:
                 self._publish(self._port, pdu_heard(packet))
 
     def send_pdu(self, pdu: Any) -> None:
-        """Send one packet as a PDU with metadata."""
+        """Send one packet as a PDU with metadata, to readers that cannot be called."""
         self._publish(self._port, pdu)
 
 
-def credit_of(packets: int, since: float) -> Any:
+class CreditPort(_OutPort):
+    """Message port `credit` out of a Python block."""
+
+    def __init__(self, block: Any) -> None:
+        super().__init__(block, "credit")
+
+    def grant(self, packets: int, since: float | None) -> None:
+        """Give credits; see :func:`credit_of`."""
+        if self.direct:
+            for call in self._calls:
+                call(packets, since)
+        else:
+            self._publish(self._port, credit_of(packets, since))
+
+
+def credit_of(packets: int, since: float | None) -> Any:
     """The credit for so many further packets.
 
     :param since: s on the clock of both blocks, since when the air is free for them; infinite = they were held back
-        until now, by a limit or a switch
+        until now, by a limit or a switch; None = nothing is known of the air
     """
+    if since is None:
+        return pmt.from_long(packets)
     return pmt.cons(pmt.from_long(packets), pmt.from_double(since))
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import pmt
@@ -55,7 +55,12 @@ class StreamTimes:
         self._tags: deque[tuple[int, float, bool]] = deque(maxlen=_KEPT)
         self._lock = threading.Lock()
 
-    def arrived(self, count: int, tags: list[Any]) -> None:
+    def begins(self, place: int, seconds: float) -> None:
+        """A burst begins or began at a sample, counted from the start, and at a time of ``clock``."""
+        with self._lock:
+            self._tags.append((place, seconds, False))
+
+    def arrived(self, count: int, tags: Iterable[Any] = ()) -> None:
         """So many samples have arrived since the start, the last of them now, and these tags with them."""
         with self._lock:
             self._arrived.append((count, self._clock()))

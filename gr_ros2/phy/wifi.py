@@ -29,10 +29,11 @@ from gr_ros2.link.events import AirPacket
 from gr_ros2.phy import PHY
 from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import Samples
-from gr_ros2.phy.burst_blocks import STOCK, AirOptions, TakesPackets
+from gr_ros2.phy.burst_blocks import STOCK, AirOptions
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import decoders
 from gr_ros2.phy.pdus import PDUS, PduPort, pdu_of
+from gr_ros2.phy.taken_packets import TakesPackets
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
 from gr_ros2.phy.theory import convolutional_success, qam_bit_error
 from gr_ros2.phy.threads import KeptAlive, lift_message_limit

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import pmt
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.phy.pdus import CREDIT
+from gr_ros2.phy.pdus import CreditPort
 from gr_ros2.phy.threads import WaitingBlock
 
 WINDOW = 32
@@ -37,14 +36,18 @@ class CreditWindow(WaitingBlock, gr.basic_block):  # type: ignore[misc]
             raise ConfigError(f"window = {window}: must be 1 or more")
         self._progress = progress
         self._window = window
-        self.message_port_register_out(CREDIT)
+        self._credits = CreditPort(self)
+
+    def start(self) -> bool:
+        self._credits.find_readers()
+        return super().start()
 
     def run(self) -> None:
         granted = self._progress()
         while self._running:
             credits = self._progress() + self._window - granted
             if credits * _SHARE >= self._window:
-                self.message_port_pub(CREDIT, pmt.from_long(credits))
+                self._credits.grant(credits, None)
                 granted += credits
             with self._changed:
                 if self._running:

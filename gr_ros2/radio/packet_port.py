@@ -14,16 +14,15 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import pmt
 from gnuradio import gr
 
 from gr_ros2.core.errors import RadioError
 from gr_ros2.link.events import AirPacket
 from gr_ros2.phy import Phy
-from gr_ros2.phy.pdus import PDUS, octets, pdu_heard
+from gr_ros2.phy.pdus import PduPort, packets_of, take_messages
 from gr_ros2.phy.threads import BlockThread
 from gr_ros2.radio.framing import Framing
 from gr_ros2.radio.front_end import FrontEnd, FrontEndCounters
@@ -155,11 +154,11 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
         self._stopped = threading.Event()
         self._stopped.set()
         self._thread = BlockThread()
-        self.message_port_register_in(PDUS)
-        self.message_port_register_out(PDUS)
-        self.set_msg_handler(PDUS, self._arrive)
+        self._port = PduPort(self)
+        take_messages(self, "pdus", "_arrive", called="take")
 
     def start(self) -> bool:
+        self._port.find_readers()
         self._stopped.clear()
         self._thread.start(self._run, f"gr-ros2-{self._called}")
         return True
@@ -186,13 +185,18 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
             end.close()
 
     def _arrive(self, pdu: Any) -> None:
-        if self._connection is None:
-            self._counters["disconnected"] += 1
-        elif len(self._outgoing) >= _WAITING:
-            self._counters["not_taken"] += 1
-        else:
-            self._outgoing.append(octets(pmt.cdr(pdu)))
-            self._wake()
+        self.take(packets_of(pdu)[0])
+
+    def take(self, packets: Sequence[AirPacket]) -> None:
+        """Packets are to leave."""
+        for packet in packets:
+            if self._connection is None:
+                self._counters["disconnected"] += 1
+            elif len(self._outgoing) >= _WAITING:
+                self._counters["not_taken"] += 1
+            else:
+                self._outgoing.append(packet.data)
+                self._wake()
 
     def _wake(self) -> None:
         try:
@@ -254,8 +258,7 @@ class PacketPort(gr.basic_block):  # type: ignore[misc]
     def _receive(self, connection: Connection) -> None:
         for packet in connection.receive():
             self._counters["frames_in"] += 1
-            began = time.monotonic() - self._airtime(len(packet))
-            self.message_port_pub(PDUS, pdu_heard(AirPacket(packet, at=began)))
+            self._port.send([AirPacket(packet, at=time.monotonic() - self._airtime(len(packet)))])
 
 
 class PacketFrontEnd(FrontEnd):

@@ -17,7 +17,7 @@ from gnuradio import gr
 
 from gr_ros2.link.events import AirPacket
 from gr_ros2.phy import Phy
-from gr_ros2.phy.pdus import PDUS, PduPort, packets_of
+from gr_ros2.phy.pdus import PduPort, packets_of, take_messages
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2_lab.medium import Surroundings, make_medium
@@ -87,11 +87,9 @@ class _Port(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
 
     def __init__(self, take: Callable[[Sequence[AirPacket]], None]) -> None:
         super().__init__("gr_ros2_packet_medium", None, None)
-        self._take = take
+        self.take = take
         self._port = PduPort(self)
-        PduPort.readable_by(self)
-        self.message_port_register_in(PDUS)
-        self.set_msg_handler(PDUS, self._arrive)
+        take_messages(self, "pdus", "_arrive", called="take")
 
     def start(self) -> bool:
         self._port.find_readers()
@@ -102,7 +100,7 @@ class _Port(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
         self._port.send(packets)
 
     def _arrive(self, message: Any) -> None:
-        self._take(packets_of(message)[0])
+        self.take(packets_of(message)[0])
 
 
 class PortFrontEnd(FrontEnd):
