@@ -85,6 +85,24 @@ class PacketReceiver(Protocol):
         """Release everything inside. The flowgraph has stopped, or never ran. Idempotent."""
 
 
+class BurstCarrier(Protocol):
+    """What carries bursts."""
+
+    def send(self, samples: Samples, at: float | None) -> None:
+        """Send a burst and its gap.
+
+        :param samples: may be used again after the call
+        :param at: s, monotonic, when it begins; None where nothing says so
+        """
+
+    def listen(self, take: Callable[[Samples, float | None], None] | None) -> None:
+        """Call a function with each burst that comes, and when it began as far as that is known; None: no more."""
+
+
+class PacketTransceiver(PacketTransmitter, PacketReceiver, Protocol):
+    """A GNU Radio block: message ports `pdus` in and out, around a :class:`BurstCarrier`."""
+
+
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class PhyOptions:
     """Options of a PHY that has no settings except packet length and sample rate."""
@@ -230,6 +248,10 @@ class Phy(ABC):
 
         :raises PhyError: for a PHY without samples
         """
+
+    def transceiver(self, carrier: BurstCarrier) -> PacketTransceiver | None:  # noqa: ARG002
+        """A fresh block in place of both, without streams; None where GNU Radio's blocks process the samples."""
+        return None
 
 
 class PacketPhy(Phy):

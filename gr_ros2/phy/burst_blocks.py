@@ -1,4 +1,4 @@
-"""GNU Radio blocks around a burst modem: PDUs in, samples out, and back.
+"""GNU Radio blocks around a burst modem: PDUs in, samples out, and back, as streams or as whole bursts.
 
 Invariants: a PDU that is not a packet of an allowed length is counted and dropped, never sent; each burst is sent at
 once, followed by its gap; all behaviour is in the modem.
@@ -19,7 +19,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.link.events import AirPacket
-from gr_ros2.phy.base import LENGTH_TAG, PacketReceiver, PacketTransmitter, Phy
+from gr_ros2.phy.base import LENGTH_TAG, BurstCarrier, PacketReceiver, PacketTransceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst import BurstModem, Frames, Samples
 from gr_ros2.phy.demodulation import Demodulation
 from gr_ros2.phy.fec import CodeName
@@ -133,6 +133,9 @@ class BurstPhy(Phy):
 
     def receiver(self) -> PacketReceiver:
         return BurstSink(self)
+
+    def transceiver(self, carrier: BurstCarrier) -> PacketTransceiver | None:
+        return BurstTransceiver(self, carrier)
 
 
 class BurstTransmitter(TransmitterBlock):
@@ -310,3 +313,83 @@ class _Demodulator(KeptAlive, gr.sync_block):  # type: ignore[misc]
             points = self.inside.points()[-SYMBOLS_SHOWN:]
             self.message_port_pub(_POINTS, pmt.cons(pmt.PMT_NIL, pmt.to_pmt(points)))
         return count
+
+
+class BurstTransceiver(TakesPackets, gr.basic_block):  # type: ignore[misc]
+    """Message ports `pdus` in and out: transmitter and receiver of a burst PHY around what carries bursts.
+
+    A packet is modulated and handed over in the thread that gives it. A burst is demodulated in the thread that hands
+    it over, which also hands on the packets in it.
+    """
+
+    foreign = 0
+
+    def __init__(self, phy: BurstPhy, carrier: BurstCarrier) -> None:
+        super().__init__(phy.lengths, f"gr_ros2_{phy.name}", None, None)
+        self._rates, self._gap, self._carrier = phy.running_modem.rates, phy.gap, carrier
+        self._whole = np.zeros(phy.airtime_samples(), np.complex64)
+        self._demodulation = Demodulation(phy.running_modem, phy.lag, phy.gap, phy.sample_rate)
+        self._taps = None if phy.receiver_taps is None else np.asarray(phy.receiver_taps, np.float32)
+        self._before = np.zeros(0 if self._taps is None else len(self._taps) - 1, np.complex64)
+        """The newest samples, which the filter still needs."""
+        self._port = PduPort(self)
+        self._sent = 0
+
+    @property
+    def damaged(self) -> int:
+        """Bursts found whose CRC-32 was wrong."""
+        return self._demodulation.damaged
+
+    @property
+    def snr_db(self) -> float | None:
+        """SNR over the sampled band of the newest packets, dB; None before the first."""
+        return self._demodulation.snr_db
+
+    def packets_sent(self) -> int:
+        """Packets that have left it as samples."""
+        return self._sent
+
+    def follow_clock(self, offset: Callable[[], float]) -> None:
+        """Do nothing: whatever carries bursts tells their times."""
+
+    def tap_symbols(self) -> None:
+        """Nothing is shown."""
+
+    def release(self) -> None:
+        """Nothing is inside."""
+
+    def start(self) -> bool:
+        self._port.find_readers()
+        self._demodulation.start()
+        self._before[:] = 0
+        self._carrier.listen(self._hear)
+        return super().start()
+
+    def stop(self) -> bool:
+        self._carrier.listen(None)
+        self._demodulation.stop()
+        return super().stop()
+
+    def take_packets(self, packets: list[AirPacket]) -> None:
+        for packet in packets:
+            # An MCS that this end does not have is one of settings that differ: the most robust one is sent.
+            mcs = packet.mcs or 0
+            modem = self._rates[mcs if 0 <= mcs < len(self._rates) else 0]
+            samples = self._whole[: modem.samples_of(len(packet.data)) + self._gap]
+            modem.modulate_into([packet.data], self._gap, samples)
+            self._carrier.send(samples, packet.at)
+            self._sent += 1
+
+    def _hear(self, samples: Samples, at: float | None) -> None:
+        demodulation = self._demodulation
+        if at is not None:
+            demodulation.times.begins(demodulation.fed, at)
+        demodulation.times.arrived(demodulation.fed + len(samples))
+        self._port.send(demodulation.feed(self._filtered(samples)))
+
+    def _filtered(self, samples: Samples) -> Samples:
+        if self._taps is None:
+            return samples
+        joined = np.concatenate([self._before, samples])
+        self._before = joined[len(samples) :]
+        return np.convolve(joined, self._taps, "valid").astype(np.complex64, copy=False)

@@ -17,7 +17,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.phy.base import PacketReceiver, PacketTransmitter
+from gr_ros2.phy.base import BurstCarrier, PacketReceiver, PacketTransceiver, PacketTransmitter
 from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
@@ -489,3 +489,6 @@ class LoraPhy(BurstPhy):
 
     def receiver(self) -> PacketReceiver:
         return super().receiver() if self._sdr is None else SdrReceiver(self._sdr)
+
+    def transceiver(self, carrier: BurstCarrier) -> PacketTransceiver | None:
+        return super().transceiver(carrier) if self._sdr is None else None

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.rate import Mcs
-from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy
+from gr_ros2.phy.base import BurstCarrier, PacketReceiver, PacketTransceiver, PacketTransmitter, Phy
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.ofdm_layout import CRC_LEN, OfdmLayout, point_power
 from gr_ros2.phy.ofdm_modem import AdaptiveOfdmModem, OfdmModem
@@ -209,3 +209,6 @@ class OfdmPhy(BurstPhy):
 
     def receiver(self) -> PacketReceiver:
         return super().receiver() if self._stock is None else StockReceiver(self._stock)
+
+    def transceiver(self, carrier: BurstCarrier) -> PacketTransceiver | None:
+        return super().transceiver(carrier) if self._stock is None else None

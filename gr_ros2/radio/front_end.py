@@ -18,6 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import Phy
+from gr_ros2.phy.base import BurstCarrier
 from gr_ros2.settings.config import STRICT, Seconds, build
 
 AGAIN_MS = 1
@@ -129,6 +130,11 @@ class FrontEnd(ABC):
     @property
     def packets(self) -> Any:
         """Block with message ports `pdus` in and out that carries packets; None if it carries samples."""
+        return None
+
+    @property
+    def bursts(self) -> BurstCarrier | None:
+        """What carries each burst as a whole, without ``sink`` and ``source``; None if it needs streams."""
         return None
 
     def wire(self, graph: Any) -> None:  # noqa: B027 - most have one block in each direction

@@ -112,7 +112,13 @@ class Radio(PacketPath, HierBlock):
         if front_end.packets is not None:
             last = self._follow(last, front_end.packets)
         elif phy.has_samples:
-            self._connect_samples(record, instrumented)
+            whole = None
+            if front_end.bursts is not None and not (self.channel.on_samples() or self._simulated or record or shows):
+                whole = self._transmitter = self._receiver = phy.transceiver(front_end.bursts)
+            if whole is None:
+                self._connect_samples(record, instrumented)
+            else:
+                self._follow(last, whole)
             last = self._receiver
         if last is None:
             return

@@ -24,6 +24,7 @@ import time
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from math import isfinite, nan
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -37,6 +38,7 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import Phy
+from gr_ros2.phy.base import BurstCarrier
 from gr_ros2.phy.stream_times import BURST_TIME
 from gr_ros2.phy.threads import KeepsThreadState
 from gr_ros2.radio.bursts import BurstCutter
@@ -67,6 +69,8 @@ MAX_SENDERS = 256
 MOST_SAMPLES = 1 << 20
 """Samples of the longest burst that is accepted, whatever another end has set."""
 _MAX_PORT = 65535
+_Arrived = tuple[NDArray[np.complex64], float | None]
+"""Samples of a burst, and when it began on the link's clock, as far as a medium process tells it."""
 _log = logging.getLogger(__name__)
 
 
@@ -165,15 +169,14 @@ class ZmqFrontEnd(FrontEnd):
         self._counters: Counter[str] = Counter()
         self._passed: Callable[[], int | None] = lambda: None
         self._medium_clock = MediumClock() if self.options.medium_process == "lockstep" else None
-        self._sink: _BurstPublisher | None = None
-        self._source: _BurstSubscriber | None = None  # the thread behind it may be told the time at once
+        self._out: _Departures | None = None
         if self._medium_clock is not None:
             self.timing_error_s = _LOCKED_S
         try:
             if self.transmits or self._medium_clock is not None:  # in lock step, who only listens answers too
                 publisher = self._socket(zmq.PUB)
                 open_socket(publisher.bind, "bind", self.options.bind)
-                self._sink = _BurstPublisher(publisher, phy, self._counters, self._medium_clock)
+                self._out = _Departures(publisher, phy, self._counters, self._medium_clock)
             subscriber = self._socket(zmq.SUB)
             subscriber.subscribe(b"")
             for address in self.options.connect:
@@ -183,16 +186,30 @@ class ZmqFrontEnd(FrontEnd):
             raise
         self._sockets.remove(subscriber)  # its thread closes it
         told = None if self._medium_clock is None else self._told
-        arrivals = _Arrivals(subscriber, phy, self.options.burst_queue, self._counters, told)
-        self._source = _BurstSubscriber(arrivals, self._medium_clock)
+        self.arrivals = _Arrivals(
+            subscriber, phy, self.options.burst_queue, self._counters, clock=self._medium_clock, told=told
+        )
 
-    @property
+    @cached_property
     def sink(self) -> Any:
-        return self._sink
+        return None if self._out is None else _BurstPublisher(self._out, self.phy)
+
+    @cached_property
+    def source(self) -> Any:
+        return _BurstSubscriber(self.arrivals)
 
     @property
-    def source(self) -> Any:
-        return self._source
+    def bursts(self) -> BurstCarrier:
+        return self
+
+    def send(self, samples: NDArray[np.complex64], at: float | None) -> None:
+        """Send a burst to all who listen."""
+        if self._out is not None:
+            self._out.send(samples, at)
+
+    def listen(self, take: Callable[[NDArray[np.complex64], float | None], None] | None) -> None:
+        """Call a function with each burst that comes."""
+        self.arrivals.listen(take)
 
     def ahead(self) -> float | None:
         return None if self.options.medium_process == "none" else 0.0
@@ -208,14 +225,14 @@ class ZmqFrontEnd(FrontEnd):
         """The medium process has told the time: answer when all has been sent that begins before, and the receiver has
         what came."""
         assert self._medium_clock is not None
-        assert self._sink is not None
+        assert self._out is not None
         self._medium_clock.tick(medium, at)
         limit = time.monotonic() + _ANSWER_S
-        while self._passed() != self._counters["bursts_out"] or self._source is None or self._source.behind:
-            if time.monotonic() > limit or self._sink.closed:
+        while self._passed() != self._counters["bursts_out"] or self.arrivals.behind:
+            if time.monotonic() > limit or self._out.closed:
                 return
             time.sleep(_LOOK_S)
-        self._sink.answer(at)
+        self._out.answer(at)
 
     def counters(self) -> FrontEndCounters:
         """Counters of what passed and what did not.
@@ -229,8 +246,8 @@ class ZmqFrontEnd(FrontEnd):
         return FrontEndCounters({name: self._counters[name] for name in ("bursts_out", "bursts_in")}, lost)
 
     def close(self) -> None:
-        if self._sink is not None:
-            self._sink.close()
+        if self._out is not None:
+            self._out.close()
         self._let_go()
 
     def _socket(self, kind: int) -> Any:
@@ -286,26 +303,22 @@ def open_socket(action: Callable[[str], object], key: str, address: str, whom: s
         ) from error
 
 
-class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Sends the samples of each packet as one message."""
+class _Departures:
+    """Sends each burst as one message."""
 
     def __init__(self, socket: Any, phy: Phy, counters: Counter[str], clock: MediumClock | None) -> None:
-        super().__init__("gr_ros2_zmq_publisher", [np.complex64], None)
         self._socket = socket
         self._sample_rate = phy.sample_rate
-        self._cutter = BurstCutter(phy.airtime_samples(), phy.any_length)
         self._sender = int.from_bytes(os.urandom(4), "little")
         self._counters = counters
         self._medium_clock = clock
-        self._sending = threading.Lock()  # flowgraph and arrivals send
+        self._sending = threading.Lock()  # the link and arrivals send
 
-    def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
-        bursts, taken = self._cutter.cut(self, input_items[0])
-        for burst in bursts:
-            at = nan if burst.at is None or self._medium_clock is None else self._medium_clock.there(burst.at)
-            self._send(at, burst.samples.astype(SAMPLE, copy=False).tobytes())
-            self._counters["bursts_out"] += 1
-        return taken
+    def send(self, samples: NDArray[np.complex64], at: float | None) -> None:
+        """Send a burst, which begins at a time of the link's clock, as far as that is known."""
+        there = nan if at is None or self._medium_clock is None else self._medium_clock.there(at)
+        self._send(there, samples.astype(SAMPLE, copy=False).tobytes())
+        self._counters["bursts_out"] += 1
 
     def answer(self, at: float) -> None:
         """Tell the medium process that all has been sent that begins before ``at``."""
@@ -329,11 +342,11 @@ class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
 
 
 class _Arrivals:
-    """Received bursts that wait for the flowgraph.
+    """Received bursts, which a function takes at once, or a flowgraph when it is ready for them.
 
-    Invariants: one thread empties the socket, checks and counts each message, and never waits for the flowgraph; at
-    most ``most`` bursts wait, in the order of their arrival, each no longer than twice the longest packet here; the
-    thread ends, and closes the socket, with the context.
+    Invariants: one thread empties the socket, checks and counts each message, and waits for nobody but the function,
+    before each call of which it empties the socket; at most ``most`` bursts wait, in the order of their arrival, each
+    no longer than twice the longest packet here; the thread ends, and closes the socket, with the context.
     """
 
     def __init__(
@@ -342,6 +355,8 @@ class _Arrivals:
         phy: Phy,
         most: int,
         counters: Counter[str],
+        *,
+        clock: MediumClock | None = None,
         told: Callable[[int, float], None] | None = None,
     ) -> None:
         self._socket = socket
@@ -350,30 +365,50 @@ class _Arrivals:
         self._most = most
         self._senders: dict[int, int] = {}
         self._counters = counters
-        self._told = told
-        self._waiting: queue.SimpleQueue[tuple[float, NDArray[np.complex64]]] = queue.SimpleQueue()
+        self._clock, self._told = clock, told
+        self._waiting: queue.SimpleQueue[_Arrived] = queue.SimpleQueue()
+        self._listener: Callable[[NDArray[np.complex64], float | None], None] | None = None
+        self._listening = threading.Lock()
+        self.unread = 0
+        """Samples of the newest burst that a flowgraph has not taken yet."""
         threading.Thread(target=self._run, name="zmq-arrivals", daemon=True).start()
 
-    def take(self, timeout_s: float) -> tuple[float, NDArray[np.complex64]] | None:
-        """Time and samples of the oldest burst that waits, or None if none has come in time."""
+    def take(self, timeout_s: float) -> _Arrived | None:
+        """Samples of the oldest burst that waits and when it began, or None if none has come in time."""
         try:
             return self._waiting.get(timeout=timeout_s)
         except queue.Empty:
             return None
 
+    def listen(self, listener: Callable[[NDArray[np.complex64], float | None], None] | None) -> None:
+        """Hand over each burst from now on, those that wait too; None: let them wait. Returns when no call goes on."""
+        with self._listening:
+            self._listener = listener
+        while self._hand_over():
+            pass
+
     @property
-    def waits(self) -> bool:
-        """Whether a burst waits."""
-        return not self._waiting.empty()
+    def behind(self) -> bool:
+        """Whether not all that has arrived has been taken."""
+        return bool(self.unread) or not self._waiting.empty()
+
+    def _hand_over(self) -> bool:
+        """Hand the oldest burst over; returns whether there may be another."""
+        with self._listening:
+            if self._listener is None or self._waiting.empty():
+                return False
+            self._listener(*self._waiting.get())
+        return True
 
     def _run(self) -> None:
         with self._socket:
             while True:
                 try:
-                    message = self._socket.recv()
+                    self.arrived(self._socket.recv(zmq.NOBLOCK if self.behind and self._listener else 0))
+                except zmq.Again:
+                    self._hand_over()
                 except zmq.ContextTerminated:
                     return
-                self.arrived(message)
 
     def arrived(self, message: bytes) -> None:
         """Keep the samples of a message, unless it is refused or the queue is full."""
@@ -387,7 +422,7 @@ class _Arrivals:
         self._counters["bursts_in"] += 1
         self._waiting.put(burst)
 
-    def _burst(self, message: bytes) -> tuple[float, NDArray[np.complex64]] | None:
+    def _burst(self, message: bytes) -> _Arrived | None:
         size = len(message) - HEADER.size
         if size < 0 or size % SAMPLE.itemsize or message[: len(MAGIC)] != MAGIC:
             self._count("malformed", f"a message of {len(message)} bytes is no burst of samples")
@@ -401,6 +436,8 @@ class _Arrivals:
             return None
         if not size and self._told is not None:
             if isfinite(at):
+                while self._hand_over():  # what has come before
+                    pass
                 self._told(sender, at)
             else:
                 self._count("malformed", "a time that is no finite number")
@@ -410,7 +447,8 @@ class _Arrivals:
             self._count("malformed", "a burst has samples that are no finite numbers")
             return None
         self._follow(sender, number)
-        return at, samples if len(samples) <= self._longest else samples[: self._longest].copy()
+        samples = samples if len(samples) <= self._longest else samples[: self._longest].copy()
+        return samples, self._clock.here(at) if self._clock is not None and isfinite(at) else None
 
     def _follow(self, sender: int, number: int) -> None:
         before = self._senders.pop(sender, None)
@@ -429,32 +467,41 @@ class _Arrivals:
             _log.warning("front_end zmq: %s", problem)
 
 
-class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
-    """Gives the samples of the bursts that have arrived."""
+class _BurstPublisher(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
+    """Sends the bursts of a stream."""
 
-    def __init__(self, arrivals: _Arrivals, clock: MediumClock | None) -> None:
+    def __init__(self, departures: _Departures, phy: Phy) -> None:
+        super().__init__("gr_ros2_zmq_publisher", [np.complex64], None)
+        self._departures = departures
+        self._cutter = BurstCutter(phy.airtime_samples(), phy.any_length)
+
+    def work(self, input_items: list[NDArray[np.complex64]], output_items: list[Any]) -> int:  # noqa: ARG002
+        bursts, taken = self._cutter.cut(self, input_items[0])
+        for burst in bursts:
+            self._departures.send(burst.samples, burst.at)
+        return taken
+
+
+class _BurstSubscriber(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
+    """Gives the samples of the bursts that have arrived as a stream."""
+
+    def __init__(self, arrivals: _Arrivals) -> None:
         super().__init__("gr_ros2_zmq_subscriber", None, [np.complex64])
-        self.arrivals = arrivals
-        self._medium_clock = clock
+        self._arrivals = arrivals
         self._rest: NDArray[np.complex64] = np.empty(0, np.complex64)
         self.set_blkd_input_timer_value(AGAIN_MS)
-
-    @property
-    def behind(self) -> bool:
-        """Whether the flowgraph has not taken all that has arrived."""
-        return bool(len(self._rest)) or self.arrivals.waits
 
     def work(self, input_items: list[Any], output_items: list[NDArray[np.complex64]]) -> int:  # noqa: ARG002
         if not len(self._rest):
             # Wait for a limited time: GNU Radio can end this thread only between two calls.
-            burst = self.arrivals.take(_WAIT_S)
+            burst = self._arrivals.take(_WAIT_S)
             if burst is None:
                 return 0
-            at, self._rest = burst
-            if self._medium_clock is not None and isfinite(at):
-                when = pmt.from_double(self._medium_clock.here(at))
-                self.add_item_tag(0, self.nitems_written(0), BURST_TIME, when)
+            self._rest, at = burst
+            if at is not None:
+                self.add_item_tag(0, self.nitems_written(0), BURST_TIME, pmt.from_double(at))
         count = min(len(self._rest), len(output_items[0]))
         output_items[0][:count] = self._rest[:count]
         self._rest = self._rest[count:]
+        self._arrivals.unread = len(self._rest)
         return count

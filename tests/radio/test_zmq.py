@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import nan
@@ -123,7 +124,7 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
     most, restarts, sent = 5, 3, 0
     address = ends[1]["bind"]
     front_end = ZmqFrontEnd(PHY.load("psk")(64, RATE), bind=ends[0]["bind"], connect=[address], burst_queue=most)
-    arrivals = front_end.source.arrivals
+    arrivals = front_end.arrivals
     try:
         for sender in range(1 + restarts):
             with strange_robot(address) as publisher:
@@ -139,7 +140,7 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
 
                 wait_for(dropped, "bursts that are dropped")
         assert front_end.counters().passed["bursts_in"] == most
-        numbers = [int(burst[1][0].real) for burst in (arrivals.take(10.0) for _ in range(most)) if burst is not None]
+        numbers = [int(burst[0][0].real) for burst in (arrivals.take(10.0) for _ in range(most)) if burst is not None]
         assert len(numbers) == most
         assert numbers == sorted(set(numbers))
         with strange_robot(address) as publisher:
@@ -147,7 +148,7 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
             def heard_again() -> bool:
                 publisher.send(HEADER.pack(MAGIC, 77, 0, RATE, nan) + bytes(8))
                 burst = arrivals.take(0.01)
-                return burst is not None and not burst[1].any()
+                return burst is not None and not burst[0].any()
 
             wait_for(heard_again, "a new burst, now that there is room")
     finally:
@@ -155,9 +156,48 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
     assert caplog.text.count("this computer is too slow; new ones are dropped") == 1
 
 
+def test_while_a_burst_is_taken_those_that_come_wait_and_none_beyond(ends: list[dict[str, Any]], stranger: Any) -> None:
+    most = 5
+    address = ends[1]["bind"]
+    front_end = ZmqFrontEnd(PHY.load("psk")(64, RATE), bind=ends[0]["bind"], connect=[address], burst_queue=most)
+    taken: list[int] = []
+    goes_on = threading.Event()
+
+    def take(samples: Any, at: float | None) -> None:
+        assert at is None
+        taken.append(int(samples[0].real))
+        goes_on.wait()
+
+    try:
+        front_end.listen(take)
+        sent = 0
+
+        def send(count: int) -> None:
+            nonlocal sent
+            for _ in range(count):
+                stranger.send(HEADER.pack(MAGIC, 77, sent, RATE, nan) + np.full(8, sent, "<c8").tobytes())
+                sent += 1
+
+        wait_for(lambda: send(1) or taken, "a burst that is taken")
+        send(100 * most)
+        goes_on.set()
+        wait_for(lambda: front_end.counters().lost["overflows"] and not front_end.arrivals.behind, "all bursts")
+        assert len(taken) >= most
+        assert taken == sorted(set(taken))
+        front_end.listen(None)
+        before = len(taken)
+        wait_for(lambda: send(1) or front_end.arrivals.behind, "a burst that waits")
+        assert len(taken) == before
+        front_end.listen(take)
+        assert len(taken) > before
+    finally:
+        goes_on.set()
+        front_end.close()
+
+
 def test_the_sender_forgotten_is_the_one_heard_longest_ago(ends: list[dict[str, Any]]) -> None:
     with Robot(1, ends[0]) as robot:
-        arrivals = robot.link.front_end.source.arrivals
+        arrivals = robot.link.front_end.arrivals
 
         def bursts(*numbers: tuple[int, int]) -> int:
             for sender, number in numbers:
