@@ -27,9 +27,10 @@ robot: /robot_1
 def start() -> list[Row]:
     """A link that nobody hears, and commands that print something."""
     links = [_link() for _ in range(REPEATS)]
-    resident_mb, started_s = (sorted(values)[REPEATS // 2] for values in zip(*links, strict=True))
+    resident_mb, threads, started_s = (sorted(values)[REPEATS // 2] for values in zip(*links, strict=True))
     return [
         Row("link (psk, zmq, dds): resident", resident_mb, "MB", "≤", 90, "{:.0f}"),
+        Row("link: threads", threads, "", "≤", 23 + _processors(), note="one for each processor is of OpenBLAS"),
         Row("link: processor until it runs", started_s, "s", "≤", 0.8, "{:.2f}"),
         _answers(("scenarios",), 0.5),
         _answers(("race", "--help"), 0.5),
@@ -60,8 +61,9 @@ def _run(words: Sequence[str]) -> None:
     subprocess.run([*COMMAND, *words], stdout=subprocess.DEVNULL, check=True)
 
 
-def _link() -> tuple[float, float]:
-    """MB of a link some time after its start, and s of processor that it has taken when it says that it runs."""
+def _link() -> tuple[float, int, float]:
+    """MB and threads of a link some time after its start, and s of processor that it has taken when it says that it
+    runs."""
     with TemporaryDirectory() as folder:
         config = Path(folder) / "link.yaml"
         config.write_text(LINK.replace("FOLDER", folder), encoding="utf-8")
@@ -76,8 +78,10 @@ def _link() -> tuple[float, float]:
                 status = Path(f"/proc/{link.pid}/status").read_text("utf-8")
             finally:
                 link.terminate()
-    (resident_kb,) = (int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS"))
-    return resident_kb / 1e3, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+    resident_kb, threads = (
+        int(line.split()[1]) for line in status.splitlines() if line.startswith(("VmRSS", "Threads"))
+    )
+    return resident_kb / 1e3, threads, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
 
 
 def _processors() -> int:

@@ -2,4 +2,9 @@
 
 from __future__ import annotations
 
+import os
+
 __version__ = "0.1.0"
+
+# Otherwise GNU Radio starts ten threads for its ControlPort as it is loaded, whether that is used or not.
+os.environ.setdefault("GR_CONF_THRIFT_NTHREADS", "1")

@@ -47,10 +47,10 @@ class PacketTransmitter(Protocol):
 
 
 class SymbolSource(Protocol):
-    """A source of the symbols from which packets are decoded, for display."""
+    """A source of the symbols from which packets are decoded, or of samples, for display."""
 
     def samples(self) -> Samples | None:
-        """The newest symbols, None before the first packet."""
+        """The newest, None before the first packet."""
 
 
 class PacketReceiver(Protocol):
@@ -100,7 +100,15 @@ class BurstCarrier(Protocol):
 
 
 class PacketTransceiver(PacketTransmitter, PacketReceiver, Protocol):
-    """A GNU Radio block: message ports `pdus` in and out, around a :class:`BurstCarrier`."""
+    """A GNU Radio block: message ports `pdus` in and out, around a :class:`BurstCarrier`.
+
+    :ivar channel: what becomes of received samples, before the receiver; None: nothing
+    """
+
+    channel: Callable[[Samples], Samples] | None
+
+    def tap_samples(self, size: int) -> SymbolSource:
+        """Make the newest samples received visible, behind the channel."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

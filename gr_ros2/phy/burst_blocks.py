@@ -28,7 +28,7 @@ from gr_ros2.phy.kernels import decoders, fastest, which
 from gr_ros2.phy.pdus import PDUS, PduPort
 from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, whole_and_rest
 from gr_ros2.phy.taken_packets import TakesPackets
-from gr_ros2.phy.tap import SYMBOLS_SHOWN, SymbolTap
+from gr_ros2.phy.tap import SYMBOLS_SHOWN, BurstTap, SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
 from gr_ros2.settings.fields import AUTO, Auto
 
@@ -334,6 +334,8 @@ class BurstTransceiver(TakesPackets, gr.basic_block):  # type: ignore[misc]
         """The newest samples, which the filter still needs."""
         self._port = PduPort(self)
         self._sent = 0
+        self._tap: BurstTap | None = None
+        self.channel: Callable[[Samples], Samples] | None = None
 
     @property
     def damaged(self) -> int:
@@ -352,8 +354,14 @@ class BurstTransceiver(TakesPackets, gr.basic_block):  # type: ignore[misc]
     def follow_clock(self, offset: Callable[[], float]) -> None:
         """Do nothing: whatever carries bursts tells their times."""
 
-    def tap_symbols(self) -> None:
-        """Nothing is shown."""
+    def tap_symbols(self) -> SymbolTap:
+        """Make the received constellation points visible."""
+        return SymbolTap(self._demodulation.points)
+
+    def tap_samples(self, size: int) -> BurstTap:
+        """Make the newest samples received visible."""
+        self._tap = BurstTap(size)
+        return self._tap
 
     def release(self) -> None:
         """Nothing is inside."""
@@ -385,6 +393,10 @@ class BurstTransceiver(TakesPackets, gr.basic_block):  # type: ignore[misc]
         if at is not None:
             demodulation.times.begins(demodulation.fed, at)
         demodulation.times.arrived(demodulation.fed + len(samples))
+        if self.channel is not None:
+            samples = self.channel(samples)
+        if self._tap is not None:
+            self._tap.add(samples)
         self._port.send(demodulation.feed(self._filtered(samples)))
 
     def _filtered(self, samples: Samples) -> Samples:

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Sequence, Set
+from typing import Any, ClassVar
 
+import numpy as np
 from gnuradio import gr
 
 from gr_ros2.link.events import AirPacket
 from gr_ros2.link.losses import PduLosses
-from gr_ros2.phy.base import Phy
+from gr_ros2.phy.base import Phy, Samples
 from gr_ros2.phy.pdus import PduPort, packets_of, take_messages
 from gr_ros2.phy.threads import ThreadState
 from gr_ros2.settings.config import ChannelConfig, replaced
@@ -89,6 +90,46 @@ class Channel(gr.hier_block2):  # type: ignore[misc]
 
     def _voltage(self) -> float:
         return noise_voltage(self.config.snr_db, self._burst_power, self.config.taps)
+
+
+class BurstChannel:
+    """Noise and a carrier offset on bursts as they come, without a stream: what may be changed while a link runs."""
+
+    settings: ClassVar[Set[str]] = {"snr_db", "frequency_offset"}
+    """Those that it can apply. Others need a :class:`Channel`."""
+
+    def __init__(self, config: ChannelConfig, phy: Phy) -> None:
+        self.config = config
+        self._burst_power = phy.burst_power()
+        self._rng = np.random.default_rng(config.seed)
+        self._phase = 0.0
+        """Of the next sample, in turns."""
+
+    def set_snr_db(self, snr_db: float | None) -> None:
+        """Set the SNR in dB, None = no noise.
+
+        :raises ConfigError: out of range
+        """
+        self.config = replaced(self.config, snr_db=snr_db)
+
+    def set_frequency_offset(self, frequency_offset: float) -> None:
+        """Carrier frequency offset, fraction of the sample rate.
+
+        :raises ConfigError: out of range
+        """
+        self.config = replaced(self.config, frequency_offset=frequency_offset)
+
+    def __call__(self, samples: Samples) -> Samples:
+        """The samples as they arrive."""
+        config, count = self.config, len(samples)
+        if offset := config.frequency_offset:
+            turns = self._phase + offset * np.arange(count)
+            self._phase = (self._phase + offset * count) % 1.0
+            samples = (samples * np.exp(2j * np.pi * turns)).astype(np.complex64)
+        if voltage := noise_voltage(config.snr_db, self._burst_power):
+            noise = self._rng.standard_normal(2 * count, np.float32).view(np.complex64)
+            samples = samples + noise * np.float32(voltage / 2**0.5)
+        return samples
 
 
 def _fading(config: ChannelConfig, sample_rate: float) -> Any:

@@ -14,11 +14,11 @@ from gr_ros2.core.errors import PhyError
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.base import PacketReceiver, PacketTransmitter, Phy, SymbolSource
-from gr_ros2.phy.channel import Channel, PacketLoss
+from gr_ros2.phy.channel import BurstChannel, Channel, PacketLoss
 from gr_ros2.phy.tap import Samples, Tap
 from gr_ros2.settings.config import ChannelConfig, replaced
 
-_LOOK = 1024
+SAMPLES_SHOWN = 1024
 """Samples of one snapshot of the received signal."""
 
 
@@ -54,10 +54,10 @@ class PacketPath:
     """The current impairments."""
     _gate: AirtimeGate | None = None
     _transmitter: PacketTransmitter | None = None
-    _faded: Channel | None = None
+    _faded: Channel | BurstChannel | None = None
     _receiver: PacketReceiver | None = None
     _loss: PacketLoss | None = None
-    _tap: Tap | None = None
+    _tap: SymbolSource | None = None
     _symbols: SymbolSource | None = None
 
     def counts(self) -> LinkCounts:
@@ -177,7 +177,7 @@ class PacketPath:
         self._receiver = self.phy.receiver()
         graph.connect(samples, self._receiver)
         if shown:
-            self._tap = Tap(_LOOK)
+            self._tap = Tap(SAMPLES_SHOWN)
             graph.connect(samples, self._tap)
             self._symbols = self._receiver.tap_symbols()
         return samples

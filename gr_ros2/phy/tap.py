@@ -36,6 +36,26 @@ class Tap(gr.hier_block2):  # type: ignore[misc]
         return newest if newest.any() else None
 
 
+class BurstTap:
+    """The newest samples of bursts that come as a whole.
+
+    :param size: samples
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._newest: Samples = np.empty(0, np.complex64)
+
+    def add(self, samples: Samples) -> None:
+        """A burst, or a part of one."""
+        self._newest = np.concatenate([self._newest, samples])[-self._size :]
+
+    def samples(self) -> Samples | None:
+        """``size`` consecutive samples, None before that many have come."""
+        newest = self._newest
+        return newest if len(newest) == self._size else None
+
+
 class SymbolTap:
     """The newest symbols of a receiver that decodes whole packets.
 

@@ -18,10 +18,11 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.airtime import AirtimeGate
+from gr_ros2.phy.base import PacketTransceiver
 from gr_ros2.phy.burst_blocks import BurstSink
-from gr_ros2.phy.channel import PacketLoss
+from gr_ros2.phy.channel import BurstChannel, PacketLoss
 from gr_ros2.phy.flowgraph import HierBlock
-from gr_ros2.phy.path import PacketPath
+from gr_ros2.phy.path import SAMPLES_SHOWN, PacketPath
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.limits import open_limit
@@ -113,12 +114,12 @@ class Radio(PacketPath, HierBlock):
             last = self._follow(last, front_end.packets)
         elif phy.has_samples:
             whole = None
-            if front_end.bursts is not None and not (self.channel.on_samples() or self._simulated or record or shows):
-                whole = self._transmitter = self._receiver = phy.transceiver(front_end.bursts)
+            if front_end.bursts is not None and self.channel.on_samples().keys() <= BurstChannel.settings:
+                whole = None if record or shows else phy.transceiver(front_end.bursts)
             if whole is None:
                 self._connect_samples(record, instrumented)
             else:
-                self._follow(last, whole)
+                self._connect_bursts(whole, instrumented)
             last = self._receiver
         if last is None:
             return
@@ -131,6 +132,15 @@ class Radio(PacketPath, HierBlock):
         """How many packets the front end gets as samples, of those that have passed; None while one is due."""
         passed = self.gate.at_rest()
         return None if passed is None else passed - self.refused
+
+    def _connect_bursts(self, whole: PacketTransceiver, instrumented: bool) -> None:
+        """Connect what carries whole bursts."""
+        self._transmitter = self._receiver = whole
+        if self.channel.on_samples() or self._simulated:
+            whole.channel = self._faded = BurstChannel(self.channel, self.phy)
+        if instrumented:
+            self._tap, self._symbols = whole.tap_samples(SAMPLES_SHOWN), whole.tap_symbols()
+        self._follow(self._gate, whole)
 
     def _connect_samples(self, record: str, instrumented: bool) -> None:
         """Connect the transmitter to the front end, and the front end to the receiver, where they exist."""

@@ -12,7 +12,7 @@ import numpy as np
 from gnuradio import blocks, gr
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.phy.channel import Channel, PacketLoss, noise_voltage
+from gr_ros2.phy.channel import BurstChannel, Channel, PacketLoss, noise_voltage
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
@@ -58,8 +58,30 @@ def test_equal_seeds_give_equal_noise() -> None:
     assert not np.array_equal(first, through(ChannelConfig(snr_db=10, seed=4)))
 
 
-def test_a_change_out_of_range_is_refused() -> None:
-    channel = Channel(ChannelConfig(), OfdmPhy(64, 1e6))
+@pytest.mark.parametrize("snr_db", [0.0, 20.0])
+def test_bursts_get_as_much_noise_as_a_stream(snr_db: float) -> None:
+    phy = OfdmPhy(64, RATE)
+    noise = BurstChannel(ChannelConfig(snr_db=snr_db), phy)(np.zeros(SAMPLES, np.complex64))
+    assert np.mean(np.abs(noise) ** 2) == pytest.approx(phy.burst_power() / 10 ** (snr_db / 10), rel=0.02)
+    assert abs(np.mean(noise**2)) < 0.02 * np.mean(np.abs(noise) ** 2)
+    assert np.mean(np.abs(through(ChannelConfig(snr_db=snr_db))) ** 2) == pytest.approx(
+        np.mean(np.abs(noise) ** 2), rel=0.02
+    )
+
+
+def test_bursts_are_offset_in_frequency_as_a_stream_is_wherever_they_are_cut() -> None:
+    channel = BurstChannel(ChannelConfig(frequency_offset=0.01), OfdmPhy(64, RATE))
+    ones = np.ones(1000, np.complex64)
+    got = np.concatenate([channel(ones[:300]), channel(ones[300:])])
+    turns = np.unwrap(np.angle(through(ChannelConfig(frequency_offset=0.01), 1.0)[1000:2000]))
+    assert np.allclose(np.diff(np.unwrap(np.angle(got))), np.diff(turns), atol=1e-3)
+    channel.set_frequency_offset(0.0)
+    assert channel(ones) is ones
+
+
+@pytest.mark.parametrize("kind", [Channel, BurstChannel])
+def test_a_change_out_of_range_is_refused(kind: Any) -> None:
+    channel = kind(ChannelConfig(), OfdmPhy(64, 1e6))
     channel.set_snr_db(20.0)
     channel.set_frequency_offset(0.01)
     assert (channel.config.snr_db, channel.config.frequency_offset) == (20.0, 0.01)

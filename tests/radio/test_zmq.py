@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import nan
 from pathlib import Path
@@ -21,6 +21,7 @@ import zmq
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.phy import PHY
+from gr_ros2.phy.burst_blocks import BurstSink
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.zmq import HEADER, MAGIC, MAX_SENDERS, ZmqFrontEnd, ZmqOptions
 from tests.radio.robots import RATE, Robot, config
@@ -154,6 +155,32 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
     finally:
         front_end.close()
     assert caplog.text.count("this computer is too slow; new ones are dropped") == 1
+
+
+@pytest.mark.parametrize("record", [False, True])
+def test_a_channel_changes_and_the_signal_is_seen_with_streams_and_without(
+    ends: list[dict[str, Any]], tmp_path: Path, record: bool
+) -> None:
+    """A recording needs a stream."""
+    values: dict[str, Any] = {"record": str(tmp_path / "heard")} if record else {}
+    with Robot(1, ends[0]) as one, RobotLink(config(2, ends[1], **values), instrumented=True) as two:
+        radio = two.radio
+        assert isinstance(radio._receiver, BurstSink) == record
+
+        def seen(what: Callable[[], bool]) -> None:
+            def is_so() -> bool:
+                one.say(1)
+                return what()
+
+            wait_for(is_so, "what was said")
+
+        seen(lambda: radio.samples() is not None and radio.symbols() is not None)
+        assert radio.changeable
+        radio.set_snr_db(30.0)
+        radio.set_frequency_offset(1e-4)
+        seen(lambda: radio.snr_db is not None and radio.snr_db == pytest.approx(30.0, abs=3.0))
+        radio.set_packet_loss(1.0)
+        seen(lambda: radio.counts().losses["packet_loss"] > 0)
 
 
 def test_while_a_burst_is_taken_those_that_come_wait_and_none_beyond(ends: list[dict[str, Any]], stranger: Any) -> None:
