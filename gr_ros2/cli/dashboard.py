@@ -68,8 +68,8 @@ def foxglove_server(where: str | None, console: Console) -> Iterator[list[Foxglo
         console.print(f"Foxglove: ws://{address}:{server.port}", soft_wrap=True)
         if address not in LOCAL:
             _log.warning(
-                "ws://%s:%d: everybody on the network can see all messages; leave the address out to serve this "
-                "machine only",
+                "ws://%s:%d: everybody on the network can see all messages and call services of other robots; leave "
+                "the address out to serve this machine only",
                 address,
                 server.port,
             )

@@ -265,6 +265,7 @@ def _live(running: RobotLink) -> LiveRun:
         announced=running.sink.outputs.heard.announced,
         alarms=running.same_numbers,
         wishes=running.wishes if running.calls is not None else None,
+        calls=running.calls,
         wants_key=partial(_key_frame, running),
     )
 

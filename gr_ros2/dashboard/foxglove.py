@@ -3,6 +3,8 @@
 Messages are the bytes that DDS carries, with the definition of their type where ROS ships it, so an operator's computer
 needs no ROS.
 
+Services of other robots can be called as they can on the ROS graph.
+
 Invariants: whoever watches slows nothing: this observer runs in a thread of its own behind a bounded queue, and the SDK
 drops the oldest message of a client that does not keep up; a topic is offered once its first message has come; who
 subscribes to a latched topic gets its newest message.
@@ -13,6 +15,7 @@ from __future__ import annotations
 import threading
 from contextlib import suppress
 from importlib import import_module
+from math import inf
 from typing import Any, NamedTuple
 
 from gr_ros2.codecs.messages import VIDEO
@@ -20,8 +23,9 @@ from gr_ros2.codecs.received_frames import FrameReceiver, frames_output
 from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError
 from gr_ros2.link.events import Accepted, Announced, Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.frames import MARK
+from gr_ros2.middleware.service_definitions import service_definition
 from gr_ros2.middleware.type_definitions import definition
-from gr_ros2.observe.observers import LiveRun
+from gr_ros2.observe.observers import FarServices, LiveRun
 from gr_ros2.observe.result import RunResult
 from gr_ros2.settings.registry import PICTURES
 from gr_ros2.wire import AnnouncedTopic
@@ -32,6 +36,8 @@ VIDEO_NAME = "video"
 """Of the topic beside one of pictures that has H.264 as it crossed the link."""
 _CACHED_BYTES = 1 << 26
 """Bytes of latched messages that are kept for clients that subscribe later."""
+_LOOK_S = 0.5
+"""s between two looks at which services other robots have."""
 
 
 class _Shown(NamedTuple):
@@ -64,6 +70,9 @@ class FoxgloveServer:
         self._sent: dict[tuple[int, int], _Shown] = {}
         self._videos: dict[tuple[int, int], _Shown] = {}
         self._frames = FrameReceiver()
+        self._services: dict[str, str] = {}
+        """Types of the services that are offered, by name."""
+        self._looked = -inf
         self._channels: dict[str, tuple[str, Any]] = {}
         """Type and channel of each topic."""
         self._newest: dict[int, bytes] = {}
@@ -77,6 +86,8 @@ class FoxgloveServer:
                 context=self._context,
                 message_backlog_size=BACKLOG,
                 server_listener=self,
+                capabilities=[foxglove.Capability.Services],
+                supported_encodings=["cdr"],
             )
         except (RuntimeError, OSError, ValueError) as error:
             raise ConfigError(f"foxglove = {address}:{port}: cannot be served there ({error})") from error
@@ -139,6 +150,9 @@ class FoxgloveServer:
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """Show a message that came out, and of pictures that came as video that, too."""
+        if self._run is not None and self._run.calls is not None and now - self._looked > _LOOK_S:
+            self._looked = now
+            self._offer(self._run.calls)
         if isinstance(event, Announced) and self._run is not None:
             for row in event.topics:
                 output = frames_output(row)
@@ -155,6 +169,29 @@ class FoxgloveServer:
         elif isinstance(event, Delivered) and (shown := self._told.get((event.src_id, event.topic_id))) is not None:
             self._show(shown, event.message)
             self._show_frame((event.src_id, event.topic_id), event.payload, now)
+
+    def _offer(self, calls: FarServices) -> None:
+        """Offer the services of other robots that can be called now."""
+        here = calls.reached()
+        if gone := [name for name, kind in self._services.items() if here.get(name) != kind]:
+            self._server.remove_services(gone)
+        came = [name for name, kind in here.items() if self._services.get(name) != kind]
+        self._server.add_services([self._service(name, here[name], calls) for name in came])
+        self._services = dict(here)
+
+    def _service(self, name: str, kind: str, calls: FarServices) -> Any:
+        of = self._foxglove
+        texts = service_definition(kind) or (None, None)
+        request, response = (
+            None
+            if text is None
+            else of.MessageSchema(
+                encoding="cdr", schema=of.Schema(name=f"{kind}_{part}", encoding="ros2msg", data=text.encode())
+            )
+            for text, part in zip(texts, ("Request", "Response"), strict=True)
+        )
+        schema = of.ServiceSchema(kind, request=request, response=response)
+        return of.Service(name, schema=schema, handler=lambda asked: calls.call(name, asked.payload))
 
     # ---- listener of the server
 

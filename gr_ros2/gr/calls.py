@@ -15,6 +15,8 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -204,6 +206,34 @@ class LiveCalls:
             self._change(event.src_id, here=True)
         self.on_met(event.src_id, event.boot)
 
+    # ---- calls of this process
+
+    def reached(self) -> dict[str, str]:
+        """Types, by their names here, of the services of other robots that can be called."""
+        with self._changing:
+            topics = [(src_id, self._robots[src_id].services[number]) for src_id, number in self._servers]
+            return {self._name(src_id, topic): topic.type_name for src_id, topic in topics}
+
+    def call(self, name: str, payload: bytes) -> bytes:
+        """Call a service of another robot, and wait for the reply.
+
+        :param name: as in ``reached``
+        :raises MiddlewareError: there is none, or no reply has come in time
+        """
+        with self._changing:
+            topics = [(src_id, self._robots[src_id].services[number]) for src_id, number in self._servers]
+            found = next(((src_id, topic) for src_id, topic in topics if self._name(src_id, topic) == name), None)
+        if found is None:
+            raise MiddlewareError(f"service {name}: it is not there any more")
+        src_id, topic = found
+        deadline_s = _deadline(topic) or DEADLINE_S
+        reply: Future[bytes] = Future()
+        self._request(src_id, topic, reply.set_result, payload)
+        try:
+            return reply.result(deadline_s)
+        except FutureTimeoutError:
+            raise MiddlewareError(f"service {name}: no reply within {deadline_s:g} s") from None
+
     # ---- the link itself
 
     def ask(self, robot: int, payload: bytes, take: Callable[[bytes], None], deadline_s: float) -> bool:
@@ -293,8 +323,7 @@ class LiveCalls:
         try:
             if isinstance(found, Request) and found.service_id == OF_LINK:
                 self.on_link_call(*sender, found)
-            elif isinstance(found, Answer) and found.service_id == OF_LINK:
-                assert callable(found.token)
+            elif isinstance(found, Answer) and callable(found.token):
                 found.token(found.payload)
             elif isinstance(found, Request):
                 self._clients[found.service_id].call(found.ticket, found.payload)

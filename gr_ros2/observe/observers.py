@@ -105,6 +105,16 @@ class Wishes(Protocol):
         """The wishes of this robot, and those of others here."""
 
 
+class FarServices(Protocol):
+    """What calls services of other robots: :class:`gr_ros2.gr.calls.LiveCalls`."""
+
+    def reached(self) -> Mapping[str, str]:
+        """Types, by their names here, of those that can be called."""
+
+    def call(self, name: str, payload: bytes) -> bytes:
+        """Call one, and wait for the reply. It raises a GrRos2Error where there is none."""
+
+
 class Change(NamedTuple):
     """What somebody has changed during a run.
 
@@ -138,6 +148,7 @@ class LiveRun:
     :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
     :param wants_key: called where somebody has begun to watch a topic of a robot, by their ids, that is sent as frames
     :param wishes: asks other robots for topics; None where nobody can be asked
+    :param calls: calls services of other robots; None where none can be called
     :param changed: told of each change that somebody makes while it runs
     """
 
@@ -158,6 +169,7 @@ class LiveRun:
     heard: frozenset[int] | None = None
     wants_key: Callable[[int, int], None] = lambda _src_id, _topic_id: None
     wishes: Wishes | None = None
+    calls: FarServices | None = None
     changed: Callable[[Change], None] = lambda _: None
 
 

@@ -42,7 +42,9 @@ def _run() -> Any:
     """A link that sends /tf as robot 1."""
     sent = SimpleNamespace(frames=None, named=lambda: [("/robot_1/tf", Topic(0, "tf", TF))])
     return SimpleNamespace(
-        sources={1: SimpleNamespace(subscriptions=sent)}, received_as=lambda src, name: f"/rx_robot_{src}/{name}"
+        sources={1: SimpleNamespace(subscriptions=sent)},
+        received_as=lambda src, name: f"/rx_robot_{src}/{name}",
+        calls=None,
     )
 
 
@@ -60,6 +62,11 @@ class Client:
 
     def __init__(self, port: int) -> None:
         self.channels: dict[int, Any] = {}
+        self.services: dict[str, Any] = {}
+        self.replies: list[bytes | str] = []
+        """Of services, or why there is none."""
+        self.calls: list[tuple[str, bytes]] = []
+        """Still to be made."""
         self.seen: list[tuple[str, bytes]] = []
         self._port, self._asked = port, 0
         self._of: dict[int, int] = {}
@@ -75,6 +82,10 @@ class Client:
         waiting = asyncio.ensure_future(_read(connection))
         while not until():
             work()
+            while self.calls:
+                name, payload = self.calls.pop()
+                head = struct.pack("<BIII", 2, self.services[name]["id"], 1, len(b"cdr")) + b"cdr"
+                await connection.write_message(head + payload, binary=True)
             done, _ = await asyncio.wait([waiting], timeout=0.02)
             if done:
                 await self._take(connection, waiting.result())
@@ -93,8 +104,15 @@ class Client:
             if message[0] == 1:
                 (number,) = struct.unpack_from("<I", message, 1)
                 self.seen.append((self.channels[self._of[number]]["topic"], message[13:]))
+            elif message[0] == 3:
+                self.replies.append(message[13 + len(b"cdr") :])
             return
         said = json.loads(message)
+        if said["op"] == "serviceCallFailure":
+            self.replies.append(said["message"])
+        self.services |= {each["name"]: each for each in said.get("services", ())}
+        for number in said.get("serviceIds", ()):
+            self.services = {name: each for name, each in self.services.items() if each["id"] != number}
         for channel in said.get("channels", ()) if said["op"] == "advertise" else ():
             self.channels[channel["id"]] = channel
             await self._ask(connection, [channel["id"]])
@@ -229,6 +247,43 @@ def test_a_live_link_is_seen_by_both_names(tmp_path: Path) -> None:
                 client.watch(lambda: wanted <= set(client.seen), work)
             finally:
                 observers.run_ended(None)
+        assert observers.incomplete() == []
+
+
+def test_a_service_of_another_robot_is_called_and_is_gone_with_its_server(tmp_path: Path) -> None:
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    pytest.importorskip("zmq", reason="needs pyzmq")
+    from gr_ros2.cli.link import _live
+    from gr_ros2.observe.observers import RunObservers
+    from tests.radio.test_instances import robot
+
+    lamp, request, reply = "/rx_robot_2/lamp", b"\0\1\0\0\1", b"\0\1\0\0\1\0\0\0\1\0\0\0\0"
+    with FoxgloveServer("127.0.0.1", 0) as server, MemoryMiddleware(domain_id=domain(2)) as far:
+        asked: list[bytes] = []
+
+        def answer(client: Any, payload: bytes) -> None:
+            asked.append(payload)
+            lamps.reply(client, reply)
+
+        lamps = far.serve("/robot_2/lamp", "std_srvs/srv/SetBool", answer)
+        other = far.serve("/robot_2/own", "own_package/srv/Own", lambda *_: None)
+        observers = RunObservers([server], threaded=True)
+        with robot(1, tmp_path, 2, observer=observers) as one, robot(2, tmp_path, 1):
+            observers.run_started(_live(one.link))
+            client = Client(server.port)
+            try:
+                client.watch(lambda: len(client.services) == 2)
+                assert client.services[lamp]["type"] == "std_srvs/srv/SetBool"
+                assert client.services[lamp]["request"]["schema"].strip() == "bool data"
+                assert "request" not in client.services["/rx_robot_2/own"]
+                client.calls.append((lamp, request))
+                client.watch(lambda: bool(client.replies))
+                assert (asked, client.replies) == ([request], [reply])
+                lamps.close()
+                client.watch(lambda: lamp not in client.services)
+            finally:
+                observers.run_ended(None)
+        other.close()
         assert observers.incomplete() == []
 
 
