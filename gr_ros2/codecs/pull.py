@@ -22,7 +22,11 @@ KEY_S = 2.0
 REPEAT_S = 10.0
 """s between two frames of a map that does not change, where nobody reports."""
 LEAST_BYTES = 120
-"""Budget of a frame when nothing is free: a picture that is coarse tells more than none."""
+"""Budget of a frame when less is free; frames come as seldom as that then. With 60, 15 pictures/s come at 32 kbit/s
+instead of 9, but odometry that fills 3.5 kbit/s is 1.51 times as old as alone instead of 1.24."""
+PART = 0.9
+"""Of what is free, so that a frame that came out long, or a repair, does not delay the next. With all of it, pictures
+at 128 kbit/s are 8 ms older and .5 dB farther from what the camera sees, and odometry beside them is 10 % older."""
 _LATELY = 0.2
 """Weight of the newest period in the mean."""
 _FIRST_S = 0.1
@@ -161,7 +165,11 @@ class FramePull:
         # Until the message after this one has come, which is a whole number of periods away.
         next_s = max(self._period, self.period_s) or _FIRST_S
         until = max(self._came + next_s - now, next_s / 2)
-        budget = None if rate == inf else max(LEAST_BYTES, int(rate * until) - waiting)
+        budget = None if rate == inf else int(PART * rate * until) - waiting
+        if budget is not None and budget < LEAST_BYTES:
+            if now - self._taken < LEAST_BYTES / (PART * rate):
+                return None
+            budget = LEAST_BYTES
         key = (self._key or not progress.reports) and now - self._keyed >= KEY_S
         if key:
             self._key, self._keyed = False, now

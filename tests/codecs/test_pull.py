@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.codecs.pull import KEY_S, LEAST_BYTES, PATIENCE_S, FramePull
+from gr_ros2.codecs.pull import KEY_S, LEAST_BYTES, PART, PATIENCE_S, FramePull
 from gr_ros2.link.frames import FrameState
 
 RATE = 10_000.0
@@ -34,7 +34,7 @@ def test_the_newest_message_is_coded_into_what_is_free_until_the_next() -> None:
     request = pull.pull(now, FREE)
     assert request is not None
     assert (request.message, request.came) == (b"new", now)
-    assert request.budget == pytest.approx(RATE * PERIOD, abs=1)
+    assert request.budget == pytest.approx(PART * RATE * PERIOD, abs=1)
     assert not request.key
 
 
@@ -42,7 +42,7 @@ def test_several_topics_share_what_is_free() -> None:
     pull, now = running()
     request = pull.pull(now, FREE, 0.25)
     assert request is not None
-    assert request.budget == pytest.approx(RATE * PERIOD / 4, abs=1)
+    assert request.budget == pytest.approx(PART * RATE * PERIOD / 4, abs=1)
 
 
 def test_a_channel_whose_rate_is_not_known_sets_no_budget() -> None:
@@ -57,7 +57,7 @@ def test_a_message_that_is_taken_late_has_the_bytes_that_are_left() -> None:
     pull, now = running()
     request = pull.pull(now + 0.04, FREE)
     assert request is not None
-    assert request.budget == pytest.approx(RATE * 0.06, abs=1)
+    assert request.budget == pytest.approx(PART * RATE * 0.06, abs=1)
 
 
 def test_a_newer_message_takes_the_place_of_one_that_was_not_coded() -> None:
@@ -76,7 +76,7 @@ def test_it_waits_until_the_frame_before_will_have_left_when_coding_is_done() ->
     assert pull.pull(now, FREE._replace(waiting=81)) is None
     request = pull.pull(now, FREE._replace(waiting=80))
     assert request is not None
-    assert request.budget == pytest.approx(RATE * PERIOD - 80, abs=1)
+    assert request.budget == pytest.approx(PART * RATE * PERIOD - 80, abs=1)
 
 
 def test_one_frame_is_coded_at_a_time() -> None:
@@ -88,6 +88,18 @@ def test_one_frame_is_coded_at_a_time() -> None:
     assert pull.pull(now + PERIOD, FREE)
 
 
+def test_on_a_channel_that_others_fill_frames_come_as_seldom_as_there_is_room_for_them() -> None:
+    """Otherwise frames of the least size would take most of a slow channel from the others."""
+    pull, rate, sizes = FramePull(), 100.0, []
+    for number in range(1000):
+        pull.offer(b"message", number * PERIOD)
+        if request := pull.pull(number * PERIOD, FREE._replace(rate=rate)):
+            sizes.append(request.budget)
+            pull.done()
+    assert set(sizes[1:]) == {LEAST_BYTES}
+    assert 0.8 * rate < sum(sizes[1:]) / (1000 * PERIOD) <= rate
+
+
 def test_a_longest_rate_leaves_messages_out() -> None:
     pull = FramePull(period_s=0.2)
     taken = []
@@ -97,7 +109,7 @@ def test_a_longest_rate_leaves_messages_out() -> None:
             taken.append((number, request.budget))
             pull.done()
     assert [number for number, _ in taken] == list(range(0, 20, 2))
-    assert taken[-1][1] == pytest.approx(RATE * 0.2, abs=1)
+    assert taken[-1][1] == pytest.approx(PART * RATE * 0.2, abs=1)
 
 
 def test_none_is_begun_while_all_robots_have_lacked_one_for_long_and_are_silent() -> None:
