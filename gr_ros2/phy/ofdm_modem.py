@@ -27,6 +27,9 @@ _FALSE_ALARM = 1e-3
 """Share of noise samples that are examined closely."""
 _ALIKE = 0.2
 """Threshold of the share of the power that arrives over one path; noise passes once in 10^5 examinations."""
+_MANY = 256
+"""Carriers from which on the phases of the sync words find a burst as well as the energy on one path, which is then not
+asked for: in a room a prefix that is laid around one path loses echoes, and more packets with them."""
 _SPREAD_ALARM = 2e-7
 """Share of examinations of noise, for each carrier offset tried, in which the carriers of the two sync words are turned
 alike. So a burst is found whose energy no single path holds, as in a room."""
@@ -120,6 +123,7 @@ class OfdmModem(BurstModem):
         self._level = 1 - _FALSE_ALARM ** (1 / (self._window - 1)) if threshold is None else threshold
         self._back = self._prefix // 4
         self._chunk = _CHUNK // self._size
+        self._alike = _ALIKE if self._size < _MANY else 1.0
         self.margin = self._prefix
         self.stretch = max(2048, 16 * self._size)
         self._power = layout.power(frames.bits(frames.packet_len))
@@ -311,7 +315,7 @@ class OfdmModem(BurstModem):
             "point_counts": [len(each.points) for each in constellations],
             "point_bits": [each.bits for each in constellations],
             "level": self._level,
-            "alike": _ALIKE,
+            "alike": self._alike,
             "together": self._together,
             "even_count": len(self._even),
             "delay_count": len(self._delays),
@@ -382,7 +386,7 @@ class OfdmModem(BurstModem):
         peak = int(np.argmax(profile))
         power = float(np.vdot(spectra, spectra).real)
         alike = float((profile[peak] * self._size) ** 2) / max(power * self._energy, _TINY)
-        found = alike > _ALIKE
+        found = alike > self._alike
         if not found:
             # The phases alone, so that a tone does not pass for a burst.
             together = abs((products / (np.abs(products) + _TINY)).sum()) / len(products)
