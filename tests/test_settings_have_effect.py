@@ -267,15 +267,12 @@ effects(
     scan_rate=drives(scan_rate=7.0),
     odom_rate=drives(odom_rate=20.0),
     imu_rate=drives(imu_rate=20.0),
-    cmd_vel_rate=drives(cmd_vel_rate=5.0),
-    clock_rate=drives(clock_rate=5.0),
     map_rate=drives(map_rate=3.0),
     rtcm_rate=drives(rtcm_rate=3.0),
     camera_rate=drives(camera_rate=3.0),
     beams=drives(beams=90),
     map_cells=drives(map_cells=50),
-    odom_linear_noise=drives(odom_linear_noise=0.2),
-    odom_angular_noise=drives(odom_angular_noise=0.2),
+    odom_noise=drives(odom_noise=(0.2, 0.2)),
     start_time_s=drives(start_time_s=1000.0),
     prefix_frames=drives(prefix_frames=True),
     transforms=Elsewhere("lab/sim/test_transforms.py::test_every_frame_hangs_on_the_map"),
@@ -503,33 +500,20 @@ effects(
 def judged(limit: str) -> Outcomes:
     """What is said of a poor link without any limit, and with this one."""
 
-    def said(**limits: float) -> list[Any]:
-        health = make(
-            **{item.name: 0.0 for item in fields(DiagnosticsConfig) if "_warn" in item.name or "_error" in item.name}
-            | limits
-        )
+    def said(**limits: tuple[float, float]) -> list[Any]:
+        health = make(**dict.fromkeys(LIMITS, (0.0, 0.0)) | limits)
         parts(health, 0.0)
-        poor = {
-            "packets": 60,
-            "missing": 40,
-            "delivered": 60,
-            "lost": 40,
-            "latency": 1.5,
-            "age": 2.0,
-            "queued": 9,
-            "depth": 10,
-        }
+        poor = {"packets": 60, "missing": 40, "delivered": 60, "lost": 40, "latency": 1.5, "age": 2.0}
         return [(part.level, part.message) for now in (1.0, 60.0) for part in parts(health, now, **poor)]
 
-    return lambda: (said(), said(**{limit: 0.1}))
+    return lambda: (said(), said(**{limit: (0.1, 0.0)}))
 
 
-for item in fields(DiagnosticsConfig):
-    EFFECTS["Diagnostics", item.name] = judged(item.name)
+LIMITS = [item.name for item in fields(DiagnosticsConfig) if item.name != "period_s"]
 effects(
     "Diagnostics",
     period_s=Elsewhere("radio/test_diagnostics.py::test_no_period_no_diagnostics"),
-    window_s=Elsewhere("gr/test_health.py::test_what_is_long_past_does_not_count"),
+    **{name: judged(name) for name in LIMITS},
 )
 
 
@@ -586,7 +570,6 @@ LORA, WIFI = "phy/test_lora_sdr.py::test_", "phy/test_wifi.py::test_"
 effects(
     "PHY `lora`",
     implementation=Elsewhere(f"{LORA}without_the_module_the_remedy_is_told"),
-    oversampling=Elsewhere(f"{LORA}the_samples_are_those_of_the_modules_own_transmitter"),
     sync_word=Elsewhere(f"{LORA}another_networks_frames_are_not_heard"),
     ldro=Elsewhere(f"{LORA}symbols_are_counted_as_in_lora_modems_data_sheets"),
     carrier_hz=Elsewhere(f"{LORA}with_the_carrier_known_clocks_may_differ"),
@@ -598,7 +581,6 @@ effects(
     lengths=differs(wifi, lengths="fixed"),
     encoding=differs(wifi, encoding="qpsk-1/2"),
     equalizer=Elsewhere(f"{WIFI}every_estimate_of_the_channel_receives"),
-    sensitivity=differs(wifi, sensitivity=0.4),
     network=lambda: (DataFrames(HOME, HOME).wrap(b"x", 0), DataFrames(GUEST, HOME).wrap(b"x", 0)),
     address=lambda: (DataFrames(HOME, HOME).wrap(b"x", 0), DataFrames(HOME, GUEST).wrap(b"x", 0)),
     channel_hz=Elsewhere(f"{WIFI}with_the_channel_known_clocks_may_differ"),
@@ -635,7 +617,7 @@ for name, needed in PLACES.items():
     )
 DEVICE: dict[str, Any] = {
     "half_duplex": True, "frequency": 868e6, "args": "serial=1", "frequency_rx": 434e6, "gain_tx": -10.0,
-    "gain_rx": 20.0, "antenna_tx": "LEFT", "antenna_rx": "RIGHT", "bandwidth": 5e5, "level": 0.3, "lead": 64,
+    "gain_rx": 20.0, "antenna_tx": "LEFT", "antenna_rx": "RIGHT", "bandwidth": 5e5, "level": 0.3,
     "tail": 100, "multiple": 500,
 }  # fmt: skip
 for name in ("soapy", "uhd", "pluto"):
@@ -643,7 +625,6 @@ for name in ("soapy", "uhd", "pluto"):
     EFFECTS[f"Front end `{name}`", "turnaround_s"] = opens(name, {"half_duplex": True}, turnaround_s=0.1)
 for key, value in {"clock_source": "external", "subdev_tx": "A:A", "subdev_rx": "A:B"}.items():
     EFFECTS["Front end `uhd`", key] = opens("uhd", **{key: value})
-EFFECTS["Front end `pluto`", "buffer_rx"] = opens("pluto", buffer_rx=4096)
 for name in ("kiss", "serial"):
     effects(
         f"Front end `{name}`",
@@ -670,7 +651,7 @@ effects(
         key: opens("audio", **{key: value})
         for key, value in {
             "half_duplex": True, "level": 0.3, "device": "USB", "device_rx": "USB", "centre_hz": 1500.0, "lead_s": 0.5,
-            "tail_s": 0.5, "latency_s": 0.2, "ptt": "vox",
+            "latency_s": 0.2, "ptt": "vox",
         }.items()
     },
     turnaround_s=opens("audio", {"half_duplex": True}, turnaround_s=0.2),
@@ -686,7 +667,6 @@ effects(
     "Front end `zmq`",
     bind=Elsewhere("radio/test_zmq.py::test_an_address_that_is_taken_or_wrong_is_said_in_a_line"),
     connect=Elsewhere("radio/test_zmq.py::test_what_a_slow_computer_does_not_take_is_dropped_and_counted"),
-    burst_queue=Elsewhere("radio/test_zmq.py::test_what_a_slow_computer_does_not_take_is_dropped_and_counted"),
     medium_process=opens("zmq", medium_process="lockstep"),
 )
 READ = {"read": "{}/heard"}

@@ -19,6 +19,11 @@ from gr_ros2.settings.config import DiagnosticsConfig
 
 Stats = Mapping[str, Any]
 
+WINDOW_S = 10.0
+"""s over which rates and losses are taken: long enough for a share of some packets, short enough to act on."""
+QUEUE_FULL = 0.8
+"""Share of a queue's bound that waits to be sent from which on it is about to drop messages."""
+
 LOCKED = {
     "no_key": "sealed, and no key is configured here",
     "not_sealed": "not sealed, where a key is configured",
@@ -117,7 +122,7 @@ class LinkHealth:
         snapshot = _snapshot(stats, now)
         if snapshot.received > (self._snapshots[-1].received if self._snapshots else 0):
             self._heard_at = now
-        while len(self._snapshots) > 1 and self._snapshots[1].now <= now - self._config.window_s:
+        while len(self._snapshots) > 1 and self._snapshots[1].now <= now - WINDOW_S:
             self._snapshots.popleft()
         before = self._snapshots[0] if self._snapshots else snapshot
         front_end = self._front_end(snapshot, self._snapshots[-1].front_end_lost if self._snapshots else {})
@@ -141,7 +146,7 @@ class LinkHealth:
 
         :param receiver: as :meth:`judge` has it; what troubles it troubles all links
         """
-        limits, found, now = self._config, {}, self._snapshots[-1].now
+        (degraded_s, lost_s), found, now = self._config.silence_s, {}, self._snapshots[-1].now
         far = {peer["robot"]: peer for peer in stats["peers"] if peer["hops"]}
         doubled = {peer["robot"] for peer in stats["peers"] if peer["doubled"]}
         ages = [*stats["sink"]["silence_s"].items(), *((robot, peer["heard_s"]) for robot, peer in far.items())]
@@ -153,9 +158,9 @@ class LinkHealth:
             if src_id in far:
                 state.values |= {"hops": str(far[src_id]["hops"]), "over robot": str(far[src_id]["over"])}
             watched = self._silences.setdefault(src_id, self._watch()).age(silence, now)
-            if limits.silence_error_s and watched > limits.silence_error_s:
+            if lost_s and watched > lost_s:
                 state.level, state.problems = Level.ERROR, ["lost"]
-            elif receiver.level or (limits.silence_warn_s and watched > limits.silence_warn_s):
+            elif receiver.level or (degraded_s and watched > degraded_s):
                 state.level, state.problems = Level.WARN, ["degraded"]
             else:
                 state.problems = ["up"]
@@ -170,14 +175,14 @@ class LinkHealth:
         received, missing = snapshot.received - before.received, snapshot.missing - before.missing
         if received + missing > 0:
             lost = max(missing, 0) / (received + max(missing, 0))
-            status.judge("packet loss", lost, "", limits.packet_loss_warn, limits.packet_loss_error)
+            status.judge("packet loss", lost, "", *limits.loss)
         status.judge("packets received", _rate(received, before, snapshot), "1/s", 0)
         status.judge("packets rejected", _rate(snapshot.rejected - before.rejected, before, snapshot), "1/s", 0)
         if self._heard_at is None:
             status.values["silence (s)"] = "nothing received yet"
         else:
             silence = self._silence.age(snapshot.now - self._heard_at, snapshot.now)
-            status.judge("silence", silence, "s", limits.silence_warn_s, limits.silence_error_s)
+            status.judge("silence", silence, "s", *limits.silence_s)
         status.values["packets damaged"] = str(stats["packets"]["damaged"])
         status.values["frames of others"] = str(stats["packets"]["foreign"])
         status.values["held (B)"] = str(stats["sink"]["held_bytes"])
@@ -208,7 +213,7 @@ class LinkHealth:
         bounded = [topic for topic in topics if topic["queue_depth"] and topic["queue"] != "latest"]
         if bounded:
             fullest = max(topic["queued"] / topic["queue_depth"] for topic in bounded)
-            status.judge("fullest queue", fullest, "", self._config.queue_warn)
+            status.judge("fullest queue", fullest, "", QUEUE_FULL)
         refused: dict[str, int] = {}
         for topic in topics:
             for reason, count in topic["refused"].items():
@@ -251,16 +256,16 @@ class LinkHealth:
         )
         if delivered + lost:
             share = lost / (delivered + lost)
-            status.judge("messages lost", share, "", limits.message_loss_warn, limits.message_loss_error)
+            status.judge("messages lost", share, "", *limits.loss)
         status.judge("messages", _rate(delivered, before, snapshot), "1/s", 0)
         status.values["messages delivered"] = str(topic["delivered"])
         status.values |= {f"messages lost: {reason}": str(count) for reason, count in sorted(topic["lost"].items())}
         latency = topic["recent_latency_s"]
         if latency is not None:
-            status.judge("latency", latency["p50"], "s", limits.latency_warn_s, limits.latency_error_s)
+            status.judge("latency", latency["p50"], "s", *limits.latency_s)
             status.values["latency, 95 % (s)"] = f"{latency['p95']:.3g}"
         if topic["age_s"] is not None:
-            status.judge("age", topic["age_s"], "s", limits.age_warn_s, limits.age_error_s)
+            status.judge("age", topic["age_s"], "s", *limits.age_s)
         if topic["hops"]:
             status.values |= {"hops": str(topic["hops"]), "over robot": str(topic["over"])}
         return status

@@ -21,7 +21,7 @@ from gr_ros2.phy.base import BurstCarrier, PacketReceiver, PacketTransceiver, Pa
 from gr_ros2.phy.burst import CRC_LEN, BurstModem, Frames, ModemConstants, Reading, Samples, Search
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.fec import Bits, Soft
-from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, SdrFrame, SdrReceiver, SdrTransmitter, load
+from gr_ros2.phy.lora_sdr import MAX_PAYLOAD, MAX_SYMBOL, PER_CHIP, SdrFrame, SdrReceiver, SdrTransmitter, load
 from gr_ros2.phy.preamble import parabola_peak
 from gr_ros2.phy.theory import at_least, coded_orthogonal_success, orthogonal_symbol_error, packet_success
 from gr_ros2.settings.fields import AUTO, Auto
@@ -53,7 +53,7 @@ _NIBBLE = np.array([8, 4, 2, 1])
 """Weights of a nibble's bits, in the order in which they arrive."""
 _SINC = 12
 """Number of samples on either side from which a value between two samples is interpolated."""
-_SDR_ONLY = ("oversampling", "sync_word", "ldro", "carrier_hz")
+_SDR_ONLY = ("sync_word", "ldro", "carrier_hz")
 _SDR_GAP, _SDR_LEAST_GAP = 32, 24
 """Default and least gap, chips; filter and synchroniser of the module's receiver delay by 20."""
 
@@ -68,8 +68,6 @@ class LoraOptions(BurstOptions):
     """check bits per 4 bits, 1..4; 3 and 4 correct an error in each code word"""
     implementation: Literal["own", "lora_sdr"] = "own"
     """`lora_sdr` = the frames of LoRa modems, by the module gr-lora_sdr. The same at both ends"""
-    oversampling: Annotated[Literal[2, 4, 8] | Auto, Field(title="Oversampling (samples/chip)")] = AUTO
-    """`lora_sdr` only: samples per chip; auto = 2. A symbol has 2048 samples at most"""
     sync_word: Annotated[int, Field(ge=0x11, le=0xFF)] | Auto = AUTO
     """``lora_sdr`` only: of the network, 0x11..0xff, no nibble 0; auto = 0x12, private networks"""
     ldro: Annotated[bool | Auto, Field(title="Low data rate optimisation")] = AUTO
@@ -429,27 +427,25 @@ class LoraPhy(BurstPhy):
         sync_word = 0x12 if chosen.sync_word == AUTO else chosen.sync_word
         if not sync_word & 0x0F:
             raise ConfigError(f"phy lora: sync_word = 0x{sync_word:02x}: the module takes no digit of 0")
-        per_chip = 2 if chosen.oversampling == AUTO else chosen.oversampling
-        gap = _SDR_GAP * per_chip if chosen.gap == AUTO else chosen.gap
-        if gap < _SDR_LEAST_GAP * per_chip:
+        gap = _SDR_GAP * PER_CHIP if chosen.gap == AUTO else chosen.gap
+        if gap < _SDR_LEAST_GAP * PER_CHIP:
             raise ConfigError(
-                f"phy lora: gap = {gap}: below {_SDR_LEAST_GAP * per_chip} the last packet stays in gr-lora_sdr"
+                f"phy lora: gap = {gap}: below {_SDR_LEAST_GAP * PER_CHIP} the last packet stays in gr-lora_sdr"
             )
-        if per_chip << chosen.spreading_factor > MAX_SYMBOL:
+        if PER_CHIP << chosen.spreading_factor > MAX_SYMBOL:
             raise ConfigError(
-                f"phy lora: spreading_factor = {chosen.spreading_factor} with oversampling = {per_chip}: gr-lora_sdr "
-                f"crashes with symbols above {MAX_SYMBOL} samples; take less of either, or implementation = own"
+                f"phy lora: spreading_factor = {chosen.spreading_factor}: gr-lora_sdr crashes with symbols above "
+                f"{MAX_SYMBOL} samples; take a smaller one, or implementation = own"
             )
         load()
         return SdrFrame(
             packet_len=self.packet_len,
             spreading_factor=chosen.spreading_factor,
             coding_rate=chosen.coding_rate,
-            oversampling=per_chip,
             sync_word=sync_word,
             ldro=chosen.ldro is True,
             gap=gap,
-            carrier=None if chosen.carrier_hz is None else chosen.carrier_hz * per_chip / self.sample_rate,
+            carrier=None if chosen.carrier_hz is None else chosen.carrier_hz * PER_CHIP / self.sample_rate,
         )
 
     @property

@@ -34,6 +34,8 @@ MAX_SYMBOL = 2048
 """Samples. For a preamble that begins late in a symbol the module reads up to a quarter of a symbol before its current
 position, and thus before the buffer when it is at its start (gr-lora_sdr, issue 144). GNU Radio guards its buffers with
 one page, 512 samples; a read beyond it ends the process."""
+PER_CHIP = 2
+"""Samples of a chip. With more, fewer spreading factors stay below ``MAX_SYMBOL``."""
 _PREAMBLE, _HEAD_QUARTERS = 8, 17
 """Up-chirps, and the quarters of a chirp after them: two chirps of the sync word, two and a quarter down-chirps."""
 _HEADER_NIBBLES, _CRC_NIBBLES = 5, 4
@@ -67,7 +69,6 @@ def load() -> Any:
 class SdrFrame:
     """The LoRa frame of a packet.
 
-    :param oversampling: samples per chip
     :param sync_word: two nibbles, none of them 0
     :param ldro: low data rate optimisation: two bits fewer per symbol
     :param gap: zero samples after each packet
@@ -77,7 +78,6 @@ class SdrFrame:
     packet_len: int
     spreading_factor: int
     coding_rate: int
-    oversampling: int
     sync_word: int
     ldro: bool
     gap: int
@@ -97,7 +97,7 @@ class SdrFrame:
     @property
     def symbol_samples(self) -> int:
         """Samples of a symbol."""
-        return self.oversampling << self.spreading_factor
+        return PER_CHIP << self.spreading_factor
 
     @property
     def airtime_samples(self) -> int:
@@ -152,7 +152,7 @@ class SdrTransmitter(TransmitterBlock):
         factor, rate = frame.spreading_factor, frame.coding_rate
         self._framer = _SdrFramer(frame)
         to_stream = pdu.pdu_to_tagged_stream(gr.types.byte_t, _TX_KEY)
-        modulator = lora.modulate(factor, frame.oversampling, 1, [frame.sync_word], frame.gap, _PREAMBLE)
+        modulator = lora.modulate(factor, PER_CHIP, 1, [frame.sync_word], frame.gap, _PREAMBLE)
         self.msg_connect((self, "pdus"), (self._framer, "pdus"))
         self.msg_connect((self._framer, "pdus"), (to_stream, "pdus"))
         self.connect(
@@ -190,10 +190,10 @@ class SdrReceiver(ReceiverBlock):
         super().__init__("gr_ros2_lora_sdr_rx")
         lora = load()
         self._collector = _Collector(frame)
-        factor, per_chip = frame.spreading_factor, frame.oversampling
+        factor = frame.spreading_factor
         # The module decimates without a filter, so that noise outside the band would alias into it.
-        band = filter.fir_filter_ccf(1, firdes.low_pass(1, per_chip, 0.52, 0.1, window.WIN_HAMMING))
-        sync = lora.frame_sync(*frame.carrier_and_bandwidth, factor, False, [frame.sync_word], per_chip, _PREAMBLE)
+        band = filter.fir_filter_ccf(1, firdes.low_pass(1, PER_CHIP, 0.52, 0.1, window.WIN_HAMMING))
+        sync = lora.frame_sync(*frame.carrier_and_bandwidth, factor, False, [frame.sync_word], PER_CHIP, _PREAMBLE)
         header = lora.header_decoder(False, frame.coding_rate, MAX_PAYLOAD, True, int(frame.ldro), False)
         self.connect(
             self,

@@ -64,6 +64,9 @@ _SMALLEST_BUFFER = 32768
 """Bytes that GNU Radio gives every buffer by default."""
 _UNKNOWN_CARRIER = 1e15
 """Hz. The module divides a carrier offset by the carrier to compute a clock offset; this makes it 0."""
+_SENSITIVITY = 0.5
+"""Part of the preamble's autocorrelation from which on a frame is looked at: frames are heard from 3 dB on. With the
+module's own 0.56 they are from 5 dB on."""
 _GAP = 400
 """Zero samples after a packet. With 336 the receiver would keep most of the last packets."""
 _LOOKED_BACK = 16
@@ -96,9 +99,6 @@ class WifiOptions(AirOptions):
     an SNR; `sta` averages"""
     gap: Annotated[int, Field(ge=360, le=100_000, title="Gap after a packet (samples)")] | Auto = AUTO
     """zero samples after each packet, 360..100000; auto = 400"""
-    sensitivity: Annotated[float, Field(ge=0.3, le=0.9)] = 0.5
-    """part of the preamble's autocorrelation from which on a frame is looked at, 0.3..0.9; the module's default is
-    0.56, which hears frames from 5 dB on"""
     network: Annotated[Address, Field(title="Network (BSSID)")] = "02:67:72:2d:72:32"
     """address 3 (BSSID) of the frames; those of others are counted as `foreign` and dropped"""
     address: Annotated[Address, Field(title="Own address")] = "02:67:72:00:00:01"
@@ -295,7 +295,7 @@ class WifiReceiver(ReceiverBlock):
         correlation = filter.fir_filter_ccf(1, [1.0] * window)
         power = filter.fir_filter_fff(1, [1.0] * (window + CP_LEN))
         ratio = blocks.divide_ff()
-        short = wifi.sync_short(options.sensitivity, 2, False, False)
+        short = wifi.sync_short(_SENSITIVITY, 2, False, False)
         long = wifi.sync_long(length, False, False)
         # The module corrects the clock offset in the wrong direction; the sign turns it round.
         carrier = _UNKNOWN_CARRIER if options.channel_hz is None else -options.channel_hz

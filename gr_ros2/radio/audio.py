@@ -52,8 +52,6 @@ class AudioOptions(BurstDeviceOptions):
     lead_s: Annotated[_KeyedS | Auto, Field(title="Silence before a packet (s)")] = AUTO
     """s of silence, or with ``ptt: vox`` of a tone, before each packet; auto = .3 with a transmitter to key, otherwise
     .02"""
-    tail_s: Annotated[_KeyedS | Auto, Field(title="Silence behind a packet (s)")] = AUTO
-    """s of silence behind each packet; auto = .1 with a transmitter to key, otherwise .02"""
     latency_s: Annotated[float, Field(gt=0, le=2, title="Latency of the card (s)")] = 0.1
     """s that the card is asked to be ahead and behind"""
     turnaround_s: Annotated[Seconds, Field(title="Turn-around time (s)")] = 0.05
@@ -70,8 +68,8 @@ class AudioOptions(BurstDeviceOptions):
 
     @property
     def tails_s(self) -> float:
-        """``tail_s``, s."""
-        return (0.1 if self.keys else 0.02) if self.tail_s == AUTO else self.tail_s
+        """How long it is silent behind each packet, while a key is still pressed, s."""
+        return 0.1 if self.keys else 0.02
 
     def layout(self, samples: int, sample_rate: float) -> BurstLayout:
         return BurstLayout(samples, round(self.leads_s * sample_rate), round(self.tails_s * sample_rate))

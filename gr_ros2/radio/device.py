@@ -22,6 +22,8 @@ from gr_ros2.settings.fields import AUTO, Auto
 
 _MOST_ZEROS = 1 << 20
 """Samples."""
+LEAD = 32
+"""Zero samples before each burst, while the amplifier settles."""
 Decibels = Annotated[float, Field(ge=-200, le=200)]
 
 
@@ -45,8 +47,6 @@ class DeviceOptions(BurstDeviceOptions):
     """port to receive from, auto = the device's default"""
     bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
     """Hz, of the analogue filters, auto = the device's choice"""
-    lead: Annotated[int, Field(ge=0, le=_MOST_ZEROS, title="Zeros before a burst (samples)")] = 32
-    """zero samples before each burst, while the amplifier settles"""
     tail: Annotated[int, Field(ge=0, le=_MOST_ZEROS, title="Zeros behind a burst (samples)")] = 64
     """zero samples behind each burst at least"""
     multiple: Annotated[int, Field(ge=1, le=1 << 22, title="Burst length in steps of (samples)")] = 1
@@ -58,7 +58,7 @@ class DeviceOptions(BurstDeviceOptions):
         return self.frequency if self.frequency_rx == AUTO else self.frequency_rx
 
     def layout(self, samples: int, sample_rate: float) -> BurstLayout:  # noqa: ARG002 - all are counted in samples
-        return BurstLayout(samples, self.lead, self.tail, self.multiple)
+        return BurstLayout(samples, LEAD, self.tail, self.multiple)
 
 
 class DeviceFrontEnd(BurstFrontEnd):

@@ -43,6 +43,8 @@ _FULL_POWER_DBM = 7.0
 _CHANNELS = [True, True]
 _LARGEST_ATTENUATION = 89.75
 _AUTOMATIC_FILTER = ("Auto", "", 0.0, 0.0)
+_HANDED_OVER_S = 0.005
+"""s of samples that the receiver hands over at a time."""
 _PHY = "ad9361-phy"
 _CONVERTERS = {"tx": "cf-ad9361-dds-core-lpc", "rx": "cf-ad9361-lpc"}
 _OSCILLATORS = {"tx": "altvoltage1", "rx": "altvoltage0"}
@@ -62,8 +64,6 @@ class PlutoOptions(DeviceOptions):
     gain_rx: Annotated[float, Field(ge=-3, le=76, title="Receive gain (dB)")] = 30.0
     bandwidth: Annotated[Hertz | Auto, Field(title="Analogue bandwidth (Hz)")] = AUTO
     """Hz, of the transmitter's analogue filter, auto = ``sample_rate``"""
-    buffer_rx: Annotated[int, Field(ge=1, le=1 << 22, title="Receive buffer (samples)")] | Auto = AUTO
-    """samples the receiver hands over at a time, auto = 5 ms of them"""
 
 
 class PlutoFrontEnd(DeviceFrontEnd):
@@ -105,7 +105,7 @@ class PlutoFrontEnd(DeviceFrontEnd):
     def _open_receiver(self) -> Any:
         self._check_asked()
         rate, options = self.phy.sample_rate, self.options
-        size = max(1024, int(rate * 0.005)) if options.buffer_rx == AUTO else options.buffer_rx
+        size = max(1024, int(rate * _HANDED_OVER_S))
         block = iio.fmcomms2_source_fc32(self.device_args, _CHANNELS, size)
         self._receiving = block  # for `close`, if a setting below is wrong
         block.set_filter_params(*_AUTOMATIC_FILTER)

@@ -51,6 +51,8 @@ sample on the clock of the medium process, NaN without one. The samples follow a
 MAGIC = b"GRI1"
 
 SAMPLE = np.dtype("<c8")
+WAITING = 300
+"""Bursts that may wait for a slow peer, and for this computer when received; beyond, new ones are dropped."""
 _HEARTBEAT_MS, _DEAD_MS = 250, 1000
 """Interval and limit of heartbeats. The connection to a peer that is silent up to the limit is closed, with all bursts
 that wait for it. Then a new connection is tried."""
@@ -111,8 +113,6 @@ class ZmqOptions(FrontEndOptions):
     """address to publish at: `5555` (all interfaces), `10.0.0.1:5555`, `ipc:///tmp/a`"""
     connect: Annotated[tuple[Address, ...], Field(min_length=1, title="Addresses of other robots")]
     """addresses of the other robots, ``10.0.0.2:5555``"""
-    burst_queue: Annotated[int, Field(ge=1, le=10_000, title="Queue (bursts)")] = 300
-    """bursts that may wait for a slow peer, and for this computer, 1..10000; of more the new ones are dropped"""
     medium_process: Annotated[Literal["none", "lockstep", "real"], Field(title="Medium process")] = "none"
     """what ``connect`` names: none = other robots; lockstep or real = ``gr-ros2 medium`` with this ``time``"""
 
@@ -186,9 +186,7 @@ class ZmqFrontEnd(FrontEnd):
             raise
         self._sockets.remove(subscriber)  # its thread closes it
         told = None if self._medium_clock is None else self._told
-        self.arrivals = _Arrivals(
-            subscriber, phy, self.options.burst_queue, self._counters, clock=self._medium_clock, told=told
-        )
+        self.arrivals = _Arrivals(subscriber, phy, WAITING, self._counters, clock=self._medium_clock, told=told)
 
     @cached_property
     def sink(self) -> Any:
@@ -239,7 +237,7 @@ class ZmqFrontEnd(FrontEnd):
 
         ``bursts_out``, ``bursts_in``: bursts sent and received. ``missed``: gaps in the numbers of a sender.
         ``restarts``: senders beyond one for each address. ``malformed`` and ``wrong_rate``: refused messages.
-        ``overflows``: bursts that arrived while ``burst_queue`` bursts waited for the flowgraph, and were dropped.
+        ``overflows``: bursts that arrived while ``WAITING`` bursts waited for the flowgraph, and were dropped.
         """
         lost = {name: self._counters[name] for name in ("missed", "malformed", "wrong_rate", "overflows")}
         lost["restarts"] = max(0, self._counters["senders"] - len(self.options.connect))
@@ -254,7 +252,7 @@ class ZmqFrontEnd(FrontEnd):
         socket = self._context.socket(kind)
         self._sockets.append(socket)
         addresses = (self.options.bind, *self.options.connect)
-        prepare(socket, self.options.burst_queue, self.phy.airtime_samples(), addresses)
+        prepare(socket, WAITING, self.phy.airtime_samples(), addresses)
         return socket
 
 

@@ -76,15 +76,22 @@ DEFAULT_MIDDLEWARE = "dds"
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Traffic:
+class Seeded:
+    """What draws random numbers."""
+
+    seed: Seed = 0
+    """of everything random in it; the same seed draws the same numbers. That of a scenario is that of its channel and
+    simulator too, unless it is set there"""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Traffic(Seeded):
     """What a link is given to carry."""
 
     source: str = "sim"
     """where messages come from: `sim`, the simulated robots, or `bag:PATH`, a recording"""
     duration_s: Seconds = 15.0
     """s during which messages are submitted; 0 = no limit: as long as the recording"""
-    seed: Seed = 0
-    """of everything random in it; the same seed draws the same numbers"""
 
     @model_validator(mode="after")
     def _sim_or_bag(self) -> Traffic:
@@ -138,11 +145,17 @@ def _off(given: object) -> object:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class CameraOptions:
-    """What leaves of pictures."""
+class MayBeOff:
+    """Of what would else be made smaller."""
 
     off: bool = False
-    """pictures pass exactly"""
+    """they pass exactly"""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class CameraOptions(MayBeOff):
+    """What leaves of pictures."""
+
     size: Annotated[str, Field(pattern=r"^(auto|full|[1-9]\d{0,4}x[1-9]\d{0,4})$")] = AUTO
     """pixels at most, such as 320x240; full = as they come, auto = halved where the air is short"""
     fps: Annotated[float, Field(gt=0, le=1000)] | Auto = AUTO
@@ -160,11 +173,9 @@ class CameraOptions:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class DepthOptions:
+class DepthOptions(MayBeOff):
     """What leaves of depth images (16UC1, 32FC1, compressedDepth)."""
 
-    off: bool = False
-    """they pass exactly"""
     mode: Literal["auto", "8", "10", "12", "exact"] = AUTO
     """auto = video of inverse distances that fits the air; or so many bits"""
     near: Annotated[float, Field(ge=0, allow_inf_nan=False, title="Nearest (m)")] = 0.0
@@ -282,7 +293,7 @@ class BurstLoss:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class ChannelConfig:
+class ChannelConfig(Seeded):
     """The simulated channel between transmitter and receiver (docs/reference/channels.md).
 
     ``snr_db`` to ``doppler_hz`` act on samples, and a PHY without samples refuses them; ``packet_loss`` to ``outages``
@@ -309,8 +320,6 @@ class ChannelConfig:
     """losses in bursts; null = none"""
     outages: tuple[tuple[Seconds, Seconds], ...] = ()
     """[from_s, to_s) since the run began in which nothing passes, in order of time"""
-    seed: Seed = 0
-    """of noise, fading and losses; in a scenario by default the scenario's"""
 
     @model_validator(mode="after")
     def _outages_in_order(self) -> ChannelConfig:
@@ -447,6 +456,30 @@ class ScenarioChannel(Transceiver, MeasuredChannel):
         return self
 
 
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Reach:
+    """Who of several robots hears whom, and how well."""
+
+    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
+    """what lies between all of them"""
+    gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
+    """gain from robot to robot, dB: one number, or a row for each, null where nothing arrives; the SNR then follows
+    from power, noise figure and `phy.sample_rate`. null = `channel.snr_db` between all"""
+
+    def check_levels(self, robots: int) -> None:
+        """Check that the levels have one origin, and that it says something of each robot.
+
+        :raises ValueError: naming the setting
+        """
+        matrix = self.gains_db
+        if isinstance(matrix, tuple) and [len(row) for row in matrix] != [robots] * robots:
+            raise ValueError(f"gains_db: {robots} robots need {robots} rows of {robots} numbers")
+        if self.channel.trace and matrix is not None:
+            raise ValueError("gains_db: levels follow from the trace; leave one of them out")
+        if self.channel.from_positions and matrix is not None:
+            raise ValueError("gains_db: levels follow from positions; leave it out, or set channel.from: settings")
+
+
 LEVELS = (
     ActsWhere(
         ("channel.snr_db",),
@@ -530,30 +563,15 @@ class DiagnosticsConfig:
 
     period_s: Seconds = 1.0
     """s between two messages, 0 = none at all"""
-    window_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
-    """s over which rates and losses are taken, 1 or more"""
-    packet_loss_warn: Probability = 0.1
-    """share of packets lost, 0..1; 0 = never, as for all limits"""
-    packet_loss_error: Probability = 0.5
-    """the same for an error"""
-    message_loss_warn: Probability = 0.1
-    """share of messages lost, 0..1"""
-    message_loss_error: Probability = 0.5
-    """the same for an error"""
-    latency_warn_s: Seconds = 1.0
-    """s from a message's stamp to its publication here, median of the newest"""
-    latency_error_s: Seconds = 5.0
-    """the same for an error"""
-    age_warn_s: Seconds = 0.0
-    """s since the stamp of a topic's newest message (where it has none, since its publication)"""
-    age_error_s: Seconds = 0.0
-    """the same for an error"""
-    silence_warn_s: Seconds = 3.0
-    """s without any packet, once there was one"""
-    silence_error_s: Seconds = 10.0
-    """the same for an error"""
-    queue_warn: Probability = 0.8
-    """share of ``queue_depth`` that waits to be sent, 0..1"""
+    loss: tuple[Probability, Probability] = (0.1, 0.5)
+    """share of packets, and of a topic's messages, lost in the last 10 s: [warning, error]; 0 = never, as for all
+    limits"""
+    latency_s: tuple[Seconds, Seconds] = (1.0, 5.0)
+    """s from a message's stamp to its publication here, median of the newest: [warning, error]"""
+    age_s: tuple[Seconds, Seconds] = (0.0, 0.0)
+    """s since the stamp of a topic's newest message (where it has none, since its publication): [warning, error]"""
+    silence_s: tuple[Seconds, Seconds] = (3.0, 10.0)
+    """s without any packet, once there was one: [warning, error]"""
 
 
 def build(cls: type[_T], values: Mapping[str, Any], where: str = "") -> _T:

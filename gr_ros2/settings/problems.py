@@ -45,6 +45,14 @@ OLD_NAMES = {
     "back": "write robots: 2, and paths where the channels differ",
     "reports": "write robots: [{}, {topics: []}], and paths where the channels differ",
     "receivers": "write robots: [{}, {topics: []}, {topics: []}], and paths where the channels differ",
+    **dict.fromkeys(
+        ("packet_loss_warn", "packet_loss_error", "message_loss_warn", "message_loss_error"),
+        "write loss: [warning, error]",
+    ),
+    **dict.fromkeys(("latency_warn_s", "latency_error_s"), "write latency_s: [warning, error]"),
+    **dict.fromkeys(("age_warn_s", "age_error_s"), "write age_s: [warning, error]"),
+    **dict.fromkeys(("silence_warn_s", "silence_error_s"), "write silence_s: [warning, error]"),
+    **dict.fromkeys(("odom_linear_noise", "odom_angular_noise"), "write odom_noise: [m/s, rad/s]"),
 }
 """What says now what a setting of another name said."""
 _LIKE_AUTO: tuple[Any, ...] = (None, -1, 0, "", [])

@@ -42,6 +42,7 @@ from gr_ros2.wire import BROADCAST
 ONE_RADIO = "a robot with one radio sends everything over that"
 """Why ``via`` does nothing there."""
 _ALIASED = ConfigDict(**STRICT, populate_by_name=True)
+Direction = Literal["both", "send", "receive"]
 Age = Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")]
 
 
@@ -124,7 +125,7 @@ class RobotConfig:
 
     robot: Annotated[int, Field(ge=0, le=BROADCAST - 1)] | str
     """its number on the air, 0..254, or its name, of which the last digits are the number: /robot_1 is robot 1"""
-    direction: Literal["both", "send", "receive"] = "both"
+    direction: Direction = "both"
     """with send it gets no reports, with receive it gives none"""
     topics: Annotated[dict[str, SendOptions], BeforeValidator(topics_of), AfterValidator(_checked_topics)] = Field(
         default_factory=lambda: {AUTO: SendOptions()}

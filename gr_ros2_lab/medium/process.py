@@ -38,15 +38,14 @@ from pydantic.dataclasses import dataclass
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.watch import Watch
 from gr_ros2.phy import PHY, configured
-from gr_ros2.radio.zmq import HEADER, MAGIC, SAMPLE, Address, OwnAddress, open_socket, prepare
+from gr_ros2.radio.zmq import HEADER, MAGIC, SAMPLE, WAITING, Address, OwnAddress, open_socket, prepare
 from gr_ros2.settings.config import (
     LEVELS,
     STRICT,
-    Decibels,
     PacketLen,
     PhyConfig,
-    ScenarioChannel,
-    Seed,
+    Reach,
+    Seeded,
     Text,
     Transceiver,
     build,
@@ -67,8 +66,6 @@ GONE_S = 1.0
 """s without an answer after which a robot is not waited for."""
 _AGAIN_S = 0.05
 """s after which the time is told again to robots that have not answered: they may just have connected."""
-_WAITING = 300
-"""Bursts that may wait for a slow link."""
 _log = logging.getLogger(__name__)
 
 
@@ -85,7 +82,7 @@ class MediumRobot(Transceiver):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class MediumConfig:
+class MediumConfig(Reach, Seeded):
     """A medium process and its robots."""
 
     name: Text = "medium"
@@ -96,32 +93,21 @@ class MediumConfig:
     """bytes, that of the links"""
     robots: Annotated[tuple[MediumRobot, ...], Field(min_length=2, max_length=BROADCAST)]
     """those that share the channel"""
-    gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
-    """gain from one robot to another, dB: one number, or a row for each robot; null = `channel.snr_db` between all"""
-    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
-    """of all pairs; with ``from: positions`` levels follow from where the robots are"""
     time: Literal["lockstep", "real"] = "lockstep"
     """lockstep = links take the medium's clock, and it waits for them; real = nobody waits"""
-    seed: Seed = 0
-    """of noise and phases"""
     conditions: ClassVar[Any] = LEVELS
 
     @model_validator(mode="after")
     def _fits(self) -> MediumConfig:
-        count, placed = len(self.robots), [robot.position is not None for robot in self.robots]
+        placed = [robot.position is not None for robot in self.robots]
         if self.phy.name not in PHY:
             raise ValueError(f"phy.name = {self.phy.name!r}: no such phy; known are {', '.join(PHY)}")
         if self.phy.sample_rate == AUTO:
             raise ValueError("phy.sample_rate = auto: a medium needs one, the same as the links")
-        if isinstance(self.gains_db, tuple) and [len(row) for row in self.gains_db] != [count] * count:
-            raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
         told = self.channel.from_positions or bool(self.channel.trace)
         if (self.channel.from_positions and not all(placed)) or (any(placed) and not (all(placed) and told)):
             raise ValueError("robots: position is for all robots together with channel.from: positions, or a survey")
-        if self.channel.trace and self.gains_db is not None:
-            raise ValueError("gains_db: levels follow from the trace; leave one of them out")
-        if self.channel.from_positions and self.gains_db is not None:
-            raise ValueError("gains_db: levels follow from positions; leave it out, or set channel.from: settings")
+        self.check_levels(len(self.robots))
         if self.channel.loses_packets:
             raise ValueError("channel: a medium of samples loses no whole packets; leave these settings out")
         addresses = [address for robot in self.robots for address in (robot.connect, robot.bind)]
@@ -178,7 +164,7 @@ class _Link:
         addresses = (robot.bind, robot.connect)
         self.publisher, self.subscriber = (stack.enter_context(context.socket(kind)) for kind in (zmq.PUB, zmq.SUB))
         for socket in (self.publisher, self.subscriber):
-            prepare(socket, _WAITING, samples, addresses)
+            prepare(socket, WAITING, samples, addresses)
         open_socket(self.publisher.bind, "bind", robot.bind, "medium")
         self.subscriber.subscribe(b"")
         open_socket(self.subscriber.connect, "connect", robot.connect, "medium")

@@ -25,9 +25,8 @@ from gr_ros2.settings.config import (
     LEVELS,
     STRICT,
     AirConfig,
-    Decibels,
     PathConfig,
-    ScenarioChannel,
+    Reach,
     Seconds,
     Traffic,
     build,
@@ -66,21 +65,16 @@ class Experiment:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Scenario(Experiment, Traffic, AirConfig):
+class Scenario(Experiment, Traffic, AirConfig, Reach):
     """One experiment: robots, the medium between them, what they send, and for how long."""
 
     robots: Annotated[tuple[ScenarioRobot, ...], Field(max_length=BROADCAST)]
     """the robots, those that send first; or how many, which differ in their names alone"""
-    channel: ScenarioChannel = Field(default_factory=ScenarioChannel)
-    """what lies between all of them"""
     paths: tuple[PathConfig, ...] = ()
     """the channels that differ: what is not set in one is as in ``channel``"""
     duplex: Literal["full", "half"] = "full"
     """full = each robot sends on a channel of its own; half = all use one, and packets that overlap disturb each
     other"""
-    gains_db: Decibels | tuple[tuple[Decibels | None, ...], ...] | None = None
-    """gain from robot to robot, dB: one number, or a row for each, null where nothing arrives; the SNR then follows
-    from power, noise figure and `phy.sample_rate`. null = `channel.snr_db` between all"""
     paper: PaperConfig | None = None
     """the robots are the paper's blocks; null = ROS Links"""
     drain_s: Seconds = 2.0
@@ -153,8 +147,6 @@ class Scenario(Experiment, Traffic, AirConfig):
             raise ValueError("gains_db: levels follow from the trace; leave one of them out")
         if not placed:
             return
-        if gains:
-            raise ValueError("gains_db: levels follow from positions; leave it out, or set channel.from: settings")
         if self.channel.walls_db and self.bag_path is not None:
             raise ValueError("channel.walls_db: a recording has no world to count walls in; leave it out")
 
@@ -186,9 +178,7 @@ class Scenario(Experiment, Traffic, AirConfig):
                 f"task = {self.task!r}: robots act on what they hear in real time or at packets; set time: real or "
                 "packets, and let all of them send"
             )
-        matrix = self.gains_db
-        if isinstance(matrix, tuple) and [len(row) for row in matrix] != [count] * count:
-            raise ValueError(f"gains_db: {count} robots need {count} rows of {count} numbers")
+        self.check_levels(count)
         if not self.simulated:
             self._check_live_robots()
 

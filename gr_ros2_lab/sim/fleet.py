@@ -20,7 +20,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.sim.driver import Driver
 from gr_ros2_lab.sim.motion import RADIUS, TICK, State, places_and_velocities
 from gr_ros2_lab.sim.roadmap import Roadmap
-from gr_ros2_lab.sim.sensors import ALL_TYPES, CAMERA, TYPES, Sensors
+from gr_ros2_lab.sim.sensors import ALL_TYPES, ALWAYS_HZ, CAMERA, TYPES, Sensors
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from gr_ros2_lab.sim.world import World
 
@@ -92,13 +92,14 @@ class Fleet:
 
     def topics(self) -> dict[str, str]:
         """Topic name without namespace -> type, in the order of the paper's table 4, then what is optional."""
-        return {
-            name: kind for name, kind in ALL_TYPES.items() if name in TYPES or getattr(self.settings, f"{name}_rate")
-        }
+        return {name: kind for name, kind in ALL_TYPES.items() if name in TYPES or self._rate(name)}
 
     def rates(self) -> dict[str, float]:
         """Topic name without namespace -> Hz; 0 = once."""
-        return {name: getattr(self.settings, f"{name}_rate") for name in self.topics()}
+        return {name: self._rate(name) for name in self.topics()}
+
+    def _rate(self, name: str) -> float:
+        return ALWAYS_HZ[name] if name in ALWAYS_HZ else getattr(self.settings, f"{name}_rate")
 
     def state(self, robot_id: int, t: float) -> State:
         """The true place and motion of a robot at simulated time ``t`` >= 0."""

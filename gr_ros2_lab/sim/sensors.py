@@ -35,6 +35,8 @@ RTCM: Final = "rtcm"
 CAMERA: Final = "camera"
 ALL_TYPES: Final = {**TYPES, RTCM: "rtcm_msgs/msg/Message", CAMERA: "sensor_msgs/msg/Image"}
 """And the corrections of a base station, in the type that GNSS drivers use for them, and a camera."""
+ALWAYS_HZ: Final = {"cmd_vel": 10.0, "clock": 10.0}
+"""Rates that nobody sets: those of a usual controller, and of a usual clock."""
 GRAVITY: Final = 9.80665
 SCAN_RANGE: Final = 12.0
 """Farthest range that the scanner measures, m; beyond it a beam reads +inf (REP 117)."""
@@ -78,7 +80,8 @@ class Sensors:
         self._bearings: Floats = -math.pi + turn * np.arange(settings.beams, dtype=np.float64)
         # Variances as drivers fill them in: position, height, roll, pitch and heading.
         pose = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)
-        twist = (settings.odom_linear_noise**2, 1e-6, 1e6, 1e6, 1e6, settings.odom_angular_noise**2)
+        speed_noise, turn_noise = settings.odom_noise
+        twist = (speed_noise**2, 1e-6, 1e6, 1e6, 1e6, turn_noise**2)
         self._pose_covariance, self._twist_covariance = np.diag(pose).ravel(), np.diag(twist).ravel()
         self._imu_covariance = [
             np.diag([noise**2] * 3).ravel() for noise in (IMU_ORIENTATION_NOISE, IMU_GYRO_NOISE, IMU_ACCEL_NOISE)
@@ -124,9 +127,9 @@ class Sensors:
         )
 
     def _odom(self, t: float, state: State, others: Sequence[State]) -> Any:  # noqa: ARG002
-        settings, (speed_noise, turn_noise) = self._settings, self._rng["odom"].standard_normal(2).tolist()
-        speed = state.speed + settings.odom_linear_noise * speed_noise
-        turn = state.turn + settings.odom_angular_noise * turn_noise
+        (speed_noise, turn_noise), drawn = self._settings.odom_noise, self._rng["odom"].standard_normal(2).tolist()
+        speed = state.speed + speed_noise * drawn[0]
+        turn = state.turn + turn_noise * drawn[1]
         dt, self._odom_t = t - self._odom_t, t
         x, y, heading = self._odom_pose
         middle = heading + 0.5 * turn * dt

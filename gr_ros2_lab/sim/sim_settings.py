@@ -10,18 +10,16 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.settings.config import Seed
+from gr_ros2.settings.config import Seeded
 
 Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
 Noise = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
-class SimSettings:
+class SimSettings(Seeded):
     """Robots, world, rates and noise."""
 
-    seed: Seed = 0
-    """of the world, the routes and all noise; in a scenario by default the scenario's"""
     robots: Annotated[int, Field(ge=1, le=255)] = 2
     """number of robots; they are called robot_1, robot_2, ..."""
     size_m: Annotated[float, Field(ge=10, le=100)] = 20.0
@@ -36,10 +34,6 @@ class SimSettings:
     """odometry, Hz"""
     imu_rate: Rate = 50.0
     """Hz"""
-    cmd_vel_rate: Rate = 10.0
-    """velocity commands, Hz"""
-    clock_rate: Rate = 10.0
-    """Hz"""
     map_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
     """maps, Hz; 0 = once at the start"""
     rtcm_rate: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
@@ -50,10 +44,8 @@ class SimSettings:
     """of a laser scan, over the full turn"""
     map_cells: Annotated[int, Field(ge=10, le=2000)] = 100
     """cells along each side of the map"""
-    odom_linear_noise: Noise = 0.02
-    """of the measured forward speed, m/s; the odometry pose integrates it, so it drifts"""
-    odom_angular_noise: Noise = 0.01
-    """of the measured turn rate, rad/s; integrated likewise"""
+    odom_noise: tuple[Noise, Noise] = (0.02, 0.01)
+    """of the measured forward speed, m/s, and turn rate, rad/s; the odometry pose integrates both, so it drifts"""
     start_time_s: Annotated[float, Field(ge=0, le=2**31 - 1)] = 0.0
     """s, what the stamps begin at"""
     prefix_frames: bool = False

@@ -42,7 +42,7 @@ def test_the_common_packages_are_covered() -> None:
 
 
 def test_learning_is_repeatable_and_pays() -> None:
-    payloads = simulated("odom", 10.0, odom_linear_noise=0.0331)
+    payloads = simulated("odom", 10.0, odom_noise=(0.0331, 0.01))
     samples = [("nav_msgs/msg/Odometry", payload) for payload in payloads[::2]]
     made = learn(samples, "mine", base=shipped())
     assert learn(samples, "yours", base=shipped()).digest == made.digest

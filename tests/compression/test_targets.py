@@ -47,9 +47,7 @@ def test_recorded_sensors(drive: Drive) -> None:
         assert mean(sizes(drive.topics[name], payloads(drive, name))) <= LARGEST[name], name
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"prefix_frames": True, "seed": 7}, {"odom_linear_noise": 0.0331, "odom_angular_noise": 0.0173}]
-)
+@pytest.mark.parametrize("settings", [{}, {"prefix_frames": True, "seed": 7}, {"odom_noise": (0.0331, 0.0173)}])
 def test_simulated_odometry_with_noise_in_all_its_doubles(settings: dict[str, float]) -> None:
     found = sizes("nav_msgs/Odometry", simulated("odom", 20.0, **settings))
     assert found[int(0.99 * len(found))] <= TWO_PACKETS * 0.6

@@ -48,7 +48,7 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("wifi", {"encoding": "16qam-1/2", "channel_hz": 5.89e9}),
     ("wifi", {"encoding": "64qam-3/4"}),
     ("lora", {"implementation": "lora_sdr"}),
-    ("lora", {"implementation": "lora_sdr", "spreading_factor": 9, "coding_rate": 3, "oversampling": 4}),
+    ("lora", {"implementation": "lora_sdr", "spreading_factor": 9, "coding_rate": 3}),
     ("lora", {"implementation": "lora_sdr", "spreading_factor": 8, "coding_rate": 1, "ldro": True, "gap": 48}),
 ]
 LENGTHS = (14, 15, 64, 4095)

@@ -81,7 +81,6 @@ def test_without_the_module_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) 
         (64, {"encoding": "256qam"}, "encoding = '256qam'"),
         (64, {"equalizer": "zf"}, "equalizer = 'zf'"),
         (64, {"gap": 359}, "gap = 359"),
-        (64, {"sensitivity": 0.1}, "sensitivity = 0.1"),
         (64, {"network": "02:67:72"}, "network = '02:67:72': must be six octets"),
         (64, {"address": "zz:67:72:00:00:01"}, "address = 'zz:67:72:00:00:01': must be six octets"),
         (64, {"channel_hz": 0}, "channel_hz"),

@@ -20,6 +20,7 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.phy.psk import PskPhy
+from gr_ros2.radio.device import LEAD
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.soapy import SoapyFrontEnd
 from tests.compiled import compiled
@@ -413,9 +414,9 @@ def test_airtime_counts_padding_guard_and_turnaround(monkeypatch: pytest.MonkeyP
     for half in ("_open_transmitter", "_open_receiver"):
         monkeypatch.setattr(SoapyFrontEnd, half, lambda _self: None)
     phy = PskPhy(64, RATE)
-    common = {"frequency": 433e6, "lead": 10, "tail": 20, "multiple": 1000, "guard_s": 0.003}
+    common = {"frequency": 433e6, "tail": 20, "multiple": 1000, "guard_s": 0.003}
     full = SoapyFrontEnd(phy, **common)
-    padded = -(-(phy.airtime_samples() + 30) // 1000) * 1000
+    padded = -(-(phy.airtime_samples() + LEAD + 20) // 1000) * 1000
     assert full.airtime() == pytest.approx(padded / RATE + 0.003)
     # A packet comes before the one before it is over, but not in the silence that is to follow that.
     assert full.ahead() == 0

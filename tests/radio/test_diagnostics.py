@@ -40,7 +40,7 @@ def test_a_running_link_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyP
             "channel": {"snr_db": 20.0},
             "robot": "/robot_1",
             "graph": {"domain_id": number},
-            "diagnostics": {"period_s": 0.1, "latency_warn_s": 1.0},
+            "diagnostics": {"period_s": 0.1, "latency_s": [1.0, 5.0]},
         }
     )
     began = int(time.time())

@@ -91,7 +91,7 @@ def test_the_robot_stands_still_when_its_operator_is_gone(tmp_path: Path, how: s
     def link(number: int, own: str, other: str) -> RobotLink:
         values: dict[str, Any] = {"registry": "", "state": str(tmp_path / f"state-{number}")}
         front_end = {"name": "zmq", "bind": own, "connect": [other]}
-        quick = {"period_s": 0.1, "silence_warn_s": 1.0, "silence_error_s": 2.5}
+        quick = {"period_s": 0.1, "silence_s": [1.0, 2.5]}
         topics = ["cmd_vel"] if number == 2 else []
         return RobotLink(config(number, front_end, **values, topics=topics, diagnostics=quick))
 

@@ -58,7 +58,7 @@ def test_who_only_receives_says_that_it_cannot_send() -> None:
 
 
 def test_the_state_of_a_link_is_a_latched_topic() -> None:
-    quick: dict[str, Any] = {"period_s": 0.05, "silence_warn_s": 0.3, "silence_error_s": 3.0}
+    quick: dict[str, Any] = {"period_s": 0.05, "silence_s": [0.3, 3.0]}
     with Robot(1, SIM, hears=(1,), diagnostics=quick) as robot:
         robot.say(1)
         wait_for(lambda: robot.heard, "a message")

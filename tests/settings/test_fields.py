@@ -25,7 +25,7 @@ from gr_ros2_lab.study.sweep.definition import Sweep
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 ROOTS = (Scenario, LinkConfig, MediumConfig, Sweep, RaceSettings, SendOptions)
-ANOTHER_TIME = {"max_rate", "packet_rate", "speed", "bag_speed", "clock_rate", "time"}
+ANOTHER_TIME = {"max_rate", "packet_rate", "speed", "bag_speed", "time"}
 """Rates and clocks: no durations."""
 
 

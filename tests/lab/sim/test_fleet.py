@@ -152,16 +152,17 @@ def test_odometry_is_noisy_and_drifts_little(fleet: Fleet, messages: list[SimMes
     truth = [fleet.state(2, t) for t, _ in odometry]
     speed = np.array([m.twist.twist.linear.x for _, m in odometry]) - [s.speed for s in truth]
     turn = np.array([m.twist.twist.angular.z for _, m in odometry]) - [s.turn for s in truth]
-    assert speed.std() == pytest.approx(fleet.settings.odom_linear_noise, rel=0.15)
-    assert turn.std() == pytest.approx(fleet.settings.odom_angular_noise, rel=0.15)
-    assert abs(speed.mean()) < 5 * fleet.settings.odom_linear_noise / math.sqrt(len(speed))
+    speed_noise, turn_noise = fleet.settings.odom_noise
+    assert speed.std() == pytest.approx(speed_noise, rel=0.15)
+    assert turn.std() == pytest.approx(turn_noise, rel=0.15)
+    assert abs(speed.mean()) < 5 * speed_noise / math.sqrt(len(speed))
     position = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for _, m in odometry])
     error = np.hypot(*(position - [(s.x, s.y) for s in truth]).T)
     assert error[0] < 0.05
     assert 0 < error.max() < 1.0
     assert odometry[0][1].header.frame_id == "odom"
     assert odometry[0][1].child_frame_id == "base_link"
-    assert odometry[0][1].twist.covariance[0] == pytest.approx(fleet.settings.odom_linear_noise**2)
+    assert odometry[0][1].twist.covariance[0] == pytest.approx(speed_noise**2)
 
 
 def test_imu_measures_motion_and_gravity(fleet: Fleet, messages: list[SimMessage]) -> None:

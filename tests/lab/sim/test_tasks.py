@@ -17,7 +17,7 @@ from gr_ros2_lab.sim.sensors import read_command, read_odometry, write_command
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from gr_ros2_lab.sim.tasks import Command, Formation, LastHeard, Rendezvous, Task, TaskRobots, make_task, towards
 
-QUIET = SimSettings(odom_linear_noise=0, odom_angular_noise=0, odom_rate=10)
+QUIET = SimSettings(odom_noise=(0, 0), odom_rate=10)
 
 
 class OnlyAhead(Task):
