@@ -12,7 +12,8 @@ import time
 from array import array
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from gnuradio import gr
@@ -20,24 +21,24 @@ from gnuradio import gr
 from gr_ros2.core.closing import Closing
 from gr_ros2.gr import RosLink
 from gr_ros2.gr.factory import Start
-from gr_ros2.gr.receiving import ReceivingBlock
-from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.link import ReceiverEvent, SenderEvent
-from gr_ros2.link.air import Air
 from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import Middleware, join_graph
-from gr_ros2.paper import RosSink, RosSource
+from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.pdus import PDUS, packets_of, pdu_of
 from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
-from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig
+from gr_ros2.radio.config import LinkConfig
+from gr_ros2.radio.robot_link import RobotLink
+from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig, DiagnosticsConfig, PhyConfig
 from gr_ros2.settings.registry import Registry
-from gr_ros2.settings.robot import robot_from
+from gr_ros2.settings.robot import Direction, GraphConfig, PublishConfig
 from gr_ros2_lab.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2_lab.race.namespaces import inside
 from gr_ros2_lab.race.race_settings import PHY_NAME
 from gr_ros2_lab.race.tun import Tun, loopback_up, own_air
+from gr_ros2_lab.run.paper_link import PaperLink
 
 DOMAINS = (1, 2)
 """DDS domains at both ends of gr-ros2, the sending end first. One process cannot use one domain in two namespaces."""
@@ -123,56 +124,40 @@ class RaceRosLink(Closing):
         packet_len: int,
         contender: Contender,
     ) -> None:
-        self._radio, self._settings, self._packet_len = radio, contender.settings, packet_len
-        self._registry = Registry.from_rows([topic])
-        self._logs = (LinkLog(), LinkLog())
+        registry, self._logs = Registry.from_rows([topic]), (LinkLog(), LinkLog())
+        settings = dict(contender.settings)
+        paper = settings.pop("paper", None)
+        phy, block = radio.with_frames_of(packet_len), partial(RosLink, start=Start(), registry=registry)
+        ways: tuple[Direction, Direction] = ("both", "both")
+        if paper is not None:
+            ways = ("send", "receive")
+            block = partial(PaperLink, paper=PaperConfig(**paper), registry=registry, seed=radio.seed)
         with ExitStack() as stack:
-            ends: list[tuple[SendingBlock | None, ReceivingBlock | None]] = []
-            for direction, (namespace, domain_id) in enumerate(zip(namespaces, DOMAINS, strict=True)):
+            places = [f"ipc://{stack.enter_context(TemporaryDirectory(prefix='gr-ros2-'))}/air" for _ in DOMAINS]
+            self._links: list[RobotLink] = []
+            for end, (namespace, domain_id) in enumerate(zip(namespaces, DOMAINS, strict=True)):
                 loopback_up(namespace)
                 graph = stack.enter_context(inside(namespace, lambda domain=domain_id: _graph(domain)))  # type: ignore[misc]
-                ends.append(self._end(direction, graph, stack))
-            source, sink = ends[0][0], ends[1][1]
-            assert source is not None and sink is not None, "one sends, the other receives"
-            self._source, self._sink = source, sink
+                config = LinkConfig(
+                    robot=SOURCE_ID + end,
+                    direction=ways[end],
+                    packet_len=packet_len,
+                    graph=GraphConfig(namespace="", depth=DEPTH),
+                    publish=PublishConfig(depth=DEPTH),
+                    phy=PhyConfig(name=PHY_NAME, sample_rate=radio.sample_rate),
+                    front_end={"name": "zmq", "bind": places[end], "connect": [places[1 - end]]},
+                    channel=radio.channel(1 - end),
+                    diagnostics=DiagnosticsConfig(period_s=0),
+                    **settings,
+                )
+                observer = _FrameLog(phy, self._logs[end])
+                self._links.append(RobotLink(config, middleware=graph, observer=observer, block=block))
+                stack.callback(self._links[-1].stop)
+            self._source, self._sink = self._links[0].source, self._links[1].sink
             self._sink.outputs.announce(SOURCE_ID, [0])
-            self._links: list[LoopbackLink] = []
-            for direction, (sends, _) in enumerate(ends):
-                phy, hears = radio.with_frames_of(packet_len), ends[1 - direction][1]
-                if sends is not None and hears is not None:
-                    self._links.append(LoopbackLink(phy, sends, hears, channel=radio.channel(direction)))
-                    stack.callback(self._links[-1].stop)
             for link in reversed(self._links):  # the receiving end listens when the sending end begins
                 link.start()
             self._stack = stack.pop_all()
-
-    def _end(
-        self, direction: int, graph: Middleware, stack: ExitStack
-    ) -> tuple[SendingBlock | None, ReceivingBlock | None]:
-        """The blocks of one robot. Its packets take a direction each."""
-        phy = self._radio.with_frames_of(self._packet_len)
-        common: dict[str, Any] = {"middleware": graph, "observer": _FrameLog(phy, self._logs[direction])}
-        values: dict[str, Any] = {
-            "robot": SOURCE_ID + direction,
-            "packet_len": self._packet_len,
-            "graph_namespace": "",
-            "graph_depth": DEPTH,
-            "publish_depth": DEPTH,
-            **self._settings,
-        }
-        paper = values.pop("paper", None)
-        if paper is None:
-            air, start = Air(any_length=phy.any_length), Start()
-            link = RosLink(robot_from(**values), air=air, start=start, registry=self._registry, **common)
-            stack.callback(link.close)
-            return link.source, link.sink
-        block: RosSource | RosSink
-        if direction:
-            block = RosSink(self._registry, **common, **values, **paper)
-        else:
-            block = RosSource(self._registry, seed=self._radio.seed, **common, **values, **paper)
-        stack.callback(block.close)
-        return (None, block) if isinstance(block, RosSink) else (block, None)
 
     @property
     def output_topic(self) -> str:
@@ -187,7 +172,7 @@ class RaceRosLink(Closing):
         """The traffic on the air so far."""
         topics = self._source.stats()["topics"].values()
         drops = {reason: count for topic in topics for reason, count in topic["refused"].items()}
-        on_air = sum(link.counts().dropped for link in self._links)
+        on_air = sum(link.radio.counts().dropped for link in self._links)
         return LinkReport(*self._logs, {**drops, "on_air": on_air})
 
     def close(self) -> None:

@@ -371,7 +371,8 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), **set
     if scenario.task:
         task_class(scenario.task)
     if _contradicted(overrides):
-        return scenario_from({**values, "description": _described(scenario, overrides)}, str(name_or_path))
+        # To build it again for a text would take as long as the first time.
+        object.__setattr__(scenario, "description", _described(scenario, overrides))
     return scenario
 
 

@@ -56,7 +56,6 @@ PURE_NUMBERS = {
     "bt",
     "carriers",
     "detection_threshold",
-    "sensitivity",
     "domain_id",
     "graph_domain_id",
     "dst_id",
@@ -372,8 +371,8 @@ def test_the_noise_of_the_simulated_radio_can_be_changed_while_it_runs(platform:
     finally:
         top.stop()
         top.wait()
-        top.ros2_source_0.close()
-        top.ros2_sink_0.close()
+        top.ros2_link_1.close()
+        top.ros2_link_2.close()
         top.radio.close()
 
 
