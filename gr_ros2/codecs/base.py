@@ -12,8 +12,7 @@ CodecError, with memory and time that ``max_size`` bounds; after an error the ne
 from __future__ import annotations
 
 from binascii import crc32
-from collections import OrderedDict
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol
 
 from gr_ros2.core.errors import DamagedError
 
@@ -27,7 +26,6 @@ number of no codec."""
 _FOLLOWS = 0x80
 _NAME = 4
 """Bytes of a name."""
-_Kept = TypeVar("_Kept")
 
 
 class Coded(NamedTuple):
@@ -117,15 +115,3 @@ def opened(data: bytes) -> tuple[int, int | None, bytes]:
     if data[0] & _FOLLOWS:
         return data[0] & ~_FOLLOWS, int.from_bytes(data[1 : 1 + _NAME], "little"), data[1 + _NAME :]
     return data[0], None, data[1:]
-
-
-KEPT = 4
-"""Messages that a codec of changes keeps; older ones are not referred to any more."""
-
-
-def keep(messages: OrderedDict[int, _Kept], name: int, message: _Kept) -> None:
-    """Keep a message as the newest of ``KEPT``, by the name of its frame. Equal ones have one name."""
-    messages[name] = message
-    messages.move_to_end(name)
-    while len(messages) > KEPT:
-        messages.popitem(last=False)

@@ -1,15 +1,15 @@
 """What codecs have in common whose frames say what has changed since a message that all receivers have confirmed.
 
 Invariants: exact to the byte; changes refer to a message that all receivers have decoded, as far as the encoder was
-told, and are sent only where they are shorter than the whole message; both ends keep the newest ``KEPT`` messages, and
-an encoder refers to no other.
+told, and are sent only where they are short, or shorter than the whole message; both ends keep the newest ``KEPT``
+messages, and an encoder refers to no other.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 from gr_ros2.codecs.base import Coded, frame, name_of, opened
 from gr_ros2.codecs.pack import Packer
@@ -36,6 +36,9 @@ class ChangesEncoder(ABC, Generic[_Read]):
     :param packer: packs whole messages
     """
 
+    small: ClassVar[float] = 0.0
+    """Part of a message below which its changes are sent without a look at how long all of it would be."""
+
     def __init__(self, packer: Packer) -> None:
         self._packer = packer
         self._sent: OrderedDict[int, _Read] = OrderedDict()
@@ -51,16 +54,23 @@ class ChangesEncoder(ABC, Generic[_Read]):
         """What has changed since an earlier message."""
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:  # noqa: ARG002
-        read = self._read(message)
-        coded = frame(WHOLE, self._packer.pack(message))
+        read, changes = self._read(message), None
         if key:
             self._sent.clear()
             self._base = None
         elif self._base is not None and self._base in self._sent:
             changes = frame(CHANGES, self._changes(self._sent[self._base], read), self._base)
-            coded = changes if len(changes.data) < len(coded.data) else coded
+        if changes is not None and len(changes.data) < self.small * len(message):
+            coded = changes
+        else:
+            whole = self._whole(message)
+            coded = whole if changes is None or len(whole.data) <= len(changes.data) else changes
         _keep(self._sent, coded.name, read)
         return coded
+
+    def _whole(self, message: bytes) -> Coded:
+        """The frame of a message by itself."""
+        return frame(WHOLE, self._packer.pack(message))
 
     def confirmed(self, name: int) -> None:
         if name in self._sent:
@@ -75,6 +85,9 @@ class ChangesDecoder(ABC, Generic[_Read]):
     :param max_size: bytes of the largest message that it makes
     """
 
+    last: ClassVar[int] = CHANGES
+    """The last form of frames."""
+
     def __init__(self, max_size: int) -> None:
         self._packer, self._max_size = Packer(), max_size
         self._kept: OrderedDict[int, _Read] = OrderedDict()
@@ -82,6 +95,10 @@ class ChangesDecoder(ABC, Generic[_Read]):
     @abstractmethod
     def _read(self, message: bytes) -> _Read:
         """:raises DamagedError: not a message of this codec"""
+
+    def _unpacked(self, form: int, body: bytes) -> bytes:  # noqa: ARG002 - there is one
+        """The message of a frame by itself."""
+        return self._packer.unpack(body, self._max_size)
 
     @property
     def held(self) -> int:
@@ -101,10 +118,10 @@ class ChangesDecoder(ABC, Generic[_Read]):
 
     def decode(self, data: bytes) -> bytes:
         form, before, body = opened(data)
-        if form > CHANGES or (form == CHANGES) != (before is not None):
+        if form > self.last or (form == CHANGES) != (before is not None):
             raise DamagedError(f"damaged frame: no form {form}")
         if before is None:
-            message = self._packer.unpack(body, self._max_size)
+            message = self._unpacked(form, body)
         else:
             base = self._kept.get(before)
             if base is None:

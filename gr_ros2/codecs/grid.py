@@ -2,14 +2,10 @@
 
 A grid that has grown or moved is compared with the confirmed one where both overlap, cells that are new with the
 unknown (-1). What is sent is the box around all changes, as differences (XOR) or as it is, whichever is shorter.
-
-Invariants: exact to the byte; a whole grid is sent when nothing is confirmed or a key frame is asked for; a decoder
-keeps at most ``KEPT`` grids beside the one that was last referred to, and an encoder refers to no other.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
 from struct import pack
 from typing import Any, NamedTuple
@@ -17,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gr_ros2.codecs.base import MAX_SIZE, Coded, frame, keep, name_of, opened
+from gr_ros2.codecs.base import MAX_SIZE
+from gr_ros2.codecs.changes import ChangesDecoder, ChangesEncoder
 from gr_ros2.codecs.messages import GRID, GRID_UPDATE, read, take
 from gr_ros2.codecs.pack import Packer
 from gr_ros2.compression import bounds
 from gr_ros2.compression.zstd_frames import read_varint
-from gr_ros2.core.errors import DamagedError, MissingFrameError
+from gr_ros2.core.errors import DamagedError
 from gr_ros2.wire import varint
 
 _UNKNOWN = 0xFF
-_WHOLE, _CHANGES = range(2)
 _PLAIN, _XOR = range(2)
 Cells = npt.NDArray[np.uint8]
 
@@ -44,10 +40,6 @@ class _Grid(NamedTuple):
     cells: Cells
     tail: bytes
     place: tuple[int, int] | None
-
-    @property
-    def message(self) -> bytes:
-        return self.head + self.cells.tobytes() + self.tail
 
 
 @dataclass(frozen=True)
@@ -67,82 +59,44 @@ class GridCodec:
         return GRID
 
 
-class GridEncoder:
+class GridEncoder(ChangesEncoder[_Grid]):
     """Maps to frames."""
 
     def __init__(self) -> None:
-        self._packer = Packer()
-        self._sent: OrderedDict[int, _Grid] = OrderedDict()
-        self._base: int | None = None
-        """The newest grid that was confirmed, by name."""
+        super().__init__(Packer())
 
-    def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:  # noqa: ARG002
-        grid = _split(message)
-        coded = frame(_WHOLE, self._packer.pack(message))
-        if key:
-            self._sent.clear()
-            self._base = None
-        elif self._base is not None and self._base in self._sent:  # others hold the newest ``KEPT`` that they got
-            changes = self._changes(self._base, self._sent[self._base], grid)
-            coded = changes if len(changes.data) < len(coded.data) else coded
-        keep(self._sent, coded.name, grid)
-        return coded
+    def _read(self, message: bytes) -> _Grid:
+        return _split(message)
 
-    def confirmed(self, name: int) -> None:
-        if name in self._sent:
-            self._base = name
-            while next(iter(self._sent)) != name:
-                self._sent.popitem(last=False)
-
-    def _changes(self, name: int, base: _Grid, grid: _Grid) -> Coded:
-        height, width = grid.cells.shape
-        dx, dy = (base.place[0] - grid.place[0], base.place[1] - grid.place[1]) if base.place and grid.place else (0, 0)
+    def _changes(self, base: _Grid, read: _Grid) -> bytes:
+        height, width = read.cells.shape
+        dx, dy = (base.place[0] - read.place[0], base.place[1] - read.place[1]) if base.place and read.place else (0, 0)
         if max(abs(dx), abs(dy)) >= 1 << 31:
             dx = dy = 0
         expected = _moved(base.cells, width, height, dx, dy)
-        changed = expected != grid.cells
+        changed = expected != read.cells
         rows, columns = np.flatnonzero(changed.any(1)), np.flatnonzero(changed.any(0))
         top, bottom = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)
         left, right = (int(columns[0]), int(columns[-1]) + 1) if len(rows) else (0, 0)
-        box = grid.cells[top:bottom, left:right]
-        head = _xor(grid.head, base.head)
+        box = read.cells[top:bottom, left:right]
+        head = _xor(read.head, base.head)
         forms = {_PLAIN: box, _XOR: box ^ expected[top:bottom, left:right]}
-        packed = {way: self._packer.pack(head + grid.tail + cells.tobytes()) for way, cells in forms.items()}
+        packed = {way: self._packer.pack(head + read.tail + cells.tobytes()) for way, cells in forms.items()}
         way = min(packed, key=lambda way: len(packed[way]))
-        shape = (width, height, _folded(dx), _folded(dy), way, left, top, right - left, len(head), len(grid.tail))
-        return frame(_CHANGES, b"".join(map(varint, shape)) + packed[way], name)
+        shape = (width, height, _folded(dx), _folded(dy), way, left, top, right - left, len(head), len(read.tail))
+        return b"".join(map(varint, shape)) + packed[way]
 
 
-class GridDecoder:
+class GridDecoder(ChangesDecoder[_Grid]):
     """Frames back to messages."""
 
-    def __init__(self, max_size: int) -> None:
-        self._packer, self._max_size = Packer(), max_size
-        self._held: OrderedDict[int, _Grid] = OrderedDict()
+    def _read(self, message: bytes) -> _Grid:
+        return _split(message)
 
-    @property
-    def held(self) -> int:
-        """Bytes in use."""
-        return sum(grid.cells.size for grid in self._held.values())
+    def _size(self, read: _Grid) -> int:
+        return read.cells.size
 
-    def decode(self, data: bytes) -> bytes:
-        form, before, body = opened(data)
-        if form > _CHANGES or (form == _CHANGES) != (before is not None):
-            raise DamagedError(f"damaged grid: no form {form}")
-        if before is None:
-            message = self._packer.unpack(body, self._max_size)
-            grid = _split(message)
-        else:
-            base = self._held.get(before)
-            if base is None:
-                raise MissingFrameError("grid: the grid that this one changes was not decoded here")
-            grid = self._changed(body, base)
-            message = grid.message
-            grid = _split(message)  # which also checks that it is one
-        keep(self._held, name_of(data), grid)
-        return message
-
-    def _changed(self, body: bytes, base: _Grid) -> _Grid:
+    def _changed(self, body: bytes, base: _Grid) -> bytes:
         shape, rest = [], body
         for _ in range(10):
             value, at = read_varint(rest)
@@ -161,7 +115,7 @@ class GridDecoder:
         part = cells[top : top + down, left : left + across]
         new = np.frombuffer(box, np.uint8).reshape(down, across)
         part[...] = part ^ new if way == _XOR else new
-        return _Grid(_xor(parts[:head_size], base.head), cells, parts[head_size:], None)
+        return _xor(parts[:head_size], base.head) + cells.tobytes() + parts[head_size:]
 
 
 def updated(message: bytes, update: bytes) -> bytes:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.codecs import CodedTopic
-from gr_ros2.codecs.base import KEPT
+from gr_ros2.codecs.changes import KEPT
 from gr_ros2.codecs.grid import updated
 from gr_ros2.codecs.messages import GRID, GRID_UPDATE, read
 from gr_ros2.core.errors import DamagedError, MissingFrameError
