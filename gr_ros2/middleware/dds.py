@@ -25,21 +25,14 @@ from gr_ros2.middleware.cdr_dds import (
     RawReader,
     RawWriter,
     create_topic,
-    delete,
     guid,
 )
 from gr_ros2.middleware.dds_domains import POOL
 from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
 from gr_ros2.middleware.dds_events import DdsEvents
 from gr_ros2.middleware.dds_found import FoundEndpoints
-from gr_ros2.middleware.dds_services import DdsClient, DdsServer, ServiceParticipant
-from gr_ros2.middleware.services import (
-    SERVICE_QOS,
-    ReplyCallback,
-    RequestCallback,
-    ServerCallback,
-    Witness,
-)
+from gr_ros2.middleware.dds_services import DdsClient, DdsPairs, DdsServer, ServiceParticipant
+from gr_ros2.middleware.services import ReplyCallback, RequestCallback, ServerCallback, Witness
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import normalize_type
 
@@ -80,17 +73,15 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         self._closing = threading.Lock()
         self._lock = threading.Lock()  # for the tables below; held only briefly, never during a callback
         self._announcing = threading.Lock()
-        self._offering = threading.Lock()  # for the servers
         self._topics: dict[tuple[str, str], Entity] = {}
         self._subscriptions: list[DdsSubscription] = []
         self._advertised: list[DdsPublisher] = []
-        self._pairs: list[DdsServer | DdsClient] = []
-        self._servers: list[DdsServer] = []
         self._participant = POOL.join(self.domain_id, options, ros_graph.PARTICIPANT_USER_DATA)
         try:
             self._guid = guid(self._participant)
             self._others = FoundEndpoints(self._guid)
             self._events = DdsEvents(self._participant)
+            self.pairs = DdsPairs(self, self._participant, self._events, self._others)
             for publishers in (True, False):
                 watch = EndpointWatch(self._participant, publishers=publishers)
                 changed = partial(self._graph_changed, watch, publishers=publishers)
@@ -140,9 +131,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
     def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> DdsServer:
         self._check_open(f"serve {service}")
         server = DdsServer(self, ros_graph.check_topic(service), type_name, on_request, node)
-        with self._offering:
-            self._servers.append(server)
-            server.offer(on=self._others.takes_replies())
+        self.pairs.add(server)
         return server
 
     def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> DdsClient:
@@ -207,56 +196,15 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             endpoint.writer.delete()
         self.announce()
 
-    def make_pair(self, end: DdsServer | DdsClient) -> None:
-        names = ros_graph.dds_service(end.name, end.type_name)
-        topics = [create_topic(self._participant, *name) for name in names]
-        data = [ros_graph.endpoint_user_data(self._others.hash_of(name)) + end.mark for _, name in names]
-        # Writers are first, the spare ones before all: no client of Fast DDS finds as many writers as readers.
-        writes = topics[end.writes], SERVICE_QOS
-        spare = [RawWriter(self._participant, *writes, b"") for _ in range(end.spare_writers)]
-        writer = RawWriter(self._participant, *writes, data[end.writes])
-        reader = RawReader(self._participant, topics[end.reads], SERVICE_QOS, data[end.reads])
-        for topic in topics:
-            delete(topic)  # it lives on in its endpoints
-        writer.watch_matches()
-        reader.watch_matches()
-        end.reader, end.writers = reader, (writer, *spare)
-        with self._lock:
-            self._pairs.append(end)
-        self._events.attach(reader.entity, (reader.entity, reader.condition, writer.entity), end.service)
-        self.announce()
-
-    def drop_pair(self, end: DdsServer | DdsClient) -> None:
-        if self._closed:
-            return
-        with self._lock:
-            if end not in self._pairs:
-                return
-            self._pairs.remove(end)
-        self._events.detach(end.reader.entity)
-        end.reader.delete()
-        for writer in end.writers:
-            writer.delete()
-        self.announce()
-
-    def forget_server(self, server: DdsServer) -> None:
-        with self._offering:
-            if server in self._servers:
-                self._servers.remove(server)
-
     def announce(self) -> None:
         with self._announcing:
             with self._lock:
                 readers = [reader.guid for subscription in self._subscriptions for reader in subscription.readers()]
                 writers = [publisher.writer.guid for publisher in self._advertised]
-                own = [end for end in self._pairs if not end.node]
-                readers += [end.reader.guid for end in own]
-                writers += [end.writers[0].guid for end in own]
-                nodes = [ros_graph.NodeEntities(*self._node, readers, writers)]
-                for name in sorted({end.node for end in self._pairs if end.node}):
-                    ends = [end for end in self._pairs if end.node == name]
-                    guids = [end.reader.guid for end in ends], [end.writers[0].guid for end in ends]
-                    nodes.append(ros_graph.NodeEntities(*_split(name), *guids))
+            pairs = self.pairs.nodes()
+            own_readers, own_writers = pairs.pop("", ([], []))
+            nodes = [ros_graph.NodeEntities(*self._node, readers + own_readers, writers + own_writers)]
+            nodes += [ros_graph.NodeEntities(*_split(name), *guids) for name, guids in sorted(pairs.items())]
             info = ros_graph.participant_entities_info(self._guid, nodes, gid_bytes=self._gid_bytes)
             try:
                 self._discovery.write(info)
@@ -301,9 +249,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             self._gid_bytes = 16
             self.announce()
         if ros_graph.DISCOVERY_TOPIC in changed:
-            with self._offering:
-                for server in self._servers:
-                    server.offer(on=self._others.takes_replies())
+            self.pairs.look()
         if publishers:
             with self._lock:
                 affected = [s for s in self._subscriptions if ros_graph.dds_topic(s.topic) in changed]

@@ -22,9 +22,21 @@ from abc import abstractmethod
 from collections.abc import Hashable
 
 from gr_ros2.core.errors import MiddlewareError
-from gr_ros2.middleware.cdr_dds import DdsError, DiscoveredEndpoint, RawReader, RawWriter
+from gr_ros2.middleware import ros_graph
+from gr_ros2.middleware.cdr_dds import (
+    DdsError,
+    DiscoveredEndpoint,
+    Entity,
+    RawReader,
+    RawWriter,
+    create_topic,
+    delete,
+)
+from gr_ros2.middleware.dds_events import DdsEvents
+from gr_ros2.middleware.dds_found import FoundEndpoints
 from gr_ros2.middleware.services import (
     OTHER_RMW,
+    SERVICE_QOS,
     ReplyCallback,
     RequestCallback,
     ServerCallback,
@@ -65,17 +77,91 @@ class ServiceParticipant(ServiceGraph):
         """GUID of the participant."""
 
     @abstractmethod
-    def make_pair(self, end: DdsServer | DdsClient) -> None:
-        """Set the endpoints of a server or a client. From then on, ``end.service`` is called when something arrives or
-        matches change."""
+    def announce(self) -> None:
+        """Announce to the graph which endpoints belong to this node."""
 
-    @abstractmethod
-    def drop_pair(self, end: DdsServer | DdsClient) -> None:
-        """Delete the endpoints of a server or a client, where it has any."""
+    pairs: DdsPairs
+    """The endpoints of its servers and clients."""
 
-    @abstractmethod
-    def forget_server(self, server: DdsServer) -> None:
+
+class DdsPairs:
+    """The servers and clients of a participant, each with a reader and a writer on the DDS.
+
+    :param entity: the participant
+    :param events: calls ``service`` of a server or client when something arrives, or matches change
+    :param others: what others have on the domain
+    """
+
+    def __init__(
+        self, participant: ServiceParticipant, entity: Entity, events: DdsEvents, others: FoundEndpoints
+    ) -> None:
+        self._participant, self._entity, self._events, self._others = participant, entity, events, others
+        self._lock = threading.Lock()  # for the pairs
+        self._pairs: list[DdsServer | DdsClient] = []
+        self._offering = threading.Lock()  # for the servers
+        self._servers: list[DdsServer] = []
+
+    def add(self, server: DdsServer) -> None:
+        """A new server, which is offered as long as somebody can call it."""
+        with self._offering:
+            self._servers.append(server)
+            server.offer(on=self._others.takes_replies())
+
+    def forget(self, server: DdsServer) -> None:
         """The server is closed: it is not offered any more."""
+        with self._offering:
+            if server in self._servers:
+                self._servers.remove(server)
+
+    def look(self) -> None:
+        """Others have come or gone: offer the servers, or take them off the graph."""
+        with self._offering:
+            for server in self._servers:
+                server.offer(on=self._others.takes_replies())
+
+    def make(self, end: DdsServer | DdsClient) -> None:
+        """Set the endpoints of a server or a client."""
+        names = ros_graph.dds_service(end.name, end.type_name)
+        topics = [create_topic(self._entity, *name) for name in names]
+        data = [ros_graph.endpoint_user_data(self._others.hash_of(name)) + end.mark for _, name in names]
+        # Writers are first, the spare ones before all: no client of Fast DDS finds as many writers as readers.
+        writes = topics[end.writes], SERVICE_QOS
+        spare = [RawWriter(self._entity, *writes, b"") for _ in range(end.spare_writers)]
+        writer = RawWriter(self._entity, *writes, data[end.writes])
+        reader = RawReader(self._entity, topics[end.reads], SERVICE_QOS, data[end.reads])
+        for topic in topics:
+            delete(topic)  # it lives on in its endpoints
+        writer.watch_matches()
+        reader.watch_matches()
+        end.reader, end.writers = reader, (writer, *spare)
+        with self._lock:
+            self._pairs.append(end)
+        self._events.attach(reader.entity, (reader.entity, reader.condition, writer.entity), end.service)
+        self._participant.announce()
+
+    def drop(self, end: DdsServer | DdsClient) -> None:
+        """Delete the endpoints of a server or a client, where it has any."""
+        if self._participant.closed:
+            return
+        with self._lock:
+            if end not in self._pairs:
+                return
+            self._pairs.remove(end)
+        self._events.detach(end.reader.entity)
+        end.reader.delete()
+        for writer in end.writers:
+            writer.delete()
+        self._participant.announce()
+
+    def nodes(self) -> dict[str, tuple[list[bytes], list[bytes]]]:
+        """GUIDs of all readers and writers, by the node that has them; '' is the participant's own."""
+        found: dict[str, tuple[list[bytes], list[bytes]]] = {}
+        with self._lock:
+            for end in self._pairs:
+                readers, writers = found.setdefault(end.node, ([], []))
+                readers.append(end.reader.guid)
+                writers.append(end.writers[0].guid)
+        return found
 
 
 class _DdsEnd:
@@ -118,7 +204,7 @@ class _DdsEnd:
             self._closed = True
             with self._calling:  # a callback in progress ends first, unless this call comes from it
                 pass
-            self._participant.drop_pair(self)  # type: ignore[arg-type]
+            self._participant.pairs.drop(self)  # type: ignore[arg-type]
 
 
 class DdsServer(_DdsEnd, ServiceServer):
@@ -141,11 +227,11 @@ class DdsServer(_DdsEnd, ServiceServer):
                 return
             self._offered = on
             if on:
-                self._participant.make_pair(self)
+                self._participant.pairs.make(self)
             else:
                 text = f"{self.name} and all other services: not offered, since every node here {OTHER_RMW}"
                 self._participant.count_once(f"not_offered:{self.name}", text, alike=True)
-                self._participant.drop_pair(self)
+                self._participant.pairs.drop(self)
 
     def service(self) -> None:
         """Take requests. Called by the participant's thread."""
@@ -173,7 +259,7 @@ class DdsServer(_DdsEnd, ServiceServer):
         self._write(self.writers[0], client, payload, "reply of")
 
     def close(self) -> None:
-        self._participant.forget_server(self)
+        self._participant.pairs.forget(self)
         self._close()
 
 
@@ -195,7 +281,7 @@ class DdsClient(_DdsEnd, ServiceClient):
         self._on_reply, self._on_server = on_reply, on_server
         self._name = os.urandom(_NAME)
         self._available = False
-        participant.make_pair(self)
+        participant.pairs.make(self)
         self.service()  # there may be matches already
 
     def service(self) -> None:
