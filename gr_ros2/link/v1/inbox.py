@@ -1,41 +1,35 @@
-"""The receiving side for one robot: it turns packets into messages.
+"""The receiving side for one robot: it turns packets into the contents of packets, those that repairs recover too.
 
-Which messages wait for an earlier one says ``order``, which for the table of topics says ``announced``, which are
-delivered says ``delivery``, and when the sender is told what has arrived says ``reports``. Messages of topics without
-reliable publishers are delivered as they arrive, but never after a later message of the same topic.
+What becomes of their messages says ``arriving``, and when the sender is told what has arrived says ``reports``.
 
-Invariants: no message is delivered twice, or after a later message of its topic; every message of which a part arrived
-ends in one Delivered or Lost; memory is bounded.
+Invariants: no packet is taken twice; memory is bounded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from math import inf
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-from gr_ros2.core.errors import CodecError, PadError, WireError
-from gr_ros2.link.events import Announced, Delivered, Lost
-from gr_ros2.link.fates import FATES, Fate
+from gr_ros2.core.errors import PadError, WireError
+from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.announced import ARRIVING_S, AnnouncedTopics
+from gr_ros2.link.v1.arriving import ArrivingMessages, Passing
 from gr_ros2.link.v1.decoder import MOST_EQUATIONS, RepairDecoder
-from gr_ros2.link.v1.delivery import UNKNOWN_S, DeliveryRules, for_all_in_order, passed_over
+from gr_ros2.link.v1.delivery import DeliveryRules
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready, nobody
 from gr_ros2.link.v1.outcomes import Outcomes
-from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
+from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
-from gr_ros2.wire.control import MAP, Control, Waited
+from gr_ros2.wire.control import MAP, Control
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import CARRIED_TOPIC, SPAN, TABLE_TOPIC, EntryV1, Part, read_body
+from gr_ros2.wire.v1 import SPAN, TABLE_TOPIC, EntryV1, read_body
 
 _PACKET_COST, _EQUATION_COST = 250, 350
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
 of the list of gaps)."""
-_INCOMPLETE_S = 60.0
-"""s that an incomplete message waits for its next fragment, unless its sender repairs it until it is here."""
 
 
 class Bounds(NamedTuple):
@@ -65,35 +59,6 @@ class Bounds(NamedTuple):
         return cls(span, equations, most // 4, most // 8, most // 8)
 
 
-def _waited(entries: Sequence[EntryV1]) -> Waited | None:
-    """What a packet tells, behind its messages, of how long these have waited."""
-    for entry in reversed(entries):
-        if isinstance(entry, Part):
-            return None
-        if isinstance(entry, Waited):
-            return entry
-    return None
-
-
-class Passing(Protocol):
-    """What is told of messages that may be sent on."""
-
-    def direct(self, src_id: int, boot: int, ready: Ready, now: float) -> None:
-        """A message has come from the robot that made it."""
-
-    def receive(self, via: int, ready: Ready, now: float, *, withheld: bool = False) -> None:
-        """A message of another robot has come over one that is heard.
-
-        :param withheld: the packet may have been held back too long for what has to be fresh
-        """
-
-    def in_order(self, inbox: Inbox, ready: Ready, late: int) -> None:
-        """A message of a reliable topic for all has come out.
-
-        :param late: how many messages of its topic robots get that come later
-        """
-
-
 class Inbox:
     """What arrives from one start of one robot.
 
@@ -110,7 +75,7 @@ class Inbox:
     :param patience_s, brings: see :class:`gr_ros2.link.v1.order.Order`
     :ivar first: see above
     :ivar reports: what the robot is told of its packets
-    :ivar announced: its topics
+    :ivar messages: what becomes of its messages
     :ivar order: which of its messages wait for an earlier one
     :ivar deliveries: which of them are delivered
     :ivar began: when the packet that is processed began to arrive, s
@@ -137,8 +102,7 @@ class Inbox:
         self.src_id, self.boot = src_id, boot
         self.deliveries = DeliveryRules(settings, marks)
         self._room, self._settings = room, settings
-        self._control, self._relaying = control, relaying
-        self._outcomes, self._stats = outcomes, outcomes.stats
+        self._stats = outcomes.stats
         bounds = Bounds.of(settings.max_source_bytes, room)
         self.decoder = RepairDecoder(room, self._plausible, bounds.span, bounds.equations)
         self.decoder.begin(first)
@@ -164,12 +128,28 @@ class Inbox:
             if settings.shares
             else Reporter(of, self.decoder, self.order, settings)
         )
-        self.announced = AnnouncedTopics(decoder_for, bounds.unknown)
+        self.messages = ArrivingMessages(
+            of,
+            settings,
+            order=self.order,
+            announced=AnnouncedTopics(decoder_for, bounds.unknown),
+            deliveries=self.deliveries,
+            reassembly=self._reassembly,
+            reports=self.reports,
+            outcomes=outcomes,
+            control=control,
+            relaying=relaying,
+        )
         self._now = 0.0
         self._takes = False
         """Whether packets are taken that are known at once. The decoder has all of them from the first one on: whoever
         settled before the last one, as for a message of this robot that it hands on, would pass over the others'."""
         self.began = inf
+
+    @property
+    def announced(self) -> AnnouncedTopics:
+        """Its topics."""
+        return self.messages.announced
 
     @property
     def newest(self) -> int:
@@ -207,7 +187,7 @@ class Inbox:
         try:
             for found in decoder.source(number, body[: self._room]):
                 if found[0] == number:
-                    self._take(number, entries, qos, repaired=late)
+                    self.messages.take(number, entries, qos, now, self.began, repaired=late)
                 else:
                     self._recovered(found)
         finally:
@@ -257,40 +237,22 @@ class Inbox:
         """Go on without packets that have been waited for long enough."""
         self._now = now
         self._settle()
-        for partial in self._reassembly.expired(now, self._incomplete_s, self._repaired_until_here):
-            self._lose(partial, Fate.EXPIRED)
+        self.messages.expire(now)
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do."""
-        ordered, waiting = self.order.next_timeout(), self._reassembly.next_timeout()
-        if waiting is None:
-            return ordered
-        waiting += self._incomplete_s
-        return waiting if ordered is None else min(ordered, waiting)
-
-    @property
-    def _incomplete_s(self) -> float:
-        return _INCOMPLETE_S * self._settings.slower
-
-    def _repaired_until_here(self, partial: PartialMessage) -> bool:
-        if partial.topic_id > TABLE_TOPIC:  # of another robot
-            return self.order.told and self.order.wanted <= partial.newest[0]
-        topic = self.announced.topics.get(partial.topic_id)
-        return self.order.told and topic is not None and topic.reliable
+        times = self.order.next_timeout(), self.messages.next_expiry()
+        return min((at for at in times if at is not None), default=None)
 
     def ended(self, now: float) -> None:
         """The sender has started again: no packet of this start comes any more, so nothing waits for one."""
         self._now = now
-        self._release(self.order.without(()))
+        self.messages.release(self.order.without(()), now)
         self.close(Fate.SENDER_RESTARTED)
 
     def close(self, reason: Fate) -> None:
         """Give up everything that is not delivered."""
-        for partial in self._reassembly.clear():
-            self._lose(partial, reason)
-        self._give_up(self.order.without(()), reason)
-        for ready in self.announced.waiting():
-            self._give_up([ready], self.announced.unknown(ready))
+        self.messages.close(reason)
 
     def lacks(self, mark: tuple[int, int], number: int, now: float) -> bool:
         """Whether a latched message or the table, named in a hello at a packet number, is neither here, nor a newer one
@@ -307,14 +269,7 @@ class Inbox:
     def _settle(self) -> None:
         """Deliver the messages that waited for what is here or given up now."""
         if not self._takes and (due := self.order.settle(self._now)):
-            self._release(due)
-
-    def _release(self, due: Iterable[Ready]) -> None:
-        for ready in due:
-            if ready.topic_id == CARRIED_TOPIC:
-                self._of_another(ready)
-            else:
-                self._deliver(ready, self.announced.topics[ready.topic_id])
+            self.messages.release(due, self._now)
 
     def _plausible(self, body: bytes) -> bool:
         try:
@@ -348,115 +303,13 @@ class Inbox:
 
     def _recovered(self, found: tuple[int, bytes]) -> None:
         number, body = found
-        self._take(number, read_body(body, self._room), -1, repaired=True)
-
-    def _take(self, number: int, entries: Sequence[EntryV1], qos: int, *, repaired: bool) -> None:
-        """Process the entries of a packet that is known now."""
-        self.order.contents.learn(number)
-        repaired_s = self._repaired_s(entries) if repaired else inf
-        waited = _waited(entries)
-        for place, entry in enumerate(entries):
-            if not isinstance(entry, Part):
-                self._control(entry)
-                continue
-            waited_s = 0.0 if waited is None else min(waited.age_s(place), UNKNOWN_S)
-            topic = self.announced.topics.get(entry.topic_id)
-            if topic is None or topic.reliable or topic.latched:
-                self.reports.confirms = True
-            if entry.whole:
-                ready = Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired)
-                self._arrived(ready, repaired_s, waited_s)
-            else:
-                self._fragment(entry, number, place, qos, repaired=repaired, waited_s=waited_s)
-
-    def _fragment(self, part: Part, number: int, place: int, qos: int, *, repaired: bool, waited_s: float) -> None:
-        if (number, place) < self.deliveries.newest.get(part.topic_id, (0, 0)) or number < part.back:
-            self._stats.dropped["overtaken"] += 1
-            return
-        made = self.deliveries.made(number, self.began, repaired=repaired) - waited_s if waited_s else inf
-        whole = self._reassembly.add(part, number, place, repaired=repaired, now=self._now, made=made)
-        for partial in self._reassembly.overflowing():
-            self._lose(partial, Fate.MEMORY)
-        if whole is None:
-            return
-        payload = whole.payload()
-        if payload is None:
-            self._lose(whole, Fate.DAMAGED)
-            return
-        ready = Ready(whole.topic_id, whole.order, payload, qos, whole.coded, whole.repaired)
-        ready.made = whole.made
-        self._arrived(ready)
-
-    def _repaired_s(self, entries: Iterable[EntryV1]) -> float:
-        """s for which the sender repairs a packet: as long as one of its messages is of use."""
-        rows = (self.announced.topics.get(entry.topic_id) for entry in entries if isinstance(entry, Part))
-        return max((inf if row is None else row.deadline_s or inf for row in rows), default=inf)
-
-    def _arrived(self, ready: Ready, repaired_s: float = inf, waited_s: float = 0.0) -> None:
-        """A message is complete.
-
-        :param repaired_s: s for which its sender repairs the packet that brought it
-        :param waited_s: s for which it had waited at its sender when that packet left
-        """
-        topic = self.announced.topics.get(ready.topic_id)
-        if repaired_s < inf and topic is not None and repaired_s > self.deliveries.deadline_s(topic):
-            repaired_s = inf
-        left = self.deliveries.made(ready.order[0], self.began, repaired_s, repaired=ready.repaired)
-        ready.made = min(ready.made, left - waited_s)
-        if ready.topic_id > TABLE_TOPIC:
-            if ready.topic_id == CARRIED_TOPIC and ready.order[0] > self.order.low:
-                self.order.wait(ready, self._now)
-            else:
-                self._of_another(ready)
-            return
-        if ready.topic_id == TABLE_TOPIC:
-            self.announced.newest = max(ready.order[0], self.announced.newest[0]), self._now
-            self._table(ready.payload, ready.order)
-        if self._relaying is not None:
-            if ready.topic_id == TABLE_TOPIC:
-                ready.payload = self.announced.table
-            self._relaying.direct(self.src_id, self.boot, ready, self._now)
-        if ready.topic_id != TABLE_TOPIC:
-            self._known(ready)
-
-    def _known(self, ready: Ready) -> None:
-        """Deliver a message as soon as its topic is known. One of a reliable topic waits for those before it, unless
-        robots that kept all of them have handed it on."""
-        topic = self.announced.topic_of(ready)
-        if topic is None:
-            self._await_table(ready)
-        elif not topic.reliable or ready.carried or self.order.passes(ready):
-            self._deliver(ready, topic)
-        else:
-            self.order.wait(ready, self._now)
-
-    def _await_table(self, ready: Ready) -> None:
-        for lost in self.announced.wait(ready):
-            self._give_up([lost], self.announced.unknown(lost))
-
-    def _of_another(self, ready: Ready) -> None:
-        """A message of another robot."""
-        if self._relaying is None:
-            self._stats.dropped["relayed"] += 1
-            return
-        ready.sealed = self.deliveries.sealed(ready)
-        withheld = self._now - ready.sealed > self.deliveries.withheld_s
-        self._relaying.receive(self.src_id, ready, self._now, withheld=withheld)
+        entries = read_body(body, self._room)
+        self.messages.take(number, entries, -1, self._now, self.began, repaired=True)
 
     def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""
         self._now = now
-        if ready.topic_id == TABLE_TOPIC:
-            self._table(ready.payload, ready.order, direct=False)
-        else:
-            if not self.deliveries.came_over(ready) and not self.order.told_again(ready):
-                self._stats.repeats += 1
-                return
-            topic = self.announced.topics.get(ready.topic_id)
-            begins = topic is not None and topic.latched and ready.topic_id not in self.deliveries.newest
-            if begins or (topic is not None and not for_all_in_order(topic)):
-                ready.after = (0, 0)  # it follows whatever is here
-            self._known(ready)
+        self.messages.over_another(ready, now)
         self._settle()
 
     def up_to(self, topic: AnnouncedTopic) -> tuple[int, int] | None:
@@ -470,74 +323,9 @@ class Inbox:
 
         :return: whether none of that is left
         """
-        self._give_up(self.order.beyond(number), Fate.DAMAGED)
+        self.messages.give_up(self.order.beyond(number), Fate.DAMAGED)
         return self.deliveries.overrule(number, self.began)
 
     def adopt(self, far: Inbox) -> None:
         """Go on from what has come of this start over other robots."""
-        self.deliveries.adopt(far.deliveries)
-        self.order.reached.update(far.order.reached)
-        self.order.passed_on.update(far.order.passed_on)
-        for ready in far.order.without(()):
-            self.order.wait(ready, self._now)
-        if not self.announced.topics:
-            self.announced = far.announced
-        for ready in far.announced.waiting():
-            self._known(ready)
-
-    def _deliver(self, ready: Ready, topic: AnnouncedTopic) -> None:
-        refusal = self.deliveries.refusal(ready, topic, self._now)
-        if refusal is not None:
-            self._give_up([ready], refusal)
-            return
-        new = self.deliveries.takes(ready, topic, self._now)
-        for partial in self._reassembly.overtaken(ready.topic_id, ready.order[0]):
-            self._lose(partial, passed_over(topic))
-        if not new:
-            self._stats.repeats += 1
-            return
-        if self._relaying is not None and for_all_in_order(topic) and not ready.carried:
-            self.order.reached[ready.topic_id] = ready.order
-            self._relaying.in_order(self, ready, max(topic.depth, 1) * topic.latched)
-        try:
-            payload = self.announced.decode(ready) if ready.coded else ready.payload
-        except CodecError as error:
-            self._give_up([ready], FATES[error.fate])
-            return
-        qos = ready.qos if ready.qos >= 0 else topic.qos
-        key = Key(self.boot, ready.order[0], ready.order[1])
-        self._outcomes.delivered(
-            Delivered(
-                self.src_id,
-                ready.topic_id,
-                payload,
-                qos,
-                key,
-                ready.repaired,
-                ready.hops,
-                ready.over,
-                self._now - ready.made,
-            )
-        )
-
-    def _table(self, payload: bytes, order: tuple[int, int], *, direct: bool = True) -> None:
-        try:
-            topics = self.announced.take(payload, order, direct=direct)
-        except WireError:
-            self._stats.dropped["bad_table"] += 1
-            return
-        if topics is None:
-            return
-        for ready in self.order.without({*self.announced.topics, CARRIED_TOPIC}):
-            self._await_table(ready)  # its topic is not offered any more
-        self._outcomes.events.append(Announced(self.src_id, topics))
-        for ready in self.announced.waiting():
-            self._known(ready)
-
-    def _lose(self, partial: PartialMessage, reason: Fate) -> None:
-        key = Key(self.boot, partial.begin, partial.place)
-        self._outcomes.lost(Lost(self.src_id, partial.topic_id, reason, key))
-
-    def _give_up(self, messages: Iterable[Ready], reason: Fate) -> None:
-        for ready in messages:
-            self._outcomes.lost(Lost(self.src_id, ready.topic_id, reason, Key(self.boot, *ready.order)))
+        self.messages.adopt(far.messages, self._now)

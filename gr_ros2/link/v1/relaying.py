@@ -25,6 +25,7 @@ from math import inf
 
 from gr_ros2.core.errors import WireError
 from gr_ros2.link.message_codec import FRAME
+from gr_ros2.link.v1.arriving import ArrivingMessages
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.delivery import UNKNOWN_S, for_all_in_order
 from gr_ros2.link.v1.far import FarRobots
@@ -157,18 +158,18 @@ class Relaying:
         if now <= (until := ready.made + self._limit_s(message)):
             self.sent_on.take(src_id, ToPass(message, ready.made, until), now)
 
-    def in_order(self, inbox: Inbox, ready: Ready, late: int) -> None:
+    def in_order(self, messages: ArrivingMessages, ready: Ready, late: int) -> None:
         """A message of a reliable topic for all has come out: it is kept for those who do not hear its origin."""
         if ready.payload[:1] == FRAME and ready.coded:
             return
-        (number, place), after = ready.order, inbox.order.before(ready)
-        inbox.order.passed_on[ready.topic_id] = ready.order
-        origin, start = inbox.src_id, inbox.boot & 0xFFFF
+        (number, place), after = ready.order, messages.order.before(ready)
+        messages.order.passed_on[ready.topic_id] = ready.order
+        origin, start = messages.src_id, messages.boot & 0xFFFF
         message = Relayed(
             origin, start, number, place, ready.topic_id, ready.hops, ready.payload, ready.coded, after=after
         )
         until = ready.made + min(self._limit_s(message), ready.limit_s)
-        via = inbox.src_id if ready.over is None else ready.over
+        via = messages.src_id if ready.over is None else ready.over
         self.sent_on.take_in_order(Kept(message, ready.made, until), via, late)
 
     def receive(self, via: int, ready: Ready, now: float, *, withheld: bool = False) -> None:

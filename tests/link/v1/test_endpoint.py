@@ -439,7 +439,8 @@ def test_an_announced_length_reserves_nothing() -> None:
     air = Air(one, two)
     air.run(1.0)
     inbox = two.end.neighbours.all.get(1).inbox  # type: ignore[union-attr]
-    inbox._take(inbox.newest, [Part(MAP, b"x", 0, MAX_MESSAGE - 1, True)], 0, repaired=False)
+    part = Part(MAP, b"x", 0, MAX_MESSAGE - 1, True)
+    inbox.messages.take(inbox.newest, [part], 0, air.now, air.now, repaired=False)
     assert 0 < inbox.held < 1000
 
 
