@@ -136,7 +136,7 @@ class Victim:
             any_length=True,
             max_sources=3,
             max_source_bytes=1 << 16,
-            turn_s=lambda: 0.02,
+            packet_s=lambda: 0.02,
         )
         self.events: list[Accepted] = []
         self.end = EndpointV1(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from fuzz.loop import main, work
 from gr_ros2.link import AirPacket
@@ -260,12 +260,11 @@ def insider(data: bytes) -> None:
             Topic(2, "goal", "std_msgs/msg/String", SendOptions(to=1)),
         ]
     )
-    settings = Settings(
-        _OWN, packet_len=PACKET_LEN, any_length=True, max_sources=3, max_source_bytes=16_384, relay=relay
-    )
     access = Slots(_OWN, _SLOT_S, random.Random(1), period_s=0.1) if relay or script.byte() & 1 else None
+    common: dict[str, Any] = {"any_length": True, "max_sources": 3, "max_source_bytes": 16_384}
+    settings = Settings(_OWN, packet_len=PACKET_LEN, access=access, relay=relay, **common)
     keys = Keys((_KEY,) if mode != "none" else (), mode)
-    end = EndpointV1(topics, settings, boot=_BOOT, keys=keys, access=access, save=lambda *_: None)
+    end = EndpointV1(topics, settings, boot=_BOOT, keys=keys, save=lambda *_: None)
     end.pace.use_credit()
     robots: dict[tuple[int, int], Robot] = {}
     now, echo = 0.0, bytes(4)

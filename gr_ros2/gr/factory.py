@@ -134,6 +134,5 @@ def make_endpoint(
         save=start.save,
         observer=observer,
         mcs_table=air.mcs_table,
-        access=air.access(robot.robot_id),
         instances=instances_of,
     )

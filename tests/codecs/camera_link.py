@@ -55,7 +55,7 @@ class Robot:
             packet_len=PACKET_LEN,
             any_length=self.any_length,
             hears=self.hears,
-            turn_s=lambda: PACKET_LEN * 8e-3 / self.kbit_s,
+            packet_s=lambda: PACKET_LEN * 8e-3 / self.kbit_s,
         )
         known = message_codec()
         self.end = EndpointV1(

@@ -47,10 +47,6 @@ _EARLY_S = 1e-6
 """s before its time at which a packet may begin: times are not exact to the last bit."""
 
 
-def _shared(settings: Settings, access: Access) -> Settings:
-    return replace(settings, shares=True, turn_s=lambda: access.turn_s)
-
-
 class EndpointV1:
     """Both directions of one robot.
 
@@ -64,7 +60,6 @@ class EndpointV1:
     :param observer: called with every SenderEvent, in order
     :param mcs_table: the rates of an adaptive rate, see :mod:`gr_ros2.link.rate`; () for a fixed rate
     :param instances: tells the instances of a topic that it sends
-    :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
     :ivar answers: whether what it receives can change what it sends
     :ivar pace: when packets may leave
     :ivar window: the packets that are worth repairing
@@ -90,11 +85,10 @@ class EndpointV1:
         save: Save | None = None,
         observer: Callable[[SenderEvent], None] | None = None,
         mcs_table: Sequence[Mcs] = (),
-        access: Access | None = None,
         instances: InstancesOf = no_instances,
     ) -> None:
-        self._access = access
-        self.settings = settings = settings if access is None else _shared(settings, access)
+        self._access = access = settings.access
+        self.settings = settings
         self.boot = boot
         self.keys = keys = keys if keys is not None else Keys()
         self.mcs_table = tuple(mcs_table)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.access import Access
 from gr_ros2.link.air import Air
 from gr_ros2.link.v1.repair import RepairMode
 from gr_ros2.settings.commands import COMMAND_TYPES
@@ -35,7 +36,7 @@ class Settings:
     :param expected_loss: share of packets that are lost, used until a report gives it
     :param hears: whether this end receives too, and reports what it hears
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
-    :param shares: whether others send on the same channel: reports are few then. An endpoint with medium access sets it
+    :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
     :param relay: whether messages of other robots are sent on
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
     :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
@@ -50,7 +51,8 @@ class Settings:
     :param deadlines: s by topic likewise, after which a message is not delivered any more, whatever its
         sender says; 0 = any time
     :param airtime_share: part of the time that this robot may send, above 0..1
-    :param turn_s: tells s from one packet of this robot to its next, where it always has one; 0 = not known
+    :param packet_s: tells s from one packet of this robot to its next, where nobody shares its channel and it always
+        has one; 0 = not known
     :param beacon_s: s without hearing any robot after which one hello leaves every so many s, and nothing else; 0 = off
     """
 
@@ -62,7 +64,7 @@ class Settings:
     expected_loss: float = 0.2
     hears: bool = True
     half_duplex: bool = False
-    shares: bool = False
+    access: Access | None = field(default=None, compare=False)
     relay: bool = False
     hold_s: float = 1.0
     max_age_s: float | Auto = AUTO
@@ -75,7 +77,7 @@ class Settings:
     commands: tuple[str, ...] = COMMAND_TYPES
     deadlines: Mapping[str, float] = field(default_factory=dict)
     airtime_share: float = 1.0
-    turn_s: Callable[[], float] = field(default=lambda: 0.0, compare=False)
+    packet_s: Callable[[], float] = field(default=lambda: 0.0, compare=False)
     beacon_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -88,6 +90,15 @@ class Settings:
                 f"beacon_s = {self.beacon_s:g}: this end never hears anybody, so it would fall silent for ever; set 0, "
                 "or run a link both ways"
             )
+
+    @property
+    def shares(self) -> bool:
+        """Whether others send on the same channel: reports are few then."""
+        return self.access is not None
+
+    def turn_s(self) -> float:
+        """s from one packet of this robot to its next, where it always has one; 0 = not known."""
+        return self.packet_s() if self.access is None else self.access.turn_s
 
     @property
     def slower(self) -> float:
@@ -116,6 +127,7 @@ def end_settings(robot: RobotConfig, air: Air, *, loops_back: bool = False) -> S
         expected_loss=robot.expected_loss,
         hears=air.hears,
         half_duplex=air.half_duplex,
+        access=air.access(robot.robot_id),
         relay=air.relay,
         hold_s=robot.hold_s,
         max_age_s=robot.max_age_s,
@@ -128,6 +140,6 @@ def end_settings(robot: RobotConfig, air: Air, *, loops_back: bool = False) -> S
         commands=robot.commands,
         deadlines={name: options.deadline_s for name, options in taken if options.deadline_s != AUTO},
         airtime_share=air.airtime_share,
-        turn_s=lambda: air.airtime_s,
+        packet_s=lambda: air.airtime_s,
         beacon_s=robot.beacon_s,
     )

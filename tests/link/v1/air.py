@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from math import inf
 from typing import Any
 
@@ -54,14 +55,22 @@ class Robot:
         **settings: Any,
     ) -> None:
         self.src_id, self.topics, self.coding = src_id, topics, coding
-        self.access = access
         self.keys = keys(mode)
-        self.settings = Settings(src_id, **{"packet_len": 64, "relay": self.relays, **settings})
+        self.settings = Settings(src_id, **{"packet_len": 64, "relay": self.relays, "access": access, **settings})
         self.stored: dict[int, tuple[int, int]] = {}
         self.save: Callable[[int, tuple[int, int]], None] = self.stored.__setitem__
         self.boot = 1000 * abs(src_id)
         self.events: list[SenderEvent | ReceiverEvent] = []
         self.start()
+
+    @property
+    def access(self) -> Access | None:
+        """What decides when it may send; another one acts from the next start on."""
+        return self.settings.access
+
+    @access.setter
+    def access(self, access: Access) -> None:
+        self.settings = replace(self.settings, access=access)
 
     def start(self, boot: int | None = None) -> None:
         """Start anew: everything but the stored state is forgotten."""
@@ -76,7 +85,6 @@ class Robot:
             heard=dict(self.stored),
             save=lambda src_id, boot, floor: self.save(src_id, (boot, floor)),
             observer=self.events.append,
-            access=self.access,
         )
         self.end.pace.use_credit()
 

@@ -13,7 +13,7 @@ CAMERA, ODOMETRY = range(2)
 @pytest.mark.parametrize("turn_s", [0.004, 0.1, 1.0])
 def test_the_rate_that_others_leave_is_a_mean_at_any_packet_length(turn_s: float) -> None:
     topics = registry(camera=SendOptions(), odom=SendOptions(queue="latest"))
-    robot = Robot(1, topics, hears=False, repair="off", turn_s=lambda: turn_s)
+    robot = Robot(1, topics, hears=False, repair="off", packet_s=lambda: turn_s)
     robot.end.frames.begin(CAMERA)
     now, free = 0.0, []
     for turn in range(600):

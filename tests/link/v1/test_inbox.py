@@ -56,7 +56,7 @@ def inbox_of(outcomes: Outcomes, relaying: Any = None, **settings: Any) -> Inbox
 @pytest.mark.parametrize(("turn_s", "waits_s"), [(0.01, 60.0), (1.0, 180.0)])
 def test_a_fragment_is_waited_for_longer_where_packets_take_long(turn_s: float, waits_s: float) -> None:
     outcomes = Outcomes()
-    inbox = inbox_of(outcomes, turn_s=lambda: turn_s)
+    inbox = inbox_of(outcomes, packet_s=lambda: turn_s)
     part = v1.Part(GOAL, b"the first half", last=False)
     inbox.source(1, v1.write_body([part], ROOM).ljust(ROOM, b"\0"), [part], 0, 1.0)
     inbox.handle_timeout(waits_s)

@@ -12,7 +12,7 @@ def test_packets_before_their_first_hello_are_kept_longer_where_packets_take_lon
     turn_s: float, later_s: float
 ) -> None:
     one = Robot(1, registry(), mode="encrypt", hears=False)
-    two = Robot(2, mode="encrypt", turn_s=lambda: turn_s)
+    two = Robot(2, mode="encrypt", packet_s=lambda: turn_s)
     sent = []
     while len(sent) < 5:  # in the first a hello, in the next ones its table
         one.end.messages.submit(1, b"scan", 0.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from math import inf
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -27,7 +29,8 @@ def reporter() -> tuple[SharedReporter, RepairDecoder, Reassembly]:
     reassembly = Reassembly(10_000)
     order = Order(decoder, 1, 1.0, sure=10_000, fits=lambda _: False, room=ROOM)
     order.told = True
-    return SharedReporter((1, 1), decoder, order, reassembly, Settings(2, shares=True)), decoder, reassembly
+    access: Any = SimpleNamespace(turn_s=0.0)
+    return SharedReporter((1, 1), decoder, order, reassembly, Settings(2, access=access)), decoder, reassembly
 
 
 def test_packets_that_nobody_repairs_are_not_reported() -> None:
