@@ -16,17 +16,15 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import Any, Protocol
 
-from gnuradio import gr
-
 from gr_ros2.core.errors import GrRos2Error
-from gr_ros2.core.guard import Guard
 from gr_ros2.gr.early import CHECK_S
 from gr_ros2.gr.failures import Failures
+from gr_ros2.gr.half import HalfBlock
 from gr_ros2.gr.latency import RECENT
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.loops import LOOP_GUARD
 from gr_ros2.gr.outputs import Outputs
-from gr_ros2.gr.readable import debug_logger, describe
+from gr_ros2.gr.readable import describe
 from gr_ros2.link import AirPacket, Delivered, Received, ReceiverEvent, Rejected
 from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import Endpoint
@@ -37,8 +35,6 @@ from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import packets_of, take_messages
-from gr_ros2.phy.threads import BlockThread
-from gr_ros2.settings.config import replaced
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.settings.robot import RobotConfig
 
@@ -61,19 +57,16 @@ class Services(Protocol):
         """Take over the topics and services that a robot announces now."""
 
 
-class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
+class ReceivingBlock(HalfBlock):
     """Reassembles packets into messages and publishes them on a ROS graph.
 
     Message port: `pdus` in (PMT pair of anything and a u8vector), with several radios also `pdus_2` and so on. The
     first message of each sender and topic creates a publisher.
 
     :param registry: the topics of other robots that announce none, with configured options
-    :param end: the robot's endpoint
-    :param graph: the robot's participant on its ROS graph, which the caller closes
+    :param end, graph, clock, bond: see :class:`HalfBlock`
     :param observer: called with every ReceiverEvent, in order; with Delivered after the message was published. An
         observer that raises is not called again
-    :param clock: s, monotonic
-    :param bond: the radios, where it receives over several
     :raises ConfigError: when it would publish what a robot of this process sends
     """
 
@@ -91,18 +84,10 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         clock: Callable[[], float] = time.monotonic,
         bond: Bond | None = None,
     ) -> None:
-        super().__init__("ros2_sink", None, None)
-        self.config, self.registry = config, registry
-        self.live, self._end = end, end.endpoint
+        super().__init__("ros2_sink", config, end, graph, observer=observer, clock=clock, bond=bond)
+        self.registry = registry
         self._calls: Services | None = None
-        self._observer = observer
-        self._guard = Guard("observer of ros2_sink")
-        self._clock = clock
-        self._log = debug_logger("gr_ros2.gr.sink", config.debug)
-        self._lock = end.lock
         self._timer_idle = False
-        self._running = False
-        self._thread = BlockThread()
         self._failures = Failures(self._log, self._lock)
         self._types: TypeSearch | None = None
         self._said: set[str] = set()
@@ -112,10 +97,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         """Packets of each robot that were taken."""
         self.handled = 0
         """Number of PDUs that this block has finished with, whatever the result."""
-        self._bond = bond
-        take_messages(self, "pdus", "_handle", 1 if bond is None else len(bond.carries), called="take")
-        self.middleware = graph
-        """The robot's participant on the ROS graph."""
+        take_messages(self, "pdus", "_handle", self.radios, called="take")
         try:
             LOOP_GUARD.add_sink(self, graph, config.publish, registry)
             self.outputs = Outputs(
@@ -183,9 +165,9 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
                 "packet_loss_est": stats.packet_loss_est,
                 "unknown_gaps": stats.unknown_gaps,
                 "message_loss_est": stats.message_loss_est,
-                "silence_s": {src_id: self._clock() - at for src_id, at in self._heard.items()},
+                "silence_s": {src_id: self.clock() - at for src_id, at in self._heard.items()},
                 "held_bytes": self._end.held_bytes,
-                "no_table": [peer.robot for peer in self._end.peers(self._clock()) if peer.no_table],
+                "no_table": [peer.robot for peer in self._end.peers(self.clock()) if peer.no_table],
                 "latency_clock": "stamp_sim" if self.config.graph.use_sim_time else "stamp_wall",
                 "middleware": dict(self.middleware.counters),
             }
@@ -201,12 +183,6 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
                 topic["delivered"] += named[name]["delivered"]
             named[name] = topic
         return {**counted, "topics": named}
-
-    def set_debug(self, debug: bool) -> None:
-        """Turn the readable log of headers, topic ids and entries on or off."""
-        with self._lock:
-            self.config = replaced(self.config, debug=debug)
-        self._log = debug_logger(self._log.name, self.config.debug)
 
     def _stop_search(self) -> None:
         if self._types is not None:
@@ -243,9 +219,9 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         with self._lock:
             for packet in packets:
                 if self._bond is None:
-                    events += self._end.receive(packet, self._clock())
+                    events += self._end.receive(packet, self.clock())
                 elif self._bond.arrive(radio, packet.data):
-                    caused = self._end.receive(packet, self._clock())
+                    caused = self._end.receive(packet, self.clock())
                     self._bond.note(caused)
                     events += caused
             if self._bond is not None and (asks := self._bond.asks()):
@@ -265,7 +241,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
                 if debug and isinstance(event, Received | Rejected):
                     self._log.debug("rx %s", describe(event, self.registry))
                 if isinstance(event, Received):
-                    self._heard[event.packet.src_id] = self._clock()
+                    self._heard[event.packet.src_id] = self.clock()
                     self._packets[event.packet.src_id] += 1
                 elif isinstance(event, Announced):
                     topics = self.outputs.take(event)
@@ -283,7 +259,7 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
 
     def _tell(self, event: ReceiverEvent) -> None:
         if self._observer is not None:
-            self._guard(self._observer.receiver_event, event, self._clock())
+            self._guard(self._observer.receiver_event, event, self.clock())
 
     def _warn(self, event: Rejected) -> None:
         """Log the first refusal of each reason."""
@@ -295,18 +271,18 @@ class ReceivingBlock(gr.basic_block):  # type: ignore[misc]
         outputs = self.outputs
         while True:
             opening = list(outputs.opening)
-            outputs.release([o for o in opening if o.early is None or o.early.ended(self._clock())])
+            outputs.release([o for o in opening if o.early is None or o.early.ended(self.clock())])
             with self._lock:
                 if not self._running:
                     return
-                events = self._end.handle_timeout(self._clock())
+                events = self._end.handle_timeout(self.clock())
                 if self._bond is not None:
                     self._bond.note(events)
                 if not events:
                     at = self._end.next_timeout()
                     if outputs.opening:
-                        at = min(self._clock() + CHECK_S, inf if at is None else at)
+                        at = min(self.clock() + CHECK_S, inf if at is None else at)
                     self._timer_idle = at is None
-                    outputs.due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self._clock()))
+                    outputs.due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self.clock()))
                     self._timer_idle = False
             self._settle(events)

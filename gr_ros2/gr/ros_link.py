@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import secrets
 import time
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -33,7 +32,7 @@ from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.mac import GUARD_S, access_of
-from gr_ros2.middleware import Middleware, join
+from gr_ros2.middleware import Middleware, joined
 from gr_ros2.phy.pdus import port_of
 from gr_ros2.settings.config import airtime_from, replaced
 from gr_ros2.settings.fields import AUTO
@@ -176,15 +175,14 @@ class RosLink(LinkBlock):
         sending = self.end = LiveEnd(lambda events: make(observer=events, calls=calls))
         if loops_back:
             self.end = LiveEnd(lambda events: make(observer=events, loops_back=True))
-        self._graph = middleware or join(config.graph, f"gr_ros2_link_{config.robot_id}")
-        self._leave = weakref.finalize(self, self._graph.close if middleware is None else lambda: None)
+        graph, self._leave = joined(self, middleware, config.graph, f"gr_ros2_link_{config.robot_id}")
         published = heard.with_options(config.publish.topics, announced=True)
         try:
-            self.source = LinkSendingBlock(config, topics, sending, self._graph, backpressure=backpressure, **common)
-            self.sink = ReceivingBlock(config, published, self.end, self._graph, **common)
+            self.source = LinkSendingBlock(config, topics, sending, graph, backpressure=backpressure, **common)
+            self.sink = ReceivingBlock(config, published, self.end, graph, **common)
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
-                self.wishes = LiveWishes(config, self.end, self.calls, self.source.found, self._graph, clock=clock)
+                self.wishes = LiveWishes(config, self.end, self.calls, self.source.found, graph, clock=clock)
         except GrRos2Error:
             self.close()
             raise

@@ -16,13 +16,11 @@ from collections.abc import Callable
 from math import inf
 from typing import Any
 
-from gnuradio import gr
-
 from gr_ros2.core.errors import GrRos2Error
-from gr_ros2.core.guard import Guard
+from gr_ros2.gr.half import HalfBlock
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.pmts import PduMaker
-from gr_ros2.gr.readable import debug_logger, describe
+from gr_ros2.gr.readable import describe
 from gr_ros2.gr.subscriptions import Subscriptions
 from gr_ros2.link import AirPacket, Ended, Refused, SenderEvent, SentPacket
 from gr_ros2.link.bond import Bond
@@ -31,7 +29,6 @@ from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
 from gr_ros2.phy.pdus import PduPort, credited, port_of, take_messages
-from gr_ros2.phy.threads import BlockThread
 from gr_ros2.settings.config import replaced
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import Registry
@@ -43,7 +40,7 @@ _BATCH = 32
 """Number of packets composed before the lock is released, so that callbacks do not wait long."""
 
 
-class SendingBlock(gr.basic_block):  # type: ignore[misc]
+class SendingBlock(HalfBlock):
     """Subscribes to topics of a ROS graph and emits their messages as packets.
 
     Message ports: `pdus` out (PMT pair of metadata ``src_id, dst_id, seq, qos, t_src_wall`` and u8vector); `credit` in,
@@ -56,13 +53,10 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
     The block takes messages from its construction on. Packets leave while the flowgraph runs. ``close`` ends both.
 
     :param registry: the topics that it may send
-    :param end: the robot's endpoint
-    :param graph: the robot's participant on its ROS graph, which the caller closes
+    :param end, graph, clock, bond: see :class:`HalfBlock`
     :param observer: called with every SenderEvent, in order, while the block's lock is held. It must not call the
         block. An observer that raises is not called again
-    :param clock: s, monotonic
     :param backpressure: holds the middleware back instead of dropping when a queue is full (bags)
-    :param bond: the radios, where it sends over several
     """
 
     _subscribes: type[Subscriptions] = Subscriptions
@@ -79,33 +73,23 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
         backpressure: bool = False,
         bond: Bond | None = None,
     ) -> None:
-        super().__init__("ros2_source", None, None)
-        self.config = config
+        super().__init__(
+            f"ros2_source {config.robot_id}", config, end, graph, observer=observer, clock=clock, bond=bond
+        )
         self.src_id = config.robot_id
         """The source id on the wire."""
         end.observer = self._observe
-        self.live, self._end = end, end.endpoint
-        self._observer = observer
-        self._guard = Guard(f"observer of ros2_source {self.src_id}")
-        self.clock = clock
         self._pdus = PduMaker()
         self._mcs = 0
         """MCS of the newest packet."""
-        self._log = debug_logger("gr_ros2.gr.source", config.debug)
-        self._lock, self._work = end.lock, end.work
-        self._running = False
-        self._thread = BlockThread()
+        self._work = end.work
         self._unread = False
         self._counters: Counter[str] = Counter()
         self.composed = self.emitted = 0
         """Number of packets composed, and number of PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
-        self._bond = bond
-        radios = 1 if bond is None else len(bond.carries)
-        self._ports = [PduPort(self, port_of("pdus", radio)) for radio in range(radios)]
-        take_messages(self, "credit", "_credit", radios, called="grant")
-        self.middleware = graph
-        """The robot's participant on the ROS graph."""
+        self._ports = [PduPort(self, port_of("pdus", radio)) for radio in range(self.radios)]
+        take_messages(self, "credit", "_credit", self.radios, called="grant")
         self._backpressure = backpressure
         self.subscriptions = self._subscribes(
             registry,
@@ -225,12 +209,6 @@ class SendingBlock(gr.basic_block):  # type: ignore[misc]
     def set_repeat_s(self, repeat_s: float) -> None:
         """Set the time between repeats of a transient-local topic, s; 0 is off."""
         self._reconfigure(repeat_s=repeat_s)
-
-    def set_debug(self, debug: bool) -> None:
-        """Turn the readable log of headers, topic ids and entries on or off."""
-        with self._lock:
-            self.config = replaced(self.config, debug=debug)
-        self._log = debug_logger(self._log.name, self.config.debug)
 
     def _reconfigure(self, **changes: Any) -> None:
         with self._lock:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gr_ros2.middleware.base import Middleware, Publisher, Qos, Subscription, TopicInfo
-from gr_ros2.middleware.graph_backends import MIDDLEWARE, GraphBackend, join, join_graph, meet
+from gr_ros2.middleware.graph_backends import MIDDLEWARE, GraphBackend, join, join_graph, joined, meet
 
 __all__ = [
     "MIDDLEWARE",
@@ -15,5 +15,6 @@ __all__ = [
     "TopicInfo",
     "join",
     "join_graph",
+    "joined",
     "meet",
 ]

@@ -6,8 +6,10 @@ other module mentions a middleware by name.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
+from weakref import finalize
 
 from gr_ros2.core.backends import Backend, BackendTable
 from gr_ros2.core.errors import ConfigError
@@ -108,6 +110,18 @@ def join(graph: GraphConfig, node_name: str) -> Middleware:
     return join_graph(
         graph.middleware, domain_id=graph.domain_id, node_name=node_name, localhost_only=graph.localhost_only
     )
+
+
+def joined(
+    owner: object, given: Middleware | None, graph: GraphConfig, node_name: str
+) -> tuple[Middleware, Callable[[], object]]:
+    """A participant for an owner, and what lets go of it: one that is given stays open, and one that is opened here is
+    closed, with its owner at the latest.
+
+    :param given: an open participant; None: opened on the graph
+    """
+    participant = given or join(graph, node_name)
+    return participant, finalize(owner, participant.close if given is None else lambda: None)
 
 
 def meet(one: Middleware, other: Middleware) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import time
-import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +12,7 @@ from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.receiving import ReceivingBlock
 from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.link.observe import LinkObserver
-from gr_ros2.middleware import Middleware, join
+from gr_ros2.middleware import Middleware, joined
 from gr_ros2.paper.factory import make_paper_endpoint
 from gr_ros2.paper.settings import PaperConfig, paper_from
 from gr_ros2.settings.config import NOBODY
@@ -48,8 +47,7 @@ class RosSource(SendingBlock):
         topics = _read(registry)
         rng = random.Random(seed)
         end = LiveEnd(lambda events: make_paper_endpoint(robot, paper, topics, rng=rng, observer=events))
-        graph = middleware or join(robot.graph, f"gr_ros2_source_{robot.robot_id}")
-        self._leave = weakref.finalize(self, graph.close if middleware is None else lambda: None)
+        graph, self._leave = joined(self, middleware, robot.graph, f"gr_ros2_source_{robot.robot_id}")
         try:
             super().__init__(robot, topics, end, graph, observer=observer, clock=clock, backpressure=backpressure)
         except GrRos2Error:
@@ -97,8 +95,7 @@ class RosSink(ReceivingBlock):
         robot, paper = _settings(registry, {"direction": "receive", **values})
         topics = _read(registry)
         end = LiveEnd(lambda events: make_paper_endpoint(robot, paper, topics, own=own, observer=events))
-        graph = middleware or join(robot.graph, "gr_ros2_sink")
-        self._leave = weakref.finalize(self, graph.close if middleware is None else lambda: None)
+        graph, self._leave = joined(self, middleware, robot.graph, "gr_ros2_sink")
         try:
             super().__init__(
                 robot, topics.with_options(robot.publish.topics), end, graph, observer=observer, clock=clock
