@@ -65,7 +65,7 @@ class Experiment:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Scenario(Experiment, Traffic, AirConfig, Reach):
+class Scenario(Reach, Experiment, Traffic, AirConfig):
     """One experiment: robots, the medium between them, what they send, and for how long."""
 
     robots: Annotated[tuple[ScenarioRobot, ...], Field(max_length=BROADCAST)]

@@ -77,7 +77,7 @@ def test_overrides_of_the_command_line_win_over_the_file_and_not_over_the_sweep(
     [
         (
             {"grid": {"channel.snr": [1]}},
-            r"cell 1 of 1 \(channel.snr=1\): .*unknown key channel.snr; known are snr_db",
+            r"cell 1 of 1 \(channel.snr=1\): .*unknown key channel.snr; known are seed, snr_db",
         ),
         (
             {"grid": {"channel.packet_loss": [0.5, 2]}},
