@@ -141,7 +141,9 @@ def test_what_a_slow_computer_does_not_take_is_dropped_and_counted(
 
                 wait_for(dropped, "bursts that are dropped")
         assert front_end.counters().passed["bursts_in"] == WAITING
-        numbers = [int(burst[0][0].real) for burst in (arrivals.take(10.0) for _ in range(WAITING)) if burst is not None]
+        numbers = [
+            int(burst[0][0].real) for burst in (arrivals.take(10.0) for _ in range(WAITING)) if burst is not None
+        ]
         assert len(numbers) == WAITING
         assert numbers == sorted(set(numbers))
         with strange_robot(address) as publisher:
