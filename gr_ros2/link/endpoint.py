@@ -255,10 +255,12 @@ class Questions(Protocol):
 
     :ivar wall_s: clock of the wall minus ``now``, s; 0 = unknown
     :ivar snr_db: returns the SNR of the newest packets of all robots, dB
+    :ivar asked_by: when each robot asked last what this one is, s
     """
 
     wall_s: float
     snr_db: Callable[[], float | None]
+    asked_by: Mapping[int, float]
 
     def introduce(self, packet_len: int, phy: int, key: int, text: str) -> None:
         """Tell those who ask what this end is.

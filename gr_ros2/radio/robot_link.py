@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from math import inf
@@ -129,9 +129,11 @@ class RobotLink(Flowgraph):
         if all(radio.phy.has_airtime for radio in radios):  # without, nothing sets a pace
             self.source.use_credit()
         told = about(config, [radio.phy for radio in radios])
+        asked_by: Mapping[int, float] = {}
         if hasattr(self.end.endpoint, "questions"):  # the paper's robots ask nothing
             introduce(self.end, told, lambda: self.radio.snr_db, self._clock())
-        self._mismatch = Mismatch(told, self.ping)
+            asked_by = self.end.endpoint.questions.asked_by
+        self._mismatch = Mismatch(told, self.ping, asked_by)
         if isinstance(graph, ServiceGraph):
             switch = TransmitSwitch(graph, self.node_name, lambda on: self.transmit(on=on))
             self._stack.callback(switch.close)

@@ -24,7 +24,7 @@ def asked(about: dict[str, Any] | None) -> tuple[Mismatch, list[int]]:
         robots.append(robot)
         return {"about": about}
 
-    return Mismatch(OWN, ask), robots
+    return Mismatch(OWN, ask, {}), robots
 
 
 def test_a_robot_that_is_set_differently_says_what_it_has() -> None:
@@ -78,3 +78,15 @@ def test_a_signal_without_packets_is_said_while_nobody_is_heard() -> None:
         "sample_rate or options, or it is somebody else (here packet_len is 96)"
     ]
     assert mismatch.lines(stats(arrived=100, energy=200), [2], LOOK_S) == [], "what comes is a packet"
+
+
+def test_an_end_that_is_asked_compares_itself_while_the_other_asks() -> None:
+    about = {**OWN, "packet_len": 64}
+    asked_by: dict[int, float] = {}
+    mismatch = Mismatch(OWN, lambda _: {"about": about}, asked_by)
+    assert mismatch.lines(stats(arrived=100), [2], 0.0) == []
+    asked_by[2] = 4.0
+    asked_by[3] = 4.0
+    line = "robot 2: packet_len is 64 there and 96 here; set the same at both ends"
+    assert mismatch.lines(stats(arrived=200), [2], LOOK_S) == [line], "robot 3 is not heard"
+    assert mismatch.lines(stats(arrived=300), [2], 4 + 4 * LOOK_S) == []

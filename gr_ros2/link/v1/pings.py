@@ -137,6 +137,7 @@ class Pings:
     :ivar wall_s: clock of the wall minus ``now``, s; 0 = unknown
     :ivar snr_db: returns the SNR of the newest packets of all robots, for PHYs that do not tell it packet by packet
     :ivar asked: what came of the questions, by robot
+    :ivar asked_by: when each robot asked last what this one is, s
     """
 
     def __init__(self, about: About | None = None, turn_s: Callable[[], float] = lambda: 0.0) -> None:
@@ -145,6 +146,7 @@ class Pings:
         self.wall_s = 0.0
         self.snr_db: Callable[[], float | None] = lambda: None
         self.asked: dict[int, RoundTrips] = {}
+        self.asked_by: dict[int, float] = {}
         self._to_ask: dict[int, bool] = {}
         self._to_answer: dict[int, _Question] = {}
         self._counts: dict[int, int] = {}
@@ -211,6 +213,8 @@ class Pings:
             return
         elif not entry.reply:
             self._counts[src_id] = self._counts.get(src_id, 0) + 1
+            if entry.wants_about:
+                self.asked_by[src_id] = now
             self._to_answer[src_id] = _Question(entry.number, now, entry.wants_about)
             self.due = min(self.due, self._not_before)
         elif src_id in self.asked:
