@@ -29,10 +29,12 @@ TABLE_FIRST = 2
 SETTLING_S = 1.0
 """s after which a latched message is named in hellos: a receiver that lacks it then has lost it, not just not received
 it yet."""
-ANSWERS, PAUSE, PAUSE_S = 3, 9, 1.0
+ANSWERS, PAUSE, PAUSE_S = 3, 10, 1.0
 """A message is sent again for robots that ask once in a pause, and up to ``ANSWERS`` times at once after a time without
-need. A pause is ``PAUSE`` times the time that the message took to leave, and ``PAUSE_S`` s at least. So those who join
-one after the other are answered at once, and forged requests take a tenth of the time at most in the long run."""
+need. A pause is ``PAUSE`` times the time that the message takes on the air, and ``PAUSE_S`` s at least. So those who
+join one after the other are answered at once, and forged requests take a tenth of the time at most in the long run.
+The time that it waits does not count: three rows of a table that waited for seconds beside a backlog were refused for
+40 s then."""
 STARTING_S = 2.0
 """s from the start during which the table is repaired even if no receiver reports; any other kept message is for so
 long beyond the time that it waited."""
@@ -82,8 +84,6 @@ class KeptMessages:
         """The rows of the table by topic id."""
         self._answers: dict[int, tuple[float, float]] = {}
         """How often messages of each topic may be sent again because somebody asks, at a time in s."""
-        self._took: dict[int, float] = {}
-        """How long the newest of them took to leave, s."""
         self._starting_until = inf
 
     def keep(self, topic: SentTopic, message: Message) -> None:
@@ -123,15 +123,20 @@ class KeptMessages:
     @property
     def table_packets(self) -> float:
         """Packets that the table of topics takes."""
-        return sum(len(kept.payload) + ENTRY for kept in self._rows.values()) / self._room
+        return self._packets(TABLE_TOPIC)
+
+    def _packets(self, topic_id: int) -> float:
+        """Packets that all take which are kept of a topic."""
+        return sum(len(kept.payload) + ENTRY for kept in self._of(topic_id)) / self._room
 
     def forget(self, topic_id: int) -> None:
         """Keep none of the messages of a topic so far."""
         self._kept.pop(topic_id, None)
 
-    def asked(self, topic_id: int, now: float, *, anew: bool = False) -> bool:
+    def asked(self, topic_id: int, now: float, interval_s: float = 0.0, *, anew: bool = False) -> bool:
         """A robot asks for the kept message of a topic; returns whether that is not too often.
 
+        :param interval_s: s from one packet of this robot to the next; 0 = not known
         :param anew: it has nothing of it. Otherwise rows of the table that wait may be those that it lacks
         """
         slow = self._settings.shares and self._settings.slower > 1
@@ -139,7 +144,7 @@ class KeptMessages:
             return True
         if not self._of(topic_id):
             return True
-        pause = max(PAUSE_S * self._settings.slower, PAUSE * self._took.get(topic_id, 0.0))
+        pause = max(PAUSE_S * self._settings.slower, PAUSE * self._packets(topic_id) * interval_s)
         left, at = self._answers.get(topic_id, (ANSWERS, now))
         left = min(left + (now - at) / pause, ANSWERS)
         if left >= 1:
@@ -239,8 +244,6 @@ class KeptMessages:
         """
         if not (of := self._of(message.topic_id)):
             return
-        if message.repeat or message.key:
-            self._took[message.topic_id] = now - message.submitted
         for kept in of:
             if kept.payload is message.payload:
                 kept.named = min(kept.named, now + SETTLING_S * self._settings.slower)

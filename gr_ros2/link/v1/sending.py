@@ -194,7 +194,7 @@ class SendingSide:
                 self._left(robot, now, ended=ended)
             case Asked(topic_ids):
                 for topic_id in topic_ids:
-                    if self._messages.kept.asked(topic_id, now):
+                    if self._messages.kept.asked(topic_id, now, self._interval):
                         self._messages.asks[topic_id] += 1
                     else:
                         self._neighbours.dropped["asked_too_often"] += 1
@@ -237,7 +237,12 @@ class SendingSide:
             self.hellos.met(now, knows=knows)
         if self.settings.shares and self.settings.slower > 1 and self._started:
             # It lacks the table, and would say so some turns later.
-            self._messages.kept.asked(TABLE_TOPIC, now, anew=True)
+            self._messages.kept.asked(TABLE_TOPIC, now, self._interval, anew=True)
+
+    @property
+    def _interval(self) -> float:
+        """s from one packet of this robot to the next, while it is busy; 0 = not known."""
+        return max(self.settings.turn_s(), self._pace.interval)
 
     def reconfigure(self, settings: Settings, now: float) -> None:
         """Use other settings from now on."""

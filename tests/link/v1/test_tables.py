@@ -10,11 +10,14 @@ from hypothesis import strategies as st
 
 from gr_ros2.link.events import Announced
 from gr_ros2.link.v1.reassembly import Reassembly
+from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import Part
+from gr_ros2.wire.v1 import TABLE_TOPIC, Part
 from tests.link.v1.air import Air, Robot, registry
+from tests.link.v1.test_ages import MODES
+from tests.link.v1.test_waits import hold_back
 
 NAMES = [f"subsystem_{n % 7}/sensor_{n}" for n in range(40)]
 DEFAULT, LATCHED = SendOptions(), SendOptions(durability="transient_local")
@@ -166,3 +169,20 @@ def test_a_peer_has_as_many_topics_as_a_person_counts() -> None:
     air.run(3.0, lambda: len(rows(two)) == 3)
     (peer,) = two.end.peers(air.now)
     assert (len(rows(two)), peer.topics) == (3, 1)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("topic_id", [TABLE_TOPIC, 0])
+def test_what_had_to_wait_for_its_turn_is_sent_again_when_it_is_asked_for(topic_id: int, mode: SealMode) -> None:
+    """Its robot is asked three times and can send nothing for long; then one comes that needs it."""
+    topics = registry(map=SendOptions(durability="transient_local"), odom=SendOptions(queue="latest"))
+    one, late = Robot(1, topics, mode=mode), Robot(3, mode=mode)
+    air = Air(one, Robot(2, mode=mode))
+    one.end.messages.submit(0, b"map", air.now)
+    air.run(5.0)
+    for _ in range(3):
+        one.end.messages.kept.asked(topic_id, air.now)
+        hold_back(one, 6.0, air.run)
+        air.run(0.5)
+    air.robots.append(late)
+    assert air.run(10.0, lambda: b"map" in late.delivered()) <= 3.0
