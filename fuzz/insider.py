@@ -194,7 +194,13 @@ def _control(script: Script, echo: bytes) -> Control:
             script.pick((_OWN, 1)), script.number(), script.byte() & 1 > 0, script.byte() & 1 > 0, script.number(), 1, 2
         ),
         lambda: About(script.number(), 1, 2, script.bytes(20)),
-        lambda: Newest(script.pick(_ROBOTS), script.byte(), script.pick(_TOPICS), script.number()),
+        lambda: Newest(
+            script.pick((*_ROBOTS, _OWN, _OWN)),
+            script.pick((_BOOT & 0xFF, script.byte())),
+            script.pick(_TOPICS),
+            script.number(),
+            script.pick((None, 0, 255)),
+        ),
         lambda: Hello(script.byte(), script.byte(), script.byte(), script.byte()),
         lambda: Waited(bytes([script.byte() for _ in range(1 + script.byte() % 4)])),
     ]

@@ -73,6 +73,17 @@ class Reported(NamedTuple):
     report: Report
 
 
+class Has(NamedTuple):
+    """A robot has all messages of a topic up to one, whoever brought them.
+
+    :param order: the packet in which that one began, and its place there
+    """
+
+    src_id: int
+    topic_id: int
+    order: tuple[int, int]
+
+
 class Asked(NamedTuple):
     """A robot lacks messages that are kept for such robots."""
 
@@ -90,4 +101,4 @@ class ProofWanted(NamedTuple):
     """A robot lacks the proof that this one hears it."""
 
 
-Fact = Taken | Early | Appeared | PeerMet | PeerLeft | Reported | Asked | Questioned | ProofWanted
+Fact = Taken | Early | Appeared | PeerMet | PeerLeft | Reported | Has | Asked | Questioned | ProofWanted

@@ -35,6 +35,8 @@ class Lifetime:
     :param chained: whether it is of use only to who has followed so far: it is not kept for those out of range
     :param fresh: whether the next message of its topic is its repair on a channel that many share
     :param keys: the instances that it speaks of
+    :param topic_id: its topic
+    :param order: the packet in which it began, and its place there
     """
 
     expires: float = inf
@@ -45,6 +47,8 @@ class Lifetime:
     fresh: bool = False
     chained: bool = False
     keys: Keys = ALL
+    topic_id: int = -1
+    order: tuple[int, int] = (0, 0)
 
     def end(self) -> None:
         """It was replaced by a newer message, or needs no repair."""

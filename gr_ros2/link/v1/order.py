@@ -205,6 +205,11 @@ class Order:
             here = (begin, place - 1) if place > 0 else (begin - 1, ALL)
         return max(here, self.reached.get(topic_id, (-1, 0)))
 
+    def ahead(self, topic_id: int) -> bool:
+        """Whether messages have come over others that began more than a report covers after the first packet that is
+        waited for: its sender does not know that it repairs them in vain."""
+        return self.reached.get(topic_id, (-1, 0))[0] > self.wanted + MAP
+
     def before(self, ready: Ready) -> tuple[int, int] | None:
         """Number and place of the message after which one that came out follows, as far as that is known."""
         since = self.all_from - 1, ALL

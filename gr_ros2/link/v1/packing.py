@@ -27,6 +27,7 @@ from gr_ros2.link.v1.freshness import RANK, Turns, value
 from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
+from gr_ros2.link.v1.order import ALL
 from gr_ros2.link.v1.sent_topics import ON_AIR, SentTopics
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.ages import AGE_STEP_S, age_code
@@ -221,6 +222,7 @@ class Packing:
                 message.begin, message.place = number - back, -1 if back else place
                 lifetime.chained = topic.coded
                 lifetime.expires, lifetime.keys = message.expires, message.keys
+                lifetime.topic_id, lifetime.order = topic_id, (message.begin, message.place if not back else ALL)
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
                 lifetime.long = len(message.payload) > self._short
                 lifetime.fresh = not (lifetime.in_order or topic.kept or topic_id > TABLE_TOPIC)

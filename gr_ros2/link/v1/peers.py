@@ -86,6 +86,8 @@ class Peer:
     """Reports of such packets in a row."""
     repairs: int = 0
     """Repairs that have left since its last report."""
+    has: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """By topic: it has all messages up to this one, as it says."""
 
     @property
     def delay(self) -> float:
@@ -279,6 +281,21 @@ class Peers:
         self._note()
         if settled:
             self._settle(peer, number - MAP, needs)
+        self._packets.retire(now)
+
+    def has(self, src_id: int, topic_id: int, order: tuple[int, int], now: float) -> None:
+        """A peer says that all messages of a topic up to one have come, over others: it needs no packet with nothing
+        else."""
+        peer, records = self.all.get(src_id), self._packets.records
+        before = (-1, 0) if peer is None else peer.has.get(topic_id, (-1, 0))
+        if peer is None or order <= before:
+            return
+        peer.has[topic_id] = order
+        for number in range(max(before[0], self._packets.oldest), order[0] + 1):
+            alive = [one for one in records[number].lifetimes if now < one.expires] if number in records else []
+            if alive and all(one.in_order and one.order <= peer.has.get(one.topic_id, (-1, 0)) for one in alive):
+                records[number].confirmed |= peer.bit
+                peer.lost.discard(number)
         self._packets.retire(now)
 
     def _settle(self, peer: Peer, number: int, needs: int) -> None:

@@ -30,6 +30,7 @@ from gr_ros2.link.v1.facts import (
     Asked,
     Early,
     Fact,
+    Has,
     PeerLeft,
     PeerMet,
     ProofWanted,
@@ -332,7 +333,9 @@ class ReceivingSide:
         if isinstance(entry, Report):
             self._reported(self._sender.src_id, entry)
         elif isinstance(entry, Newest):
-            if self.relaying is not None:
+            if entry.origin == self._settings.src_id:
+                self._has(self._sender.src_id, entry)
+            elif self.relaying is not None:
                 self.relaying.newest(self._sender.src_id, entry, self._now)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
             self._facts.append(Asked(tuple(dict.fromkeys(entry.topic_ids))))
@@ -346,6 +349,11 @@ class ReceivingSide:
         if number < 0:
             raise EntryKindError(f"a report of packet {report.number}, which was never sent")
         self._facts.append(Reported(sender, number, report))
+
+    def _has(self, sender: int, newest: Newest) -> None:
+        """A robot says which messages of this one it has."""
+        if newest.place is not None and newest.start == self._boot & 0xFF and newest.number <= self._sent.newest:
+            self._facts.append(Has(sender, newest.topic_id, (newest.number, newest.place)))
 
     def _brings(self, since: float) -> bool:
         """Whether a robot that is heard still repairs something that was missing at this time, s."""

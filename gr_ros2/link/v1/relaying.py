@@ -356,7 +356,7 @@ class Relaying:
         self.sent_on.left(message, now, self.custody.repaired_for)
 
     def tells(self, now: float) -> list[Newest]:
-        """What this robot has of others' topics, in turn: of reliable topics for all, what it does not hear itself."""
+        """What this robot has of others' topics, in turn: of reliable topics for all, what has not come directly."""
         told: list[Newest] = []
         for _ in range(TOLD):
             if not self._telling:
@@ -374,11 +374,13 @@ class Relaying:
         return told
 
     def _apart(self, now: float) -> list[Stream]:
-        """The reliable topics for all of robots that are not heard."""
+        """The reliable topics for all of robots that are not heard, or were not for long."""
         found = []
         for src_id in {*self._neighbours.all, *self.far.inboxes}:
             inbox, neighbour = self.far.present(src_id), self._neighbours.all.get(src_id)
-            if inbox is not None and not (neighbour is not None and self.gains.near(neighbour.heard, now)):
+            if inbox is not None:
+                heard = neighbour is not None and self.gains.near(neighbour.heard, now)
                 topics = [topic.topic_id for topic in inbox.announced.topics.values() if for_all_in_order(topic)]
-                found += [Stream(src_id, inbox.boot & 0xFFFF, topic_id) for topic_id in topics]
+                told = [topic_id for topic_id in topics if not heard or inbox.order.ahead(topic_id)]
+                found += [Stream(src_id, inbox.boot & 0xFFFF, topic_id) for topic_id in told]
         return found

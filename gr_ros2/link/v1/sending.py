@@ -13,7 +13,18 @@ from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import RateController
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.facts import Appeared, Asked, Fact, PeerLeft, PeerMet, ProofWanted, Questioned, Reported, Taken
+from gr_ros2.link.v1.facts import (
+    Appeared,
+    Asked,
+    Fact,
+    Has,
+    PeerLeft,
+    PeerMet,
+    ProofWanted,
+    Questioned,
+    Reported,
+    Taken,
+)
 from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.neighbours import Neighbours
@@ -182,6 +193,8 @@ class SendingSide:
                 self.urgent = self.urgent or urgent or self.reports.requests.lacking
             case Reported(robot, number, report):
                 self._reported(robot, number, report, now)
+            case Has(robot, topic_id, order):
+                self._window.peers.has(robot, topic_id, order, now)
             case Appeared(knows):
                 self._appeared(now, knows=knows)
             case PeerMet(robot, proven, wanted):

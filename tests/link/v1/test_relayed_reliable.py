@@ -111,6 +111,20 @@ def test_some_seconds_out_of_reach_cost_nothing(pattern: str, relay: bool) -> No
     assert whole(everybody, goals)
 
 
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_what_came_over_others_is_not_repaired_when_its_origin_is_heard_again(mode: SealMode) -> None:
+    """New messages would wait for it, almost as long as the two were apart."""
+    everybody = cell(mode, 0.2)
+    everybody.apart = lambda one, other: {one, other} == {0, 2}
+    goals = talk(everybody, 130)
+    everybody.apart = lambda _, __: False
+    goals += talk(everybody, 1, after=len(goals))
+    met = everybody.now
+    while not whole(everybody, goals) and everybody.now < met + 60:
+        everybody.run(0.5)
+    assert everybody.now - met < 10
+
+
 def test_a_robot_that_starts_again_takes_nothing_from_the_others() -> None:
     everybody = cell("encrypt", 0.2)
     first, other, again = everybody.robots
