@@ -25,7 +25,7 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import BackendName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.ping import check
-from gr_ros2.cli.status import OFFERS, PING, SET, STATUS, WANT, airtime_words, tables
+from gr_ros2.cli.status import MEASURE, OFFERS, PING, SET, STATUS, WANT, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.guard import Guard
@@ -190,6 +190,14 @@ class _Changes:
     changes: list[tuple[str, Any]]
 
 
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class _Measure:
+    """The robot the link to which is measured, and s for each direction; without a robot, what has come of it."""
+
+    robot: RobotId | None = None
+    for_s: int = 10
+
+
 def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
     """What clients may ask a running link, by the names of :mod:`gr_ros2.cli.status`."""
     from gr_ros2.radio.live_settings import LiveSettings
@@ -215,12 +223,19 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
             running.wishes.give_up(wish.robot, wish.topic)
         return running.wishes.wish(wish.robot, wish.topic)
 
+    def measure(asks: Any) -> dict[str, Any]:
+        asked = build(_Measure, asks, MEASURE)
+        if asked.robot is not None:
+            running.throughput.measure(asked.robot, asked.for_s)
+        return running.throughput.look()
+
     return {
         STATUS: lambda _: {**running.stats(), "findings": running.findings()},
         PING: ping,
         SET: change,
         OFFERS: offers,
         WANT: want,
+        MEASURE: measure,
     }
 
 

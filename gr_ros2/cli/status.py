@@ -18,7 +18,7 @@ from gr_ros2.cli.control_socket import request, running_programs
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.settings.files import parse_override
 
-STATUS, PING, SET, OFFERS, WANT = "status", "ping", "set", "offers", "want"
+STATUS, PING, SET, OFFERS, WANT, MEASURE = "status", "ping", "set", "offers", "want", "measure"
 """Questions to the control socket of a link."""
 _EVERY_S = 0.5
 

@@ -35,7 +35,7 @@ from gr_ros2.link.events import Gone, Met
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceClient, ServiceGraph, ServiceServer
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import CALLS_TYPE, Topic
+from gr_ros2.settings.registry import CALLS_TYPE, FILLER_TYPE, Topic
 
 DEADLINE_S = 30.0
 """s that a call waits for its reply, unless ``deadline_s`` of its service says otherwise."""
@@ -83,6 +83,10 @@ class LiveCalls:
         """The services of this robot whose server is there, by id, and its link."""
         self.on_link_call: Callable[[int, int, Request], None] = lambda _robot, _boot, _request: None
         """Called when another robot, of this start, calls the link itself; must return at once."""
+        self.link_calls: dict[int, Callable[[int, int, Request], None]] = {}
+        """The same for calls that begin with this byte."""
+        self.on_filler: Callable[[int, bytes], None] = lambda _robot, _payload: None
+        """Called with a message of a measurement (:mod:`gr_ros2.gr.throughput`); must return at once."""
         self.on_met: Callable[[int, int], None] = lambda _robot, _boot: None
         """Called when a robot of this start is heard for the first time or again; must return at once."""
         self._clients: dict[int, ServiceClient] = {}
@@ -97,9 +101,13 @@ class LiveCalls:
             self._met(event)
         elif isinstance(event, Gone):
             self._change(event.src_id, here=False)
-        elif isinstance(event, Delivered) and self._is_frame(event):
-            self._receive(event)
-            return True
+        elif isinstance(event, Delivered):
+            type_name = self._type_of(event)
+            if type_name == CALLS_TYPE:
+                self._receive(event)
+            elif type_name == FILLER_TYPE:
+                self.on_filler(event.src_id, event.payload)
+            return type_name in (CALLS_TYPE, FILLER_TYPE)
         return False
 
     def learn(self, src_id: int, topics: Sequence[Topic]) -> None:
@@ -311,10 +319,10 @@ class LiveCalls:
 
     # ---- frames
 
-    def _is_frame(self, event: Delivered) -> bool:
+    def _type_of(self, event: Delivered) -> str:
         with self._lock:
             topic = self._end.topics_of(event.src_id).get(event.topic_id)
-        return topic is not None and topic.type_name == CALLS_TYPE
+        return "" if topic is None else topic.type_name
 
     def _receive(self, event: Delivered) -> None:
         with self._lock:
@@ -322,7 +330,7 @@ class LiveCalls:
             found = self._engine.receive(sender, event.payload, self._offered, self._clock(), event.age_s)
         try:
             if isinstance(found, Request) and found.service_id == OF_LINK:
-                self.on_link_call(*sender, found)
+                self.link_calls.get(found.payload[0] if found.payload else 0, self.on_link_call)(*sender, found)
             elif isinstance(found, Answer) and callable(found.token):
                 found.token(found.payload)
             elif isinstance(found, Request):

@@ -24,6 +24,7 @@ from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.receiving import ReceivingBlock
 from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.gr.subscriptions import OpenSubscriptions
+from gr_ros2.gr.throughput import LiveThroughput
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.air import Air
 from gr_ros2.link.airtime import LEAD_S
@@ -95,6 +96,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     :ivar end: its endpoint; of a robot that receives its own packets, the one that receives
     :ivar calls: the services that cross the link; None where it goes one way, or topics leave no room for calls
     :ivar wishes: topics asked for from afar; None likewise
+    :ivar throughput: measurements of what the link carries; None likewise
     """
 
     source: SendingBlock
@@ -102,6 +104,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     end: LiveEnd[Any]
     calls: LiveCalls | None = None
     wishes: LiveWishes | None = None
+    throughput: LiveThroughput | None = None
 
     def __init__(self, config: RobotConfig, radios: int = 1) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
@@ -121,7 +124,13 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
-        for part in (self.wishes, self.calls, getattr(self, "source", None), getattr(self, "sink", None)):
+        for part in (
+            self.throughput,
+            self.wishes,
+            self.calls,
+            getattr(self, "source", None),
+            getattr(self, "sink", None),
+        ):
             if part is not None:
                 part.close()
 
@@ -183,6 +192,9 @@ class RosLink(LinkBlock):
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
                 self.wishes = LiveWishes(config, self.end, self.calls, self.source.found, graph, clock=clock)
+                self.throughput = LiveThroughput(
+                    config, self.end, self.calls, self.sink, share=air.airtime_share, clock=clock
+                )
         except GrRos2Error:
             self.close()
             raise

@@ -19,6 +19,7 @@ from typing import Any
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.watch import Watch
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
+from gr_ros2.gr.throughput import LiveThroughput
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import without_table
@@ -340,6 +341,18 @@ class RobotLink(Flowgraph):
         if self._ros.link.wishes is None:
             raise ConfigError(f"link {self.config.name}: nobody can be asked over it; that needs direction: both")
         return self._ros.link.wishes
+
+    @property
+    def throughput(self) -> LiveThroughput:
+        """Measurements of what the link carries.
+
+        :raises ConfigError: where nobody can be asked over this link
+        """
+        if self._ros.link.throughput is None:
+            raise ConfigError(
+                f"link {self.config.name}: goes one way, or has no room for calls, so nobody can be asked"
+            )
+        return self._ros.link.throughput
 
     @property
     def remark(self) -> str:

@@ -36,6 +36,9 @@ PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUD = "sensor_msgs/msg/PointCloud2"
 CALLS_TYPE = "gr_ros2/calls/Frame"
 """Type of the row in which requests and replies are sent (see :mod:`gr_ros2.calls`); no topic has this type."""
+FILLER_TYPE = "gr_ros2/throughput/Filler"
+"""Type of the row that fills the air while the link is measured (:mod:`gr_ros2.gr.throughput`); no topic has it."""
+_INTERNAL = (CALLS_TYPE, FILLER_TYPE)
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
 _FEEDBACK = re.compile(r"[A-Za-z][A-Za-z0-9_]*/action/[A-Za-z][A-Za-z0-9]*_FeedbackMessage")
@@ -137,8 +140,8 @@ class Topic:
 
     @property
     def is_topic(self) -> bool:
-        """Whether this row names a topic: neither a service nor the row of requests and replies."""
-        return self.type_name != CALLS_TYPE and not self.is_service
+        """Whether this row names a topic: neither a service, nor a row of this link's own."""
+        return self.type_name not in _INTERNAL and not self.is_service
 
 
 NewTopic = tuple[str, str, SendOptions]
@@ -315,7 +318,7 @@ def announced(told: AnnouncedTopic, options: Mapping[str, PublishOptions]) -> To
     """
     if fault := topic_fault(told.name if told.name.startswith("/") else f"/{told.name}"):
         raise ConfigError(f"malformed topic name {told.name!r}: {fault}")
-    special = told.type_name == CALLS_TYPE or is_service(told.type_name)
+    special = told.type_name in _INTERNAL or is_service(told.type_name)
     offered = build(
         SendOptions, {"durability": "transient_local" if told.latched else "volatile", "depth": told.depth or AUTO}
     )

@@ -1,0 +1,135 @@
+"""Links of several robots over UDP, each in a process of its own, of which a test asks what they count."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from unittest.mock import patch
+
+from gr_ros2.cli.main import run
+from tests.e2e.support import COMMAND
+from tests.radio.cables import free_ports
+from tests.waiting import PATIENCE_S, wait_for
+
+
+class LinkProcess:
+    """One of them.
+
+    :param command: what runs the link, before the name of its file
+    :ivar said: lines of its output so far
+    """
+
+    def __init__(self, file: Path, env: Mapping[str, str], command: Sequence[str], *more: str) -> None:
+        self.said: list[str] = []
+        self._env = env
+        self._process = subprocess.Popen(
+            [*command, str(file), *more],
+            env={**os.environ, **env},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def tell(self, line: str) -> None:
+        """Write a line to its input."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{line}\n")
+        self._process.stdin.flush()
+
+    def ask(self, *words: str) -> tuple[int, str]:
+        """How a command that asks this link ends, and what it says."""
+        with patch.dict(os.environ, self._env), redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+            status = run([*words, "--pid", str(self._process.pid)])
+        return status, out.getvalue() + err.getvalue()
+
+    def status(self) -> Any:
+        """What it counts; {} before it answers."""
+        assert self._process.poll() is None, "\n".join(self.said)
+        status, said = self.ask("status", "--json")
+        return {} if status else json.loads(said)
+
+    def heard(self) -> dict[int, Any]:
+        """The robots that it hears."""
+        return {peer["robot"]: peer for peer in self.status().get("peers", ())}
+
+    def end(self, number: signal.Signals = signal.SIGINT) -> int:
+        """Its status after a signal."""
+        self._process.send_signal(number)
+        status = self._process.wait(PATIENCE_S)
+        self._reader.join(PATIENCE_S)
+        return status
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._reader.join()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.said.append(line.rstrip("\n"))
+
+
+class Links:
+    """Robots 1, 2, … that all hear each other, on graphs in memory.
+
+    :param folder: for their files
+    :param settings: of each robot, as in a file
+    :param bit_rate: of the air, bit/s
+    """
+
+    def __init__(self, folder: Path, *settings: Mapping[str, Any], bit_rate: int = 1_000_000) -> None:
+        self._folder = folder
+        self._env = {"XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder / "state")}
+        ports = free_ports(len(settings), socket.SOCK_DGRAM)
+        self.files = []
+        for number, (own, port) in enumerate(zip(settings, ports, strict=True), 1):
+            others = [f"127.0.0.1:{other}" for other in ports if other != port]
+            values = {
+                "robot": f"/robot_{number}",
+                "graph": {"middleware": "memory", "domain_id": 0},
+                "phy": {"name": "modem", "options": {"bit_rate": bit_rate}},
+                "front_end": {"name": "udp", "listen": f"127.0.0.1:{port}", "send_to": others},
+                **own,
+            }
+            file = folder / f"robot_{number}.yaml"
+            file.write_text(json.dumps(values))
+            self.files.append(file)
+        self._running: list[LinkProcess] = []
+
+    def start(self, number: int, *more: str, command: Sequence[str] = (*COMMAND, "link")) -> LinkProcess:
+        """Start the link of a robot.
+
+        :param more: words after the name of its file
+        :param command: what runs the link, before the name of its file
+        """
+        process = LinkProcess(self.files[number - 1], self._env, command, *more)
+        self._running.append(process)
+        return process
+
+    def meet(self) -> None:
+        """All running links hear each other."""
+        for link in self._running:
+            wait_for(lambda: len(link.heard()) == len(self._running) - 1, "the other robots to be heard")  # noqa: B023
+
+    def __enter__(self) -> Links:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in self._running:
+            process.close()
