@@ -417,11 +417,13 @@ effects(
     depth=Elsewhere("radio/test_config.py::test_the_depths_of_a_graph_are_those_of_its_blocks"),
     use_sim_time=Elsewhere("gr/test_sink.py::test_latency_by_simulated_clock"),
 )
+CLOCKS = Elsewhere("e2e/test_clocks.py::test_a_computer_whose_clock_is_wrong_is_taken_into_account")
 effects(
     "Publish",
     depth=differs(published, publish_depth=3),
     frame_prefix=differs(published, publish_frame_prefix="robot_{robot}/"),
     merge_tf=Elsewhere("gr/test_frame_ids.py::test_two_robots_on_one_graph_of_a_real_dds"),
+    stamps=CLOCKS,
     topics=differs(published, publish_topics={"odom": {"as": "/here"}}),
     **{"as": differs(published, publish_as="/from_{robot}")},
 )
@@ -456,8 +458,10 @@ effects(
     transmit=differs(linked, transmit=False),
     open=Elsewhere("radio/test_permission.py::test_a_radio_asks_first"),
     record=Elsewhere("radio/test_radio.py::test_it_records_what_it_receives_and_finishes_it_without_being_closed"),
+    clock=CLOCKS,
     diagnostics=Elsewhere("radio/test_diagnostics.py::test_a_running_link_is_diagnosed"),
 )
+effects("Clocks of other robots", every_s=CLOCKS, chrony=CLOCKS, robot=CLOCKS)
 
 
 def crosses(*robots: dict[str, Any], beside: Mapping[str, Any] = MappingProxyType({}), **changed: Any) -> Outcomes:

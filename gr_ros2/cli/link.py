@@ -30,6 +30,7 @@ from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.guard import Guard
 from gr_ros2.core.systemd import notify
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.middleware import MIDDLEWARE
 from gr_ros2.radio import FRONT_ENDS, PRESETS
 from gr_ros2.radio.config import LinkConfig, link_from, load_link
@@ -278,7 +279,8 @@ def _live(running: RobotLink) -> LiveRun:
         airtime=running.phy.airtime if running.phy.has_airtime else None,
         received_as=running.sink.outputs.heard.name_of,
         announced=running.sink.outputs.heard.announced,
-        alarms=running.same_numbers,
+        alarms=running.alarms,
+        clocks=running.clocks,
         wishes=running.wishes if running.calls is not None else None,
         calls=running.calls,
         wants_key=partial(_key_frame, running),
@@ -374,6 +376,11 @@ def status_line(stats: Mapping[str, Any]) -> str:
         parts.append(f"packets lost: about {sink['packet_loss_est']}")
     if stats["phy"]["snr_db"] is not None:
         parts.append(f"SNR {stats['phy']['snr_db']:.1f} dB")
+    parts += [
+        f"clock of robot {peer['robot']} {ClockOffset(**peer['clock']).words} ahead"
+        for peer in stats["peers"]
+        if peer["clock"] is not None
+    ]
     parts += [f"{name} is {t['type']} now" for name, t in source["topics"].items() if t["types"] > 1]
     if lost := sum(topic["lost_on_graph"] for topic in source["topics"].values()):
         parts.append(f"{lost} messages lost on the ROS graph before they were sent")

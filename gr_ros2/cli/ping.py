@@ -20,7 +20,7 @@ from gr_ros2.cli.params import set_option
 from gr_ros2.cli.status import PING, ask_link, find_link, json_option, pid_option
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.radio.config import LinkConfig, load_link
-from gr_ros2.settings.config import DiagnosticsConfig
+from gr_ros2.settings.config import ClockConfig, DiagnosticsConfig
 from gr_ros2.wire import BROADCAST
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def without_topics(settings: LinkConfig) -> LinkConfig:
         record="",
         topics={},
         graph=replace(settings.graph, middleware="memory"),
+        clock=ClockConfig(),
         diagnostics=DiagnosticsConfig(period_s=0.0),
     )
 

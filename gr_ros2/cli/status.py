@@ -16,6 +16,7 @@ from rich.table import Table
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.control_socket import request, running_programs
 from gr_ros2.core.errors import ConfigError, RunError
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.settings.files import parse_override
 
 STATUS, PING, SET, OFFERS, WANT, MEASURE = "status", "ping", "set", "offers", "want", "measure"
@@ -77,8 +78,9 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
     """The robots that were heard."""
     if not peers:
         return "nobody heard yet (gr-ros2 link --check says why)"
-    table = _table("robot", "state", "heard ago", "SNR", "packets lost", "topics", "sealed")
+    table = _table("robot", "state", "heard ago", "SNR", "packets lost", "topics", "sealed", "clock")
     for peer in peers:
+        clock = peer["clock"]
         table.add_row(
             str(peer["robot"]),
             _peer_state(peer),
@@ -87,6 +89,7 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
             f"{peer['lost']} ({peer['loss']:.1%} lately)",
             str(peer["topics"]),
             "yes" if peer["sealed"] else "no",
+            "" if clock is None else f"{ClockOffset(**clock).words} ahead",
         )
     return table
 
@@ -172,7 +175,7 @@ def _reasons(counts: Mapping[str, int]) -> str:
 
 
 def _seconds(value: float) -> str:
-    return f"{value:.1f} s" if value >= 1 else f"{value * 1e3:.0f} ms"
+    return f"{value:.1f} s" if abs(value) >= 1 else f"{value * 1e3:.0f} ms"
 
 
 def find_link(pid: int | None) -> int:

@@ -152,7 +152,7 @@ class RunMonitor:
         now, links = run.clock(), run.links
         snr_db = links[0].snr_db if links else None
         late_s = max((_late_s(link.gate_lateness(), now) for link in links), default=0.0)
-        snapshot = state.tick(now, queued, snr_db=snr_db, late_s=late_s, told=run.alarms())
+        snapshot = state.tick(now, queued, snr_db=snr_db, late_s=late_s, told=run.alarms(), clocks=run.clocks())
         if run.wishes is not None:
             told = run.wishes.stats()
             held = [f"robot {wish['robot']} wants {wish['topic']}" for wish in told["wanted"]]

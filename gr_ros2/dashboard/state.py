@@ -11,6 +11,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from math import nan
 from threading import Lock
+from types import MappingProxyType
 from typing import get_args
 
 import numpy as np
@@ -21,6 +22,7 @@ from gr_ros2.dashboard.pictures import newest_picture
 from gr_ros2.dashboard.topic_names import Key, TopicNames
 from gr_ros2.dashboard.views import GOOD, SILENT_S, AirView, PathView, RobotView, SeriesView, Snapshot, TopicView
 from gr_ros2.dashboard.windows import RATE_S, AgeMeter, PathComparison, Rate
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.events import (
     Accepted,
     AirKind,
@@ -250,6 +252,7 @@ class DashboardState:
         snr_db: float | None = None,
         late_s: float = 0.0,
         told: Sequence[str] = (),
+        clocks: Mapping[int, ClockOffset] = MappingProxyType({}),
     ) -> Snapshot:
         """A snapshot of the link now. Until the run is over, it also becomes the newest point of the history.
 
@@ -257,6 +260,7 @@ class DashboardState:
         :param snr_db: of the newest packets received, dB
         :param late_s: how late the computer was in the last seconds, s
         :param told: what the link itself says is wrong
+        :param clocks: what is known of the clocks of other robots
         """
         ledger = {} if self._ledger is None else self._ledger()
         with self._lock:
@@ -311,7 +315,7 @@ class DashboardState:
                 state=next(iter(alarms), "" if over or self._start is None else "up"),
                 alarms=tuple(text for texts in alarms.values() for text in texts),
                 heard=tuple(
-                    RobotView(src_id, now - last, count, *self._ways.get(src_id, ()))
+                    RobotView(src_id, now - last, count, *self._ways.get(src_id, (0, None)), clocks.get(src_id))
                     for src_id, (last, count) in sorted(self._robots.items())
                 ),
                 air=AirView(
@@ -516,13 +520,17 @@ class DashboardState:
         topic.repaired += event.repaired
         topic.delivered_bytes += len(event.payload)
         topic.delivered_rate.add(now, len(event.payload))
+        made = now - (event.age_s if event.latency_s is None else event.latency_s)
         if message is not None:
-            topic.latencies.append(now - message.t_sent)
-            topic.age.delivered(message.t_sent, now)
-        elif source is None:  # its sender is not observed: what it has waited there is not known
-            topic.age.delivered(now - event.age_s, now)
+            made = message.t_sent
+            topic.latencies.append(now - made)
+            topic.age.delivered(made, now)
+        elif source is None:  # its sender is not observed: what it has waited there, its stamp tells at most
+            topic.age.delivered(made, now)
+            if event.latency_s is not None:
+                topic.latencies.append(event.latency_s)
         if topic.picture is not None:
-            topic.picture.take(event.message, now - event.age_s if message is None else message.t_sent)
+            topic.picture.take(event.message, made)
         if topic.read_position is not None:
             point = topic.read_position(event.payload)
             if point is not None:

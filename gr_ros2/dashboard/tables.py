@@ -107,12 +107,14 @@ def heard_html(snapshot: Snapshot) -> str:
     rows = "".join(
         f'<tr data-robot="{robot.src_id}"><th scope="row" class="name">robot {robot.src_id}</th>'
         f'<td data-field="silent">{robot.silent_s:.1f}</td><td data-field="packets">{robot.packets:,}</td>'
-        f'<td data-field="way">{way_text(robot.hops, robot.over)}</td></tr>'
+        f'<td data-field="way">{way_text(robot.hops, robot.over)}</td>'
+        f'<td data-field="clock">{"" if robot.clock is None else robot.clock.words}</td></tr>'
         for robot in snapshot.heard
     )
     return (
         '<table class="heard"><thead><tr><th scope="col" class="name">robot</th><th scope="col">heard [s ago]</th>'
-        f'<th scope="col">packets</th><th scope="col">messages come</th></tr></thead><tbody>{rows}</tbody></table>'
+        '<th scope="col">packets</th><th scope="col">messages come</th><th scope="col">its clock is ahead</th></tr>'
+        f"</thead><tbody>{rows}</tbody></table>"
     )
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from gr_ros2.core.arrays import Floats
 from gr_ros2.dashboard.windows import Point
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.observe.latency import Latency
 from gr_ros2.observe.team import TeamView
 
@@ -174,6 +175,7 @@ class RobotView:
     :param packets: received of it
     :param hops: robots that have sent its newest message on
     :param over: the last of them; None where it is heard itself
+    :param clock: its clock beside this computer's; None where it is not known
     """
 
     src_id: int
@@ -181,6 +183,7 @@ class RobotView:
     packets: int
     hops: int = 0
     over: int | None = None
+    clock: ClockOffset | None = None
 
 
 @dataclass(frozen=True)

@@ -148,6 +148,7 @@ class LinkHealth:
         """
         (degraded_s, lost_s), found, now = self._config.silence_s, {}, self._snapshots[-1].now
         far = {peer["robot"]: peer for peer in stats["peers"] if peer["hops"]}
+        clocks = {peer["robot"]: peer["clock"] for peer in stats["peers"]}
         doubled = {peer["robot"] for peer in stats["peers"] if peer["doubled"]}
         ages = [*stats["sink"]["silence_s"].items(), *((robot, peer["heard_s"]) for robot, peer in far.items())]
         for src_id, age in ages:
@@ -155,6 +156,8 @@ class LinkHealth:
         for src_id, at in self._reached.items():
             silence = now - at
             state = Status(f"gr_ros2/link_{src_id}", values={"age (s)": f"{silence:.2f}"})
+            if (clock := clocks.get(src_id)) is not None:
+                state.values["clock ahead (s)"] = f"{clock['ahead_s']:.4f} ± {clock['error_s']:.4f}"
             if src_id in far:
                 state.values |= {"hops": str(far[src_id]["hops"]), "over robot": str(far[src_id]["over"])}
             watched = self._silences.setdefault(src_id, self._watch()).age(silence, now)

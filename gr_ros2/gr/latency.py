@@ -73,6 +73,10 @@ class LatencyWindow:
         self._count += 1
         self._negative += seconds < 0
 
+    def forget(self) -> None:
+        """Forget the values, which a wrong clock has measured; the counts stay."""
+        self._values.clear()
+
     def copy(self) -> LatencyWindow:
         """A copy of the current state."""
         copied = LatencyWindow()

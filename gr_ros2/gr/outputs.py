@@ -24,7 +24,9 @@ from gr_ros2.gr.heard_topics import HeardTopics, Key
 from gr_ros2.gr.latency import Latencies, LatencyWindow
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.loops import LOOP_GUARD
+from gr_ros2.gr.stamps import MovedStamps
 from gr_ros2.link import Delivered, ReceiverEvent
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import Announced
 from gr_ros2.link.fates import Fate
@@ -46,6 +48,7 @@ class Output:
     :param opening: held while ``early`` is used
     :param published: number of messages
     :param delivered_at: time of the newest one, s
+    :param measured_by: how often the clock had been set by which ``latency`` was measured; None: it is not known
     :param way: how many robots have sent it on, and the last of them
     :param kept: digests of the newest messages of a latched topic that comes as frames, by chain
     """
@@ -58,6 +61,7 @@ class Output:
     published: int = 0
     delivered_at: float | None = None
     latency: LatencyWindow | None = None
+    measured_by: int | None = None
     way: tuple[int, int | None] = (0, None)
     kept: dict[int, bytes] = field(default_factory=dict)
 
@@ -98,6 +102,8 @@ class Outputs:
         self._outputs: dict[Key, Output] = {}
         self.frames = FrameReceiver()
         self._prefix = FramePrefix(config.publish.frame_prefix, failures.counters)
+        self._stamps = MovedStamps(failures.counters) if config.publish.stamps == "mine" else None
+        self._sim_time = config.graph.use_sim_time
         self._transforms: MergedTransforms | None = None
         if config.publish.merge_tf:
             self._transforms = MergedTransforms(config.publish.merged_topics, graph, failures.counters)
@@ -168,6 +174,8 @@ class Outputs:
             self._log.info("ros2_sink: %s", error)
             return
         self._prefix.learn(described.type_name, store)
+        if self._stamps is not None:
+            self._stamps.learn(described.type_name, store)
         self._latencies.learn(described.type_name, store)
 
     def stats(self) -> dict[Key, dict[str, Any]]:
@@ -246,7 +254,10 @@ class Outputs:
             chain, digest = (chain_of(event.payload)[0], blake2b(shown).digest()) if framed else (0, b"")
             if framed and output.kept.get(chain) == digest:
                 return event._replace(shown=shown)  # a key frame for another robot
+            clock = self._clock_of(event.src_id)
             payload = self._prefix.apply(topic.type_name, event.src_id, shown)
+            if self._stamps is not None:
+                payload = self._moved(self._stamps, topic.type_name, payload, clock)
             publisher = output.publisher or self._advertise(key, output)
             publisher.publish(payload)
         except Exception as error:  # noqa: BLE001 - whatever the reason, nobody got the message
@@ -259,11 +270,12 @@ class Outputs:
         with self._lock:
             output.published += 1
             output.delivered_at, output.way = self._clock(), (event.hops, event.over)
-            if self._latencies.has(topic.type_name):
-                self._measure(output, shown)
+            latency_s = self._measure(output, shown, clock) if self._latencies.has(topic.type_name) else None
         if self._transforms is not None and topic.type_name == TF_TYPE:
             self._merge(self._transforms, payload, static=topic.latched)
-        return event if shown is event.payload else event._replace(shown=shown)
+        if shown is not event.payload:
+            event = event._replace(shown=shown)
+        return event if latency_s is None else event._replace(latency_s=latency_s)
 
     def _shown(self, event: Delivered, topic: Topic) -> bytes:
         """The message that a delivered one is: a frame is decoded, and a CameraInfo fitted to its picture.
@@ -335,14 +347,38 @@ class Outputs:
                 self.due.notify_all()
         return publisher
 
-    def _measure(self, output: Output, payload: bytes) -> None:
-        """Note the latency of a message; the caller holds the lock."""
+    def _clock_of(self, src_id: int) -> ClockOffset | None:
+        """The clock of a robot's stamps beside this one's; None where it is not known."""
+        if self._sim_time:
+            return None  # all of them follow one /clock
+        with self._lock:
+            return self._end.clock_of(src_id, self._clock())
+
+    def _moved(self, stamps: MovedStamps, type_name: str, payload: bytes, clock: ClockOffset | None) -> bytes:
+        """A message with stamps of this robot's clock, as far as the other one's is known."""
+        if clock is None:
+            self._failures.counters["stamps_not_moved"] += 1
+            return payload
+        return stamps.apply(type_name, payload, -clock.ahead_s)
+
+    def _measure(self, output: Output, payload: bytes, clock: ClockOffset | None) -> float | None:
+        """Note the latency of a message, and return it where it is known, s; the caller holds the lock.
+
+        :param clock: of its stamp
+        """
         latency = self._latencies.of(payload)
-        if latency is not None:
-            if output.latency is None:
-                self._forget_the_gone()
-                output.latency = LatencyWindow()
-            output.latency.add(latency)
+        if latency is None:
+            return None
+        by = None if clock is None else clock.jumps
+        if output.latency is None:
+            self._forget_the_gone()
+            output.latency = LatencyWindow()
+        elif output.measured_by != by:
+            output.latency.forget()
+        output.measured_by = by
+        known = None if clock is None else latency + clock.ahead_s
+        output.latency.add(latency if known is None else known)
+        return known
 
     def _forget_the_gone(self) -> None:
         """Free the latencies of senders that the receiver no longer knows: 0.3 MB per topic."""

@@ -44,6 +44,7 @@ _MOST_JOINED = 65535
 _COUNTED = (
     *("not_a_pair", "not_u8", "joined", Fate.PUBLISH_FAILED.value, "handler_failed", "bad_announcement"),
     *("frame_unknown_type", "frame_damaged", "tf_damaged", "tf_static_full", "tf_failed"),
+    *("stamp_unknown_type", "stamp_damaged", "stamps_not_moved"),
 )
 
 

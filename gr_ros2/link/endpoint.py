@@ -17,6 +17,7 @@ from math import inf
 from typing import Any, NamedTuple, Protocol
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SentPacket
 from gr_ros2.link.frames import FrameSide
 from gr_ros2.link.pace import Pace
@@ -334,6 +335,9 @@ class Endpoint(PacketSide, Protocol):
 
     def knows(self, src_id: int) -> bool:
         """Whether the state of a sender is held at present."""
+
+    def clock_of(self, src_id: int, now: float) -> ClockOffset | None:
+        """What is known of another robot's clock, if the version asks for it."""
 
     def peers(self, now: float) -> list[HeardRobot]:
         """The robots that are known, if the version tells."""

@@ -79,7 +79,9 @@ class Delivered(NamedTuple):
     """A message is complete. ``qos`` is the class of the packet that completed it; ``repaired``: at least one of its
     packets was lost at first and recovered later; ``hops``: robots that have sent it on, and ``over``: the last of
     them, None where there were none; ``age_s``: s for which it has been under way at least; ``shown``: the message
-    that was published, where a frame was decoded for it (:mod:`gr_ros2.link.frames`), None: the payload."""
+    that was published, where a frame was decoded for it (:mod:`gr_ros2.link.frames`), None: the payload;
+    ``latency_s``: s from its stamp to its publication, None where it has no stamp, or the clock of its sender is not
+    known."""
 
     src_id: int
     topic_id: int
@@ -91,6 +93,7 @@ class Delivered(NamedTuple):
     over: int | None = None
     age_s: float = 0.0
     shown: bytes | None = None
+    latency_s: float | None = None
 
     @property
     def message(self) -> bytes:

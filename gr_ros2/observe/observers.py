@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from gr_ros2.core.backlog import Backlog
 from gr_ros2.core.errors import RunError
 from gr_ros2.core.guard import Guard
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers, name_of
@@ -145,6 +146,7 @@ class LiveRun:
         where the names of ``topics`` are shown
     :param announced: source id, absolute name here and meaning of each topic that other robots have announced so far
     :param alarms: what is wrong with the robots that are heard, or with what lies between them, one line each
+    :param clocks: what is known of the clocks of the robots that are heard
     :param heard: source ids of the robots that the receiver of the run's events can hear; None = all
     :param wants_key: called where somebody has begun to watch a topic of a robot, by their ids, that is sent as frames
     :param wishes: asks other robots for topics; None where nobody can be asked
@@ -166,6 +168,7 @@ class LiveRun:
     received_as: Callable[[int, str], str] = lambda _src_id, _name: ""
     announced: Callable[[], Sequence[tuple[int, str, Topic]]] = tuple
     alarms: Callable[[], Sequence[str]] = tuple
+    clocks: Callable[[], Mapping[int, ClockOffset]] = dict
     heard: frozenset[int] | None = None
     wants_key: Callable[[int, int], None] = lambda _src_id, _topic_id: None
     wishes: Wishes | None = None

@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.endpoint import HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.message_codec import MessageCodec
@@ -86,6 +87,9 @@ class EndpointV0:
 
     def peers(self, now: float) -> list[HeardRobot]:  # noqa: ARG002 - senders are not followed
         return []
+
+    def clock_of(self, src_id: int, now: float) -> ClockOffset | None:  # noqa: ARG002 - version 0 asks nobody
+        return None
 
     def knows(self, src_id: int) -> bool:
         return self._receiver is not None and self._receiver.knows(src_id)

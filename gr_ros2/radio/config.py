@@ -18,7 +18,16 @@ from gr_ros2.phy import PHY, Phy, configured
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.permission import check_band
 from gr_ros2.settings.airtime import Airtime, AirtimeConfig
-from gr_ros2.settings.config import STRICT, AirConfig, ChannelConfig, DiagnosticsConfig, PhyConfig, Text, build
+from gr_ros2.settings.config import (
+    STRICT,
+    AirConfig,
+    ChannelConfig,
+    ClockConfig,
+    DiagnosticsConfig,
+    PhyConfig,
+    Text,
+    build,
+)
 from gr_ros2.settings.effect import ActsWhere
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import read_settings
@@ -106,6 +115,8 @@ class LinkConfig(AirConfig, RobotConfig):
     """impairments of what is received, for front ends without a radio"""
     record: Annotated[str, Field(title="Recording of what is received")] = ""
     """SigMF recording to write of all samples received, '' = none"""
+    clock: ClockConfig = Field(default_factory=ClockConfig)
+    """how the clocks of other robots are watched, and given to chrony (docs/how-to/ros2.md)"""
     diagnostics: DiagnosticsConfig = Field(default_factory=DiagnosticsConfig)
     """what the link says on ``/diagnostics`` (docs/how-to/ros2.md)"""
 
@@ -120,6 +131,11 @@ class LinkConfig(AirConfig, RobotConfig):
             ("medium",),
             lambda link: not link.radios,
             "slots are those of one channel, and several radios have one each; leave radios or medium out",
+        ),
+        ActsWhere(
+            ("publish.stamps",),
+            lambda link: not link.graph.use_sim_time,
+            "all stamps follow one /clock; leave graph.use_sim_time or publish.stamps out",
         ),
         ActsWhere(("record",), lambda link: not link.radios, "several radios have no signal in common; leave it out"),
     )

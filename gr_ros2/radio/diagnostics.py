@@ -102,6 +102,8 @@ class Diagnostics:
         statuses = [*judged, *self._second_sender()]
         if twins := doubled(stats["peers"]):
             statuses.append(Status(f"{self._node_name}: numbers", Level.WARN, twins))
+        if jumps := stats["clocks"]["set"]:
+            statuses.append(Status(f"{self._node_name}: clocks", Level.WARN, jumps))
         for src_id, state in self._health.links(stats, judged[0]).items():
             if not self._stop.is_set():
                 self._link(src_id).publish(diagnostic_status(state, self._node_name))

@@ -72,7 +72,19 @@ def peers(live: LiveEnd[OpenEndpoint], now: float) -> list[dict[str, Any]]:
     """The robots that were heard; the one heard last comes first."""
     with live.lock:
         found = live.endpoint.peers(now)
-    return [{**asdict(peer), "start": f"{peer.start:016x}"} for peer in sorted(found, key=lambda peer: peer.heard_s)]
+        clocks = {peer.robot: live.endpoint.clock_of(peer.robot, now) for peer in found}
+    told = {robot: None if clock is None else clock._asdict() for robot, clock in clocks.items()}
+    return [
+        {**asdict(peer), "start": f"{peer.start:016x}", "clock": told[peer.robot]}
+        for peer in sorted(found, key=lambda peer: peer.heard_s)
+    ]
+
+
+def set_wall(live: LiveEnd[OpenEndpoint], wall_s: float) -> None:
+    """From now on this computer's clock is so many s ahead of that of the link."""
+    with live.lock:
+        if (questions := getattr(live.endpoint, "questions", None)) is not None:  # the paper's robots ask nothing
+            questions.wall_s = wall_s
 
 
 def ping(live: LiveEnd[OpenEndpoint], robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
@@ -83,7 +95,6 @@ def ping(live: LiveEnd[OpenEndpoint], robot: int, now: float, *, anew: bool = Fa
     """
     with live.lock:
         questions = live.endpoint.questions
-        questions.wall_s = time.time() - now  # the clock of the wall may have been set
         told = questions.put(robot, now, anew=anew)
         snrs = {peer.robot: peer.snr_db for peer in live.endpoint.peers(now)}
         live.work.notify()
@@ -246,5 +257,6 @@ def in_words(peer: Mapping[str, Any]) -> str:
         parts.append(f"rate {peer['mcs']}")
     if peer["clock_s"] is not None:
         ahead = "ahead of" if peer["clock_s"] >= 0 else "behind"
-        parts.append(f"its clock is {abs(peer['clock_s']) * 1e3:.0f} ms {ahead} this one")
+        error = f"± {peer['clock_error_s'] * 1e3:.1f} ms"
+        parts.append(f"its clock is {abs(peer['clock_s']) * 1e3:.1f} ms {ahead} this one ({error})")
     return "; ".join(parts)

@@ -22,6 +22,7 @@ from gr_ros2.gr.ros_link import LinkBlock, RosLink
 from gr_ros2.gr.throughput import LiveThroughput
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.bond import Bond
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.endpoint import without_table
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware
@@ -29,9 +30,10 @@ from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.phy import Phy
 from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.pdus import port_of
+from gr_ros2.radio.clocks import ClockWatch
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
-from gr_ros2.radio.findings import about, doubled, introduce, outrun, peers, ping, same_id, unheard
+from gr_ros2.radio.findings import about, doubled, introduce, outrun, peers, ping, same_id, set_wall, unheard
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.mismatch import Mismatch
 from gr_ros2.radio.one_radio import OneRadio, together
@@ -135,6 +137,14 @@ class RobotLink(Flowgraph):
             introduce(self.end, told, lambda: self.radio.snr_db, self._clock())
             asked_by = self.end.endpoint.questions.asked_by
         self._mismatch = Mismatch(told, self.ping, asked_by)
+        self._clocks = ClockWatch(
+            config.clock,
+            mine=config.publish.stamps == "mine",
+            heard=partial(peers, self.end),
+            ask=self.ping,
+            set_wall=partial(set_wall, self.end),
+        )
+        self._stack.callback(self._clocks.close)
         if isinstance(graph, ServiceGraph):
             switch = TransmitSwitch(graph, self.node_name, lambda on: self.transmit(on=on))
             self._stack.callback(switch.close)
@@ -289,6 +299,7 @@ class RobotLink(Flowgraph):
         if not self._running:
             return
         now = self._clock()
+        self._clocks.look(now)
         self._goes_on("sending thread", self._watch, self.source.stalled_s(now), now)
         for one in self.radios:
             if one.retry_at < inf or one.gone:
@@ -378,15 +389,22 @@ class RobotLink(Flowgraph):
             *without_table(peer["robot"] for peer in heard if peer["no_table"]),
             full if self._ros.shares else None,
             *self._mismatch.lines(stats, robots, now),
+            *self._clocks.lines(now),
         ]
         with self.end.lock:
             if self._ros.slots is not None and self._ros.slots.unheard(now):
                 lines.append(unheard(own, robots))
         return [line for line in lines if line is not None]
 
-    def same_numbers(self) -> list[str]:
-        """One line for each number under which two robots send."""
-        return self._same_numbers(peers(self.end, self._clock()))
+    def alarms(self) -> list[str]:
+        """One line for each number under which two robots send, and for each clock that was set lately."""
+        now = self._clock()
+        return [*self._same_numbers(peers(self.end, now)), *self._clocks.lines(now)]
+
+    def clocks(self) -> dict[int, ClockOffset]:
+        """What is known of the clocks of the robots that are heard."""
+        heard = peers(self.end, self._clock())
+        return {peer["robot"]: ClockOffset(**peer["clock"]) for peer in heard if peer["clock"] is not None}
 
     def _same_numbers(self, heard: list[dict[str, Any]]) -> list[str]:
         with self.end.lock:
@@ -422,5 +440,6 @@ class RobotLink(Flowgraph):
             "calls": {} if self.calls is None else self.calls.stats(),
             "wishes": {} if self._ros.link.wishes is None else self._ros.link.wishes.stats(),
             **radios,
+            "clocks": {"set": self._clocks.lines(self._clock()), "given_to_chrony": self._clocks.given},
             "incomplete": self.incomplete(),
         }

@@ -558,6 +558,29 @@ class AirConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class ClockConfig:
+    """How a live link watches the clocks of other robots."""
+
+    every_s: Annotated[
+        Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] | Auto, Field(title="Asked every (s)")
+    ] = AUTO
+    """s between two questions for the clock of each robot heard; 0 = only `gr-ros2 ping` asks; auto = 10 where
+    `publish.stamps` is mine, 1 with `chrony`, else 0"""
+    chrony: Annotated[str, Field(title="Socket of chrony")] = ""
+    """socket of a reference clock of chrony (refclock SOCK), which is given the clock of ``robot``; '' = none"""
+    robot: RobotId | None = None
+    """number of the robot whose clock chrony is given"""
+
+    @model_validator(mode="after")
+    def _whole(self) -> ClockConfig:
+        if bool(self.chrony) != (self.robot is not None):
+            raise ValueError("chrony and robot: the socket and whose clock it is given belong together; set both")
+        if self.chrony and self.every_s == 0:
+            raise ValueError("every_s = 0: nobody asks for the clock that chrony is given; leave it out")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class DiagnosticsConfig:
     """What a live link says about itself on ``/diagnostics``, and when it calls that a warning or an error."""
 

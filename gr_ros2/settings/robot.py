@@ -108,6 +108,8 @@ class PublishConfig:
     """before every frame name of a message, ``{robot}`` is the sender; '' none"""
     merge_tf: Annotated[MergedTopic, Field(title="Merged transforms")] = ""
     """topic for the transforms of all senders too, static ones on this + `_static`; needs `frame_prefix`; '' off"""
+    stamps: Annotated[Literal["theirs", "mine"], Field(title="Header stamps")] = "theirs"
+    """of messages: theirs = as sent; mine = moved to this computer's clock, as answers to questions tell it"""
     topics: Annotated[dict[str, PublishOptions], AfterValidator(_named), Field(title="Topics that come out")] = Field(
         default_factory=dict
     )

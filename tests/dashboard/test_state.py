@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from gr_ros2.dashboard.state import LATENCIES, PACKETS_SHOWN, UNDER_WAY, DashboardState
+from gr_ros2.dashboard.tables import heard_html
 from gr_ros2.dashboard.views import Snapshot
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.events import Accepted, Announced, Delivered, SentPacket
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Topic
@@ -205,6 +207,17 @@ def test_what_comes_of_a_sender_that_is_not_observed_has_an_age() -> None:
     (topic,) = [topic for topic in state.tick(4.0).topics if topic.src_id == 9]
     assert topic.age_now_s == pytest.approx(3.25)
     assert topic.latency_s is None
+
+
+def test_where_the_clock_of_a_sender_is_known_its_messages_have_a_latency() -> None:
+    state, clock = make(), ClockOffset(3600.5, 0.002, 0, 0.0, 1, 3600.5, 0.0)
+    state.receiver_event(Delivered(9, 3, at(1, 2), 0, "key", hops=1, over=4, age_s=0.1, latency_s=0.75), 1.0)
+    snapshot = state.tick(2.0, clocks={9: clock})
+    [topic], [robot] = [topic for topic in snapshot.topics if topic.src_id == 9], snapshot.heard
+    assert topic.latency_s is not None
+    assert (topic.latency_s.p50, topic.age_now_s) == (0.75, 1.75)
+    assert "3,600,500.0 ± 2.0 ms" in heard_html(snapshot)
+    assert robot.clock == clock
 
 
 def test_one_end_of_a_link_does_not_say_what_arrives_of_what_it_sends() -> None:

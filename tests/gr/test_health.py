@@ -157,7 +157,10 @@ def test_what_comes_over_others_says_over_whom_and_its_link_is_lost_when_nothing
     assert "hops" not in parts(health, 0.0)[2].values
     topic = parts(health, 1.0, hops=2)[2]
     assert (topic.values["hops"], topic.values["over robot"]) == ("2", "3")
-    reached = {**stats(), "peers": [{"robot": 7, "heard_s": 0.5, "hops": 2, "over": 3, "doubled": False}]}
+    reached = {
+        **stats(),
+        "peers": [{"robot": 7, "heard_s": 0.5, "hops": 2, "over": 3, "doubled": False, "clock": None}],
+    }
     state = health.links(reached, health.judge(reached, 2.0)[0])[7]
     assert (state.message, state.values) == ("up", {"age (s)": "0.50", "hops": "2", "over robot": "3"})
     reached["peers"][0]["doubled"] = True

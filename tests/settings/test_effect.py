@@ -95,6 +95,13 @@ IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
         {},
         "leave it out",
     ),
+    (Scenario, "robots.*.publish.stamps"): ({"robots": [{}, {"publish": {"stamps": "mine"}}]}, {}, {}, "leave it out"),
+    (LinkConfig, "publish.stamps"): (
+        {"publish": {"stamps": "mine"}},
+        {"graph": {"use_sim_time": True}},
+        {},
+        "leave graph.use_sim_time or publish.stamps out",
+    ),
     **{
         (LinkConfig, f"{part}.*.via"): (
             {part: {"odom": {"via": "all"}}},
@@ -150,7 +157,7 @@ for cls, values in ((CameraOptions, CAMERA), (DepthOptions, DEPTH)):
         IDLE[cls, name] = ({name: value}, {"off": True}, {}, "leave off out")
 for name, value in {"range": 30.0, "keep": "rgb", "fit": True}.items():
     IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
-NEVER = {(Scenario, f"robots.*.{name}") for name in ("state", "offer", "topics.*.via")}
+NEVER = {(Scenario, f"robots.*.{name}") for name in ("state", "offer", "publish.stamps", "topics.*.via")}
 """Nothing makes them act."""
 
 

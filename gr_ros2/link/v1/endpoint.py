@@ -17,6 +17,7 @@ from math import inf
 from typing import Any
 
 from gr_ros2.link.access import Access
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.endpoint import LIVE_OPTIONS, HeardRobot, check_live
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.link.instances import InstancesOf, no_instances
@@ -253,6 +254,9 @@ class EndpointV1:
 
     def knows(self, src_id: int) -> bool:
         return self._inbox(src_id) is not None
+
+    def clock_of(self, src_id: int, now: float) -> ClockOffset | None:
+        return self.pings.clock_of(src_id, now)
 
     def topics_of(self, src_id: int) -> Mapping[int, AnnouncedTopic]:
         inbox = self._inbox(src_id)

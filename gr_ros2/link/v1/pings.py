@@ -14,6 +14,7 @@ from math import inf
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.link.clocks import ClockOffset, OtherClock
 from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.control import ABOUT_LEN, HELD_STEP_S, PING_LEN, About, Ping, reportable
 
@@ -35,7 +36,7 @@ class RoundTrips:
     :ivar arrived: questions that have arrived there, from the first that was answered to the newest; None before it
     :ivar round_trips: s from a question's leaving to its answer's arrival, the newest ``KEPT``
     :ivar held_s: s of the newest one for which the other robot held it
-    :ivar clock_s: s by which the other robot's clock is ahead, from the shortest round trip; None if one has no clock
+    :ivar clock: the other robot's; nothing is known of it if one has no clock
     :ivar snr_there_db: SNR at the other robot of what this one sends; None where it is not measured
     :ivar about: what the other end is; None if it has not said so
     :ivar not_before: time in s before which it is not asked again
@@ -46,13 +47,12 @@ class RoundTrips:
     arrived: int | None = None
     round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
     held_s: float = 0.0
-    clock_s: float | None = None
+    clock: OtherClock = field(default_factory=OtherClock)
     snr_there_db: float | None = None
     about: About | None = None
     not_before: float = -inf
     earlier: int = 0
     _left: dict[int, float] = field(default_factory=dict)
-    _shortest: float = inf
     _counted: int = 0
     _first: int = 0
     _newest: int = 0
@@ -87,12 +87,13 @@ class RoundTrips:
         took = now - left
         self.round_trips.append(took)
         self.held_s = ping.held * HELD_STEP_S
-        if took - self.held_s < self._shortest and ping.clock_us and wall_s:
-            self._shortest = took - self.held_s
-            self.clock_s = ping.clock_us * 1e-6 - (wall_s + now - self._shortest / 2)
+        if ping.clock_us and wall_s:
+            ways_s = took - self.held_s
+            self.clock.answered(ping.clock_us * 1e-6 - (wall_s + now - ways_s / 2), ways_s + HELD_STEP_S, now)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self, now: float) -> dict[str, Any]:
         """All of it as plain values, with the median and the 99th percentile of the round trips."""
+        clock = self.clock.at(now)
         took, about = sorted(self.round_trips), self.about
         told = None if about is None else {**about._asdict(), "text": about.text.decode("utf-8", "replace")}
         return {
@@ -106,7 +107,8 @@ class RoundTrips:
                 "last": self.round_trips[-1] if took else None,
             },
             "held_s": self.held_s if took else None,
-            "clock_s": self.clock_s,
+            "clock_s": None if clock is None else clock.ahead_s,
+            "clock_error_s": None if clock is None else clock.error_s,
             "snr_there_db": self.snr_there_db,
             "about": told,
         }
@@ -134,7 +136,6 @@ class Pings:
 
     :param about: what this end is, to be told to those who ask; None tells nothing
     :param turn_s: tells s from one packet of this robot to its next; 0 = not known
-    :ivar wall_s: clock of the wall minus ``now``, s; 0 = unknown
     :ivar snr_db: returns the SNR of the newest packets of all robots, for PHYs that do not tell it packet by packet
     :ivar asked: what came of the questions, by robot
     :ivar asked_by: when each robot asked last what this one is, s
@@ -143,7 +144,7 @@ class Pings:
     def __init__(self, about: About | None = None, turn_s: Callable[[], float] = lambda: 0.0) -> None:
         self.about = about
         self._turn_s = turn_s
-        self.wall_s = 0.0
+        self._wall_s = 0.0
         self.snr_db: Callable[[], float | None] = lambda: None
         self.asked: dict[int, RoundTrips] = {}
         self.asked_by: dict[int, float] = {}
@@ -154,13 +155,29 @@ class Pings:
         self.due = inf
         """When a question or an answer is to leave, s; infinite if none waits."""
 
+    @property
+    def wall_s(self) -> float:
+        """Clock of the wall minus ``now``, s; 0 = unknown. Setting it moves what is known of other clocks."""
+        return self._wall_s
+
+    @wall_s.setter
+    def wall_s(self, wall_s: float) -> None:
+        if self._wall_s:
+            for trips in self.asked.values():
+                trips.clock.own_was_set(wall_s - self._wall_s)
+        self._wall_s = wall_s
+
+    def clock_of(self, robot: int, now: float) -> ClockOffset | None:
+        trips = self.asked.get(robot)
+        return None if trips is None else trips.clock.at(now)
+
     def introduce(self, packet_len: int, phy: int, key: int, text: str) -> None:
         self.about = About(packet_len, phy, key, text.encode())
 
     def put(self, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
         if anew and (before := self.asked.get(robot)) is not None:  # numbers go on, so that no late answer counts
-            self.asked[robot] = RoundTrips(before.asked, earlier=before.asked, about=before.about)
-        return self.ask(robot, now, wants_about=True).summary()
+            self.asked[robot] = RoundTrips(before.asked, earlier=before.asked, about=before.about, clock=before.clock)
+        return self.ask(robot, now, wants_about=True).summary(now)
 
     def ask(self, robot: int, now: float, *, wants_about: bool = False) -> RoundTrips:
         """Ask a robot as soon as a packet may leave, unless it was asked less than ``ASK_S`` ago; returns what has come

@@ -1,0 +1,101 @@
+"""Two links whose computers' clocks differ: ages, stamps, what is said, and what chrony gets."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.radio.clocks import MAGIC, SAMPLE
+from tests.e2e.links import LinkProcess, Links
+from tests.waiting import wait_for
+
+PEER = (sys.executable, "-m", "tests.e2e.clock_peer")
+ADJUSTED_S = 1e-3
+"""s by which the clock of the machine that runs the tests may be adjusted meanwhile, or read at another moment."""
+
+
+def got(link: LinkProcess) -> list[tuple[float, float]]:
+    """Of each message that came out: the true time when it was stamped, and its stamp."""
+    lines = [line.split() for line in list(link.said)]
+    return [(float(line[1]), float(line[2])) for line in lines if line[0] == "got"]
+
+
+def clock(link: LinkProcess) -> Any:
+    """What the link knows of the clock of the only other robot."""
+    return next(iter(link.heard().values()))["clock"]
+
+
+def close_to(found: Any, ahead_s: float) -> bool:
+    return found is not None and abs(found["ahead_s"] - ahead_s) <= found["error_s"] + ADJUSTED_S
+
+
+def test_a_computer_whose_clock_is_wrong_is_taken_into_account(tmp_path: Path) -> None:
+    ahead_s, address = 3600.5, tmp_path / "chrony.sock"
+    settings = {"topics": {"place": {}}}
+    mine = {"clock": {"every_s": 0.5, "chrony": str(address), "robot": 2}, "publish": {"stamps": "mine"}}
+    with (
+        Links(tmp_path, {**settings, **mine}, settings) as links,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as chrony,
+    ):
+        chrony.bind(str(address))
+        one = links.start(1, "1", "0", command=PEER)
+        two = links.start(2, "2", str(ahead_s), command=PEER)
+        links.meet()
+
+        seconds, us, offset_s, pulse, leap, _, magic = SAMPLE.unpack(chrony.recv(SAMPLE.size + 1))
+        assert (pulse, leap, magic) == (0, 0, MAGIC)
+        assert seconds + us * 1e-6 <= time.time()
+
+        wait_for(lambda: clock(one), "its clock to be known")
+        found = clock(one)
+        assert close_to(found, ahead_s)
+        assert close_to({**found, "ahead_s": offset_s, "error_s": 0.5}, ahead_s)
+        assert "3,600," in one.ask("peers")[1]
+
+        wait_for(lambda: topic(one)["recent_latency_s"] and topic(one)["recent_latency_s"]["p50"] < 100, "latency")
+        before = len(got(one))
+        wait_for(lambda: len(got(one)) > before + 5, "messages with stamps that were moved")
+        for true, stamp in got(one)[before:]:
+            assert abs(stamp - true) <= found["error_s"] + ADJUSTED_S
+        latency = topic(one)["recent_latency_s"]
+        assert -found["error_s"] - ADJUSTED_S <= latency["p50"] <= latency["max"] < ahead_s / 100
+        assert topic(one)["age_s"] < ahead_s / 100
+
+        two.tell(str(ahead_s - 60))
+        wait_for(lambda: one.status()["clocks"]["set"], "the jump to be said")
+        assert one.status()["clocks"]["set"][0].startswith("the clock of robot 2 was set 60 s back")
+        assert close_to(clock(one), ahead_s - 60)
+        one.tell("30")
+        wait_for(lambda: len(one.status()["clocks"]["set"]) == 2, "the jump of its own clock")
+        assert any(line.startswith("this computer's clock was set 30 s forward") for line in one.status()["findings"])
+        assert close_to(clock(one), ahead_s - 90)
+
+        assert got(two), "robot 2 asks nobody, and publishes stamps as they are"
+        assert all(abs(stamp - true) <= ADJUSTED_S for true, stamp in got(two) if stamp < true + 10)
+        assert clock(two) is None
+        assert one.end() == 0
+        assert "clock of robot 2 3,510," in one.said[-1]
+
+
+def topic(link: LinkProcess) -> Any:
+    return link.status()["sink"]["topics"].get("/rx_robot_2/place", {"recent_latency_s": None})
+
+
+def test_ping_tells_a_clock_that_nobody_watches(tmp_path: Path) -> None:
+    settings = {"topics": {"place": {}}}
+    with Links(tmp_path, settings, settings) as links:
+        one, _ = links.start(1, "1", "0", command=PEER), links.start(2, "2", "-7", command=PEER)
+        links.meet()
+        assert clock(one) is None
+        status, said = one.ask("ping", "2", "--count", "5", "--interval", "0.2", "--json")
+        told = json.loads(said)
+        assert (status, told["clock_s"]) == (0, pytest.approx(-7, abs=told["clock_error_s"] + ADJUSTED_S))
+        assert close_to(clock(one), -7)
