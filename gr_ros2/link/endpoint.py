@@ -261,7 +261,7 @@ class Questions(Protocol):
 
     wall_s: float
     snr_db: Callable[[], float | None]
-    asked_by: Mapping[int, float]
+    asked_by: dict[int, float]
 
     def introduce(self, packet_len: int, phy: int, key: int, text: str) -> None:
         """Tell those who ask what this end is.
