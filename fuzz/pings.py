@@ -63,7 +63,7 @@ def pings(data: bytes) -> None:
     for trips in robot.pings.asked.values():
         assert trips.answered <= trips.asked
         assert len(trips.round_trips) <= KEPT
-    json.dumps([trips.summary() for trips in robot.pings.asked.values()], allow_nan=False)
+    json.dumps([trips.summary(now) for trips in robot.pings.asked.values()], allow_nan=False)
 
 
 def corpus() -> list[bytes]:

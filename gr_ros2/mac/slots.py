@@ -90,11 +90,12 @@ EASED = 0.97
 VAIN = 4
 """What v is multiplied by after an entry in vain. With 2, v stays near 2 while 50 robots enter from cold, most entries
 collide, and it takes 10 instead of 7.5 s on average; with 3 to 8 it is the same."""
-_FIRST_RATE, _NAMED_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 1.0, 4.0, 64.0, 64.0
-"""v at the start; of one that was alone and is named by the first robot it hears; after an entry (with 8 a grid of 5 ×
-4 is 3 % older); and the most that entries in vain make. With 8 at the start and 4 for one that is named (and a
-``QUIET`` of 6), the first message of two robots comes after 14 instead of 10 s where packets take half a second
-(``python -m bench first``), 50 robots from cold take as long. With 3 or 2 at the start, it is the same."""
+_FIRST_RATE, _NAMED_RATE, _ENTRY_RATE, _DEAF_RATE, _LEAST_RATE = 4.0, 2.0, 4.0, 64.0, 64.0
+"""v at the start; of one that is named, and has no slots; after an entry (with 8 a grid of 5 × 4 is 3 % older); and the
+most that entries in vain make. For one that is named: with 4, the first message of two robots with a key comes after
+15.7 s where packets take half a second (``python -m bench first``); with 1, the ends of a line of three, which do not
+hear each other, begin at once, and one that comes back gets a message too late for a deadline of 4 s in 4 of 14 starts,
+as in one with 2. At the start it is the same with 3 or 2."""
 _NEVER = -1 << 40
 _SWEEP = 64
 _SILENT = 4096

@@ -39,9 +39,10 @@ _FASTEST = 3.5e-3
 """How much faster or slower than its receiver's clock a burst may pass: sound from a robot that drives at 1.1 m/s."""
 _DELAY_STEP = 0.4
 """Samples between two delays of the second sync word that are tried, over the share of carriers that are used."""
-_SURE = 4.0
+_SURE = 8.0
 """Deviations by which a pace must differ from 0: where it does not, reading samples as they are is nearer to the
-truth."""
+truth. The deviation itself is estimated from few carriers: with 4, one in 500 packets that nothing delays is lost to it
+at any SNR (64 carriers, 1,000 packets at 9.5 to 12 dB)."""
 _CHUNK = 16 * 64
 """Carriers of the payload symbols decided together; timing and channel are estimated once for each such group."""
 _CLOCKS = 50e-6

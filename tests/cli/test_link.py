@@ -45,6 +45,7 @@ def stats(
             "publish_failed": unpublished,
         },
         "packets": {"out": 90, "in": 64, "refused": 0, "damaged": damaged},
+        "peers": [],
         "phy": {"snr_db": snr_db},
         "front_end": {"name": "uhd", "passed": {"bursts_out": 90}, "lost": {"overflows": 0}},
         "airtime": {"transmits": True, "sent_s": 0.0, "refused": {}},

@@ -89,7 +89,7 @@ def test_a_publisher_that_comes_back_with_another_type_is_carried_again(make: Ca
         assert stats["source"]["topics"]["/count"]["submitted"] == 120
         assert len(pair.source.subscriptions.registry) == 2
         rest = {"packets": {"in": 1, "out": 1, "refused": 0, "damaged": 0}, "airtime": {"transmits": True}}
-        rest["uptime_s"] = 1.0
+        rest |= {"uptime_s": 1.0, "peers": []}
         line = status_line({**stats, **rest, "phy": {"snr_db": None}, "front_end": {"lost": {}}})
         assert f"/count is {STRING} now" in line
         published = [info.type_name for info in pair.far.discover() if info.publishers]

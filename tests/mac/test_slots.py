@@ -281,28 +281,6 @@ def test_a_robot_that_was_alone_for_long_sends_soon_once_it_hears_somebody() -> 
     assert block.ahead[0] < 10
 
 
-def test_who_was_alone_and_is_named_by_the_first_robot_it_hears_sends_in_the_next_free_slot() -> None:
-    for seed in range(20):
-        made = robot(5, seed)
-        begin, _ = send(made, 1.0)
-        slot = made.clock.slot(begin + SLOT / 2) + 6
-        made.departure(begin + SLOT)
-        hear(made, 9, slot, Block(0, (1, 200), 1, (5, NOBODY)))
-        begin, _ = send(made, made.clock.begin(slot) + SLOT / 2)
-        assert made.clock.slot(begin + SLOT / 2) == slot + 2, "the other one has announced the first"
-
-
-@pytest.mark.parametrize("heard", [0, 1])
-def test_who_hears_nobody_in_its_own_slots_moves_to_those_of_a_robot_that_hears_others(heard: int) -> None:
-    made = robot(5)
-    begin, _ = send(made, 1.0)
-    slot = made.clock.slot(begin + SLOT / 2)
-    behind = Block((slot + 1) % 256, (20, 20), heard, (NOBODY, NOBODY))
-    made.hear(9, behind, made.clock.begin(slot + 1) + SLOT / 2)
-    assert made.clock.jumps == heard
-    assert (set(made._robots) == {9}) == bool(heard)
-
-
 def test_an_entrant_that_nobody_names_starts_over() -> None:
     made = robot(5)
     hear(made, 1, 60, Block(0, (200, 200), 2, (NOBODY, NOBODY)))

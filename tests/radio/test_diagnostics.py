@@ -128,7 +128,7 @@ def test_a_second_link_of_the_same_robot_on_one_graph_is_told(caplog: pytest.Log
 
 def test_two_robots_of_one_number_are_named_on_diagnostics() -> None:
     arrays: list[Any] = []
-    doubled = {"robot": 7, "heard_s": 0.5, "hops": 0, "over": None, "doubled": True}
+    doubled = {"robot": 7, "heard_s": 0.5, "hops": 0, "over": None, "doubled": True, "clock": None}
     store = typestore()
     with MemoryMiddleware(domain_id=domain()) as graph:
         graph.subscribe(

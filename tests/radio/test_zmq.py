@@ -186,9 +186,8 @@ def test_a_channel_changes_and_the_signal_is_seen_with_streams_and_without(
 
 
 def test_while_a_burst_is_taken_those_that_come_wait_and_none_beyond(ends: list[dict[str, Any]], stranger: Any) -> None:
-    most = 5
     address = ends[1]["bind"]
-    front_end = ZmqFrontEnd(PHY.load("psk")(64, RATE), bind=ends[0]["bind"], connect=[address], burst_queue=most)
+    front_end = ZmqFrontEnd(PHY.load("psk")(64, RATE), bind=ends[0]["bind"], connect=[address])
     taken: list[int] = []
     goes_on = threading.Event()
 
@@ -208,10 +207,10 @@ def test_while_a_burst_is_taken_those_that_come_wait_and_none_beyond(ends: list[
                 sent += 1
 
         wait_for(lambda: send(1) or taken, "a burst that is taken")
-        send(100 * most)
+        send(100 * WAITING)
         goes_on.set()
         wait_for(lambda: front_end.counters().lost["overflows"] and not front_end.arrivals.behind, "all bursts")
-        assert len(taken) >= most
+        assert len(taken) >= WAITING
         assert taken == sorted(set(taken))
         front_end.listen(None)
         before = len(taken)

@@ -234,7 +234,7 @@ def test_three_robots_with_a_key_hear_each_other_soon_where_packets_take_half_a_
     assert whole()
 
 
-@pytest.mark.parametrize(("mode", "most"), [("none", 18), ("encrypt", 19)])
+@pytest.mark.parametrize(("mode", "most"), [("none", 18), ("encrypt", 20)])
 def test_the_first_message_comes_after_some_turns_however_long_a_packet_lasts(mode: SealMode, most: int) -> None:
     """From cold: a robot that starts, or is met, does not only say that it is there."""
     airtime_s, took = 0.526, []
