@@ -155,6 +155,7 @@ STATS = {
         "topics": {},
     },
     "peers": [],
+    "clocks": {"set": []},
     "packets": {"out": 0, "backlog": 0, "damaged": 0, "foreign": 0},
     "phy": {"airtime_s": 0.0},
     "front_end": {"name": "sim", "passed": {}, "lost": {}},
