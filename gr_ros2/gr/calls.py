@@ -218,9 +218,7 @@ class LiveCalls:
 
     def reached(self) -> dict[str, str]:
         """Types, by their names here, of the services of other robots that can be called."""
-        with self._changing:
-            topics = [(src_id, self._robots[src_id].services[number]) for src_id, number in self._servers]
-            return {self._name(src_id, topic): topic.type_name for src_id, topic in topics}
+        return {name: topic.type_name for name, _, topic in self._reached()}
 
     def call(self, name: str, payload: bytes) -> bytes:
         """Call a service of another robot, and wait for the reply.
@@ -228,9 +226,7 @@ class LiveCalls:
         :param name: as in ``reached``
         :raises MiddlewareError: there is none, or no reply has come in time
         """
-        with self._changing:
-            topics = [(src_id, self._robots[src_id].services[number]) for src_id, number in self._servers]
-            found = next(((src_id, topic) for src_id, topic in topics if self._name(src_id, topic) == name), None)
+        found = next(((src_id, topic) for known, src_id, topic in self._reached() if known == name), None)
         if found is None:
             raise MiddlewareError(f"service {name}: it is not there any more")
         src_id, topic = found
@@ -241,6 +237,12 @@ class LiveCalls:
             return reply.result(deadline_s)
         except FutureTimeoutError:
             raise MiddlewareError(f"service {name}: no reply within {deadline_s:g} s") from None
+
+    def _reached(self) -> list[tuple[str, int, Topic]]:
+        """The services that can be called: name here, robot and topic."""
+        with self._changing:
+            topics = [(src_id, self._robots[src_id].services[number]) for src_id, number in self._servers]
+            return [(self._name(src_id, topic), src_id, topic) for src_id, topic in topics]
 
     # ---- the link itself
 
@@ -270,6 +272,16 @@ class LiveCalls:
         """The robots that are heard."""
         with self._changing:
             return sorted(number for number, robot in self._robots.items() if robot.here)
+
+    def check_heard(self, robot: int) -> None:
+        """Check that a robot can be asked.
+
+        :raises ConfigError: it is not heard
+        """
+        heard = self.heard()
+        if robot not in heard:
+            those = f"heard are {', '.join(map(str, heard))}" if heard else "nobody is heard"
+            raise ConfigError(f"robot {robot} is not heard; {those}")
 
     def _change(self, src_id: int, *, services: dict[int, Topic] | None = None, here: bool | None = None) -> None:
         """Make and close servers after a robot was heard, has become silent, or has announced other services."""

@@ -177,8 +177,7 @@ class LiveThroughput:
             raise ConfigError(f"for = {for_s} s: write 1 to {LONGEST_S} s")
         if not self._config.sends:
             raise ConfigError("this robot sends nothing (direction: receive), so it cannot ask another one")
-        if robot not in (heard := self._calls.heard()):
-            raise ConfigError(f"robot {robot} is not heard; heard are {', '.join(map(str, heard)) or 'none'}")
+        self._calls.check_heard(robot)
         number, now = secrets.randbits(32), self._clock()
         with self._lock:
             if self._thread is not None:

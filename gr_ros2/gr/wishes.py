@@ -165,7 +165,7 @@ class LiveWishes:
         :param anew: ask it now
         :raises ConfigError: for a robot that is not heard
         """
-        self._check_robot(robot)
+        self._calls.check_heard(robot)
         with self._due:
             if anew:
                 self._lists[robot] = _List([])
@@ -213,17 +213,11 @@ class LiveWishes:
 
         :raises ConfigError: for a robot that is not heard, or a name that no topic has
         """
-        self._check_robot(robot)
+        self._calls.check_heard(robot)
         plain = name.lstrip("/")
         if fault := topic_fault(f"/{plain}"):
             raise ConfigError(f"{name!r} {fault}; write it as gr-ros2 topics {robot} does")
         return plain
-
-    def _check_robot(self, robot: int) -> None:
-        heard = self._calls.heard()
-        if robot not in heard:
-            those = f"heard are {', '.join(map(str, heard))}" if heard else "nobody is heard"
-            raise ConfigError(f"robot {robot} is not heard; {those}")
 
     # ---- what others want
 

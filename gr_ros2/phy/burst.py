@@ -251,6 +251,11 @@ class BurstModem(ABC):
         rate is fixed. This modem reads the bursts of all of them."""
         return (self,)
 
+    def on_mcs(self, mcs: int | None) -> BurstModem:
+        """The modem of an MCS by its index; the most robust one for None, or one of other settings."""
+        rates = self.rates
+        return rates[mcs if mcs is not None and 0 <= mcs < len(rates) else 0]
+
     @abstractmethod
     def samples_of(self, packet_len: int) -> int:
         """Samples of the burst of a packet of ``packet_len`` bytes as sent, without gap."""

@@ -167,7 +167,7 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
     def __init__(self, phy: BurstPhy) -> None:
         super().__init__(phy.lengths, f"gr_ros2_{phy.name}_modulator", None, [np.complex64])
         self._tagged = phy.any_length
-        self._rates = phy.running_modem.rates
+        self._modem = phy.running_modem
         self._gap = phy.gap
         self._waiting: deque[tuple[BurstModem, AirPacket]] = deque()
         self._whole = np.zeros(phy.airtime_samples(), np.complex64)
@@ -180,10 +180,7 @@ class _Modulator(TakesPackets, gr.sync_block):  # type: ignore[misc]
         self.set_min_output_buffer(_BUFFER)
 
     def take_packets(self, packets: list[AirPacket]) -> None:
-        # An MCS that this end does not have is one of settings that differ: the most robust one is sent.
-        for packet in packets:
-            mcs = packet.mcs or 0
-            self._waiting.append((self._rates[mcs if 0 <= mcs < len(self._rates) else 0], packet))
+        self._waiting.extend((self._modem.on_mcs(packet.mcs), packet) for packet in packets)
 
     def take(self, packets: Sequence[AirPacket]) -> None:
         super().take(packets)
@@ -326,7 +323,7 @@ class BurstTransceiver(TakesPackets, gr.basic_block):  # type: ignore[misc]
 
     def __init__(self, phy: BurstPhy, carrier: BurstCarrier) -> None:
         super().__init__(phy.lengths, f"gr_ros2_{phy.name}", None, None)
-        self._rates, self._gap, self._carrier = phy.running_modem.rates, phy.gap, carrier
+        self._modem, self._gap, self._carrier = phy.running_modem, phy.gap, carrier
         self._whole = np.zeros(phy.airtime_samples(), np.complex64)
         self._demodulation = Demodulation(phy.running_modem, phy.lag, phy.gap, phy.sample_rate)
         self._taps = None if phy.receiver_taps is None else np.asarray(phy.receiver_taps, np.float32)
@@ -380,9 +377,7 @@ class BurstTransceiver(TakesPackets, gr.basic_block):  # type: ignore[misc]
 
     def take_packets(self, packets: list[AirPacket]) -> None:
         for packet in packets:
-            # An MCS that this end does not have is one of settings that differ: the most robust one is sent.
-            mcs = packet.mcs or 0
-            modem = self._rates[mcs if 0 <= mcs < len(self._rates) else 0]
+            modem = self._modem.on_mcs(packet.mcs)
             samples = self._whole[: modem.samples_of(len(packet.data)) + self._gap]
             modem.modulate_into([packet.data], self._gap, samples)
             self._carrier.send(samples, packet.at)

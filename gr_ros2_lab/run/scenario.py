@@ -144,7 +144,7 @@ class Scenario(Reach, Experiment, Traffic, AirConfig):
         if (placed or gains) and not PHY.load(self.phy.name).has_samples:
             key = "channel.from = 'positions'" if placed else "gains_db"
             raise ValueError(f"{key}: phy {self.phy.name} has no samples, so no level; choose another")
-        if gains and any(one.trace for one in (self.channel, *self.paths)):
+        if gains and any(path.trace for path in self.paths):
             raise ValueError("gains_db: levels follow from the trace; leave one of them out")
         if not placed:
             return
