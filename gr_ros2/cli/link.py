@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.live import Live
 
 from gr_ros2.calls.wish_frames import MOST_RATE
+from gr_ros2.cli.bag import bag_option, output_bag
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option, foxglove_option, foxglove_server
@@ -80,6 +81,7 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @dashboard_option
 @foxglove_option
 @pcap_option
+@bag_option
 def link(
     *,
     config: Path | None,
@@ -98,6 +100,7 @@ def link(
     dashboard: str | None,
     foxglove: str | None,
     pcap: Path | None,
+    bag: Path | None,
     **flags: Any,
 ) -> int:
     """Run this robot's end of a link: its ROS topics to the air, and what is received to its ROS graph.
@@ -143,8 +146,9 @@ def link(
     with ExitStack() as stack:
         clients = stack.enter_context(audience(dashboard, console, settings.name, answers=answers))
         captures = stack.enter_context(capture(pcap))
+        bags = stack.enter_context(output_bag(bag))
         viewers = stack.enter_context(foxglove_server(foxglove, console))
-        run_observers = RunObservers([clients, *captures, *viewers], threaded=True)
+        run_observers = RunObservers([clients, *captures, *bags, *viewers], threaded=True)
         stack.callback(run_observers.run_ended, None)
         running = RobotLink(settings, observer=run_observers, instrumented=True)
         stack.callback(running.stop)
@@ -160,9 +164,10 @@ def link(
         stats = running.stats()
         stack.close()
         console.print(status_line(stats), soft_wrap=True)
-        for line in running.incomplete():
+        missing = [*running.incomplete(), *(line for each in bags for line in each.incomplete())]
+        for line in missing:
             console.print(line, soft_wrap=True)
-        return FAILED if running.incomplete() else 0
+        return FAILED if missing else 0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

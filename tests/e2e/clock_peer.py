@@ -1,4 +1,4 @@
-"""`gr-ros2 link FILE` on a computer whose clock is wrong, with its programs: ``clock_peer.py FILE ROBOT AHEAD_S``.
+"""`gr-ros2 link FILE` on a computer whose clock is wrong, with its programs: ``clock_peer.py FILE ROBOT AHEAD_S …``.
 
 Each line of input sets the clock: s by which it is ahead of the true one. Messages that the robot publishes are stamped
 by that clock, and say in them what the true time was. ``got TRUE STAMP`` is said of each message that comes out here.
@@ -41,7 +41,7 @@ PERIOD_S = 0.1
 KEEPS = Qos("reliable", "volatile", 10)
 
 
-def main(file: str, number: str, ahead_s: str) -> int:
+def main(file: str, number: str, ahead_s: str, *options: str) -> int:
     CLOCK.set(ahead_s)
     store = humble_types()
     types = store.types
@@ -75,7 +75,7 @@ def main(file: str, number: str, ahead_s: str) -> int:
         for work in (publish, be_told):
             threading.Thread(target=work, daemon=True).start()
         try:
-            return run(["link", file])
+            return run(["link", file, *options])
         finally:
             over.set()
 

@@ -13,10 +13,13 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.observe.positions import humble_types
 from gr_ros2.radio.clocks import MAGIC, SAMPLE
 from tests.e2e.links import LinkProcess, Links
 from tests.waiting import wait_for
 
+POINT = "geometry_msgs/msg/PointStamped"
 PEER = (sys.executable, "-m", "tests.e2e.clock_peer")
 ADJUSTED_S = 1e-3
 """s by which the clock of the machine that runs the tests may be adjusted meanwhile, or read at another moment."""
@@ -99,3 +102,23 @@ def test_ping_tells_a_clock_that_nobody_watches(tmp_path: Path) -> None:
         told = json.loads(said)
         assert (status, told["clock_s"]) == (0, pytest.approx(-7, abs=told["clock_error_s"] + ADJUSTED_S))
         assert close_to(clock(one), -7)
+
+
+def test_a_bag_of_what_came_out_has_the_times_of_this_computers_clock(tmp_path: Path) -> None:
+    settings = {"topics": {"place": {}}}
+    bag = tmp_path / "recorded"
+    with Links(tmp_path, {**settings, "clock": {"every_s": 0.5}}, settings) as links:
+        one = links.start(1, "1", "0", "--bag", str(bag), command=PEER)
+        links.start(2, "2", "-500", command=PEER)
+        links.meet()
+        wait_for(lambda: clock(one), "its clock to be known")
+        before, found = len(got(one)), clock(one)
+        wait_for(lambda: len(got(one)) > before + 10, "messages")
+        assert one.end() == 0
+    recorded = list(read_bag(bag))
+    assert [each.stamp_ns for each in recorded] == sorted(each.stamp_ns for each in recorded)
+    assert len(recorded) >= before + 10
+    store = humble_types()
+    for each in recorded[before + 1 :]:
+        true = store.deserialize_cdr(each.payload, POINT).point.x
+        assert abs(each.stamp_ns / 1e9 - true) <= found["error_s"] + ADJUSTED_S
