@@ -125,7 +125,8 @@ def audience(
                 place = build(_Place, asked, "dashboard")
                 return {"url": serve(place.address, place.port)}
             if strange := sorted(set(asked) - set(answers)):
-                raise ConfigError(f"{', '.join(strange)}: no question here; known are {', '.join(sorted(answers))}")
+                known = ", ".join(sorted({"address", "port", *answers}))
+                raise ConfigError(f"{', '.join(strange)}: no question here; known are {known}")
             return {key: answers[key](value) for key, value in asked.items()}
 
         if where is not None:

@@ -23,7 +23,7 @@ from typing import Any
 
 from gr_ros2.calls import NO_DEADLINE, Answer, Calls, Offer, OutgoingFrame, Request, Service
 from gr_ros2.calls.frames import OF_LINK
-from gr_ros2.core.errors import ConfigError, GrRos2Error, MiddlewareError
+from gr_ros2.core.errors import ConfigError, GrRos2Error, MiddlewareError, WireError
 from gr_ros2.gr.found_topics import FoundTopics
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.loops import LOOP_GUARD
@@ -84,7 +84,7 @@ class LiveCalls:
         self.on_link_call: Callable[[int, int, Request], None] = lambda _robot, _boot, _request: None
         """Called when another robot, of this start, calls the link itself; must return at once."""
         self.link_calls: dict[int, Callable[[int, int, Request], None]] = {}
-        """The same for calls that begin with this byte."""
+        """The same for calls that begin with this byte; raises WireError for one that cannot be read."""
         self.on_filler: Callable[[int, bytes], None] = lambda _robot, _payload: None
         """Called with a message of a measurement (:mod:`gr_ros2.gr.throughput`); must return at once."""
         self.on_met: Callable[[int, int], None] = lambda _robot, _boot: None
@@ -351,6 +351,8 @@ class LiveCalls:
                 self._servers[found.robot, found.service_id].reply(found.token, found.payload)
         except KeyError:
             self._tell_first("not_passed_on", MiddlewareError("a reply came after the server here was closed"))
+        except WireError as error:
+            self._tell_first("malformed", error)
         except GrRos2Error as error:
             self._tell_first("not_passed_on", error)
 

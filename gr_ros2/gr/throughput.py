@@ -220,11 +220,11 @@ class LiveThroughput:
     # ---- the other robot
 
     def _called(self, robot: int, _boot: int, request: Request) -> None:
-        """Answer another robot, in the thread that receives."""
-        try:
-            asked = read_measure(request.payload)
-        except WireError:
-            return
+        """Answer another robot, in the thread that receives.
+
+        :raises WireError: its request cannot be read
+        """
+        asked = read_measure(request.payload)
         now = self._clock()
         with self._lock:
             run = self._run

@@ -148,11 +148,23 @@ def read_metadata(text: bytes) -> SigmfRecording:
                     f"{key} = {part[key]!r:.80}: the samples do not fill {DATA} alone; write them, and nothing else, "
                     f"to a recording without {key}"
                 )
+    _check_extensions(about.get("core:extensions"))
     _check_hz("core:sample_rate", sample_rate, above=0)
     frequency = captures[0].get("core:frequency") if captures else None
     if frequency is not None:
         _check_hz("core:frequency", frequency, above=-_MOST_HZ)
     return SigmfRecording(float(sample_rate), frequency, str(about.get("core:description", "")))
+
+
+def _check_extensions(declared: Any) -> None:
+    """Check that nobody has to know an extension of SigMF to read the samples. Before version 1.0.0 they were an object
+    of names and versions, and did not say whether they have to be known."""
+    for extension in declared if isinstance(declared, list) else []:
+        if not isinstance(extension, dict) or extension.get("optional") is not True:
+            raise ValueError(
+                f"core:extensions has {extension!r:.80}: no extension is known here; if its samples can be replayed "
+                "without it, set its optional to true"
+            )
 
 
 def _check_hz(key: str, value: Any, above: float) -> None:

@@ -65,7 +65,7 @@ def goes_on(robot: Robot) -> None:
         ({SET: [["topic\nx\x1b[1m", 7]]}, r"topic x\\x1b\[1m cannot change"),
         ({SET: [["topics.a\nb.to", 7]]}, r"topics: 'a\\nb' '\\n' may not stand in a ROS name"),
         ({"p\nong": 7}, "p ong: no question here"),
-        ({"pong": 7}, "pong: no question here; known are measure, offers, ping, set, status, want"),
+        ({"pong": 7}, "pong: no question here; known are address, measure, offers, ping, port, set, status, want"),
         ({"address": "127.0.0.1", "port": 70000}, "dashboard: port = 70000: .* 65535"),
         ({"address": "127.0.0.1"}, "dashboard: port"),
     ],
@@ -75,6 +75,12 @@ def test_what_cannot_be_asked_is_refused_and_says_what_can(robot: Robot, questio
         request(os.getpid(), question)
     assert "\n" not in str(refused.value)
     goes_on(robot)
+
+
+def test_a_run_that_answers_nothing_else_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with audience(None, console(), "run"), pytest.raises(RunError, match=r"pong: .*; known are address, port$"):
+        request(os.getpid(), {"pong": 7})
 
 
 def test_a_number_given_as_text_is_a_number(robot: Robot) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.calls.throughput_frames import MEASURE, REPORT
 from gr_ros2.gr import RosLink
 from gr_ros2.link import AirPacket
 from gr_ros2.link.air import Air
@@ -117,6 +118,17 @@ def line(tmp_path: Any) -> Iterator[Line]:
     with ExitStack() as stack:
         line.robots = [LinkedRobot(src_id, line, tmp_path, stack) for src_id in range(1, LAST + 1)]  # type: ignore[misc]
         yield line
+
+
+@pytest.mark.parametrize("payload", [bytes([MEASURE]), bytes([REPORT]) + bytes(6)])
+def test_a_question_about_the_link_that_cannot_be_read_is_counted(line: Line, payload: bytes) -> None:
+    first, second, *_ = line.robots
+    while not first.link.calls.ask(2, payload, lambda _: None, 30):  # type: ignore[attr-defined]
+        line.run(1)
+    end = line.now + 30
+    while line.now < end and "malformed" not in second.counted():  # type: ignore[attr-defined]
+        line.run(1)
+    assert second.counted()["malformed"] == 1  # type: ignore[attr-defined]
 
 
 @pytest.mark.slow

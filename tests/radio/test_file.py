@@ -205,6 +205,9 @@ RECORDED = {"core:datatype": "cf32_le", "core:sample_rate": 1e6, "core:version":
         ({"core:sample_rate": None}, [], "core:sample_rate = None: set a number in Hz"),
         ({}, [{"core:frequency": "100 MHz"}], "core:frequency = '100 MHz': set a number in Hz"),
         ({}, [{"core:frequency": float("inf")}], "core:frequency = inf: set a number in Hz"),
+        ({"core:extensions": [{"name": "multichannel", "version": "1.0.0", "optional": False}]}, [], "multichannel"),
+        ({"core:extensions": [{"name": "ntia-core", "version": "2.0.0"}]}, [], "core:extensions has .*ntia-core"),
+        ({"core:extensions": ["antenna"]}, [], "core:extensions has 'antenna'"),
         ({"core:num_channels": 2}, [], "datatype 'cf32_le', channels 2; only cf32_le of one channel"),
     ],
 )
@@ -221,11 +224,13 @@ def test_metadata_that_cannot_be_honoured_are_refused_in_one_line(
 
 def test_metadata_of_others_that_can_be_honoured(tmp_path: Path) -> None:
     captures = [{"core:sample_start": 0, "core:header_bytes": 0, "core:frequency": 433000000}, {"core:sample_start": 9}]
-    whole = {"global": RECORDED | {"core:sample_rate": 1000000, "core:trailing_bytes": 0}, "captures": captures}
+    extensions = [{"name": "antenna", "version": "1.0.0", "optional": True}]
+    about = {"core:sample_rate": 1000000, "core:trailing_bytes": 0, "core:extensions": extensions}
+    whole = {"global": RECORDED | about, "captures": captures}
     (tmp_path / "in.sigmf-meta").write_text(json.dumps(whole))
     (tmp_path / "in.sigmf-data").write_bytes(bytes(800))
-    about, samples = read_recording(tmp_path / "in")
-    assert (about.sample_rate, about.frequency, len(samples)) == (1e6, 433e6, 100)
+    found, samples = read_recording(tmp_path / "in")
+    assert (found.sample_rate, found.frequency, len(samples)) == (1e6, 433e6, 100)
 
 
 def test_an_empty_recording_ends_at_once(tmp_path: Path) -> None:
