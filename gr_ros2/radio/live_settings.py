@@ -53,13 +53,17 @@ class LiveSettings:
             self._setters[name](value)
             return shortened(f"{name} = {value}")
         topic, option = place
+        sent = self._source.subscriptions.subscribed
+        topic = sent[topic].name if topic in sent else topic  # as status writes it
         given = self._source.config.topics
         known = next((other for other in given if other.lstrip("/") == topic.lstrip("/")), topic)
         before = options_of(topic, self._source.config.options, SendOptions())
         changed = {**{each.name: getattr(before, each.name) for each in fields(SendOptions)}, option: value}
         self._source.set_topics({**given, known: changed})
-        sent = {topic.name.lstrip("/") for topic in self._source.subscriptions.subscribed.values()}
-        return shortened(f"{name} = {value}") + ("" if topic.lstrip("/") in sent else f"; no topic {topic} is sent now")
+        if topic.lstrip("/") in {one.name.lstrip("/") for one in self._source.subscriptions.subscribed.values()}:
+            return shortened(f"{name} = {value}")
+        names = ", ".join(sorted(self._source.subscriptions.subscribed)) or "none"
+        return shortened(f"{name} = {value}; no topic {topic} is sent now, it waits for one; sent are {names}")
 
     def _set_both(self, name: str, value: Any) -> None:
         """Change what both directions have."""

@@ -175,6 +175,7 @@ class Scenario(Reach, Experiment, Traffic, AirConfig):
                 if number is not None and number not in numbers:
                     raise ValueError(f"paths: there is no robot {number}; there are {', '.join(map(str, numbers))}")
         if self.task and (not all(sends) or self.time == "samples"):
+            task_class(self.task)  # that there is no such task is said first
             raise ValueError(
                 f"task = {self.task!r}: robots act on what they hear in real time or at packets; set time: real or "
                 "packets, and let all of them send"

@@ -48,7 +48,7 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
         top.msg_connect((source, "pdus"), (sink, "pdus"))
     live = LiveSettings(source, sinks[0])
     said = live.change(TO, 2)  # also of a topic that the graph does not have yet
-    assert said == f"{TO} = 2" + "; no topic goal is sent now" * found
+    assert said == f"{TO} = 2" + "; no topic goal is sent now, it waits for one; sent are none" * found
     top.start()
     try:
         wait_for(publisher.matched, "the source's subscription")
@@ -68,6 +68,12 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
         ):
             live.change("packet_len", 100)
         live.change("topics./goal.weight", 2.0)
+        if found:
+            said = live.change("topics.gaol.to", 2)
+            assert said == "topics.gaol.to = 2; no topic gaol is sent now, it waits for one; sent are /goal"
+        else:
+            with pytest.raises(ConfigError, match="topic 'gaol' is not in the registry; it has goal"):
+                live.change("topics.gaol.to", 2)
         (counted,) = source.stats()["topics"].values()
         assert (counted["submitted"], counted["types"], counted["sent"]) == (5, 1, 5)
         counts = lambda: [sink.stats()["topics"]["/rx_robot_1/goal"]["delivered"] for sink in sinks]  # noqa: E731

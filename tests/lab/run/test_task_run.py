@@ -155,6 +155,7 @@ def test_a_run_without_controllers_says_where_they_are_missed(monkeypatch: pytes
         (["time=samples"], "task = 'formation'"),
         (["registry=table4", "topics=auto"], "their odometry|send their odometry alone"),
         (["task=dance"], "task = 'dance': is no task"),
+        (["task=dance", "time=samples"], "task = 'dance': is no task"),
         (["controller=ros"], "controller = 'ros'"),
         (["task=", "time=real", "controller=ros"], "controller = 'ros'"),
     ],
