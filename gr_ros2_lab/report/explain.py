@@ -19,6 +19,8 @@ from gr_ros2_lab.record.team_numbers import air_span_s, airtime_of_senders, ledg
 from gr_ros2_lab.record.trace import Ints, Packets, Trace
 from gr_ros2_lab.report.table import ends, milliseconds
 
+_NO_REPAIR = "packets that say what is given up"
+"""What is sent as repair is sent where repair is off; such a packet may bring one back."""
 _KINDS = {"new": "new messages", "repair": "repair", "report": "reports", "hello": "hellos"}
 _BEHIND = 0.01
 """A link falls behind if its latency grows by more than this share of the run. Otherwise its queues just fluctuate."""
@@ -129,7 +131,16 @@ def air_lines(result: Result) -> Iterator[str]:
     span = air_span_s(result)
     if senders and span:
         sending = {str(topic.src_id) for topic in result.topics}
-        yield air_line(senders, span, sending, shared=result.config.get("duplex") == "half")
+        words = repair_words(result)
+        told = {src: {words if kind == "repair" else kind: s for kind, s in of.items()} for src, of in senders.items()}
+        yield air_line(told, span, sending, shared=result.config.get("duplex") == "half")
+
+
+def repair_words(result: Result) -> str:
+    """What the packets are that count as repair."""
+    robots = result.config.get("robots") or [{}]
+    off = all({**result.config, **robot}.get("repair") == "off" for robot in robots)
+    return _NO_REPAIR if off else "repair"
 
 
 def air_line(senders: Mapping[str, Mapping[str, float]], span: float, sending: Container[str], *, shared: bool) -> str:

@@ -12,7 +12,7 @@ from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.record.team_numbers import TEAM_VALUES, ledger_of, team_pairs
 from gr_ros2_lab.record.trace import Trace
-from gr_ros2_lab.report.explain import air_lines, change_lines, lateness_lines, percent, seconds, why
+from gr_ros2_lab.report.explain import air_lines, change_lines, lateness_lines, percent, repair_words, seconds, why
 from gr_ros2_lab.report.table import Grid, by_receiver, faults, number
 
 MOST_LINES = 15
@@ -25,7 +25,13 @@ _TOPICS = 6
 def headline(result: Result, trace: Trace) -> list[str]:
     """The lines without the table: the computer's lateness, what the robots achieved, and what was worst and why."""
     pairs, grid = team_pairs(result), topics_grid(result)
-    lines = [*lateness_lines(result), *change_lines(result), *_tasks(result), _delivered(pairs), *faults(result)]
+    lines = [
+        *lateness_lines(result),
+        *change_lines(result),
+        *_tasks(result),
+        _delivered(pairs, repair_words(result)),
+        *faults(result),
+    ]
     lines += [*_ages(result), *_hopeless(result, pairs)]
     if grid is None:
         lines += _worst(result)
@@ -64,7 +70,7 @@ def _tasks(result: Result) -> Iterator[str]:
         yield f"{label[0].capitalize()}: {known}."
 
 
-def _delivered(pairs: Sequence[TopicResult]) -> str:
+def _delivered(pairs: Sequence[TopicResult], repair: str) -> str:
     ledger = ledger_of(pairs)
     sent = ledger.total()
     if not sent:
@@ -72,7 +78,7 @@ def _delivered(pairs: Sequence[TopicResult]) -> str:
     here = sum(ledger[fate] for fate in ARRIVED)
     robots = len({topic.src_id for topic in pairs})
     of = f" of {robots} robots" if robots > 1 else ""
-    repaired = f", {percent(ledger[Fate.REPAIRED] / sent)} after repair" if ledger[Fate.REPAIRED] else ""
+    repaired = f", {percent(ledger[Fate.REPAIRED] / sent)} after {repair}" if ledger[Fate.REPAIRED] else ""
     lost = f"; {_lost(ledger)}" if here < sent else ""
     return f"Delivered: {here:,} of {sent:,} messages{of} ({percent(here / sent)}{repaired}){lost}."
 

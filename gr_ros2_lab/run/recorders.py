@@ -188,6 +188,11 @@ class RunRecords:
         for guard in (*self._guards, self._acting):
             guard.check()
 
+    def progress(self) -> tuple[int, int]:
+        """Messages sent and delivered so far, at all receivers together."""
+        sent, delivered = zip(*(recorder.progress() for recorder in self._recorders), strict=True)
+        return sum(sent), sum(delivered)
+
     def unresolved(self) -> int:
         """Messages whose result is open, at all receivers together."""
         return sum(recorder.ledger.unresolved() for recorder in self._recorders)

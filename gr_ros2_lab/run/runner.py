@@ -359,7 +359,7 @@ class _Run:
         self.records.check()
         self.live.check()
         if on_progress is not None:
-            sent, delivered = self.records.recorder.progress()
+            sent, delivered = self.records.progress()
             now = Progress(self.clock() - begin, self.scenario.duration_s, sent, delivered, self.live.graphs)
             self.progress_guard(on_progress, now)
 

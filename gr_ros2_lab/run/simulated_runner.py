@@ -94,7 +94,7 @@ def run_simulated(
                 records.check()
             if on_progress is not None and time.monotonic() > reported + _REPORT_S:
                 reported = time.monotonic()
-                progress(on_progress, Progress(clock.now, scenario.duration_s, *records.recorder.progress()))
+                progress(on_progress, Progress(clock.now, scenario.duration_s, *records.progress()))
         records.check()
     counted = [_counters(run, number, source_names(robot, registry)) for number, robot in enumerate(senders)]
     return records.outcome(

@@ -22,8 +22,8 @@ from tests.middleware.support import CUSTOM, message
 from tests.radio.robots import QOS, config
 
 PERIODS_S = {1: 0.05, 2: 0.06}
-"""s between two messages of a robot, on its link's clock, which in lock step is slower than this machine's. They differ,
-so that robots that begin together do not go on sending together."""
+"""s between two messages of a robot, on its link's clock, which in lock step is slower than this machine's. They
+differ, so that robots that begin together do not go on sending together."""
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload([__name__, "gr_ros2.phy.psk", "gr_ros2.radio.zmq", "gr_ros2.compression"])
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass as plain_dataclass
 from itertools import product
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
@@ -21,7 +22,7 @@ from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import Phy
 from gr_ros2.settings.config import ScenarioChannel, Text, build, read_yaml
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.files import find_registry
+from gr_ros2.settings.files import find_registry, parse_override
 from gr_ros2_lab.record.team_numbers import TEAM_VALUES
 from gr_ros2_lab.run.builtin import SCENARIO_DIR
 from gr_ros2_lab.run.load import check_channels, make_phy, source_names
@@ -51,6 +52,9 @@ VALUES = {
 
 OF_THE_LINK = (PDR, "goodput_Bps", "airtime_per_message_s", "airtime_per_byte_s", *TEAM_VALUES)
 """The numbers that exist for all topics together."""
+
+OF_THE_SWEEP = (("repetitions",), ("time",))
+"""Settings of a scenario that a sweep has for all its cells."""
 
 Overrides = Mapping[str, Any]
 """Dotted key -> value, as on the command line after ``--set``."""
@@ -88,6 +92,9 @@ class Sweep(Experiment):
         if not self.grid and not self.list:
             raise ValueError("nothing to sweep; give grid, list or both")
         swept = self.keys
+        for (key,) in OF_THE_SWEEP:
+            if key in self.set or key in swept:
+                raise ValueError(f"{key} is the same in all cells; write it at the top of the file")
         for key in swept:
             if key in self.set:
                 raise ValueError(f"{key} stands in set and is swept; take it out of one of them")
@@ -160,20 +167,27 @@ class SweepPlan:
 def load_sweep(name_or_path: str | Path, overrides: Sequence[str] = ()) -> SweepPlan:
     """Read a built-in sweep or a YAML file and make all its cells.
 
-    :param overrides: `key=value` for all cells, over the file's own ``set``
+    :param overrides: `key=value` for all cells, over the file's own ``set``; those of ``OF_THE_SWEEP`` replace its own
     :raises ConfigError: when there is no such sweep or a setting is wrong; names the cell and the key
     """
     path, where = _path(name_or_path), str(name_or_path)
-    sweep = read_sweep(name_or_path)
-    return SweepPlan(path.stem, sweep, _cells(sweep, path.parent, overrides, where))
+    given = [(text, *parse_override(text)) for text in overrides]
+    own = {keys[0]: value for _, keys, value in given if keys in OF_THE_SWEEP}
+    sweep = read_sweep(name_or_path, own)
+    return SweepPlan(
+        path.stem,
+        sweep,
+        _cells(sweep, path.parent, [text for text, keys, _ in given if keys not in OF_THE_SWEEP], where),
+    )
 
 
-def read_sweep(name_or_path: str | Path) -> Sweep:
+def read_sweep(name_or_path: str | Path, own: Mapping[str, Any] = MappingProxyType({})) -> Sweep:
     """Read a built-in sweep or a YAML file, without making its cells.
 
+    :param own: settings of the sweep, over those of the file
     :raises ConfigError: when there is no such sweep, or one of its keys is unknown or wrong
     """
-    return build(Sweep, read_yaml(_path(name_or_path)), str(name_or_path))
+    return build(Sweep, {**read_yaml(_path(name_or_path)), **own}, str(name_or_path))
 
 
 def builtin_sweeps() -> list[str]:

@@ -1,13 +1,14 @@
 """The numbers of a sweep: one row per run and topic, and a summary of the repetitions of each cell.
 
-Invariants: every row names its cell by all swept keys; a row with the topic ``ALL`` holds the numbers that exist for
-all topics together, or all numbers if there is only one topic; a share over repetitions is the share of all their
-messages, not a mean of shares.
+Invariants: every row names its cell by all swept keys; every receiver counts; a row with the topic ``ALL`` holds the
+numbers that exist for all topics together, or all numbers if there is only one topic; a share over repetitions or
+receivers is the share of all their messages, not a mean of shares.
 """
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pa_parquet
 
 from gr_ros2.core.files import write_whole
+from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.result import Result, topic_numbers
 from gr_ros2_lab.record.statistics import Estimate, average, share
 from gr_ros2_lab.record.team_numbers import team_numbers
@@ -28,6 +30,8 @@ ALL = "all topics"
 Results = Mapping[tuple[int, int], Result]
 """(cell number, repetition from 0) -> result. Runs that are not done or that failed are missing."""
 
+_COUNTS = ("sent", "delivered", "corrupt", "relayed")
+_PEAKS = ("latency_max_s", "age_peak_s")
 _OF_THE_RUN = ("airtime_s", "airtime_per_message_s", "airtime_per_byte_s", "sample_rate")
 
 
@@ -51,7 +55,7 @@ class Summary:
 def rows_of(plan: SweepPlan, results: Results) -> list[dict[str, Any]]:
     """One mapping per run and topic, and one per run for all topics together; cells in their order."""
     rows = []
-    ledger = sorted({fate for result in results.values() for topic in result.topics for fate in topic.ledger})
+    ledger = sorted({fate for result in results.values() for topic in _topics(result) for fate in topic.ledger})
     for cell in plan.cells:
         for repetition, scenario in enumerate(cell.runs):
             if (result := results.get((cell.number, repetition))) is None:
@@ -64,9 +68,14 @@ def rows_of(plan: SweepPlan, results: Results) -> list[dict[str, Any]]:
                 "duration_s": result.duration_s,
             }
             link = {name: result.phy.get(name) for name in _OF_THE_RUN}
-            link.update({f"packets_{name}": count for name, count in result.packets.items()})
-            topics = [topic_numbers(topic, ledger) for topic in result.topics]
-            together = {**_together(topics), **team_numbers(result)}
+            counts = (result.packets, *(receiver.packets for receiver in result.receivers))
+            packets = sum((Counter(of) for of in counts), Counter[str]())
+            link.update({f"packets_{name}": packets[name] for name in result.packets})
+            of_topic: dict[str, list[dict[str, Any]]] = {}
+            for topic in _topics(result):
+                of_topic.setdefault(topic.topic, []).append(topic_numbers(topic, ledger))
+            topics = [_at_all_receivers(same) for same in of_topic.values()]
+            together = {**_together(topics, ALL), **team_numbers(result)}
             rows += [{**common, **topic, **link, "wall_s": result.wall_s} for topic in (together, *topics)]
     return rows
 
@@ -113,14 +122,36 @@ def write_tables(rows: Sequence[Mapping[str, Any]], folder: Path, name: str) -> 
     ]
 
 
-def _together(topics: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _topics(result: Result) -> list[TopicResult]:
+    """Every topic at every receiver."""
+    return [topic for topics in (result.topics, *(one.topics for one in result.receivers)) for topic in topics]
+
+
+def _at_all_receivers(numbers: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The numbers of one topic: counts are added up, of peaks the highest counts, and of other numbers the mean."""
+    first = numbers[0]
+    if len(numbers) == 1:
+        return first
+    found = {name: [one[name] for one in numbers if one[name] is not None] for name in first}
+    merged = {
+        name: first[name]
+        if not values or isinstance(values[0], str)
+        else max(values)
+        if name in _PEAKS
+        else sum(values) / len(values)
+        for name, values in found.items()
+    }
+    return {**merged, "src_id": first["src_id"], **_together(numbers, first["topic"])}
+
+
+def _together(topics: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     if len(topics) == 1:
-        return {**topics[0], "topic": ALL}
-    counts = [name for name in topics[0] if name in ("sent", "delivered", "corrupt") or name.startswith("ledger_")]
-    totals = {name: sum(topic[name] for topic in topics) for name in counts}
+        return {**topics[0], "topic": name}
+    counts = [key for key in topics[0] if key in _COUNTS or key.startswith("ledger_")]
+    totals = {key: sum(topic[key] for topic in topics) for key in counts}
     goodputs = [topic["goodput_Bps"] for topic in topics if topic["goodput_Bps"] is not None]
     return {
-        "topic": ALL,
+        "topic": name,
         **totals,
         "pdr": totals["delivered"] / totals["sent"] if totals["sent"] else None,
         "goodput_Bps": sum(goodputs) if goodputs else None,

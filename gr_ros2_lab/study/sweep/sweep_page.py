@@ -17,7 +17,7 @@ from gr_ros2_lab.report.page import Drawings, Picture, Section, render_page
 from gr_ros2_lab.report.table import Grid, number
 from gr_ros2_lab.study.sweep.definition import PDR, VALUES, SweepPlan
 from gr_ros2_lab.study.sweep.figures import curves_figure, heat_figure
-from gr_ros2_lab.study.sweep.summaries import Results, Summary, rows_of, summaries, summary_rows, write_tables
+from gr_ros2_lab.study.sweep.summaries import ALL, Results, Summary, rows_of, summaries, summary_rows, write_tables
 
 PAGE_FILE = "sweep.html"
 RUNS_TABLE, CELLS_TABLE = "sweep", "cells"
@@ -61,11 +61,13 @@ _INTERVALS = (
 
 
 def summary_grid(plan: SweepPlan, found: Sequence[Summary], shown: Sequence[str] = _SHOWN) -> Grid:
-    """A line per cell and topic. If there are several topics, each cell has a section.
+    """A line per cell and topic. If there are several topics, each cell has a section. Topics that have none of the
+    numbers have no lines.
 
     :param shown: names of ``VALUES``
     """
-    topics = {summary.topic for summary in found}
+    topics = {ALL} | {one.topic for one in found if any(one.numbers[name] is not None for name in shown)}
+    found = [summary for summary in found if summary.topic in topics]
     several = len(topics) > 2  # with one topic, "all topics" says the same
     lines: dict[int, list[tuple[str, ...]]] = {}
     first = next((summary.topic for summary in found), "")

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from gr_ros2_lab.record.result import Result
-from gr_ros2_lab.record.team_numbers import airtime_of_senders, team_numbers
+from gr_ros2_lab.record.team_numbers import airtime_of_senders, team_numbers, team_pairs
 from gr_ros2_lab.report.explain import percent
 from gr_ros2_lab.report.headline import MOST_LINES, headline, topics_grid
-from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.runner import Progress, run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
 from tests.lab.record.runs import empty_trace, make_run
 
@@ -43,7 +43,27 @@ def test_a_team_says_its_task_all_its_robots_and_what_was_worst() -> None:
     assert used is not None
     assert any(line.startswith(f"Air in use: {percent(used)} of the time") for line in lines)
     assert airtime_of_senders(outcome.result).keys() == {"1", "2", "3", "4"}
-    assert not any("since repair" in line for line in lines), "it is off"
+    assert not any("since repair" in line or "after repair" in line or "(repair" in line for line in lines), "it is off"
+
+
+def test_without_repair_what_says_that_a_packet_is_given_up_is_not_called_repair() -> None:
+    outcome = run_scenario(load_scenario("demo", ("repair=off", "time=packets"), duration_s=10))
+    delivered, *_, air = headline(outcome.result, outcome.trace)
+    assert sum(topic.ledger.get("repaired", 0) for topic in outcome.result.topics) > 0, "one that brings a packet back"
+    assert "% after packets that say what is given up)" in delivered
+    assert "packets that say what is given up 1%" in air
+    assert "repair" not in delivered + air
+
+
+def test_progress_counts_what_all_robots_send_and_receive() -> None:
+    seen: list[Progress] = []
+    outcome = run_scenario(load_scenario("team", (), duration_s=3), on_progress=seen.append)
+    pairs = team_pairs(outcome.result)
+    robots = {topic.src_id for topic in outcome.result.topics}
+    assert len(robots) < len({topic.src_id for topic in pairs}), "the first receiver does not hear itself"
+    assert seen[-1].sent > sum(topic.sent for topic in outcome.result.topics)
+    assert seen[-1].sent <= sum(topic.sent for topic in pairs)
+    assert 0 < seen[-1].delivered <= sum(topic.delivered for topic in pairs)
 
 
 def test_where_nothing_arrives_the_snr_that_the_radio_needs_is_told(result: Result) -> None:

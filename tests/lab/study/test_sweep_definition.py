@@ -72,6 +72,18 @@ def test_overrides_of_the_command_line_win_over_the_file_and_not_over_the_sweep(
     assert [cell.runs[0].channel.packet_loss for cell in made.cells] == [0.0, 0.01, 0.1]
 
 
+def test_repetitions_and_time_may_be_set_for_the_sweep(tmp_path: Path) -> None:
+    made = load_sweep(write_sweep_file(tmp_path), ["repetitions=1", "time=packets", "duration_s=1"])
+    assert (made.sweep.repetitions, made.sweep.time) == (1, "packets")
+    runs = [run for cell in made.cells for run in cell.runs]
+    assert len(runs) == len(made.cells)
+    assert {(run.time, run.repetitions, run.duration_s) for run in runs} == {("packets", 1, 1.0)}
+    with pytest.raises(ConfigError, match=r"repetitions = 0"):
+        load_sweep(write_sweep_file(tmp_path), ["repetitions=0"])
+    with pytest.raises(ConfigError, match="repetitions is the same in all cells; write it at the top of the file"):
+        load_sweep(write_sweep_file(tmp_path, set={"repetitions": 2}))
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,13 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.observe.result import AgeResult, LatencyResult, TopicResult
-from gr_ros2_lab.record.result import Result
+from gr_ros2_lab.record.result import ReceiverResult, Result
 from gr_ros2_lab.record.statistics import share
 from gr_ros2_lab.study.sweep.axes import Axes, choose_axes, curve_panels, heat_panels
 from gr_ros2_lab.study.sweep.definition import SweepPlan
 from gr_ros2_lab.study.sweep.figures import MOST_PANELS, curves_figure, heat_figure
 from gr_ros2_lab.study.sweep.summaries import ALL, rows_of, summaries
-from gr_ros2_lab.study.sweep.sweep_page import write_sweep
+from gr_ros2_lab.study.sweep.sweep_page import summary_grid, write_sweep
 from tests.lab.study.sweeps import plan
 
 ODOM, IMU = "/robot_1/odom", "/robot_1/imu"
@@ -63,6 +64,30 @@ def test_a_row_per_run_and_topic_and_one_for_all(tmp_path: Path) -> None:
         assert (row["packets_sent"], row["packets_received"], row["wall_s"]) == (7, 5, 2.0)
     assert (found[0]["goodput_Bps"], found[0].get("latency_p50_s"), found[1]["latency_p50_s"]) == (350.0, None, 0.1)
     assert [row["ledger_lost_fragments"] for row in found] == [5, 5, 0]
+
+
+def test_every_receiver_counts(tmp_path: Path) -> None:
+    made = plan(tmp_path)
+    first = result(topic(ODOM, 10, 5, 0.1), topic(IMU, 30, 30, 0.2))
+    second = ReceiverResult(2, (topic(ODOM, 10, 9, 0.3),), packets={"sent": 7, "received": 6})
+    found = rows_of(made, {(1, 0): replace(first, receivers=(second,))})
+    assert [(row["topic"], row["sent"], row["delivered"], row["pdr"]) for row in found] == [
+        (ALL, 50, 44, 0.88),
+        (ODOM, 20, 14, 0.7),
+        (IMU, 30, 30, 1.0),
+    ]
+    assert found[1]["latency_p50_s"] == pytest.approx(0.2)
+    assert (found[1]["goodput_Bps"], found[1]["ledger_lost_fragments"]) == (140.0, 6)
+    assert (found[0]["packets_sent"], found[0]["packets_received"]) == (14, 11)
+
+
+def test_topics_without_the_number_that_is_shown_have_no_lines(tmp_path: Path) -> None:
+    made = plan(tmp_path)
+    found = summaries(made, rows_of(made, {(1, 0): result(topic(ODOM, 10, 5, 0.1), topic(IMU, 30, 30, 0.2))}))
+    assert len(summary_grid(made, found, ("pdr",)).sections[0]) == 3
+    grid = summary_grid(made, found, ("formation_error_m",))
+    assert [len(section) for section in grid.sections] == [1]
+    assert "topic" not in grid.headings
 
 
 def test_repetitions_are_pooled_for_the_pdr_and_averaged_for_the_rest(tmp_path: Path) -> None:
