@@ -160,8 +160,12 @@ class RunRecords:
 
         :param sources, links, alarms: see :class:`LiveRun`; a run in simulated time has none
         """
+        robots = self._scenario.all_robots
+        first = robots[next(iter(self._places))].config.namespace
+        # Two robots share a recorder; of more, what an observer sees is what the first one receives.
+        seen_by = f", as {first or 'receiver 1'} receives it" if len(robots) > 2 else ""
         return LiveRun(
-            name=self._scenario.name,
+            name=self._scenario.name + seen_by,
             duration_s=self._scenario.duration_s,
             packet_len=self._scenario.packet_len,
             registry=self._registry,
@@ -178,7 +182,7 @@ class RunRecords:
             alarms=alarms,
             team=None if self.team is None else self.team.view,
             heard=None
-            if len(self._scenario.all_robots) == 2  # which share a recorder
+            if len(robots) == 2
             else frozenset(src_id for src_id, places in self._hearing.items() if 0 in places),
             changed=self._changes.append,
         )

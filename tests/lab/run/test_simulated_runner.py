@@ -233,6 +233,14 @@ def test_a_dashboard_shows_the_run_and_says_that_there_is_no_channel_to_change()
     assert monitor.snapshot.delivered == outcome.result.topics[0].delivered == 60
 
 
+def test_the_dashboard_of_a_team_says_whose_view_it_is() -> None:
+    for name, shown in (("team", "team, as /robot_1 receives it"), ("paper-direct", "paper-direct")):
+        monitor = RunMonitor()
+        outcome = run_scenario(load_scenario(name, ["time=packets"], duration_s=1.0), None, None, [monitor])
+        assert monitor.snapshot.name == shown
+        assert monitor.snapshot.delivered == sum(topic.delivered for topic in outcome.result.topics)
+
+
 def test_a_run_that_is_interrupted_leaves_nothing_in_the_way_of_the_next(tmp_path: Path) -> None:
     def interrupt(progress: Progress) -> None:  # noqa: ARG001
         raise KeyboardInterrupt
