@@ -236,7 +236,7 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
         return running.throughput.look()
 
     return {
-        STATUS: lambda _: {**running.stats(), "findings": running.findings()},
+        STATUS: lambda _: {**running.stats(), "findings": running.findings.lines()},
         PING: ping,
         SET: change,
         OFFERS: offers,
@@ -328,8 +328,8 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
 
     guarded, say = Guard("status line"), partial(console.print, soft_wrap=True)  # the output may be on a full disk
     guarded(say, _opening(running))
-    if running.remark:
-        guarded(say, running.remark)
+    if running.config.remark:
+        guarded(say, running.config.remark)
     notify("READY=1")
     end = float("inf") if duration is None else time.monotonic() + duration
     live = console.is_terminal

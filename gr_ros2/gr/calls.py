@@ -92,7 +92,7 @@ class LiveCalls:
         self._clients: dict[int, ServiceClient] = {}
         for name, topic in source.subscriptions.services.items():
             self._offer(name, topic)
-        found.offer_with(self._offer_found, self._withdraw)
+        found.offer_with(partial(self._offer, found=True), self._withdraw)
         sink.share(self)
 
     def takes(self, event: ReceiverEvent) -> bool:
@@ -150,11 +150,18 @@ class LiveCalls:
 
     # ---- services of this robot
 
-    def _offer(self, name: str, topic: Topic) -> None:
+    def _offer(self, name: str, topic: Topic, *, found: bool = False) -> None:
         """Offer a service to other robots, for as long as its server is there.
 
+        :param found: it was found on the graph; nobody has named it
         :raises ConfigError: for a service that this graph cannot have
         """
+        if found and not self._source.config.key and not self._own:
+            _log.warning(
+                "service %s and others can be called by whoever can send on this link, as it has no key; set key, "
+                "or services: false",
+                name,
+            )
         graph = _with_services(self._source.middleware, name)
         self._own[topic.topic_id] = Offer(name, _deadline(topic))
         changed = partial(self._server_changed, topic.topic_id)
@@ -164,16 +171,6 @@ class LiveCalls:
                 self._clients[topic.topic_id] = client
                 return
         client.close()
-
-    def _offer_found(self, name: str, topic: Topic) -> None:
-        """The same for a service that the source has found on its graph."""
-        if not self._source.config.key and not self._own:
-            _log.warning(
-                "service %s and others can be called by whoever can send on this link, as it has no key; set key, "
-                "or services: false",
-                name,
-            )
-        self._offer(name, topic)
 
     def _withdraw(self, name: str) -> None:
         """Offer a service no more."""

@@ -19,21 +19,20 @@ from typing import Any
 from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.gr.half import HalfBlock
 from gr_ros2.gr.live_end import LiveEnd
-from gr_ros2.gr.pmts import PduMaker
+from gr_ros2.gr.radio_ports import RadioPorts
 from gr_ros2.gr.readable import describe
 from gr_ros2.gr.subscriptions import Subscriptions
-from gr_ros2.link import AirPacket, Ended, Refused, SenderEvent, SentPacket
+from gr_ros2.link import Ended, Refused, SenderEvent, SentPacket
 from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.middleware import Middleware
-from gr_ros2.phy.pdus import PduPort, credited, port_of, take_messages
+from gr_ros2.phy.pdus import credited, take_messages
 from gr_ros2.settings.config import replaced
-from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.fields import Auto
 from gr_ros2.settings.registry import Registry
 from gr_ros2.settings.robot import RobotConfig
-from gr_ros2.wire import QOS_LATENCY
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 32
@@ -79,7 +78,6 @@ class SendingBlock(HalfBlock):
         self.src_id = config.robot_id
         """The source id on the wire."""
         end.observer = self._observe
-        self._pdus = PduMaker()
         self._mcs = 0
         """MCS of the newest packet."""
         self._work = end.work
@@ -88,7 +86,7 @@ class SendingBlock(HalfBlock):
         self.composed = self.emitted = 0
         """Number of packets composed, and number of PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
-        self._ports = [PduPort(self, port_of("pdus", radio)) for radio in range(self.radios)]
+        self._ports = RadioPorts(self, self.radios, bond, self._lock, lambda: self.subscriptions.registry)
         take_messages(self, "credit", "_credit", self.radios, called="grant")
         self._backpressure = backpressure
         self.subscriptions = self._subscribes(
@@ -150,8 +148,7 @@ class SendingBlock(HalfBlock):
             self._end.pace.use_credit()
 
     def start(self) -> bool:
-        readers = [port.find_readers() for port in self._ports]
-        self._unread = not all(readers)
+        self._unread = not self._ports.find_readers()
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
         self.live.looked = self.clock()
@@ -264,42 +261,11 @@ class SendingBlock(HalfBlock):
         if self.config.debug:
             for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.subscriptions.registry))
-        if self._bond is None:
-            self._hand_over(packets, self._ports[0])
-        else:
-            for port, share in zip(self._ports, self._shared_out(self._bond, packets), strict=True):
-                self._hand_over(share, port)
+        self._ports.send(packets, adaptive=bool(self._end.mcs_table))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:
                 self._counters["unread"] += len(packets)
-
-    def _hand_over(self, packets: list[SentPacket], port: PduPort) -> None:
-        adaptive = bool(self._end.mcs_table)
-        on_air = [AirPacket(sent.data, None, sent.leave_at, sent.mcs if adaptive else None) for sent in packets]
-        if port.direct:
-            port.send(on_air)
-        else:
-            wall = time.time()
-            for sent, packet in zip(packets, on_air, strict=True):
-                port.send_pdu(self._pdus.pdu(sent.packet, packet, wall))
-
-    def _shared_out(self, bond: Bond, packets: list[SentPacket]) -> list[list[SentPacket]]:
-        """The packets that leave over each radio, in order."""
-        shares: list[list[SentPacket]] = [[] for _ in self._ports]
-        with self._lock:
-            for sent in packets:
-                for radio in bond.leave(everywhere=self._everywhere(sent)):
-                    shares[radio].append(sent)
-        return shares
-
-    def _everywhere(self, sent: SentPacket) -> bool:
-        """Whether a packet leaves over all radios."""
-        if sent.kind in ("hello", "report"):
-            return True
-        registry = self.subscriptions.registry
-        via = {registry[entry.topic_id].options.via for entry in sent.entries if entry.topic_id < len(registry)}
-        return "all" in via or (sent.packet.qos == QOS_LATENCY and AUTO in via)
 
     def _observe(self, event: SenderEvent) -> None:
         if isinstance(event, Refused):

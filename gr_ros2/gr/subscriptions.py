@@ -115,7 +115,7 @@ class Subscriptions:
     def take_losses(self) -> None:
         """Count the messages that the ROS graph lost before they arrived here. Called with the lock held."""
         for topic_id, subscription in self._subscriptions.items():
-            self._messages.missed(topic_id, subscription.lost)
+            self._messages.ledger.missed(topic_id, subscription.lost)
 
     def stats(self) -> dict[str, dict[str, Any]]:
         """The counters of each topic, by its name on the ROS graph. Called with the lock held."""
@@ -229,7 +229,7 @@ class Subscriptions:
                 return
             subscription = self._subscriptions.get(topic_id)
             if subscription is not None and subscription.lost:
-                self._messages.missed(topic_id, subscription.lost)
+                self._messages.ledger.missed(topic_id, subscription.lost)
             waited_s, publisher = (0.0, None) if subscription is None else (subscription.waited_s, subscription.source)
             if frames is not None:
                 frames.offer(now_id, payload, self._clock(), publisher)

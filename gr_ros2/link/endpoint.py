@@ -20,6 +20,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.events import AirPacket, Delivered, Lost, ReceiverEvent, SentPacket
 from gr_ros2.link.frames import FrameSide
+from gr_ros2.link.ledger import SenderLedger
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
@@ -74,7 +75,12 @@ class CodedMessage(NamedTuple):
 
 
 class MessageSide(Protocol):
-    """The messages that an end sends."""
+    """The messages that an end sends.
+
+    :ivar ledger: what becomes of them
+    """
+
+    ledger: SenderLedger
 
     def prepare(self, topic_id: int, payload: bytes) -> CodedMessage | None:
         """Code a message for ``submit`` if that takes long; otherwise None. The only method that needs no lock."""
@@ -102,12 +108,6 @@ class MessageSide(Protocol):
             known
         :param prepared: what ``prepare`` made of the same bytes
         :raises ConfigError: for a topic that is not sent
-        """
-
-    def missed(self, topic_id: int, total: int) -> None:
-        """Record how many messages of a topic the ROS graph has lost so far, before they could be submitted.
-
-        :param total: since the start; the increase is reported to the observer
         """
 
     def follow(self, topic_id: int, publishers: PublisherQos) -> bool:

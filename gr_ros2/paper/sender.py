@@ -15,8 +15,9 @@ from zlib import crc32
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.endpoint import CodedMessage
-from gr_ros2.link.events import Accepted, Missed, Refused, SenderEvent, SentEntry, SentPacket
+from gr_ros2.link.events import SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.fates import Fate
+from gr_ros2.link.ledger import SenderLedger
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
@@ -65,6 +66,7 @@ class Sender:
         self.stats = SenderStats()
         self._rng = rng if rng is not None else random.Random()
         self._observer = observer
+        self.ledger = SenderLedger(self.stats, observer)
         self._codec = codec
         self._largest = V0.largest_message(robot.packet_len)
         self._scheduler = PaperScheduler(robot.packet_len, paper)
@@ -81,7 +83,6 @@ class Sender:
         self._ids, self._numbers = 1 << V0.id_bits, 1 << V0.number_bits
         self._next_id = [self._rng.randrange(self._ids) for _ in self.registry]
         self._seq = self._rng.randrange(self._numbers)
-        self._serial = 0
         self.pace = Pace(robot.packet_rate)
         """When packets may leave."""
         self._latched: dict[int, tuple[int, bytes]] = {}
@@ -112,35 +113,23 @@ class Sender:
         """
         if topic_id not in self._queues:
             raise ConfigError(f"topic id {topic_id} is not in the registry of {len(self.registry)} topics")
-        serial = self._serial
-        self._serial += 1
-        self.stats.submitted[topic_id] += 1
+        serial = self.ledger.new(topic_id)
         if self._observer is not None:
             expected = None if self._codec is None else self._codec.canonical(topic_id, payload)
-            self._observer(Accepted(serial, topic_id, payload, now, expected))
+            self.ledger.accept(serial, topic_id, payload, now, expected)
         if self._codec is not None:
             payload = self._codec.encode(topic_id, payload)
         if len(payload) > self._largest:
-            self._refuse(serial, topic_id, Fate.TOO_LARGE, self._too_large(len(payload)))
+            self.ledger.refuse(serial, topic_id, Fate.TOO_LARGE, self._too_large(len(payload)))
             return
         message = Fragmented(serial, topic_id, payload, self._classes[topic_id], now)
         for dropped in self._queues[topic_id].admit(message, self.depth(topic_id)):
             if not dropped.message.repeat:
-                self._refuse(dropped.message.serial, topic_id, dropped.fate, dropped.detail)
+                self.ledger.refuse(dropped.message.serial, topic_id, dropped.fate, dropped.detail)
         self._stale = True
         if topic_id in self._keeps:
             self._latched[topic_id] = (serial, payload)
             self._repeat_at[topic_id] = now + self.robot.repeat_s
-
-    def missed(self, topic_id: int, total: int) -> None:
-        """Record how many messages of a topic the ROS graph has lost so far, before they could be submitted.
-
-        :param total: since the start; the increase is reported to the observer
-        """
-        new = total - self.stats.missed[topic_id]
-        if new > 0:
-            self.stats.missed[topic_id] = total
-            self._observe(Missed(topic_id, new))
 
     def next_packet(self, now: float) -> SentPacket | None:
         """The next packet that may go at ``now``, or None."""
@@ -254,7 +243,8 @@ class Sender:
         stats.air["new"] += 1
         stats.entries += len(entries)
         stats.payload_bytes += sum(plan.lengths)
-        self._observe(sent)
+        if self._observer is not None:
+            self._observer(sent)
         return sent
 
     def _take_id(self, topic_id: int) -> int:
@@ -281,14 +271,6 @@ class Sender:
         needed = V0.smallest_packet_len(size)
         remedy = f"packet_len {needed} would carry it" if needed else "no packet_len would carry it"
         return f"{size} bytes need over {V0.max_fragments} entries at packet_len {self.robot.packet_len}; {remedy}"
-
-    def _refuse(self, serial: int, topic_id: int, reason: Fate, detail: str) -> None:
-        self.stats.refused[topic_id, reason.value] += 1
-        self._observe(Refused(serial, topic_id, reason, detail))
-
-    def _observe(self, event: SenderEvent) -> None:
-        if self._observer is not None:
-            self._observer(event)
 
 
 def _packet_qos(plan: Plan) -> int:

@@ -173,6 +173,13 @@ class LinkConfig(AirConfig, RobotConfig):
             raise ValueError(f"radios: two are called {max(names, key=names.count)!r}; give each a name of its own")
 
     @property
+    def remark(self) -> str:
+        """A remark for the person who starts the link; often empty."""
+        if self.key:
+            return ""
+        return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)"
+
+    @property
     def own_radios(self) -> tuple[OwnRadio, ...]:
         """Its radios: those of ``radios``, or the one of ``front_end``."""
         radios = self.radios or (RadioConfig(front_end=self.front_end),)

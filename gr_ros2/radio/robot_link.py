@@ -23,7 +23,6 @@ from gr_ros2.gr.throughput import LiveThroughput
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.bond import Bond
 from gr_ros2.link.clocks import ClockOffset
-from gr_ros2.link.endpoint import without_table
 from gr_ros2.link.observe import LinkObserver, Observers
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
@@ -33,14 +32,14 @@ from gr_ros2.phy.pdus import port_of
 from gr_ros2.radio.clocks import ClockWatch
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.diagnostics import Diagnostics
-from gr_ros2.radio.findings import about, doubled, introduce, outrun, peers, ping, same_id, set_wall, unheard
+from gr_ros2.radio.findings import about, introduce, peers, ping, set_wall
 from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.link_findings import LinkFindings
 from gr_ros2.radio.mismatch import Mismatch
 from gr_ros2.radio.one_radio import OneRadio, together
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.ros_side import RosSide
 from gr_ros2.radio.switch import TransmitSwitch
-from gr_ros2.radio.waiting import foreign, shortcut
 from gr_ros2.radio.wish_service import WishService
 from gr_ros2.settings.registry import Registry
 
@@ -81,7 +80,6 @@ class RobotLink(Flowgraph):
         super().__init__(f"gr_ros2_link_{config.name}", config.name)
         self.config = config
         self._started: float | None = None
-        self._outrun: dict[str, int] = {}
         self._watch = Watch()
         self.bond: Bond | None = None
         """Its radios, where there are several."""
@@ -136,7 +134,6 @@ class RobotLink(Flowgraph):
         if hasattr(self.end.endpoint, "questions"):  # the paper's robots ask nothing
             introduce(self.end, told, lambda: self.radio.snr_db, self._clock())
             asked_by = self.end.endpoint.questions.asked_by
-        self._mismatch = Mismatch(told, self.ping, asked_by)
         self._clocks = ClockWatch(
             config.clock,
             mine=config.publish.stamps == "mine",
@@ -145,6 +142,16 @@ class RobotLink(Flowgraph):
             set_wall=partial(set_wall, self.end),
         )
         self._stack.callback(self._clocks.close)
+        self.findings = LinkFindings(
+            config.robot_id,
+            self.end,
+            self._ros,
+            mismatch=Mismatch(told, self.ping, asked_by),
+            clocks=self._clocks,
+            stats=self.stats,
+            clock=self._clock,
+        )
+        """What a person should know about it."""
         if isinstance(graph, ServiceGraph):
             switch = TransmitSwitch(graph, self.node_name, lambda on: self.transmit(on=on))
             self._stack.callback(switch.close)
@@ -170,11 +177,6 @@ class RobotLink(Flowgraph):
     def phy(self) -> Phy:
         """Its PHY."""
         return self.radios[0].phy
-
-    @property
-    def sends(self) -> bool:
-        """Whether it may send at all."""
-        return any(radio.sends for radio in self.radios)
 
     def _connect_radio(self, number: int) -> None:
         """Connect a radio with the blocks of ROS."""
@@ -266,8 +268,8 @@ class RobotLink(Flowgraph):
         """
         super().start(max_noutput_items)
         self._started = self._clock()
-        if self.remark:
-            _log.info("link %s: %s", self.config.name, self.remark)
+        if self.config.remark:
+            _log.info("link %s: %s", self.config.name, self.config.remark)
         for one in self.radios:
             one.phy.prefer_latency()
         if self._diagnostics is not None:
@@ -300,11 +302,11 @@ class RobotLink(Flowgraph):
             return
         now = self._clock()
         self._clocks.look(now)
-        self._goes_on("sending thread", self._watch, self.source.stalled_s(now), now)
+        _check_goes_on(self.config.name, "sending thread", self._watch, self.source.stalled_s(now), now)
         for one in self.radios:
             if one.retry_at < inf or one.gone:
                 continue
-            self._goes_on("thread that paces packets", one.pacing, one.radio.gate.stalled_s(), now)
+            _check_goes_on(self.config.name, "thread that paces packets", one.pacing, one.radio.gate.stalled_s(), now)
             try:
                 one.check(now)
             except RadioError as error:
@@ -314,15 +316,6 @@ class RobotLink(Flowgraph):
                     raise
                 else:
                     self._give_up(one, error)
-
-    def _goes_on(self, what: str, watch: Watch, told_s: float, now: float) -> None:
-        """:raises RadioError: if a thread has not gone on for long"""
-        stalled_s = inf if told_s == inf else watch.age(told_s, now)  # infinite: it has ended
-        if stalled_s > STALLED_S:
-            raise RadioError(
-                f"link {self.config.name}: the {what} has not gone on for {stalled_s:.0f} s; start the link "
-                "again, and report what it was doing (py-spy dump)"
-            )
 
     def _give_up(self, one: OneRadio, error: RadioError) -> None:
         """One of several radios has vanished, and cannot be opened again in this process.
@@ -365,51 +358,14 @@ class RobotLink(Flowgraph):
             )
         return self._ros.link.throughput
 
-    @property
-    def remark(self) -> str:
-        """A remark for the person who starts the link; often empty."""
-        if self.config.key:
-            return ""
-        return "no key, so anybody can read, forge and replay its packets (gr-ros2 key new FILE)"
-
-    def findings(self) -> list[str]:
-        """What a person should know about this link and its surroundings: one line each, mostly none."""
-        now, own = self._clock(), self.config.robot_id
-        stats = self.stats()
-        heard = stats["peers"]
-        robots = [peer["robot"] for peer in heard]
-        graph = self._ros.graph
-        names = {info.topic for info in graph.discover() if info.publishers}
-        services = graph.discover_services() if isinstance(graph, ServiceGraph) else ()
-        full, self._outrun = outrun(self._outrun, stats["source"]["topics"])
-        lines = [
-            shortcut([*names, *services], own, robots),
-            foreign(names, stats["sink"]["topics"]),
-            *self._same_numbers(heard),
-            *without_table(peer["robot"] for peer in heard if peer["no_table"]),
-            full if self._ros.shares else None,
-            *self._mismatch.lines(stats, robots, now),
-            *self._clocks.lines(now),
-        ]
-        with self.end.lock:
-            if self._ros.slots is not None and self._ros.slots.unheard(now):
-                lines.append(unheard(own, robots))
-        return [line for line in lines if line is not None]
-
     def alarms(self) -> list[str]:
-        """One line for each number under which two robots send, and for each clock that was set lately."""
-        now = self._clock()
-        return [*self._same_numbers(peers(self.end, now)), *self._clocks.lines(now)]
+        """See :meth:`LinkFindings.alarms`."""
+        return self.findings.alarms()
 
     def clocks(self) -> dict[int, ClockOffset]:
         """What is known of the clocks of the robots that are heard."""
         heard = peers(self.end, self._clock())
         return {peer["robot"]: ClockOffset(**peer["clock"]) for peer in heard if peer["clock"] is not None}
-
-    def _same_numbers(self, heard: list[dict[str, Any]]) -> list[str]:
-        with self.end.lock:
-            own = same_id(self.config.robot_id, self.end.endpoint.received.rejected)
-        return [*([own] if own else []), *doubled(heard)]
 
     @property
     def finished(self) -> bool:
@@ -443,3 +399,13 @@ class RobotLink(Flowgraph):
             "clocks": {"set": self._clocks.lines(self._clock()), "given_to_chrony": self._clocks.given},
             "incomplete": self.incomplete(),
         }
+
+
+def _check_goes_on(link: str, what: str, watch: Watch, told_s: float, now: float) -> None:
+    """:raises RadioError: if a thread has not gone on for long"""
+    stalled_s = inf if told_s == inf else watch.age(told_s, now)  # infinite: it has ended
+    if stalled_s > STALLED_S:
+        raise RadioError(
+            f"link {link}: the {what} has not gone on for {stalled_s:.0f} s; start the link again, and report what it "
+            "was doing (py-spy dump)"
+        )

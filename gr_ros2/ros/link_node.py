@@ -173,7 +173,7 @@ def main(args: Sequence[str] | None = None) -> None:
         node.get_logger().info(f"robot {node.link.source.src_id} on {node.link.front_end.name}, {phy.name}{runs_on}")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        waiting, findings = Waiting(node.link.source), NewFindings(node.link.findings)
+        waiting, findings = Waiting(node.link.source), NewFindings(node.link.findings.lines)
         notify("READY=1")
         while not (asked or node.link.finished):
             executor.spin_once(timeout_sec=_LOOK_S)

@@ -322,7 +322,7 @@ def test_what_the_graph_lost_before_submission_is_observed_once() -> None:
     events: list[SenderEvent] = []
     engine = Sender(registry(2), *paper_from(robot=1), rng=random.Random(0), observer=events.append)
     for total in (0, 2, 2, 5):
-        engine.missed(1, total)
+        engine.ledger.missed(1, total)
     assert events == [Missed(1, 2), Missed(1, 3)]
     assert (engine.stats.missed, engine.stats.submitted) == ({1: 5}, {})
     assert engine.idle

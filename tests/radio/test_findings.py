@@ -73,7 +73,7 @@ def test_both_ends_say_that_packet_len_differs_without_being_asked(tmp_path: Pat
         def told() -> bool:
             one.say(*range(5))
             two.say(*range(5))
-            said.update(*(robot.link.findings() for robot in (one, two)))
+            said.update(*(robot.link.findings.lines() for robot in (one, two)))
             return len([line for line in said if "packet_len is" in line and "set the same at both ends" in line]) == 2
 
         wait_for(told, "a line at each end", longest_s=0.25)
@@ -162,7 +162,7 @@ def test_two_robots_of_one_number_are_named_in_status_log_and_on_the_dashboard(t
     with third, robot(0, 1, addresses[2:]), robot(1, 1, addresses[2:]):
         monitor.run_started(_live(third.link))
         wait_for(lambda: any(peer["doubled"] for peer in third.link.stats()["peers"]), "both robots")
-        (line,) = third.link.findings()
+        (line,) = third.link.findings.lines()
         assert line.startswith("two robots send as robot 1")
         third.say(0)
         wait_for(lambda: line in monitor.tick().alarms, "the alarm")

@@ -205,8 +205,8 @@ def test_two_robots_with_one_id_are_told_so_both(tmp_path: Path) -> None:
             link.start()
         for link in links[::2]:
             said = "another robot sends as robot 1, which is this one"
-            wait_for(lambda: any(said in line for line in link.findings()), "to be told")  # noqa: B023 - called at once
-        assert not any("another robot" in line for line in links[1].findings())
+            wait_for(lambda: any(said in line for line in link.findings.lines()), "to be told")  # noqa: B023 - called at once
+        assert not any("another robot" in line for line in links[1].findings.lines())
 
 
 def test_a_channel_that_is_too_full_names_the_topics_that_grow_old(tmp_path: Path) -> None:
@@ -217,10 +217,10 @@ def test_a_channel_that_is_too_full_names_the_topics_that_grow_old(tmp_path: Pat
             stack.enter_context(Robot(number, front_end(tmp_path, number), **options, **values)) for number in (1, 2)
         ]
         wait_for(lambda: bool(robots[0].link.stats()["peers"]), "the other robot to be heard")
-        robots[0].link.findings()
+        robots[0].link.findings.lines()
         told = "the channel is fuller than it can carry: /robot_1/chat grow old"
         wait_for(
-            lambda: robots[0].publish(message(1, 40)) or any(told in line for line in robots[0].link.findings()),
+            lambda: robots[0].publish(message(1, 40)) or any(told in line for line in robots[0].link.findings.lines()),
             "the topic to be named",
         )
-        assert not any("fuller" in line for line in robots[1].link.findings())
+        assert not any("fuller" in line for line in robots[1].link.findings.lines())

@@ -124,8 +124,8 @@ def test_a_link_on_the_same_graph_is_seen_without_diagnostics_too(tmp_path: Path
         return Robot(number, front_end, graph=graph, state=state, **values)
 
     with robot(1) as one:
-        assert one.link.findings() == []
+        assert one.link.findings.lines() == []
         with robot(2):
             wait_for(lambda: one.link.stats()["peers"], "the other robot by radio")
-            (line,) = one.link.findings()
+            (line,) = one.link.findings.lines()
             assert line.startswith("gr_ros2_link_2 is on this robot's ROS graph, which is heard by radio too")

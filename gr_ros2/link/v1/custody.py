@@ -147,7 +147,7 @@ class Custody:
         most: int,
         dropped: Counter[str],
         drop: Callable[[list[Dropped[Message]]], None],
-        ended: Callable[[Message, bool], None],
+        ended: Callable[[int, int, int, bool], None],
     ) -> None:
         self.routes = routes
         self._src_id, self._start, self._boot = own[0], own[1] & 0xFFFF, own[1]
@@ -429,7 +429,7 @@ class Custody:
         if not arrived and not held.tries and not held.low:
             self._drop([Dropped(own, fate, "it waited too long for its way to another robot")])
         else:
-            self._ended(own, arrived)
+            self._ended(own.serial, own.topic_id, own.dst_id, arrived)
         later = self._own.get((own.topic_id, own.dst_id), [])
         if not arrived and later and later[0].last >= 0:
             self._take_back(later[0])  # the robot for which it is waits for what is over

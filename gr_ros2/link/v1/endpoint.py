@@ -170,7 +170,7 @@ class EndpointV1:
                 most=settings.max_source_bytes,
                 dropped=self.received.dropped,
                 drop=messages.drop,
-                ended=messages.ended,
+                ended=messages.ledger.ended,
             )
             messages.relayed_left, relaying.found = relaying.left, messages.found
         self.pings = self._sending.pings

@@ -13,6 +13,7 @@ from typing import Protocol
 
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.frames import LONG_S, FrameState
+from gr_ros2.link.ledger import SenderLedger
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbour
 from gr_ros2.link.v1.peers import Peer, Peers
@@ -31,18 +32,17 @@ FILLS_S = 1.0
 class Outlet(Protocol):
     """What frames need of the message side.
 
+    :ivar ledger: what becomes of its messages
     :ivar asks: how often others have asked for what is kept of a topic, or for a key frame
     """
 
+    ledger: SenderLedger
     asks: Counter[int]
 
     def submit_frame(
         self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool, chain: int
     ) -> Message | None:
         """Put a frame into the queue of its topic; None if it is too large."""
-
-    def refuse_new(self, topic_id: int, fate: Fate, detail: str) -> None:
-        """Count a message that was not submitted."""
 
     def tabulate(self) -> None:
         """Announce the topics anew."""
@@ -120,7 +120,8 @@ class SentFrames:
 
     def refuse(self, topic_id: int, fate: Fate, detail: str) -> None:
         """A message is not coded."""
-        self._outlet.refuse_new(topic_id, fate, detail)
+        ledger = self._outlet.ledger
+        ledger.refuse(ledger.new(topic_id), topic_id, fate, detail)
 
     def watched(self, topic_id: int) -> None:
         """Somebody has begun to watch a topic, and needs a key frame."""

@@ -18,9 +18,9 @@ from typing import Any, Protocol
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.endpoint import CodedMessage, check_live_options
-from gr_ros2.link.events import Accepted, Ended, Missed, Refused
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.instances import InstancesOf, no_instances
+from gr_ros2.link.ledger import MessageObserver, SenderLedger
 from gr_ros2.link.message_codec import FRAME, MessageCodec
 from gr_ros2.link.queues import OVERLOAD_S, OVERLOADED, Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
@@ -40,8 +40,6 @@ from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOP
 LARGE = 4096
 """Bytes from which on a message is coded before it is submitted. Coding 4 kB takes some .1 ms, 5 MB a fourth of a
 second, in which nothing else could leave."""
-
-Observer = Callable[[Accepted | Refused | Missed | Ended], None]
 
 
 def _changed(message: Message) -> tuple[Fate, str]:
@@ -78,6 +76,7 @@ class Outbox:
     :param room: bytes of the longest body
     :param instances: tells the instances of a topic
     :ivar topics: what it sends
+    :ivar ledger: what becomes of its messages
     :ivar sent: the same, with what waits
     :ivar asks: how often others have asked for what is kept of a topic, or for a key frame
     :ivar kept: what it keeps for robots that join late
@@ -94,7 +93,7 @@ class Outbox:
         boot: int,
         room: int,
         codec: MessageCodec | None,
-        observer: Observer | None,
+        observer: MessageObserver | None,
         instances: InstancesOf = no_instances,
     ) -> None:
         self.topics = topics
@@ -103,8 +102,8 @@ class Outbox:
         self._owner, self._peers = owner, peers
         self._room = room
         self._codec = codec
-        self._observer = observer
-        self._serial = 0
+        self.ledger = SenderLedger(self.stats, observer)
+        self._observed = observer is not None
         self.asks: Counter[int] = Counter()
         self._kept_frames: dict[tuple[int, int], tuple[int, bytes]] = {}
         """Serial and bytes of the newest frame of each chain of a latched topic, which may be sent again."""
@@ -184,18 +183,11 @@ class Outbox:
         assert self.topics is not None
         return self.topics, after.topic
 
-    def missed(self, topic_id: int, total: int) -> None:
-        new = total - self.stats.missed[topic_id]
-        if new > 0:
-            self.stats.missed[topic_id] = total
-            if self._observer is not None:
-                self._observer(Missed(topic_id, new))
-
     def prepare(self, topic_id: int, payload: bytes) -> CodedMessage | None:
         return None if self._codec is None or len(payload) < LARGE else self._coded(self._codec, topic_id, payload)
 
     def _coded(self, codec: MessageCodec, topic_id: int, payload: bytes) -> CodedMessage:
-        expected = None if self._observer is None else codec.canonical(topic_id, payload)
+        expected = codec.canonical(topic_id, payload) if self._observed else None
         return CodedMessage(topic_id, payload, codec.encode(topic_id, payload), expected)
 
     def submit(
@@ -221,17 +213,16 @@ class Outbox:
         if not (waited_s and topic.is_stream and self._owner.slow):
             waited_s = 0.0  # one delay of a computer that keeps up costs no message
         over = waited_s > OVERLOAD_S
-        serial = self._new(topic_id)
+        serial = self.ledger.new(topic_id)
         codec = None if over else self._codec
         plain, keys = topic.spoken_of(payload, serial if publisher is None else publisher)
         if codec is None:
             prepared = None
         elif prepared is None or prepared.topic_id != topic_id or prepared.payload is not plain:
             prepared = self._coded(codec, topic_id, plain)
-        if self._observer is not None:
-            self._observer(Accepted(serial, topic_id, plain, now, None if prepared is None else prepared.expected))
+        self.ledger.accept(serial, topic_id, plain, now, None if prepared is None else prepared.expected)
         if over:
-            self._refuse(serial, topic_id, Fate.OVERLOAD, OVERLOADED)
+            self.ledger.refuse(serial, topic_id, Fate.OVERLOAD, OVERLOADED)
             return
         payload = plain
         if codec is not None and prepared is not None:
@@ -239,7 +230,7 @@ class Outbox:
             if topic.kept and topic.kept_depth > 1:
                 payload = codec.numbered(payload, serial)
         if len(payload) > MAX_MESSAGE:
-            self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            self.ledger.refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return
         coded = codec is not None
         message = Message(serial, topic_id, payload, topic.qos, now - waited_s, topic.weight, lifespan_s, coded=coded)
@@ -315,12 +306,11 @@ class Outbox:
         if again:
             self.stats.repeats += 1
         else:
-            serial = self._new(topic_id)
-            if self._observer is not None:
-                self._observer(Accepted(serial, topic_id, frame, came))
+            serial = self.ledger.new(topic_id)
+            self.ledger.accept(serial, topic_id, frame, came)
         payload = FRAME + frame
         if len(payload) > MAX_MESSAGE:
-            self._refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
+            self.ledger.refuse(serial, topic_id, Fate.TOO_LARGE, f"{len(payload)} bytes; at most {MAX_MESSAGE}")
             return None
         message = Message(serial, topic_id, payload, topic.qos, came, topic.weight, coded=True, key=key)
         message.dst_id, message.repeat, message.keys = topic.dst_id, again, frozenset([chain])
@@ -329,16 +319,6 @@ class Outbox:
             self._kept_frames[topic_id, chain] = serial, frame
         topic.queue.append(message)
         return message
-
-    def refuse_new(self, topic_id: int, fate: Fate, detail: str) -> None:
-        """A message that was submitted ends here, with this fate."""
-        self._refuse(self._new(topic_id), topic_id, fate, detail)
-
-    def _new(self, topic_id: int) -> int:
-        """The serial of a message that is submitted."""
-        self._serial += 1
-        self.stats.submitted[topic_id] += 1
-        return self._serial - 1
 
     def _admit(self, topic: SentTopic, message: Message) -> None:
         if dropped := topic.queue.admit(message, self.depth(message.topic_id)):
@@ -370,21 +350,10 @@ class Outbox:
             if topic.dst_id == robot and topic.kept:
                 self.kept.ask(topic.topic.topic_id, now)
 
-    def ended(self, message: Message, arrived: bool) -> None:
-        """A message for one robot has come there, or is kept no longer without that being known."""
-        self.stats.ended[message.topic_id, arrived] += 1
-        if self._observer is not None:
-            self._observer(Ended(message.serial, message.topic_id, message.dst_id, arrived))
-
     def drop(self, dropped: list[Dropped[Message]]) -> None:
         """These messages are not sent, or not again."""
         for item in dropped:
             item.message.index = max(item.message.index, 1)
             item.message.lifetime.end()
             if not item.message.repeat:
-                self._refuse(item.message.serial, item.message.topic_id, item.fate, item.detail)
-
-    def _refuse(self, serial: int, topic_id: int, reason: Fate, detail: str) -> None:
-        self.stats.refused[topic_id, reason.value] += 1
-        if self._observer is not None:
-            self._observer(Refused(serial, topic_id, reason, detail))
+                self.ledger.refuse(item.message.serial, item.message.topic_id, item.fate, item.detail)

@@ -1,0 +1,72 @@
+"""The message ports over which the packets of a robot leave: all to its one radio, or each to some of several."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from gr_ros2.gr.pmts import PduMaker
+from gr_ros2.link import AirPacket, SentPacket
+from gr_ros2.link.bond import Bond
+from gr_ros2.phy.pdus import PduPort, port_of
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import Registry
+from gr_ros2.wire import QOS_LATENCY
+
+
+class RadioPorts:
+    """The ports `pdus` of a block, one for each radio.
+
+    :param block: whose they are
+    :param radios: how many
+    :param bond: chooses the radios of each packet, where there are several
+    :param lock: guards the bond
+    :param registry: the topics that are sent now
+    """
+
+    def __init__(
+        self, block: Any, radios: int, bond: Bond | None, lock: threading.Lock, registry: Callable[[], Registry]
+    ) -> None:
+        self._ports = [PduPort(block, port_of("pdus", radio)) for radio in range(radios)]
+        self._bond, self._lock, self._registry = bond, lock, registry
+        self._pdus = PduMaker()
+
+    def find_readers(self) -> bool:
+        """Find what reads the ports; returns whether something reads each of them."""
+        readers = [port.find_readers() for port in self._ports]  # of all, even where one has none
+        return all(readers)
+
+    def send(self, packets: list[SentPacket], *, adaptive: bool) -> None:
+        """Send packets. Called without a lock.
+
+        :param adaptive: whether each says its MCS
+        """
+        if self._bond is None:
+            self._send_over(self._ports[0], packets, adaptive)
+            return
+        shares: list[list[SentPacket]] = [[] for _ in self._ports]
+        with self._lock:
+            for sent in packets:
+                for radio in self._bond.leave(everywhere=self._everywhere(sent)):
+                    shares[radio].append(sent)
+        for port, share in zip(self._ports, shares, strict=True):
+            self._send_over(port, share, adaptive)
+
+    def _send_over(self, port: PduPort, packets: list[SentPacket], adaptive: bool) -> None:
+        on_air = [AirPacket(sent.data, None, sent.leave_at, sent.mcs if adaptive else None) for sent in packets]
+        if port.direct:
+            port.send(on_air)
+        else:
+            wall = time.time()
+            for sent, packet in zip(packets, on_air, strict=True):
+                port.send_pdu(self._pdus.pdu(sent.packet, packet, wall))
+
+    def _everywhere(self, sent: SentPacket) -> bool:
+        """Whether a packet leaves over all radios."""
+        if sent.kind in ("hello", "report"):
+            return True
+        registry = self._registry()
+        via = {registry[entry.topic_id].options.via for entry in sent.entries if entry.topic_id < len(registry)}
+        return "all" in via or (sent.packet.qos == QOS_LATENCY and AUTO in via)
