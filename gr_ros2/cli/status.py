@@ -40,7 +40,7 @@ def tables(stats: Stats) -> Group:
         _topic_table(stats),
         *_made(stats),
         *radio_words(stats),
-        *_wishes(stats),
+        *(wish["words"] for wishes in ("wanted", "wants") for wish in stats["wishes"].get(wishes, ())),
         *_air(stats),
         *_troubles(stats),
     )
@@ -118,16 +118,6 @@ def _topic_table(stats: Stats) -> Table | str:
 def _made(stats: Stats) -> list[str]:
     """What becomes of topics that are not sent as they are."""
     return [topic["frames"]["words"] for topic in stats["source"]["topics"].values() if topic["frames"]]
-
-
-def _wishes(stats: Stats) -> list[str]:
-    """What is asked for from afar."""
-    wishes = stats["wishes"]
-    held = [
-        f"robot {wish['robot']} wants {wish['topic']}" + (f" at {wish['rate']:g}/s at most" if wish["rate"] else "")
-        for wish in wishes.get("wanted", ())
-    ]
-    return held + [wish["words"] for wish in wishes.get("wants", ())]
 
 
 def _air(stats: Stats) -> list[str]:

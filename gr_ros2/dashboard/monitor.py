@@ -155,8 +155,8 @@ class RunMonitor:
         snapshot = state.tick(now, queued, snr_db=snr_db, late_s=late_s, told=run.alarms(), clocks=run.clocks())
         if run.wishes is not None:
             told = run.wishes.stats()
-            held = [f"robot {wish['robot']} wants {wish['topic']}" for wish in told["wanted"]]
-            self.asked = AskedView(run.wishes.known(), (*held, *(wish["words"] for wish in told["wants"])))
+            lines = tuple(wish["words"] for wish in (*told["wanted"], *told["wants"]))
+            self.asked = AskedView(run.wishes.known(), lines)
         self.snapshot = snapshot if run.team is None else replace(snapshot, team=run.team())
         if not links:
             return

@@ -189,7 +189,13 @@ class LiveWishes:
             self._own.expire(now)
             self._held.expire(now)
             held = [
-                {"robot": robot, "topic": name, "rate": wish.rate, "left_s": wish.until - now}
+                {
+                    "robot": robot,
+                    "topic": name,
+                    "rate": wish.rate,
+                    "left_s": wish.until - now,
+                    "words": f"robot {robot} wants {name}" + (f" at {wish.rate:g}/s at most" if wish.rate else ""),
+                }
                 for robot, name, wish in self._held
             ]
             own = [self._wish(robot, name, wish) for robot, name, wish in self._own]

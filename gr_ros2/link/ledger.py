@@ -16,18 +16,19 @@ class SenderLedger:
 
     :param stats: where everything is counted
     :param observer: is told all of it; None: nobody asks
+    :ivar serial: of the next message
     """
 
     def __init__(self, stats: SenderStats, observer: MessageObserver | None) -> None:
         self._stats = stats
         self._observer = observer
-        self._serial = 0
+        self.serial = 0
 
     def new(self, topic_id: int) -> int:
         """Count a message that is submitted; returns its serial."""
         self._stats.submitted[topic_id] += 1
-        self._serial += 1
-        return self._serial - 1
+        self.serial += 1
+        return self.serial - 1
 
     def accept(self, serial: int, topic_id: int, payload: bytes, now: float, expected: bytes | None = None) -> None:
         """A message was submitted (see :class:`Accepted`)."""

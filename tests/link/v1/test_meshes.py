@@ -66,7 +66,7 @@ class Mesh(Line):
         for n, one in enumerate(self.robots):
             topic = rng.choice((ODOM, GOAL, ALL, COMMAND))
             text = b"%d.%d.%d.%d" % (one.src_id, one.boot, topic, len(self.made))
-            self._serials[one.src_id, one.boot, one.end.messages._serial] = text
+            self._serials[one.src_id, one.boot, one.end.messages.ledger.serial] = text
             self.made[text] = one.src_id, one.boot, topic, len(self.made), self.now
             one.end.messages.submit(topic, text, self.now)
             if rng.random() < 0.01:
