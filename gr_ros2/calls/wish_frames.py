@@ -152,10 +152,10 @@ def read_answer(data: bytes) -> WishAnswer:
     """
     if len(data) != _ANSWER.size:
         raise EntryBoundsError(f"the answer to a wish has {len(data)} bytes")
-    outcome, *figures = _ANSWER.unpack(data)
-    if outcome not in list(WishOutcome) or not all(figure >= 0 for figure in figures):
-        raise EntryKindError(f"outcome {outcome}, {figures} in the answer to a wish")
-    return WishAnswer(WishOutcome(outcome), *figures)
+    outcome, rate, cost, free = _ANSWER.unpack(data)
+    if outcome not in list(WishOutcome) or not (0 <= rate < inf and 0 <= cost < inf and free >= 0):
+        raise EntryKindError(f"outcome {outcome}, {rate}/s, {cost} of {free} bytes/s in the answer to a wish")
+    return WishAnswer(WishOutcome(outcome), rate, cost, free)
 
 
 def write_offers(rows: Iterable[OfferRow]) -> bytes:

@@ -7,7 +7,7 @@ was measured is good for ``GOOD_S``.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from threading import Event
@@ -20,6 +20,8 @@ from gr_ros2.settings.registry import DEFAULT_OPTIONS, Topic, normalize_type
 from gr_ros2.settings.service_rows import ServiceRow
 
 MEASURE_S, GOOD_S = 2.0, 60.0
+_HISTORY_S = 0.5
+"""s of a measurement in which publishers are found, and send what they keep for late subscribers."""
 _SAMPLES = 3
 """Messages that are coded to find how long they are as they are sent."""
 
@@ -84,12 +86,25 @@ class MeasuredTopic:
 
 @dataclass(slots=True)
 class _Probe:
+    began: float = field(default_factory=time.monotonic)
     times: list[float] = field(default_factory=list)
     newest: list[bytes] = field(default_factory=list)
 
     def take(self, payload: bytes) -> None:
         self.times.append(time.monotonic())
         self.newest = [*self.newest[1 - _SAMPLES :], payload]
+
+
+def rate_of(times: Sequence[float], began: float) -> float:
+    """How often messages come, per s; 0 = not known.
+
+    :param times: when they came, s
+    :param began: when the subscription was made, s
+    """
+    new = [at for at in times if at - began > _HISTORY_S]
+    if len(new) > 1 and (span_s := new[-1] - new[0]) > MEASURE_S / 4:
+        return (len(new) - 1) / span_s
+    return len(new) / (MEASURE_S - _HISTORY_S)
 
 
 class Measurements:
@@ -131,9 +146,7 @@ class Measurements:
 
     def _found(self, offered: OpenTopic, probe: _Probe) -> MeasuredTopic:
         found = MeasuredTopic(self._clock())
-        times = probe.times
-        if len(times) > 1 and times[-1] > times[0]:
-            found.rate = (len(times) - 1) / (times[-1] - times[0])
+        found.rate = rate_of(probe.times, probe.began)
         if probe.newest:
             found.size = sum(map(len, probe.newest)) / len(probe.newest)
             if self._coded and not offered.fits:

@@ -99,6 +99,12 @@ def test_what_no_robot_asks_is_refused(data: str) -> None:
         read_request(bytes.fromhex(data))
 
 
+@pytest.mark.parametrize("figures", ["7f800000 00000000 00000000", "00000000 7f800000 00000000"])
+def test_no_answer_names_an_infinite_rate(figures: str) -> None:
+    with pytest.raises(WireError):
+        read_answer(bytes.fromhex(f"02 {figures}"))
+
+
 def test_a_list_has_an_end() -> None:
     row = write_offers([OfferRow("a", "b")])
     assert len(read_offers(row * MOST_OFFERS)) == MOST_OFFERS
