@@ -41,6 +41,8 @@ import math
 import random
 from collections import deque
 
+from gr_ros2.mac.around import DEAF, HEARD, NEVER, Around, SlotOwner
+from gr_ros2.mac.calendar import Calendar
 from gr_ros2.mac.slot_clock import SlotClock
 from gr_ros2.wire.mac_block import (
     LONGEST_AHEAD,
@@ -58,8 +60,6 @@ LISTEN, QUIET, FRAMES = 24, 4, 2
 in one, but ``LISTEN`` at most; ``QUIET`` at least, and where nobody is heard. With a ``LISTEN`` of 12, one of 20 whose
 clock has jumped by 1 s may collide with others 5 s later; with a ``QUIET`` of 24, two robots hear each other after 31
 slots instead of 15 (median), 50 from cold after 521 instead of 548. With 3, it is the same as with 4."""
-HEARD = 210
-"""Slots for which a robot that was heard counts as heard; more where robots send less than three times in them."""
 FILLED = 0.5
 """Part by which the frame may be longer for video: no robot's turn comes 1.5 times as late as without it."""
 CHOICE = 4
@@ -71,9 +71,6 @@ NAMED = 2.2
 UNSURE = 1.75
 """Frames without being named, of which each has two names for each robot, after which a robot may be in step with
 another one."""
-DEAF = 3
-"""Maps in a row of a neighbour that lack this robot, after which it may be in step with another one. With 1 a lost
-packet is enough: a fourth of the picks in a grid of 5 × 4 at 10 % loss are at random, which leaves slots empty."""
 KNOWN_LATE = 9
 """Slots that this is at least: a host knows a packet some slots after it began, and composes its own ahead. Without it
 two links on one computer (6 ms a slot) picked at random half of the time, and sent 27 instead of 41 packets/s each."""
@@ -81,8 +78,6 @@ NEWCOMER, NEWCOMER_FRAMES = 140, 8
 """Slots for which a robot is a newcomer; in a small cell so many frames, as they are without newcomers. Without slots
 for them, 50 robots need 18 s instead of 9 to get in from cold at 14 ms a slot, and a robot between two full cells may
 be heard by nobody for a minute. 70 slots take two seconds longer, 210 no less."""
-LATELY = 70
-"""Slots within which somebody who is there has sent; more where there are many robots."""
 LATE_S = 0.01
 """s by which a host may be late at most for a packet to be sent all the same, and a slot."""
 EASED = 0.97
@@ -96,31 +91,9 @@ most that entries in vain make. For one that is named: with 4, the first message
 15.7 s where packets take half a second (``python -m bench first``); with 1, the ends of a line of three, which do not
 hear each other, begin at once, and one that comes back gets a message too late for a deadline of 4 s in 4 of 14 starts,
 as in one with 2. At the start it is the same with 3 or 2."""
-_NEVER = -1 << 40
 _SWEEP = 64
 _SILENT = 4096
 """Slots after which a robot that does not send forgets what has passed."""
-
-
-class _HeardRobot:
-    """What is known of a robot that is heard."""
-
-    __slots__ = ("ahead", "deaf", "first", "heard", "last", "named", "weight")
-
-    def __init__(self, slot: int) -> None:
-        self.first = slot
-        """The slot in which it came."""
-        self.last = slot
-        """The slot of its newest packet."""
-        self.heard = 0
-        """Sum of the weights of the robots that it hears."""
-        self.weight = 1
-        self.ahead: tuple[int, ...] = ()
-        """The slots that it has announced."""
-        self.named = _NEVER
-        """The slot in which this robot has last named it."""
-        self.deaf = 0
-        """Maps in a row that lack the next slot of this robot; ``DEAF`` if a packet without a map does not name it."""
 
 
 class Slots:
@@ -130,6 +103,8 @@ class Slots:
     :param slot_s: s that a slot lasts: the airtime of the longest packet and the guard
     :param period_s: s from one message to the next
     :param lead_s: s before its slot at which a packet is composed. What is heard from then on comes too late for it
+    :ivar calendar: the slots that others want
+    :ivar around: who they are
     :ivar reserved: whether the block before had announced the slot of the newest one
     """
 
@@ -152,21 +127,11 @@ class Slots:
         self._announced: tuple[int, ...] = ()
         self._said: deque[tuple[int, tuple[int, ...]]] = deque(maxlen=1 + self._ahead)
         """The slots of the newest packets, and what they announced."""
-        self._taken: dict[int, int] = {}
-        """Slot -> the robot that has announced it."""
-        self._expected = 0
-        """Bit i: a neighbour expects to receive in slot ``_base`` + i."""
-        self._base = 0
-        self._conflicts: dict[int, int] = {}
-        """Slot that two robots want -> the one of them that gives it up."""
-        self._robots: dict[int, _HeardRobot] = {}
-        self._elsewhere: dict[int, float] = {}
-        """Robot with other slots than this one -> when it was last heard, s."""
-        self._named_at = self._confirmed_at = self._heard_at = _NEVER
-        """Slots: a neighbour last named another robot; this robot; anybody was heard."""
-        self._heard_since = _NEVER
-        """The slot since which somebody has been heard."""
-        self._swept = _NEVER
+        self.calendar = Calendar()
+        self.around = Around()
+        self._named_at = self._confirmed_at = NEVER
+        """Slots: a neighbour last named another robot; this robot."""
+        self._swept = NEVER
         """The slot at which what had passed was forgotten."""
         self._entered_at: int | None = None
         """The slot of the first send since the entry; None outside."""
@@ -179,8 +144,8 @@ class Slots:
         if not self.clock.runs:
             return False
         slot = self.clock.slot(now)
-        named = self._confirmed_at + 2 * self._memory(), self._heard_since + 3 * HEARD
-        return not self._alone(slot) and max(named) < slot
+        named = self._confirmed_at + 2 * self.around.memory, self.around.heard_since + 3 * HEARD
+        return not self.around.nobody(slot) and max(named) < slot
 
     # ---- sending
 
@@ -213,7 +178,7 @@ class Slots:
     def _listened(self) -> float:
         """s, when it has listened for long enough."""
         assert self._since is not None
-        frame = max(self._loads(_NEVER)) + 2 if self._robots else 0
+        frame = max(self.around.loads(NEVER, self._weight)) + 2 if self.around.robots else 0
         return self._since + min(max(FRAMES * frame, QUIET), LISTEN) * self.clock.slot_s
 
     def block(self, weight: int = 1, *, fills: bool = False) -> bytes | None:
@@ -223,9 +188,9 @@ class Slots:
         slot = self._mine.pop(0)
         self._sweep(slot - 1)  # who has announced this slot is still needed
         now = slot - self._ahead
-        alone = self._alone(now)
+        alone = self.around.nobody(now)
         if self._entered_at is None:
-            if not self._free(slot):
+            if not self.calendar.free(slot):
                 return None
             self._entered_at = slot
             self.clock.said()
@@ -238,7 +203,7 @@ class Slots:
             self._rate = min(2 * self._rate, _DEAF_RATE)
         self._filling = self._filled(now) if fills else 0
         self._weight = min(weight + self._filling, MOST_WEIGHT)
-        loads = self._loads(now)
+        loads = self.around.loads(now, self._weight)
         frame = self._frame(now, loads)
         self._every = max(frame / self._weight, 1)
         kept: list[int] = []
@@ -255,8 +220,7 @@ class Slots:
 
     def _filled(self, now: int) -> int:
         """Packets beyond its weight that this robot sends in a frame, for video."""
-        oldest = now - self._memory()
-        others = [robot.weight - 1 for robot in self._robots.values() if robot.last >= oldest]
+        others = [robot.weight - 1 for robot in self.around.present(now)]
         mine, taken, most = self._filling, sum(others), int(FILLED * (len(others) + 2))
         if not others:
             return 0
@@ -270,8 +234,8 @@ class Slots:
         """Whether neighbours that can know of this robot's entry have sent, and none has named it; or none for long."""
         entered, named = self._entered_at, self._confirmed_at
         assert entered is not None
-        answered = self._heard_at > entered + 2 * self._ahead
-        return (answered and named < entered) or max(named, entered) < now - 2 * self._memory()
+        answered = self.around.heard_at > entered + 2 * self._ahead
+        return (answered and named < entered) or max(named, entered) < now - 2 * self.around.memory
 
     def _leave(self) -> None:
         self._mine.clear()
@@ -281,29 +245,28 @@ class Slots:
     def _entry(self, first: int) -> int:
         """A free slot at random, from ``first`` on."""
         for slot in range(first, first + LONGEST_AHEAD):
-            if self._free(slot):
+            if self.calendar.free(slot):
                 if self._rng.random() < 1 / self._rate:
                     return slot
                 self._rate = max(1.0, self._rate * EASED)
         return first + LONGEST_AHEAD
 
-    def _free(self, slot: int) -> bool:
-        return slot not in self._taken and not (slot > self._base and self._expected >> slot - self._base & 1)
-
     def _pick(self, base: int, now: int, frame: int) -> int:
         """The slot to send in after ``base``."""
-        alone = self._alone(now)
+        alone = self.around.nobody(now)
         step = max(round(frame / self._weight - self._behind), 1)
         if alone:
             step = round(max(step, self._rate) * self._rng.uniform(0.5, 1.5))
         ahead = announceable(step)
         places: list[int] = []
+        free = self.calendar.free
         unnamed = self._confirmed_at < now - max(UNSURE * frame, KNOWN_LATE)
-        unsure = alone or unnamed or self._unheard(now) or self._elsewhere
+        unsure = alone or unnamed or self.around.deaf(now) or self.around.elsewhere
         wanted = CHOICE if unsure or self._rng.random() < MIXED else 1
         while ahead <= LONGEST_AHEAD and len(places) < wanted:
             at, before = base + ahead, base + ahead - frame
-            if self._free(at) and at not in self._mine and (before <= now or before == base or self._free(before)):
+            followed = before <= now or before == base or free(before)
+            if free(at) and at not in self._mine and followed:
                 places.append(at)
             ahead = announceable(ahead + 1) if ahead < LONGEST_AHEAD else ahead + 1
         picked = self._rng.choice(places) if places else base + announceable(step)
@@ -311,57 +274,27 @@ class Slots:
         self._behind = min(max(behind, 0.0), frame) if self._filling else 0.0
         return picked
 
-    def _loads(self, now: int) -> list[int]:
-        """The sum of the weights of this robot and those it hears, and the same of each robot that it hears. Robots of
-        another group count too, see ``SlotClock``."""
-        oldest = now - self._memory()
-        heard = [robot for robot in self._robots.values() if robot.last >= oldest]
-        others = sum([src_id not in self._robots for src_id in self._elsewhere])
-        own = self._weight + others + sum([robot.weight for robot in heard])
-        return [own, *[robot.heard + robot.weight for robot in heard]]
-
     def _frame(self, now: int, loads: list[int]) -> int:
         """Slots in which every robot around sends as often as its weight says, and newcomers find room. With the first
         newcomer in the slot that is free in any case, two of nine lines of four robots carry nothing over two hops in
         their first 8 s."""
         known = max(loads) + 1
         oldest = now - min(NEWCOMER, NEWCOMER_FRAMES * known)
-        newcomers = sum([robot.first >= oldest for robot in self._robots.values()])
-        return max(math.ceil(self._period - 1e-9), known + newcomers)
-
-    def _memory(self) -> int:
-        """Slots for which a robot that was heard counts as heard."""
-        return max(HEARD, 4 * len(self._robots))
-
-    def _lately(self) -> int:
-        """Slots within which somebody who is there has sent."""
-        return max(LATELY, 3 * len(self._robots))
-
-    def _alone(self, now: int) -> bool:
-        return self._heard_at < now - self._lately()
-
-    def _unheard(self, now: int) -> bool:
-        """Whether a neighbour has not expected this robot in its next slot for a while."""
-        oldest = now - self._lately()
-        return any(robot.last >= oldest and robot.deaf >= DEAF for robot in self._robots.values())
+        return max(math.ceil(self._period - 1e-9), known + self.around.newcomers(oldest))
 
     def _content(self, slot: int, frame: int, loads: list[int]) -> Block:
         now = slot - self._ahead
-        oldest = now - self._memory()
-        lately = max(oldest, now - max(NAMED * frame, KNOWN_LATE))
-        fresh = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= lately}
-        names = sorted(fresh, key=lambda src_id: fresh[src_id].named)[:2]
-        for src_id in names:
-            fresh[src_id].named = self._turn(slot) if fresh[src_id].named == _NEVER else slot
-        first, second = [*names, NOBODY, NOBODY][:2]
+        oldest = now - self.around.memory
+        names = self.around.unnamed(max(oldest, now - max(NAMED * frame, KNOWN_LATE)))
+        for _, robot in names:
+            robot.named = self._turn(slot) if robot.named == NEVER else slot
+        first, second = [*(name for name, _ in names), NOBODY, NOBODY][:2]
         ahead = self._mine[0] - slot, self._mine[1] - self._mine[0]
         short = Block(slot % SLOT_NUMBERS, ahead, loads[0] - self._weight, (first, second))
         if self._weight == 1 and self._named_at < oldest and len(set(loads)) == 1:
             return short
-        expected = sum([1 << at - slot - 1 for at in self._taken if slot < at <= slot + MAP_SLOTS])
-        wanted = min((at for at in self._conflicts if slot + 1 < at < slot + SLOT_NUMBERS), default=None)
-        conflict = (0, NOBODY) if wanted is None else (wanted - slot, self._conflicts.pop(wanted))
-        return short._replace(expected=expected, conflict=conflict, weight=self._weight)
+        calendar = self.calendar
+        return short._replace(expected=calendar.map(slot), conflict=calendar.conflict(slot), weight=self._weight)
 
     def _turn(self, now: int) -> int:
         """When a newcomer counts as named: at random, or all robots would name the same ones at the same time."""
@@ -371,14 +304,9 @@ class Slots:
         """Forget what has passed."""
         if now < self._swept + _SWEEP:
             return
-        self._expected >>= max(now - self._base, 0)
-        self._swept = self._base = now
-        self._taken = {slot: owner for slot, owner in self._taken.items() if slot > now}
-        self._conflicts = {slot: loser for slot, loser in self._conflicts.items() if slot > now}
-        memory = self._memory()
-        self._robots = {src_id: robot for src_id, robot in self._robots.items() if robot.last >= now - 2 * memory}
-        oldest = self.clock.begin(now - memory)
-        self._elsewhere = {src_id: at for src_id, at in self._elsewhere.items() if at >= oldest}
+        self._swept = now
+        self.calendar.forget(now)
+        self.around.forget(now, self.clock.begin(now - self.around.memory))
 
     # ---- what is heard
 
@@ -388,7 +316,7 @@ class Slots:
         """Note a burst. Who says nothing about slots cannot be avoided."""
         if block is None or src_id == self.src_id or not (trusted or checked or not self.clock.agreeing(began)):
             return
-        joins = block.heard > 0 and not self._robots
+        joins = block.heard > 0 and not self.around.robots
         slot = self._placed(src_id, block.slot, began, trusted=trusted, checked=checked, joins=joins)
         if slot is None:
             return
@@ -396,7 +324,7 @@ class Slots:
         ahead = (slot + first, slot + first + second) if first and second else (slot + first,) if first else ()
         if not trusted:
             for at in ahead:
-                self._taken.setdefault(at, src_id)
+                self.calendar.announce(at, src_id)
             if not checked:
                 return
         robot = self._present(src_id, slot, ahead)
@@ -405,7 +333,7 @@ class Slots:
             return
         robot.heard, robot.weight = block.heard, block.weight
         for at in ahead:
-            if self._taken.setdefault(at, src_id) != src_id or at in self._mine:
+            if not self.calendar.announce(at, src_id) or at in self._mine:
                 self._claim(at, src_id)
         self._named(block.names, slot)
         if block.expected is None:
@@ -413,30 +341,25 @@ class Slots:
         else:
             self._mapped(robot, block.expected, block.conflict)
 
-    def _present(self, src_id: int, slot: int, ahead: tuple[int, ...]) -> _HeardRobot:
+    def _present(self, src_id: int, slot: int, ahead: tuple[int, ...]) -> SlotOwner:
         """A robot sends in a slot, and has announced others."""
-        robot = self._robots.get(src_id)
+        robot = self.around.robots.get(src_id)
         if robot is None:
-            robot = self._robots[src_id] = _HeardRobot(slot)
+            robot = self.around.robots[src_id] = SlotOwner(slot)
             self._rate = max(1.0, self._rate - 1)
         elif slot not in robot.ahead:
-            robot.named = _NEVER
+            robot.named = NEVER
         self._answer(slot)
-        if self._heard_at < slot - 2 * self._memory():
-            self._heard_since = slot
-        self._heard_at = max(self._heard_at, slot)
-        if slot > self._base + _SILENT:
+        self.around.heard(slot)
+        if slot > self.calendar.base + _SILENT:
             self._sweep(slot)
-        for at in robot.ahead:
-            for known in (self._taken, self._conflicts):
-                if at not in ahead and known.get(at) == src_id:
-                    del known[at]
+        self.calendar.withdraw(src_id, [at for at in robot.ahead if at not in ahead])
         robot.last, robot.ahead = slot, ahead
         return robot
 
     def _answer(self, slot: int) -> None:
         """Somebody is heard: who was alone lets itself be heard soon."""
-        if self._entered_at is not None and self._alone(slot):
+        if self._entered_at is not None and self.around.nobody(slot):
             self._leave()
             self._rate = min(self._rate, _ENTRY_RATE)
 
@@ -448,62 +371,50 @@ class Slots:
         slot = self.clock.heard(src_id, number, began, trusted=trusted, checked=checked, joins=joins)
         if self.clock.jumps > jumps:
             assert slot is not None
-            self._elsewhere = dict.fromkeys(self._robots, began)
-            self._start_over(slot)
-        if slot is None and (trusted or checked) and not self._elsewhere:
+            self._start_over(slot, began)
+        if slot is None and (trusted or checked) and not self.around.elsewhere:
             self._answer(self.clock.slot(began))
         if trusted and slot is None:
-            self._elsewhere[src_id] = began
-        elif trusted and self._elsewhere:
-            self._elsewhere.pop(src_id, None)
+            self.around.elsewhere[src_id] = began
+        elif trusted and self.around.elsewhere:
+            self.around.elsewhere.pop(src_id, None)
         return slot
 
     def _claim(self, slot: int, src_id: int) -> None:
-        owner = self._taken[slot]
-        if owner != src_id:
-            self._conflicts[slot] = max(owner, src_id)
-        self._taken[slot] = min(owner, src_id)
+        self.calendar.claim(slot, src_id)
         if slot in self._mine:
             if src_id < self.src_id or slot not in self._announced:
                 self._mine.remove(slot)
             else:
-                self._conflicts[slot] = src_id
+                self.calendar.give_up(slot, src_id)
 
     def _named(self, names: tuple[int, ...], slot: int) -> None:
         for name in names:
-            other = self._robots.get(name)
+            other = self.around.robots.get(name)
             if name == self.src_id:
                 self._confirmed_at = max(self._confirmed_at, slot)
                 self._rate = _NAMED_RATE if self._entered_at is None else _ENTRY_RATE
-            elif other is not None and other.named == _NEVER:
+            elif other is not None and other.named == NEVER:
                 other.named = self._turn(slot)  # one confirmation is enough
             elif name != NOBODY:
                 self._named_at = slot
 
-    def _mapped(self, robot: _HeardRobot, expected: int, conflict: tuple[int, int]) -> None:
+    def _mapped(self, robot: SlotOwner, expected: int, conflict: tuple[int, int]) -> None:
         slot = robot.last
         at = slot + 1
         known = next((ahead for sent, ahead in reversed(self._said) if sent < slot - 1 - self._ahead), ())
         mine = next((mine for mine in known if mine >= at), slot)
         if 0 <= mine - at < MAP_SLOTS:
             robot.deaf = 0 if expected >> mine - at & 1 else robot.deaf + 1
-        skip = at - self._base
-        expected = expected << skip if skip > 0 else expected >> -skip
-        for mine in self._mine:
-            if mine > self._base:
-                expected &= ~(1 << mine - self._base)
-        self._expected |= expected
+        self.calendar.expect(at, expected, self._mine)
         ahead, loser = conflict
         if ahead and loser == self.src_id and slot + ahead in self._mine:
             self._mine.remove(slot + ahead)
 
-    def _start_over(self, slot: int) -> None:
+    def _start_over(self, slot: int, began: float) -> None:
         """The clock has moved to a slot: what was known by slot is void."""
         self._leave()
-        self._taken.clear()
-        self._expected = 0
-        self._conflicts.clear()
-        self._robots.clear()
-        self._heard_at = self._confirmed_at = self._named_at = _NEVER
-        self._swept, self._base = _NEVER, slot - 1
+        self.around.part(began)
+        self.calendar.clear(slot)
+        self._confirmed_at = self._named_at = self._swept = NEVER
         self._rate = _ENTRY_RATE

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from fuzz.loop import work
 from gr_ros2.core.errors import EntryBoundsError
-from gr_ros2.mac.slots import CHOICE, FILLED, HEARD, NEWCOMER, QUIET, Slots
+from gr_ros2.mac.around import HEARD
+from gr_ros2.mac.slots import CHOICE, FILLED, NEWCOMER, QUIET, Slots
 from gr_ros2.wire.mac_block import NOBODY, Block, read_block
 
 SLOT = 0.0145
@@ -71,7 +72,7 @@ def test_no_slot_is_taken_that_a_neighbour_has_announced_or_expects_to_receive_i
         block = Block(0, (7, 7), 1, (5, NOBODY), expected=0x0F0F0F0F)
         if at % 7 == 0:
             hear(made, 1, at, block)
-    free = [slot for slot in range(394, 425) if made._free(slot)]
+    free = [slot for slot in range(394, 425) if made.calendar.free(slot)]
     assert 399 + 7 not in free
     assert not any(393 <= slot < 425 and 0x0F0F0F0F >> (slot - 400) & 1 for slot in free if slot >= 400)
 
@@ -155,33 +156,33 @@ def test_frames_have_a_slot_for_each_newcomer_until_it_is_none_any_more() -> Non
     made = robot()
     for other in range(16):
         hear(made, 10 + other, 70 + other, Block(0, (300, 300), 16, (5, NOBODY)))
-    assert made._frame(90, made._loads(90)) == 17 + 1 + 16
+    assert made._frame(90, made.around.loads(90, 1)) == 17 + 1 + 16
     late = 70 + NEWCOMER
-    assert made._frame(late + 8, made._loads(late + 8)) == 17 + 1 + 8
-    assert made._frame(late + 16, made._loads(late + 16)) == 17 + 1
+    assert made._frame(late + 8, made.around.loads(late + 8, 1)) == 17 + 1 + 8
+    assert made._frame(late + 16, made.around.loads(late + 16, 1)) == 17 + 1
 
 
 def test_a_robot_that_hears_other_slots_counts_who_has_them_and_picks_at_random_until_it_forgets_them() -> None:
     made = robot()
     hear(made, 7, 60, Block(0, (300, 300), 1, (5, NOBODY)))
     hear(made, 8, 61, Block(0, (300, 300), 1, (5, NOBODY)))
-    before = max(made._loads(70))
+    before = max(made.around.loads(70, 1))
     made.hear(9, Block(62, (300, 300), 1, (5, NOBODY)), 62.5 * SLOT)
-    assert max(made._loads(70)) == before + 1
+    assert max(made.around.loads(70, 1)) == before + 1
     made._confirmed_at = 70
     assert len({made._pick(77, 70, 20) for _ in range(100)}) == CHOICE
     made._confirmed_at = late = 70 + 2 * HEARD
     made._sweep(late)
     hear(made, 7, late, Block(0, (300, 300), 1, (5, NOBODY)))
-    assert made._loads(late)[0] == 2
+    assert made.around.loads(late, 1)[0] == 2
     assert len({made._pick(late + 7, late, 20) for _ in range(100)}) < CHOICE
 
 
 def test_a_slot_in_whose_place_somebody_sends_one_frame_before_is_passed_over() -> None:
     made = robot()
     hear(made, 7, 60, Block(0, (300, 300), 1, (5, NOBODY)))
-    made._confirmed_at, frame = 70, made._frame(70, made._loads(70))
-    made._taken |= {77 + frame: 7, 78: 7}
+    made._confirmed_at, frame = 70, made._frame(70, made.around.loads(70, 1))
+    made.calendar._taken |= {77 + frame: 7, 78: 7}
     assert made._pick(77, 70, frame) == 77 + frame + 2
 
 
@@ -191,7 +192,7 @@ def test_who_is_not_in_three_maps_in_a_row_of_a_neighbour_picks_at_random() -> N
     slot = made.clock.slot(begin + SLOT / 2)
     for later, expected, deaf in ((2, 1 << block.ahead[0] - 3, False), (3, 0, False), (4, 0, False), (5, 0, True)):
         hear(made, 9, slot + later, Block(0, (300, 9), 1, (5, NOBODY), expected))
-        assert made._unheard(slot + later) is deaf
+        assert made.around.deaf(slot + later) is deaf
 
 
 def test_the_lower_id_keeps_a_slot_that_two_want() -> None:
@@ -255,7 +256,7 @@ def test_an_entrant_claims_no_slot_that_it_has_not_announced() -> None:
     entry = made._mine[0]
     hear(made, 9, 62, Block(0, (entry - 62, 40), 1, (5, NOBODY)))
     assert made._mine == [], "whoever has the lower id"
-    assert not made._conflicts
+    assert not made.calendar._conflicts
 
 
 def test_an_entrant_waits_for_who_is_to_name_it_however_seldom_that_one_sends() -> None:
@@ -279,6 +280,17 @@ def test_a_robot_that_was_alone_for_long_sends_soon_once_it_hears_somebody() -> 
     assert made.clock.slot(begin + SLOT / 2) < slot + 20
     assert block.names[0] == 9
     assert block.ahead[0] < 10
+
+
+@pytest.mark.parametrize("heard", [0, 1])
+def test_who_hears_nobody_in_its_own_slots_moves_to_those_of_a_robot_that_hears_others(heard: int) -> None:
+    made = robot(5)
+    begin, _ = send(made, 1.0)
+    slot = made.clock.slot(begin + SLOT / 2)
+    behind = Block((slot + 1) % 256, (20, 20), heard, (NOBODY, NOBODY))
+    made.hear(9, behind, made.clock.begin(slot + 1) + SLOT / 2)
+    assert made.clock.jumps == heard
+    assert (set(made.around.robots) == {9}) == bool(heard)
 
 
 def test_an_entrant_that_nobody_names_starts_over() -> None:
@@ -311,7 +323,7 @@ def test_who_is_heard_for_a_moment_only_need_not_have_named_this_robot(moves: bo
     if moves:
         for slot in range(40, 1000, 5):
             hear(made, 1, slot, Block(0, (5, 5), 1, (5, NOBODY)))
-        made._start_over(1000)
+        made._start_over(1000, 14.5)
     for slot in range(1001, 1800, 5):
         hear(made, 2, slot, Block(0, (5, 5), 1, (NOBODY, NOBODY)))
         assert not made.unheard(made.clock.begin(slot + 1)) or slot > 1000 + 3 * HEARD
@@ -345,11 +357,16 @@ def test_a_slot_that_somebody_has_announced_is_not_entered_however_long_ago_this
 def test_once_a_trusted_robot_is_heard_what_was_not_checked_says_nothing() -> None:
     made = robot(5)
     hear(made, 1, 60, Block(0, (40, 40), 1, (5, NOBODY)))
-    before = dict(made._taken), dict(made._robots), made._expected, made.clock.begin(0)
+    before = dict(made.calendar._taken), dict(made.around.robots), made.calendar._expected, made.clock.begin(0)
     for at in range(61, 90):
         hear(made, 100 + at, at, Block(0, (10, 10), 60, (5, 9), 0xFFFFFF, (4, 5)), trusted=False)
         made.hear(100, Block(7, (3, 3)), at * SLOT + 0.4 * SLOT, trusted=False)
-    assert (dict(made._taken), dict(made._robots), made._expected, made.clock.begin(0)) == before
+    assert (
+        dict(made.calendar._taken),
+        dict(made.around.robots),
+        made.calendar._expected,
+        made.clock.begin(0),
+    ) == before
     assert made.clock.jumps == 0
 
 
@@ -360,8 +377,8 @@ def test_what_may_be_a_recording_keeps_its_slots_free_and_its_sender_is_named() 
     slot = made.clock.slot(begin + SLOT / 2)
     claim = Block(0, (block.ahead[0] - 1, 40), 60, (5, 9), 0xFFFFFFF, (block.ahead[0] - 1, 5), weight=8)
     hear(made, 2, slot + 1, claim, trusted=False, checked=True)
-    assert not made._free(slot + block.ahead[0] + 40)
-    assert not made._expected
+    assert not made.calendar.free(slot + block.ahead[0] + 40)
+    assert not made.calendar._expected
     at, after = send(made, begin + SLOT / 2)
     assert made.clock.slot(at + SLOT / 2) == slot + block.ahead[0], "it stays"
     assert 2 in after.names
@@ -380,7 +397,7 @@ def test_packets_that_are_not_checked_keep_their_slots_free_and_do_nothing_else(
     assert made.clock.slot(at + SLOT / 2) == slot + block.ahead[0], "it stays"
     assert after.heard == 0
     hear(made, 1, slot + 20, Block(0, (13, 0)), trusted=False)
-    assert not made._free(slot + 33)
+    assert not made.calendar.free(slot + 33)
 
 
 def test_robots_that_left_are_forgotten() -> None:

@@ -104,7 +104,8 @@ def talk(
 
 
 def state(access: Slots) -> tuple[object, ...]:
-    known = sorted(access._robots), dict(access._taken), access._expected, dict(access._conflicts)
+    calendar = access.calendar
+    known = sorted(access.around.robots), dict(calendar._taken), calendar._expected, dict(calendar._conflicts)
     return access.clock.begin(0), access.clock.jumps, list(access._mine), *known
 
 

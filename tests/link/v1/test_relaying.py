@@ -154,7 +154,7 @@ def test_packets_for_others_keep_their_slots_and_are_confirmed_by_that_robot_onl
     for one in everybody:
         assert isinstance(one.access, Slots)
         assert not one.access.unheard(line.now)
-        assert one.access._robots.keys() == {1, 2, 3, 4} - {one.src_id}
+        assert one.access.around.robots.keys() == {1, 2, 3, 4} - {one.src_id}
     assert not everybody[2].delivered(1)
     assert everybody[2].delivered(4)
     assert everybody[0].end.window.peers.all.keys() == {2}
