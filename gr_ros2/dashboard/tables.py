@@ -104,17 +104,25 @@ def heard_html(snapshot: Snapshot) -> str:
     """The robots heard, and when last."""
     if not snapshot.heard:
         return '<div class="note">no robot has been heard yet</div>'
+    told = [
+        (robot, way_text(robot.hops, robot.over), "" if robot.clock is None else robot.clock.words)
+        for robot in snapshot.heard
+    ]
+    ways, clocks = any(way for _, way, _ in told), any(clock for *_, clock in told)  # empty columns take width alone
     rows = "".join(
         f'<tr data-robot="{robot.src_id}"><th scope="row" class="name">robot {robot.src_id}</th>'
         f'<td data-field="silent">{robot.silent_s:.1f}</td><td data-field="packets">{robot.packets:,}</td>'
-        f'<td data-field="way">{way_text(robot.hops, robot.over)}</td>'
-        f'<td data-field="clock">{"" if robot.clock is None else robot.clock.words}</td></tr>'
-        for robot in snapshot.heard
+        + f'<td data-field="way">{way}</td>' * ways
+        + f'<td data-field="clock">{clock}</td>' * clocks
+        + "</tr>"
+        for robot, way, clock in told
     )
     return (
         '<table class="heard"><thead><tr><th scope="col" class="name">robot</th><th scope="col">heard [s ago]</th>'
-        '<th scope="col">packets</th><th scope="col">messages come</th><th scope="col">its clock is ahead</th></tr>'
-        f"</thead><tbody>{rows}</tbody></table>"
+        '<th scope="col">packets</th>'
+        + '<th scope="col">messages come</th>' * ways
+        + '<th scope="col">its clock is ahead</th>' * clocks
+        + f"</tr></thead><tbody>{rows}</tbody></table>"
     )
 
 

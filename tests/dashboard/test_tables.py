@@ -123,3 +123,5 @@ def test_who_hears_whom_has_a_cell_for_each_pair() -> None:
     heard = heard_html(Snapshot(heard=(RobotView(3, 0.1, 50), RobotView(7, 0.4, 0, 2, 3))))
     assert '<td data-field="way"></td>' in heard
     assert '<td data-field="way">over 3, hop 2</td>' in heard
+    assert "its clock is ahead" not in heard, "nobody has one"
+    assert "messages come" not in heard_html(Snapshot(heard=(RobotView(3, 0.1, 50),)))
