@@ -40,6 +40,7 @@ def close_to(found: Any, ahead_s: float) -> bool:
     return found is not None and abs(found["ahead_s"] - ahead_s) <= found["error_s"] + ADJUSTED_S
 
 
+@pytest.mark.slow
 def test_a_computer_whose_clock_is_wrong_is_taken_into_account(tmp_path: Path) -> None:
     ahead_s, address = 3600.5, tmp_path / "chrony.sock"
     settings = {"topics": {"place": {}}}

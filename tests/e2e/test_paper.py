@@ -46,6 +46,7 @@ def run_witnessed(name: str, out: Path, overrides: Sequence[str] = (), duration_
         ),
     ],
 )
+@pytest.mark.slow
 def test_every_message_arrives_unaltered(tmp_path: Path, name: str, overrides: list[str]) -> None:
     sent = run_witnessed(name, tmp_path, overrides)
     received = delivered_bag(tmp_path, "/rx_robot_1/odom")

@@ -33,6 +33,7 @@ def first_part(drive: Drive, path: Path) -> list[BagMessage]:
     return messages
 
 
+@pytest.mark.slow
 @pytest.mark.real_time
 @every_drive
 def test_a_recorded_drive_crosses_the_ofdm_link_completely(tmp_path: Path, drive: Drive) -> None:

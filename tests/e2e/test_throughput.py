@@ -34,6 +34,7 @@ def measured(link: LinkProcess, *words: str) -> Any:
     return json.loads(said)
 
 
+@pytest.mark.slow
 def test_a_link_is_filled_each_way_and_its_topics_go_first(tmp_path: Path) -> None:
     with Links(tmp_path, TOPICS, TOPICS, bit_rate=BIT_RATE) as links:
         one, two = started(links, 1, 2)
@@ -52,6 +53,7 @@ def test_a_link_is_filled_each_way_and_its_topics_go_first(tmp_path: Path) -> No
         assert one.status()["sink"]["publish_failed"] == 0
 
 
+@pytest.mark.slow
 def test_no_more_leaves_than_the_airtime_limit_allows(tmp_path: Path) -> None:
     limited = {**TOPICS, "airtime": {"duty_cycle": 0.1, "window_s": 10}}
     with Links(tmp_path, limited, limited, bit_rate=BIT_RATE) as links:
@@ -64,6 +66,7 @@ def test_no_more_leaves_than_the_airtime_limit_allows(tmp_path: Path) -> None:
         assert told["there"]["messages"] > 0
 
 
+@pytest.mark.slow
 def test_who_does_not_answer_is_named(tmp_path: Path) -> None:
     with Links(tmp_path, TOPICS, TOPICS) as links:
         one, two = started(links, 1, 2)

@@ -77,6 +77,7 @@ def result(name: str, *overrides: str) -> Result:
     return run_simulated(load_scenario(name, overrides)).result
 
 
+@pytest.mark.slow
 def test_followers_keep_their_places_by_the_link_alone() -> None:
     slots = result("formation", "robots=3", "duration_s=20")
     nothing = result("formation", "robots=3", "duration_s=20", "channel.packet_loss=1")

@@ -119,6 +119,7 @@ def test_equal_scenarios_give_equal_numbers() -> None:
     assert (one.topics, one.packets) == (other.topics, other.packets)
 
 
+@pytest.mark.slow
 def test_through_the_flowgraph_too() -> None:
     (odom,) = map(checked, run(time="samples", robots=REPORTING, duration_s=1.0).topics)
     assert odom.pdr >= 0.9
