@@ -95,6 +95,7 @@ if find_spec("bokeh") is not None:
     HARNESSES["dashboard"] = (fuzz.dashboard.dashboard, fuzz.dashboard.corpus)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "count"), COUNTS.items())
 def test_a_short_run_finds_nothing(name: str, count: int) -> None:
     if name not in HARNESSES:
@@ -141,6 +142,7 @@ def test_scripts_of_an_insider_reach_delivery(monkeypatch: pytest.MonkeyPatch) -
     assert {"Met", "Received", "Announced", "Delivered", "Lost", "Gone", "Rejected"} <= found
 
 
+@pytest.mark.slow
 def test_scripts_of_frames_reach_the_decoders(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some are decoded, some are not, and our own camera goes on."""
     pytest.importorskip("av", reason="needs PyAV")

@@ -22,6 +22,7 @@ def check(env: dict[str, str], *options: str) -> subprocess.CompletedProcess[str
     return subprocess.run(command, env={**os.environ, **env}, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_a_loudspeaker_that_the_microphone_hears(tmp_path: Path) -> None:
     server = sound_server_or_skip(tmp_path)
     try:

@@ -70,6 +70,7 @@ def test_nothing_is_referred_to_that_was_not_confirmed() -> None:
         topic.decoder().decode(changed.data)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_any_history_is_exact(data: st.DataObject) -> None:

@@ -44,6 +44,7 @@ def test_twenty_robots_in_one_cell_share_it_without_a_collision() -> None:
     assert swarm.lost("collision", "sending") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robots", [2, 10])
 def test_packets_of_any_length_fill_the_same_share_of_the_slots_after_as_many_frames(robots: int) -> None:
     usual = [in_slots(robots, AIRTIME, seed) for seed in (1, 2, 3)]

@@ -111,6 +111,7 @@ def heard(folder: Path, medium: str, robots: int = 2) -> tuple[list[int], Medium
         return [len(robot.heard) for robot in graphs], process
 
 
+@pytest.mark.slow
 def test_in_slots_two_links_lose_nothing_both_ways_and_at_once_most(tmp_path: Path) -> None:
     whole, process = heard(tmp_path, "slots")
     assert whole == [SAID, SAID]

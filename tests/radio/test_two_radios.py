@@ -81,6 +81,7 @@ def test_two_like_radios_share_the_load_and_every_message_comes_once(tmp_path: P
     assert team.robots[1].link.stats()["sink"]["rejected"] == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rates", [(FAST, FAST), (FAST, SLOW), (SLOW, FAST)])
 def test_a_radio_that_is_pulled_out_loses_no_message(
     tmp_path: Path, closing: ExitStack, rates: tuple[int, int]

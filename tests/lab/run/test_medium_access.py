@@ -30,6 +30,7 @@ def delivered(name: str, *overrides: str, duration_s: float) -> tuple[dict[int, 
     return counts, run
 
 
+@pytest.mark.slow
 def test_two_robots_both_ways_lose_nothing_in_slots_and_most_of_it_otherwise() -> None:
     counts, _ = delivered("two-robots-half-duplex", *BOTH_WAYS, "medium=slots", duration_s=10)
     assert min(counts.values()) >= 0.99 * 350

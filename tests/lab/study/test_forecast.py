@@ -244,6 +244,7 @@ def test_what_cannot_be_planned(overrides: list[str], says: str) -> None:
         planner("paper-ofdm-paced", *overrides)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "duration", "rows"), [("team", 6.0, 3), ("two-robots-half-duplex", 6.0, 2), ("twenty-robots", 1.0, 19)]
 )
@@ -271,6 +272,7 @@ def test_slots_are_proposed_where_packets_overlap() -> None:
     assert followed.used == pytest.approx(slots.forecast.used)
 
 
+@pytest.mark.slow
 def test_slots_deliver_what_overlap_loses() -> None:
     plan = planner("two-robots-half-duplex", duration=15.0)
     (slots,) = (advice for advice in plan.advice() if advice.setting == "medium=slots")

@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[3]
 SKIPPED = 77
 
 
+@pytest.mark.slow
 def test_sanitizers_find_nothing() -> None:
     command = [sys.executable, str(ROOT / "tools" / "sanitize-kernels"), "20"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
