@@ -126,7 +126,6 @@ class ChangesDecoder(ABC, Generic[_Read]):
             base = self._kept.get(before)
             if base is None:
                 raise MissingFrameError("the message that this one changes was not decoded here")
-            self._kept.move_to_end(before)
             message = self._changed(body, base)
         _keep(self._kept, name_of(data), self._read(message))
         return message

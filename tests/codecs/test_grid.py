@@ -70,6 +70,22 @@ def test_nothing_is_referred_to_that_was_not_confirmed() -> None:
         topic.decoder().decode(changed.data)
 
 
+def test_what_both_ends_keep_is_the_newest_whatever_was_referred_to() -> None:
+    topic = CodedTopic(GRID)
+    encoder, decoder = topic.encoder(), topic.decoder()
+    maps, names = exploring(KEPT + 2, 200), []
+    for message in maps[:-1]:
+        coded = encoder.encode(message)
+        assert decoder.decode(coded.data) == message
+        if not names:
+            encoder.confirmed(coded.name)
+        names.append(coded.name)
+    encoder.confirmed(names[1])  # late: the oldest that both ends keep
+    coded = encoder.encode(maps[-1])
+    assert coded.before == names[1]
+    assert decoder.decode(coded.data) == maps[-1]
+
+
 @pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.data())
