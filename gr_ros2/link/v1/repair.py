@@ -161,6 +161,7 @@ class RepairWindow:
             window = self._combining.around(number, now)
         else:
             window = self._of_all(now, number)
+            self.peers.announced((number,))  # also where it stands beyond the window; a report calls for it again
         spans = bool(window) and window[0].number >= number >= window[-1].number
         record = packets.records.get(number)
         if record is not None and (not spans or self.peers.replayed(number)):
