@@ -1,7 +1,8 @@
 """What is sent on of the messages of other robots.
 
 Of reliable topics for all, all messages in their order (``relay.in_order``); of all others the newest of each topic
-(``relay.gain``). Both compete with own messages by what they are worth.
+(``relay.gain``). Both compete with own messages by what they are worth. A table that is sent again consists of
+the same bytes as before: fragments of two tries add up. The age in it counts from the first try.
 
 Invariant: what is kept is bounded by ``MOST_STREAMS``, ``MOST_KEPT`` and the bytes given; of the neighbours that
 brought it, the one with most of it loses first.
@@ -22,7 +23,7 @@ from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire import QOS_DEFAULT
 from gr_ros2.wire.ages import age_code
 from gr_ros2.wire.relayed import MOST_HOPS, RELAYED_LEN, Relayed, write_relayed
-from gr_ros2.wire.v1 import RELAYED_TOPIC
+from gr_ros2.wire.v1 import RELAYED_TOPIC, TABLE_TOPIC
 
 MOST_STREAMS = 4096
 """Topics of other robots of which a message is kept to be sent on."""
@@ -64,6 +65,8 @@ class SentOn:
         self._quotas: Quotas[Stream] = Quotas(MOST_STREAMS, most)
         self._chosen: Stream | None = None
         self._next: Name | None = None
+        self._tried: dict[Stream, tuple[ToPass, Message]] = {}
+        """The tables that have left, and how."""
 
     def take(self, via: int, to_pass: ToPass, now: float) -> bool:
         """Keep a message to be sent on; returns whether it is newer than what is here."""
@@ -147,11 +150,14 @@ class SentOn:
             self.relayed[self._next.stream.origin, self._next.stream.topic_id] += 1
         elif message.topic_id == RELAYED_TOPIC and self._chosen is not None:
             self._gains.sent(self._chosen, now)
+            if self._chosen.topic_id == TABLE_TOPIC:
+                self._tried[self._chosen] = self._newest[self._chosen], message
             self.relayed[self._chosen.origin, self._chosen.topic_id] += 1
 
     def _drop(self, stream: Stream) -> None:
         """Send nothing of a stream on."""
         self._newest.pop(stream, None)
+        self._tried.pop(stream, None)
         self._quotas.drop(stream)
         self._gains.drop(stream)
         if stream == self._chosen:
@@ -160,9 +166,14 @@ class SentOn:
     def _queue(self, topic: SentTopic, to_pass: ToPass | Kept, gain: float, now: float, leaves: float) -> None:
         message = to_pass.message
         hops = min(message.hops + 1, MOST_HOPS)
-        payload = write_relayed(message._replace(hops=hops, age=age_code(leaves - to_pass.made)))
+        payload, begin = write_relayed(message._replace(hops=hops, age=age_code(leaves - to_pass.made))), 0
+        tried = self._tried.get(Stream(message.origin, message.start, message.topic_id))
+        if tried is not None and tried[0] is to_pass:
+            payload, begin = tried[1].payload, tried[1].begin
         topic.newest = now - gain / max(self._gains.neighbours(now), 1)
-        queued = Message(-1, topic.topic.topic_id, payload, QOS_DEFAULT, now, expires=to_pass.until, repeat=True)
+        queued = Message(
+            -1, topic.topic.topic_id, payload, QOS_DEFAULT, now, expires=to_pass.until, repeat=True, begin=begin
+        )
         topic.queue.append(queued)
 
     def _cost(self, stream: Stream, now: float) -> float:

@@ -18,7 +18,7 @@ from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.relayed import PLACES, Relayed, read_carried, write_carried
 from gr_ros2.wire.v1 import CARRIED_TOPIC, QOS_REPAIR, TABLE_TOPIC, read_header, read_repair_header
 from tests.link.v1.air import Robot, registry
-from tests.link.v1.test_relaying import Line, robot
+from tests.link.v1.test_relaying import ODOM, Line, robot
 
 LAST = 4
 
@@ -62,6 +62,19 @@ def test_goals_arrive_in_order_and_once_beside_a_map_of_many_packets(mode: SealM
     assert not any(payload in one.delivered(1) for one in line.robots[1:3] for payload in (*goals, whole))
     until(line, 60, lambda: not any(len(custody_of(one)) for one in line.robots))
     assert all(not custody_of(one).held_bytes for one in line.robots)
+
+
+def test_goals_cross_three_hops_where_the_table_of_their_origin_takes_many_packets_and_a_third_is_lost() -> None:
+    rows = {1: named(), 2: ODOM, 3: ODOM, LAST: ODOM}
+    line = Line(*(robot(src_id, "encrypt", topics, packet_len=64) for src_id, topics in rows.items()), loss=0.3)
+    line._rng = random.Random(2)
+    line.run(12)
+    goals = [b"goal %d" % n for n in range(24)]
+    for goal in goals:
+        line.robots[0].end.messages.submit(1, goal, line.now)
+        line.run(1)
+    until(line, 90, lambda: goals[-1] in line.robots[-1].delivered(1))
+    assert [payload for payload in line.robots[-1].delivered(1) if payload.startswith(b"goal")] == goals
 
 
 def test_what_comes_before_the_table_of_its_origin_waits_for_it() -> None:

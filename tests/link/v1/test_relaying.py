@@ -161,6 +161,16 @@ def test_packets_for_others_keep_their_slots_and_are_confirmed_by_that_robot_onl
     assert everybody[2].end.received.dropped["not_for_us"] > 100
 
 
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+def test_tables_of_many_packets_cross_a_line(loss: float) -> None:
+    """They are of use only whole: fragments of several tries add up, and what is known leaves them time."""
+    options = {f"topic_{n}": SendOptions() for n in range(4)}
+    line = Line(*(robot(src_id, "encrypt", registry(**options), packet_len=64) for src_id in (1, 2, 3, 4)), loss=loss)
+    line.run(40)
+    for one in line.robots:
+        assert all(one.end.knows(other.src_id) for other in line.robots if other is not one)
+
+
 def test_frames_are_not_passed_on() -> None:
     """A chain of frames would be of no use to who lacks one of them."""
     topics = registry(odom=SendOptions(queue="latest"), image=SendOptions())
