@@ -305,7 +305,7 @@ def _key_frame(running: RobotLink, src_id: int, topic_id: int) -> None:
         live.wake()
 
 
-def _opening(running: Any) -> str:
+def _opening(running: RobotLink) -> str:
     radios = " and ".join(_on(one) for one in running.radios)
     return f"robot {running.source.src_id} on {radios}; Ctrl-C ends it"
 
@@ -321,7 +321,7 @@ def _on(one: Any) -> str:
     return f"{one.name}: {phy.name}{rate}{every}{on_air}{runs_on}"
 
 
-def _show(console: Console, running: Any, duration: float | None) -> None:
+def _show(console: Console, running: RobotLink, duration: float | None) -> None:
     """Print what runs and what it waits for, with a live table, or plain lines where there is no terminal,
     until the time is over or the link has finished."""
     from gr_ros2.radio.waiting import NewFindings, Waiting
@@ -336,7 +336,7 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
     waiting = Waiting(running.source)
     with Live("", console=console, auto_refresh=False) if live else ExitStack() as shows:
         shown = time.monotonic()
-        findings = NewFindings(running.findings)
+        findings = NewFindings(running.findings.lines)
         while (now := time.monotonic()) < end and not running.finished:
             time.sleep(min(_SHOW_S, end - now))
             _watch(running)
@@ -354,7 +354,7 @@ def _show(console: Console, running: Any, duration: float | None) -> None:
                 guarded(say, status_line(stats))
 
 
-def _watch(running: Any) -> None:
+def _watch(running: RobotLink) -> None:
     """Check the link, and tell systemd that it goes on, or what does not."""
     try:
         running.check()
