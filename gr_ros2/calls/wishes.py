@@ -20,7 +20,10 @@ MOST_WISHES = 32
 LEASE_S = 60.0
 """s for which a wish holds without being renewed. It is renewed at half of that."""
 PATIENCE_S = 30.0
-"""s for which an answer is waited for, before the wish is sent again."""
+"""s for which an answer is waited for; also the longest time after which a wish is sent again."""
+AGAIN_S = 4.0
+"""s after which a wish is sent again without an answer; then twice as long, and so on. A robot that has just started
+may miss what was sent before it had heard this one, and measures a topic for 2 s before it answers."""
 _SHOWN_S = 60.0
 """s for which it is remembered how a wish ended."""
 
@@ -100,6 +103,7 @@ class OwnWish:
 
     :param until: s, when it ends
     :param ask_at: when the other robot is asked, or asked again, s
+    :param again_s: after which it is asked again without an answer
     :param leased: until when it holds at the other robot, if that has taken it, s
     :param answer: the newest; None before the first
     :param ended: when it was given up, refused or over, s; infinite while it goes on
@@ -108,6 +112,7 @@ class OwnWish:
     rate: float
     until: float
     ask_at: float
+    again_s: float = AGAIN_S
     leased: float = -inf
     answer: WishAnswer | None = None
     ended: float = inf
@@ -149,7 +154,8 @@ class OwnWishes:
         for (robot, name), wish in self._wishes.items():
             if wish.ended == inf and wish.ask_at <= now:
                 lease_s = max(1, round(min(wish.until - now, LEASE_S)))
-                wish.ask_at, wish.leased = now + PATIENCE_S, now + lease_s
+                wish.ask_at, wish.leased = now + wish.again_s, now + lease_s
+                wish.again_s = min(2 * wish.again_s, PATIENCE_S)
                 asks.append((robot, WishRequest(name, wish.rate, lease_s)))
         return asks
 
@@ -163,7 +169,7 @@ class OwnWishes:
         wish = self._wishes.get((robot, request.name))
         if wish is None or wish.ended < inf or wish.rate != request.rate:
             return
-        wish.answer = answer
+        wish.answer, wish.again_s = answer, AGAIN_S
         if answer.outcome == WishOutcome.SENT:
             wish.ask_at = inf if wish.leased > wish.until - 1 else now + LEASE_S / 2
         else:
@@ -173,7 +179,7 @@ class OwnWishes:
         """A robot has started, or is heard again: it may know nothing of the wishes."""
         for (whose, _), wish in self._wishes.items():
             if whose == robot:
-                wish.ask_at = now
+                wish.ask_at, wish.again_s = now, AGAIN_S
 
     def expire(self, now: float) -> None:
         """End what is over, and forget what has been over for long."""

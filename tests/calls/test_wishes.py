@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import inf
 
 from gr_ros2.calls.wish_frames import GiveUp, WishAnswer, WishOutcome, WishRequest
-from gr_ros2.calls.wishes import LEASE_S, MOST_WISHES, PATIENCE_S, HeldWishes, OwnWishes
+from gr_ros2.calls.wishes import AGAIN_S, LEASE_S, MOST_WISHES, PATIENCE_S, HeldWishes, OwnWishes
 
 SENT = WishAnswer(WishOutcome.SENT, 2.0)
 
@@ -97,11 +98,17 @@ def test_a_short_wish_is_asked_once() -> None:
 def test_a_wish_that_is_lost_is_asked_again() -> None:
     own = OwnWishes()
     own.want(2, "scan", 2.0, 300.0, 0.0)
-    own.due(0.0)
-    assert own.next_ask == PATIENCE_S
-    assert own.due(PATIENCE_S) == [(2, wish())]
-    own.unheard(2, "scan", 40.0, 1.0)
-    assert own.next_ask == 41.0
+    asked = [0.0]
+    for _ in range(5):
+        assert own.due(asked[-1]) == [(2, wish())]
+        asked.append(own.next_ask)
+    waits = [then - now for now, then in pairwise(asked)]
+    assert waits == [AGAIN_S, 2 * AGAIN_S, 4 * AGAIN_S, PATIENCE_S, PATIENCE_S]
+    own.met(2, 200.0)
+    own.due(200.0)
+    assert own.next_ask == 200.0 + AGAIN_S, "soon, of a robot that has started again"
+    own.unheard(2, "scan", 240.0, 1.0)
+    assert own.next_ask == 241.0
 
 
 def test_a_robot_that_has_started_again_is_asked_again() -> None:
