@@ -62,8 +62,9 @@ class LiveSettings:
         self._source.set_topics({**given, known: changed})
         if topic.lstrip("/") in {one.name.lstrip("/") for one in self._source.subscriptions.subscribed.values()}:
             return shortened(f"{name} = {value}")
-        names = ", ".join(sorted(self._source.subscriptions.subscribed)) or "none"
-        return shortened(f"{name} = {value}; no topic {topic} is sent now, it waits for one; sent are {names}")
+        names = ", ".join(sorted(self._source.subscriptions.subscribed))
+        others = f"sent are {names}" if names else "nothing is sent yet"
+        return shortened(f"{name} = {value}; no topic {topic} is sent now, it waits for one; {others}")
 
     def _set_both(self, name: str, value: Any) -> None:
         """Change what both directions have."""

@@ -124,7 +124,9 @@ def test_a_running_link_tells_what_it_does(ends: Ends) -> None:
     several = ends.run("status")
     assert (several.returncode, "say which with --pid" in several.stderr) == (2, True)
     changed = ends.run("set", "topics.odom.to=2", "debug=true", "--pid", pid)
-    assert changed.stdout == "topics.odom.to = 2; no topic odom is sent now\ndebug = True\n"
+    odom, debug = changed.stdout.splitlines()
+    assert odom == "topics.odom.to = 2; no topic odom is sent now, it waits for one; nothing is sent yet"
+    assert debug == "debug = True"
     fixed = ends.run("set", "packet_len=64", "--pid", pid)
     assert (fixed.returncode, len(fixed.stderr.splitlines())) == (1, 1)
     assert "packet_len cannot change while the link runs; these can: " in fixed.stderr

@@ -48,7 +48,7 @@ def test_a_topic_is_for_one_robot_after_the_other(tmp_path: Path, found: bool) -
         top.msg_connect((source, "pdus"), (sink, "pdus"))
     live = LiveSettings(source, sinks[0])
     said = live.change(TO, 2)  # also of a topic that the graph does not have yet
-    assert said == f"{TO} = 2" + "; no topic goal is sent now, it waits for one; sent are none" * found
+    assert said == f"{TO} = 2" + "; no topic goal is sent now, it waits for one; nothing is sent yet" * found
     top.start()
     try:
         wait_for(publisher.matched, "the source's subscription")
