@@ -11,6 +11,7 @@ from typing import Any
 
 from gr_ros2.link.fates import Fate, fate_order
 from gr_ros2.observe.result import TopicResult
+from gr_ros2_lab.record.team_numbers import TEAM_VALUES, team_numbers
 from gr_ros2_lab.record.trace import Messages
 from gr_ros2_lab.report.explain import lateness_lines
 from gr_ros2_lab.report.figures import latency_figure, ledger_figure
@@ -25,7 +26,7 @@ from gr_ros2_lab.report.page import (
     render_page,
     write_summary,
 )
-from gr_ros2_lab.report.table import Grid, milliseconds, number
+from gr_ros2_lab.report.table import Grid, milliseconds, number, whose_view
 from gr_ros2_lab.report.timelines import Deliveries, age_figure, delivery_figure
 
 COMPARISON_FILE = "compare.html"
@@ -53,8 +54,9 @@ _DASH = "–"
 
 
 def compare_grid(runs: Sequence[Run]) -> Grid:
-    """What differs, with a column per run: the settings, a section per topic, and the link. What is equal in all runs
-    is left out, and so are their names where they head the columns."""
+    """What differs, with a column per run: the settings, all robots of a team, a section per topic of the first
+    receiver, and its link. What is equal in all runs is left out, and so are their names where they head the columns.
+    """
     by_topic = [{topic.topic: topic for topic in run.result.topics} for run in runs]
     sections = []
     for name in dict.fromkeys(name for topics in by_topic for name in topics):
@@ -84,10 +86,16 @@ def compare_grid(runs: Sequence[Run]) -> Grid:
             )
         )
     link += [("link", what, *(milliseconds(result.phy.get(key)) for result in results)) for what, key in _PHY.items()]
+    teams = [team_numbers(result) for result in results]
+    team = [
+        ("all robots", label, *(number(numbers.get(name), "{:.3g}") for numbers in teams))
+        for name, label in TEAM_VALUES.items()
+    ]
     labels = tuple(run.label for run in runs)
-    lines_of = [_settings([result.config for result in results]), *sections, link]
+    lines_of = [_settings([result.config for result in results]), team, *sections, link]
     kept = [tuple(line for line in section if len(set(line[2:])) > 1 and line[2:] != labels) for section in lines_of]
-    title = "What differs" if any(kept) else "Nothing differs"
+    view = whose_view(results[0])
+    title = ("What differs" + f"; topics and link {view}" * bool(view)) if any(kept) else "Nothing differs"
     return Grid(title, ("", "", *labels), tuple(filter(None, kept)), texts=2)
 
 

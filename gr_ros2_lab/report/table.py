@@ -200,6 +200,12 @@ def ends(result: Result) -> Iterator[tuple[str, Sequence[TopicResult]]]:
     yield from ((one.name or f"receiver {one.number}", one.topics) for one in result.receivers)
 
 
+def whose_view(result: Result) -> str:
+    """Whose the numbers of topics and link in a result are, in words; '' where there is one receiver."""
+    first, *others = (name for name, _ in ends(result))
+    return f"as {first} receives it" if others else ""
+
+
 def as_table(grid: Grid) -> Table:
     """A grid for the terminal."""
     # The table is narrow, so that ten columns fit a terminal of 80 characters.

@@ -18,7 +18,7 @@ from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.report.page import Run, read_runs
-from gr_ros2_lab.report.table import Grid, milliseconds, number
+from gr_ros2_lab.report.table import Grid, milliseconds, number, whose_view
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
 
@@ -88,11 +88,14 @@ def run_variants(
     :param name: as `load_scenario` takes it, likewise ``overrides``, ``seed`` and ``duration_s``
     :param out: folder in which each run has its folder
     :param on_run: called before each run
-    :raises ConfigError: when a scenario cannot be set up, or has nothing to switch off
+    :raises ConfigError: when a scenario cannot be set up, has nothing to switch off, or asks for repetitions
     :raises RunError: when a run fails
     :raises KeyboardInterrupt: when a run is interrupted; the results of earlier runs are kept
     """
-    chosen = variants(load_scenario(name, overrides, seed=seed, duration_s=duration_s))
+    whole = load_scenario(name, overrides, seed=seed, duration_s=duration_s)
+    if whole.repetitions > 1:
+        raise ConfigError(f"repetitions = {whole.repetitions}: each part is off once; set 1, or write a sweep")
+    chosen = variants(whole)
     for variant in chosen:
         on_run(variant)
         settings = [*overrides, *variant.settings]
@@ -118,7 +121,8 @@ def worth_grid(runs: Sequence[Run]) -> Grid:
     cost = tuple(number(air_bytes(run.result), "{:.0f}") for run in runs)
     sections.append((("link", "air bytes per message", *cost),))
     headings = ("Topic", "Number", *(run.label for run in runs))
-    return Grid("What each part is worth", headings, tuple(sections), texts=2)
+    title = ", ".join(filter(None, ("What each part is worth", whose_view(runs[0].result))))
+    return Grid(title, headings, tuple(sections), texts=2)
 
 
 def air_bytes(result: Result) -> float | None:

@@ -34,3 +34,13 @@ def test_it_prints_what_each_part_is_worth_and_writes_the_page(
 def test_where_nothing_is_on_it_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["ablate", "paper-ofdm"]) == BAD_INPUT
     assert "nothing to switch off" in capsys.readouterr().err
+
+
+def test_repetitions_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["ablate", "paper-ofdm-paced", "--set", "repetitions=2"]) == BAD_INPUT
+    assert "repetitions = 2: each part is off once; set 1, or write a sweep" in capsys.readouterr().err
+
+
+def test_of_a_team_it_says_whose_view_it_shows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["ablate", "team", "--duration", "1", "--out", str(tmp_path / "parts")]) == 0
+    assert "What each part is worth, as /robot_1 receives it" in capsys.readouterr().out

@@ -6,8 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from gr_ros2_lab.record.result import LatenessResult
+from gr_ros2_lab.record.team_numbers import team_numbers
 from gr_ros2_lab.report.compare import compare_grid, lateness_of, write_comparison
 from gr_ros2_lab.report.page import Run
+from gr_ros2_lab.run.runner import run_scenario
+from gr_ros2_lab.run.scenario import load_scenario
 from tests.lab.record.runs import make_run
 
 
@@ -28,6 +31,20 @@ def test_a_column_per_run_and_a_dash_where_one_has_nothing(tmp_path: Path) -> No
     assert "path error [m]" not in imu
     assert link["airtime of a packet [ms]"] == ("10.0", "–")
     assert "packets sent" not in link
+
+
+def test_of_teams_all_robots_are_compared_and_the_title_says_whose_the_topics_are() -> None:
+    runs = [
+        Run(Path(access), access, ran.result, ran.trace)
+        for access in ("slots", "aloha")
+        for ran in [run_scenario(load_scenario("team", [f"medium={access}"], duration_s=2.0))]
+    ]
+    grid = compare_grid(runs)
+    assert grid.title == "What differs; topics and link as /robot_1 receives it"
+    told = {line[1]: line[2:] for section in grid.sections for line in section if line[0] == "all robots"}
+    pdrs = [team_numbers(run.result)["pair_pdr"] for run in runs]
+    assert told["PDR over all pairs"] == tuple(f"{pdr:.3g}" for pdr in pdrs)
+    assert "time to meet [s]" not in told
 
 
 def test_the_page_and_its_figures_are_written(tmp_path: Path) -> None:
