@@ -57,7 +57,7 @@ def test_live_numbers_are_the_results(seed: int, with_ledger: bool) -> None:
     recorder = Recorder(REGISTRY, {SRC: "/robot_4"})
     state = make(recorder if with_ledger else None)
     feed = lossy_run(seed, recorder, state)
-    feed.sender.missed(0, 5)
+    feed.sender.ledger.missed(0, 5)
     feed.pass_time(61.0)
     snapshot = state.tick(60.0)
     result = result_of(recorder)
