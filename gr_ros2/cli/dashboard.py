@@ -97,7 +97,8 @@ def audience(
 
     :param where: value of ``--dashboard``; None for no dashboard at the start
     :param name: what the program is doing, for clients that search for it
-    :param answers: what clients may ask beside that, by name; called with the value given, in a thread of its own
+    :param answers: what clients may ask of a link beside that, by name; called with the value given, in a thread of its
+        own; a run has none
     :raises ConfigError: when the dashboard cannot be served at this place
     :raises BackendMissingError: when the package that draws it is not installed
     """
@@ -124,6 +125,8 @@ def audience(
             if set(asked) & {"address", "port"}:
                 place = build(_Place, asked, "dashboard")
                 return {"url": serve(place.address, place.port)}
+            if asked and not answers:
+                raise ConfigError(f"{name} is a run, and only a link answers this; gr-ros2 dashboard shows it")
             if strange := sorted(set(asked) - set(answers)):
                 known = ", ".join(sorted({"address", "port", *answers}))
                 raise ConfigError(f"{', '.join(strange)}: no question here; known are {known}")
