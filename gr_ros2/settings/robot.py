@@ -177,8 +177,8 @@ class RobotConfig:
     hold_s: Annotated[Seconds, Field(title="Wait for repair (s)")] = 1.0
     """s that a reliable message waits for an earlier one where the sender gets no reports"""
     max_age_s: Age = AUTO
-    """s for which a sealed message may have been withheld; auto = 15 for calls and topics with a deadline or lifespan,
-    else any time; 0 = any time"""
+    """s for which a sealed message may have been withheld; auto = 15 for calls and topics with a deadline or lifespan
+    (over other robots that, if longer; more where packets are long), else any time; 0 = any time"""
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
     """robots heard at a time; packets of more are dropped"""
     max_source_bytes: Annotated[Bytes, Field(title="Memory per sender (bytes)")] = 72_000_000

@@ -39,8 +39,9 @@ class Settings:
     :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
     :param relay: whether messages of other robots are sent on
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
-    :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto: 15 for calls and
-        topics with a deadline or lifespan, no bound for others; 0 = no bound
+    :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto:
+        ``MAX_AGE_S`` or, over other robots, a longer deadline, for calls and topics with a deadline or lifespan, no
+        bound for others; 0 = no bound
     :param max_ages: the same by topic; * and ? in its name stand for others
     :param repeat_s: s between repeats of latched messages while no robot reports; 0 = no repeats
     :param max_source_bytes: memory for packets and incomplete messages, per robot heard

@@ -118,6 +118,7 @@ class Outbox:
             shares=settings.shares,
             slow=lambda: settings.shares and settings.slower > 1,
         )
+        self.packing.turns.join(TABLE_TOPIC)
         self.relayed_left: Callable[[Message, float], None] = lambda _, __: None
         """Called when a message of another robot has left whole."""
         self.custody: Custody | None = None

@@ -178,7 +178,6 @@ class Packing:
         table = self._topics.get(TABLE_TOPIC)
         if table is None or not table.queue:
             return
-        self.turns.join(TABLE_TOPIC)
         started = [row for row in table.queue if row.started]
         rows = started + sorted((row for row in table.queue if not row.started), key=self._later)
         for place, row in enumerate(rows):
@@ -197,7 +196,7 @@ class Packing:
 
     def _heap(self) -> list[tuple[float, float, int, int]]:
         """Topics that may send, the most urgent and most valuable first."""
-        holder = self._holder = self.turns.holder(self._open)
+        holder = self._holder = self.turns.holder(self._open.keys() - {TABLE_TOPIC} if self.fills else self._open)
         if len(self._open) == 1:  # nothing to choose
             (only,) = self._open
             return [(0, 0, only, 0)]
@@ -206,7 +205,7 @@ class Packing:
             head = ready[0]
             worth = value(head, self._topics[topic_id].newest, ENTRY)
             rank = self._rank(head)
-            heap.append((-1 if rank and topic_id == holder else rank, -worth, topic_id, 0))
+            heap.append((-1 if topic_id == holder else rank, -worth, topic_id, 0))
         heapify(heap)
         return heap
 

@@ -30,7 +30,8 @@ MASK_LEN = MAP // 8
 """Bytes kept free there for the mask of a repair. Without it a repair of full packets names those too that are not
 repaired any more, and who lacks one of these cannot use it. A mask of more packets than a report covers may not fit."""
 FORCED = 20
-"""Number of new packets after which a report that found no room gets a packet of its own: 5 % of the slots."""
+"""Number of new packets after which a report or a request that found no room gets a packet of its own: 5 % of the
+slots."""
 
 
 class ReportSlots:
@@ -51,6 +52,8 @@ class ReportSlots:
         self.reserved = 0
         self._unheard = 0
         """New packets since a report became due and found no room."""
+        self._unasked = 0
+        """The same of a request."""
 
     def due(self, now: float, *, last: bool = False) -> list[Reporter]:
         """The reports that are due; on a shared channel as many as may leave, those first that miss something.
@@ -76,8 +79,8 @@ class ReportSlots:
 
     @property
     def overdue(self) -> bool:
-        """Whether a report that is due has found no room for long."""
-        return self._unheard >= FORCED
+        """Whether a report that is due, or a request, has found no room for long."""
+        return max(self._unheard, self._unasked) >= FORCED
 
     def next(self, now: float) -> float:
         """When a report may leave, s; inf for never."""
@@ -88,7 +91,7 @@ class ReportSlots:
         return soonest
 
     def add(self, entries: list[EntryV1], free: int, due: Iterable[Reporter], now: float) -> None:
-        """Add reports to the entries of a packet of messages, as far as they fit.
+        """Add reports and requests to the entries of a packet of messages, as far as they fit.
 
         :param free: bytes that they may take
         """
@@ -100,11 +103,11 @@ class ReportSlots:
                 self._unheard = 0
             else:
                 self._unheard += 1
-        if self._shares:  # no slot may be left for them
-            entries += self.requests.entries(free, now)
+        entries += self.requests.entries(free, now)
+        self._unasked = (self._unasked + 1) * self.requests.crowded
 
-    def packet(self, due: Iterable[Reporter], now: float) -> SentPacket:
-        """A packet with reports, and with requests where there is room."""
+    def packet(self, due: Iterable[Reporter], now: float) -> SentPacket | None:
+        """A packet with reports, and with requests where there is room; None if there are none."""
         entries: list[EntryV1] = []
         free = self._writer.room
         for report in due:
@@ -112,8 +115,8 @@ class ReportSlots:
                 free -= report.size
                 entries.append(report.make(now))
         entries += self.requests.entries(free, now)
-        self._unheard = 0
-        return self._writer.control(entries, "report", now)
+        self._unheard = self._unasked = 0
+        return self._writer.control(entries, "report", now) if entries else None
 
     def asks(self, now: float) -> SentPacket | None:
         """A packet with requests, if there are any."""

@@ -23,11 +23,12 @@ class Requests:
     """The requests of one robot.
 
     :ivar lacking: whether they keep messages that this one lacked when it last looked
+    :ivar crowded: whether some of the requests found no room then
     :ivar check_at: when it looks next, s; infinite for never
     """
 
     def __init__(self, neighbours: Iterable[Neighbour], settings: Settings) -> None:
-        self.lacking = False
+        self.lacking = self.crowded = False
         self._neighbours, self._settings = neighbours, settings
         self.check_at = -inf if settings.hears else inf
 
@@ -37,7 +38,7 @@ class Requests:
         if now < self.check_at:
             return found
         self.check_at = now + CHECK_S
-        self.lacking = False
+        self.lacking = self.crowded = False
         for neighbour in [neighbour for neighbour in self._neighbours if neighbour.proven]:
             hello, inbox, asked = neighbour.hello, neighbour.inbox, neighbour.asked
             marks = list(hello.marks)
@@ -47,9 +48,12 @@ class Requests:
             lacking += neighbour.lost_frames
             self.lacking = self.lacking or bool(lacking)
             wanted = bytes(topic for topic in dict.fromkeys(lacking) if now >= asked.get(topic, -inf))
-            if wanted and room >= ASK_LEN + len(wanted):
-                room -= ASK_LEN + len(wanted)
-                found.append(Ask(neighbour.src_id, wanted))
-                neighbour.lost_frames.difference_update(wanted)
-                asked.update(dict.fromkeys(wanted, now + ASK_S * self._settings.slower))
+            said = wanted[: max(room - ASK_LEN, 0)]
+            if len(said) < len(wanted):
+                self.crowded, self.check_at = True, now
+            if said:
+                room -= ASK_LEN + len(said)
+                found.append(Ask(neighbour.src_id, said))
+                neighbour.lost_frames.difference_update(said)
+                asked.update(dict.fromkeys(said, now + ASK_S * self._settings.slower))
         return found

@@ -117,10 +117,9 @@ class SendingSide:
         if messages.sent.deadlines:
             messages.expire(now, self._pace.sure_interval(now))
         due = reports.due(now, last=packing.awaits_row)
-        if due and reports.overdue:
-            return reports.packet(due, now)
-        first = self._window.pressing and not packing.urgent
-        if first and (repair := self.repairs.first(now, waiting=packing.next_timeout(now) <= now)) is not None:
+        if reports.overdue and (told := reports.packet(due, now)) is not None:
+            return told
+        if (repair := self.repairs.first(now, packing)) is not None:
             return repair
         if self._relaying is not None:
             leaves = now if self._writer.leave_at is None else max(now, self._writer.leave_at)
@@ -153,7 +152,7 @@ class SendingSide:
             return None
         self.hellos.rests -= self.hellos.rests > 0
         self._slowness.waited(filling.since, now)
-        if due or self.settings.shares:
+        if due or now >= reports.requests.check_at:
             reports.add(filling.parts, room - filling.used, due, now)
         filling.parts += told
         lifetimes = () if spare else filling.lifetimes

@@ -23,22 +23,25 @@ OWED = 0.5
 """Packets expected to be lost of a message in order after which a repair follows it at once."""
 WITHIN = 64
 """Packets of a message in order from which on its repairs do not wait for its end."""
+MOST_OWED = 2
+"""Packets expected to be lost from which on repairs do not wait for the end of a message. Where one message follows the
+other, repairs could not keep up with the losses otherwise."""
 
 
 class SharedRepairs:
     """What one sender on a shared channel knows of its repairs.
 
     :param packets: what has left and may be repaired
-    :ivar within: whether a message in order goes on in later packets, and is not that long that repairs must not wait
     """
 
     def __init__(self, packets: SentPackets) -> None:
-        self.within = False
         self._packets = packets
         self._ordered = -1
         """The newest packet with a part of a message in order."""
         self._begun = 0
-        """Packets of a message in order that goes on."""
+        """Packets in a row with messages in order of which none ended."""
+        self._going_on: list[Lifetime] = []
+        """Messages in order that go on."""
         self._since = 0
         """New packets since the last combination."""
         self._told_at = -inf
@@ -55,10 +58,16 @@ class SharedRepairs:
         ordered = [lifetime for lifetime in lifetimes if lifetime.in_order]
         if ordered:
             self._ordered = number
-            self._begun = 0 if all(lifetime.left for lifetime in ordered) else self._begun + 1
-            self.within = 0 < self._begun < WITHIN
+            self._begun = 0 if any(lifetime.left for lifetime in ordered) else self._begun + 1
+            self._going_on = [lifetime for lifetime in ordered if not lifetime.left]
             loss = min(loss, MOST_LOSS)
             self._owed += loss / (1 - loss)
+
+    @property
+    def within(self) -> bool:
+        """Whether messages in order go on in later packets, none has just ended, and repairs wait for that."""
+        waits = 0 < self._begun < WITHIN and self._owed < MOST_OWED
+        return waits and any(lifetime.expires > -inf for lifetime in self._going_on)
 
     @property
     def due(self) -> bool:
