@@ -64,12 +64,13 @@ BENCHMARKS = {
     "reliable": "bench.reliable",
     "sound": "bench.sound",
     "sound_live": "bench.sound_live",
+    "backfill": "bench.backfill",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
     *("gate", "rate_rules", "cells", "first", "hidden", "changes", "scale", "crowd", "energy", "cameras", "clouds"),
-    *("sound", "sound_live"),
+    *("sound", "sound_live", "backfill"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

@@ -385,6 +385,7 @@ effects(
     robot=run("robots.0.robot=7"),
     direction=run("robots.1.direction=receive", LOSSY, REPORTING),
     topics=run("topics=[odom, scan]"),
+    backfill=Elsewhere("e2e/test_backfill.py::test_what_nobody_heard_in_an_outage_is_in_the_bag_afterwards"),
     publish=Elsewhere("radio/test_robot_link.py::test_parts_that_do_not_fit_are_refused_and_nothing_stays_open"),
     graph=run("robots.0.graph.namespace=/robot_2"),
     registry=run("registry=odom.csv", "topics=[odom]"),
@@ -416,6 +417,13 @@ effects(
     namespace=run("robots.0.graph.namespace=/robot_2"),
     depth=Elsewhere("radio/test_config.py::test_the_depths_of_a_graph_are_those_of_its_blocks"),
     use_sim_time=Elsewhere("gr/test_sink.py::test_latency_by_simulated_clock"),
+)
+BACKFILL = Elsewhere("e2e/test_backfill.py::test_what_nobody_heard_in_an_outage_is_in_the_bag_afterwards")
+effects(
+    "Backfill",
+    topics=BACKFILL,
+    for_s=Elsewhere("calls/test_backfill.py::test_what_is_too_old_is_given_up"),
+    memory_mb=Elsewhere("e2e/test_backfill.py::test_what_does_not_fit_is_given_up_and_the_bag_says_so"),
 )
 CLOCKS = Elsewhere("e2e/test_clocks.py::test_a_computer_whose_clock_is_wrong_is_taken_into_account")
 effects(

@@ -4,6 +4,10 @@ A message has two times in it: `log_time`, by which a bag is read and played, is
 clock, as far as the clock of its sender is known, else for how long it has been under way at least; `publish_time` is
 when it came out here.
 
+What fills gaps of an outage (:mod:`gr_ros2.gr.backfill`) stands among the rest, once. What is missing at the end is
+said in the bag, in the way of rosbag2 on `events/messages_lost` of the link's node: messages of which a part has come,
+and those that their sender has given up.
+
 Invariants: the link never waits for the disk; what the disk cannot take is counted and said. A bag of a link that was
 killed has all but what was written last.
 """
@@ -12,18 +16,22 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from gr_ros2.calls.backfill import Missing, read_later
 from gr_ros2.core.closing import Closing
-from gr_ros2.core.errors import BagError, GrRos2Error
+from gr_ros2.core.errors import BagError, GrRos2Error, WireError
 from gr_ros2.core.files import make_folder
-from gr_ros2.link.events import Announced, Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.link.events import Announced, Delivered, Lost, ReceiverEvent, SenderEvent
+from gr_ros2.link.key import Key
 from gr_ros2.middleware.base import Qos
+from gr_ros2.radio.lost_messages import LOST_TYPE, lost_definition, lost_event
+from gr_ros2.settings.registry import BACKFILL_TYPE
 
 if TYPE_CHECKING:
     from gr_ros2.middleware.bag_recorder import BagChannel
@@ -31,6 +39,9 @@ if TYPE_CHECKING:
     from gr_ros2.observe.result import RunResult
 
 _DEPTH = 10
+_REMEMBERED = 100_000
+_Name = tuple[int, ...]
+"""Of a message: its robot, the start of that, and where it began, or its serial number there."""
 
 
 class OutputBag(Closing):
@@ -50,9 +61,17 @@ class OutputBag(Closing):
         self.name = f"bag {path}"
         self.missed: Counter[str] = Counter()
         self._run: LiveRun | None = None
+        self.filled = 0
+        self._given_up: Counter[str] = Counter()
+        """Messages of each topic that nobody has any more."""
+        self._lost: dict[_Name, str] = {}
+        """Topics of messages of which only a part has come."""
+        self._fillers: dict[tuple[int, int], int] | None = None
+        self._known: dict[_Name, None] = {}
+        """The newest messages of robots that fill gaps, as one may come twice: where it was not known to be heard."""
         self._channels: dict[tuple[int, int], BagChannel | None] = {}
         make_folder(path.parent)
-        self._recorder = BagRecorder(path, "mcap", {}, self._count, lossless=False)
+        self._recorder = BagRecorder(path, "mcap", {LOST_TYPE: lost_definition()}, self._count, lossless=False)
 
     def run_started(self, run: LiveRun) -> None:
         self._run = run
@@ -71,15 +90,30 @@ class OutputBag(Closing):
         if isinstance(event, Announced):
             for row in event.topics:
                 self._channels.pop((event.src_id, row.topic_id), None)  # it may mean something else now
-        elif isinstance(event, Delivered) and self._run is not None:
-            channel = self._channel(self._run, (event.src_id, event.topic_id))
-            if channel is not None:
-                came = time.time() - (self._run.clock() - now)
-                made = came - (event.age_s if event.latency_s is None else event.latency_s)
-                self._recorder.write(channel, round(made * 1e9), event.message, round(came * 1e9))
+            self._fillers = None
+        elif self._run is None:
+            return
+        elif isinstance(event, Lost):
+            self._note_lost(self._run, event.src_id, event.topic_id, key=event.key)
+        elif isinstance(event, Delivered):
+            came = time.time() - (self._run.clock() - now)
+            fillers = self._filling(self._run)
+            if (event.src_id, event.topic_id) in fillers:
+                self._fill(self._run, event, came)
+                return
+            fills = event.src_id in fillers.values() and isinstance(event.key, Key)
+            if fills and self._is_known(_name(event.src_id, event.key)):
+                return
+            took = event.latency_s
+            if took is None:  # one that was repaired may have been under way for any time up to its age
+                took = 0.0 if event.repaired else event.age_s
+            self._write(self._run, (event.src_id, event.topic_id), came - took, came, event.message)
 
     def close(self) -> None:
         """Finish the file; :meth:`incomplete` says what could not be written. Idempotent."""
+        with suppress(GrRos2Error):
+            if not self._recorder.closed:
+                self._tell_lost()
         with suppress(BagError):
             self._recorder.close()
 
@@ -89,6 +123,69 @@ class OutputBag(Closing):
         return failed + [
             f"{self.name}: {what.partition(':')[2]} lacks {count} messages" for what, count in self.missed.items()
         ]
+
+    def _filling(self, run: LiveRun) -> Mapping[tuple[int, int], int]:
+        """The topics whose messages fill gaps of others, and the robots that send them."""
+        if self._fillers is None:
+            rows = run.announced()
+            self._fillers = {(src, topic.topic_id): src for src, _, topic in rows if topic.type_name == BACKFILL_TYPE}
+        return self._fillers
+
+    def _fill(self, run: LiveRun, event: Delivered, came: float) -> None:
+        """Write messages that fill gaps, and note what their sender has given up."""
+        try:
+            found = read_later(event.message)
+        except WireError as error:
+            self._count(f"not_recorded:robot {event.src_id}", str(error))
+            return
+        boot = event.key.boot if isinstance(event.key, Key) else 0
+        clock = run.clocks().get(event.src_id)
+        for each in found:
+            if isinstance(each, Missing):
+                self._note_lost(run, event.src_id, each.topic_id, each.count)
+                continue
+            known = self._is_known((event.src_id, boot, each.serial))
+            if each.began is not None:
+                name = (event.src_id, boot, *each.began)
+                self._lost.pop(name, None)
+                known = self._is_known(name) or known
+            if not known:
+                made = each.made_us * 1e-6 - (0.0 if clock is None else clock.ahead_s)
+                self.filled += self._write(run, (event.src_id, each.topic_id), made, came, each.payload)
+
+    def _is_known(self, name: _Name) -> bool:
+        """Whether a message of this name is in the bag; from now on it is."""
+        if name in self._known:
+            return True
+        self._known[name] = None
+        if len(self._known) > _REMEMBERED:
+            del self._known[next(iter(self._known))]
+        return False
+
+    def _note_lost(self, run: LiveRun, src_id: int, topic_id: int, count: int = 1, key: Hashable = None) -> None:
+        """Messages are missing in the bag, unless they come later."""
+        channel = self._channel(run, (src_id, topic_id))
+        if channel is None:
+            return
+        if isinstance(key, Key) and len(self._lost) < _REMEMBERED:
+            self._lost[_name(src_id, key)] = channel.topic
+        else:
+            self._given_up[channel.topic] += count
+
+    def _tell_lost(self) -> None:
+        """Say in the bag what is missing in it, as rosbag2 does."""
+        lost = self._given_up + Counter(self._lost.values())
+        if lost and self._run is not None:
+            node = f"gr_ros2_link_{next(iter(self._run.sources), '')}"
+            where = self._recorder.channel(f"/{node}/events/messages_lost", LOST_TYPE, Qos(depth=_DEPTH))
+            self._recorder.write(where, time.time_ns(), lost_event(node, lost))
+
+    def _write(self, run: LiveRun, key: tuple[int, int], made: float, came: float, payload: bytes) -> bool:
+        """Write a message of a topic; returns whether there is such a topic."""
+        channel = self._channel(run, key)
+        if channel is not None:
+            self._recorder.write(channel, max(0, round(made * 1e9)), payload, round(came * 1e9))
+        return channel is not None
 
     def _channel(self, run: LiveRun, key: tuple[int, int]) -> BagChannel | None:
         """The channel of a topic; None for what is no topic, or has another type than one of the same name."""
@@ -106,6 +203,11 @@ class OutputBag(Closing):
 
     def _count(self, what: str, why: str) -> None:  # noqa: ARG002 - the reason is that of the error
         self.missed[what] += 1
+
+
+def _name(src_id: int, key: Hashable) -> _Name:
+    assert isinstance(key, Key)
+    return src_id, key.boot, key.number, key.place & 0xFF
 
 
 bag_option = click.option(

@@ -17,6 +17,7 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.gr.backfill import LiveBackfill
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.factory import Start, make_endpoint, start_of
 from gr_ros2.gr.found_topics import FoundTopics
@@ -97,6 +98,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     :ivar calls: the services that cross the link; None where it goes one way, or topics leave no room for calls
     :ivar wishes: topics asked for from afar; None likewise
     :ivar throughput: measurements of what the link carries; None likewise
+    :ivar backfill: what crosses later; None where nothing does
     """
 
     source: SendingBlock
@@ -105,6 +107,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     calls: LiveCalls | None = None
     wishes: LiveWishes | None = None
     throughput: LiveThroughput | None = None
+    backfill: LiveBackfill | None = None
 
     def __init__(self, config: RobotConfig, radios: int = 1) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
@@ -125,6 +128,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
         for part in (
+            self.backfill,
             self.throughput,
             self.wishes,
             self.calls,
@@ -173,6 +177,8 @@ class RosLink(LinkBlock):
             raise ConfigError(
                 "offer: nobody can ask over this link, which has no room or no way for calls; leave it out"
             )
+        if config.backfill.topics and not calls:
+            raise ConfigError("backfill: nobody is heard over this link, or it has no room for it; leave it out")
         air = air or Air(hears=config.direction == "both")
         self._start = start or start_of(config)
         heard = topics if registry is None else known
@@ -195,6 +201,8 @@ class RosLink(LinkBlock):
                 self.throughput = LiveThroughput(
                     config, self.end, self.calls, self.sink, share=air.airtime_share, clock=clock
                 )
+                if config.backfill.topics:
+                    self.backfill = LiveBackfill(config, self.end, self.source, share=air.airtime_share)
         except GrRos2Error:
             self.close()
             raise

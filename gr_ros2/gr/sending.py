@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from math import inf
-from typing import Any
+from typing import Any, Protocol
 
 from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.gr.half import HalfBlock
@@ -37,6 +37,13 @@ from gr_ros2.settings.robot import RobotConfig
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 32
 """Number of packets composed before the lock is released, so that callbacks do not wait long."""
+
+
+class Keeper(Protocol):
+    """Keeps messages for later (:mod:`gr_ros2.gr.backfill`)."""
+
+    def note(self, event: SenderEvent) -> None:
+        """An event of the sending half, with the lock of the endpoint held; must be fast."""
 
 
 class SendingBlock(HalfBlock):
@@ -86,6 +93,8 @@ class SendingBlock(HalfBlock):
         self.composed = self.emitted = 0
         """Number of packets composed, and number of PDUs that have left."""
         self._said: set[tuple[int, str]] = set()
+        self.keeper: Keeper | None = None
+        """Keeps messages for later, where something does."""
         self._ports = RadioPorts(self, self.radios, bond, self._lock, lambda: self.subscriptions.registry)
         take_messages(self, "credit", "_credit", self.radios, called="grant")
         self._backpressure = backpressure
@@ -274,6 +283,8 @@ class SendingBlock(HalfBlock):
         elif isinstance(event, Ended) and not event.arrived:
             what = f"robot {event.dst_id} did not tell whether a message came, which is kept no longer (unconfirmed)"
             self._say(logging.WARNING, event.topic_id, "unconfirmed", what)
+        if self.keeper is not None:
+            self.keeper.note(event)
         if self._observer is not None:
             self._guard(self._observer.sender_event, self.src_id, event)
 

@@ -366,5 +366,9 @@ class OpenEndpoint(Endpoint, Protocol):
         """How much of the air it uses."""
 
     @property
+    def reported(self) -> int:
+        """Number of the newest packet that the report of any robot tells of: somebody hears; -1 for none."""
+
+    @property
     def questions(self) -> Questions:
         """Its questions to other robots."""

@@ -53,11 +53,24 @@ class LostMessages:
         self._before = lost
         if not any(count > 0 for count in new.values()):
             return None
-        types = _types().types
-        topics = [
-            types[_STAT_TYPE](topic_name=name, messages_lost_in_transport=count, messages_lost_in_recorder=0)
-            for name, count in new.items()
-            if count > 0
-        ]
-        message = types[LOST_TYPE](node_name=f"/{self._node_name}", messages_lost_statistics=topics)
-        return bytes(_types().serialize_cdr(message, LOST_TYPE))
+        return lost_event(self._node_name, new)
+
+
+def lost_event(node_name: str, lost: Mapping[str, int]) -> bytes:
+    """A message of ``LOST_TYPE``.
+
+    :param lost: messages by the name of their topic
+    """
+    types = _types().types
+    topics = [
+        types[_STAT_TYPE](topic_name=name, messages_lost_in_transport=count, messages_lost_in_recorder=0)
+        for name, count in lost.items()
+        if count > 0
+    ]
+    message = types[LOST_TYPE](node_name=f"/{node_name}", messages_lost_statistics=topics)
+    return bytes(_types().serialize_cdr(message, LOST_TYPE))
+
+
+def lost_definition() -> str:
+    """The definition of ``LOST_TYPE``, as a bag has it."""
+    return _types().generate_msgdef(LOST_TYPE, ros_version=2)[0]

@@ -394,6 +394,7 @@ class RobotLink(Flowgraph):
             "sink": self.sink.stats(),
             "peers": peers(self.end, self._clock()),
             "calls": {} if self.calls is None else self.calls.stats(),
+            "backfill": {} if self._ros.link.backfill is None else self._ros.link.backfill.stats(),
             "wishes": {} if self._ros.link.wishes is None else self._ros.link.wishes.stats(),
             **radios,
             "clocks": {"set": self._clocks.lines(self._clock()), "given_to_chrony": self._clocks.given},

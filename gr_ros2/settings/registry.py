@@ -38,7 +38,9 @@ CALLS_TYPE = "gr_ros2/calls/Frame"
 """Type of the row in which requests and replies are sent (see :mod:`gr_ros2.calls`); no topic has this type."""
 FILLER_TYPE = "gr_ros2/throughput/Filler"
 """Type of the row that fills the air while the link is measured (:mod:`gr_ros2.gr.throughput`); no topic has it."""
-_INTERNAL = (CALLS_TYPE, FILLER_TYPE)
+BACKFILL_TYPE = "gr_ros2/backfill/Message"
+"""Type of the row in which gaps are filled (:mod:`gr_ros2.gr.backfill`); no topic has it."""
+_INTERNAL = (CALLS_TYPE, FILLER_TYPE, BACKFILL_TYPE)
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
 _FEEDBACK = re.compile(r"[A-Za-z][A-Za-z0-9_]*/action/[A-Za-z][A-Za-z0-9]*_FeedbackMessage")

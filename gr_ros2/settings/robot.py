@@ -96,6 +96,18 @@ class PublishOptions:
     """as of the robot, which auto takes; 0 = any time"""
 
 
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class BackfillConfig:
+    """What a robot keeps and sends when the air has room again."""
+
+    topics: Annotated[tuple[str, ...], AfterValidator(checked_words), Field(title="Topics filled later")] = ()
+    """names (with * and ?) of topics: what was superseded, or sent while nobody heard, crosses later; [] = none"""
+    for_s: Annotated[float, Field(gt=0, le=86400, title="Kept for filling (s)")] = 600.0
+    """s for which a message is kept to cross later"""
+    memory_mb: Annotated[float, Field(gt=0, le=65536, title="Memory for filling (MB)")] = 64.0
+    """MB of memory that messages to cross later take at most; of more, the oldest are given up"""
+
+
 @dataclass(frozen=True, kw_only=True, config=_ALIASED)
 class PublishConfig:
     """How what a robot receives comes out on its graph."""
@@ -139,6 +151,8 @@ class RobotConfig:
     )
     """what it sends when another robot asks for it, written as `topics`: topics, services and actions of its graph that
     it does not send anyway; max_rate limits what may be asked for, to says who may"""
+    backfill: BackfillConfig = Field(default_factory=BackfillConfig)
+    """what crosses later where a gap was: to those who record (gr-ros2 link --bag)"""
     publish: PublishConfig = Field(default_factory=PublishConfig)
     """how what it receives comes out"""
     graph: GraphConfig = Field(default_factory=GraphConfig)
@@ -200,6 +214,11 @@ class RobotConfig:
             ("offer",),
             lambda robot: robot.direction == "both",
             "nobody can ask over a link that goes one way; leave it out, or set direction: both",
+        ),
+        ActsWhere(
+            ("backfill.for_s", "backfill.memory_mb"),
+            lambda robot: bool(robot.backfill.topics),
+            "nothing is kept; set backfill.topics, or leave it out",
         ),
         ActsWhere(
             ("expected_loss",),

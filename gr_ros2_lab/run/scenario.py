@@ -100,6 +100,11 @@ class Scenario(Reach, Experiment, Traffic, AirConfig):
         ),
         ActsWhere(("robots.*.offer",), lambda _: False, "nobody asks for topics in a run; leave it out"),
         ActsWhere(("robots.*.topics.*.via",), lambda _: False, f"{ONE_RADIO}; leave it out"),
+        ActsWhere(
+            ("robots.*.backfill.topics",),
+            lambda _: False,
+            "no bag of a run takes what comes later; leave it out",
+        ),
         ActsWhere(("robots.*.publish.stamps",), lambda _: False, "the robots of a run have one clock; leave it out"),
         ActsWhere(("robots.*.state",), lambda _: False, "a run counts no starts of its robots; leave it out"),
         ActsWhere(

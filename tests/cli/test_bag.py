@@ -11,18 +11,26 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.calls.backfill import Later, Missing, write_later
 from gr_ros2.cli.bag import OutputBag
 from gr_ros2.core.errors import BagError
 from gr_ros2.core.guard import Guard
-from gr_ros2.link.events import Announced, Delivered
+from gr_ros2.link.clocks import ClockOffset
+from gr_ros2.link.events import Announced, Delivered, Lost
+from gr_ros2.link.key import Key
 from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.radio.lost_messages import LOST_TYPE, _types
 from gr_ros2.settings.config import SendOptions
-from gr_ros2.settings.registry import CALLS_TYPE, Topic
+from gr_ros2.settings.registry import BACKFILL_TYPE, CALLS_TYPE, Topic
 from tests.e2e.test_observers import disk
 from tests.middleware.support import CUSTOM, message
 from tests.waiting import wait_for
 
-TOPICS = [(2, "/rx_robot_2/chat", Topic(0, "chat", CUSTOM, SendOptions())), (2, "/x", Topic(1, "_calls", CALLS_TYPE))]
+TOPICS = [
+    (2, "/rx_robot_2/chat", Topic(0, "chat", CUSTOM, SendOptions())),
+    (2, "/x", Topic(1, "_calls", CALLS_TYPE)),
+    (2, "/y", Topic(2, "_backfill", BACKFILL_TYPE)),
+]
 
 
 class OneEnd:
@@ -32,6 +40,8 @@ class OneEnd:
 
     def __init__(self) -> None:
         self.announced: Any = lambda: TOPICS
+        self.sources = {1: None}
+        self.clocks: Any = dict
 
 
 def opened(path: Path) -> OutputBag:
@@ -45,7 +55,7 @@ def test_messages_lie_in_the_order_in_which_they_were_made(tmp_path: Path) -> No
     with opened(tmp_path / "new" / "bag") as bag:
         bag.receiver_event(Delivered(2, 0, message(2, 50), 0, age_s=1.0), now)
         bag.receiver_event(Delivered(2, 0, message(1, 50), 0, age_s=1.0, latency_s=60.0), now + 0.1)
-        bag.receiver_event(Delivered(2, 0, b"frame", 0, shown=message(3, 50)), now + 0.2)
+        bag.receiver_event(Delivered(2, 0, b"frame", 0, repaired=True, age_s=9e3, shown=message(3, 50)), now + 0.2)
         bag.receiver_event(Delivered(2, 1, b"a call", 0), now)
         bag.receiver_event(Delivered(9, 0, b"nobody knows", 0), now)
     found = list(read_bag(tmp_path / "new" / "bag"))
@@ -53,6 +63,59 @@ def test_messages_lie_in_the_order_in_which_they_were_made(tmp_path: Path) -> No
     assert {each.topic for each in found} == {"/rx_robot_2/chat"}
     assert found[1].stamp_ns - found[0].stamp_ns == pytest.approx(58.9e9, abs=1e8)
     assert bag.incomplete() == []
+
+
+def fills(*messages: Later | Missing, boot: int = 7) -> Delivered:
+    return Delivered(2, 2, write_later(messages), 0, Key(boot, 100, 0))
+
+
+def lost_of(path: Path) -> dict[str, int]:
+    """Messages that are missing, as the bag says."""
+    told = [each.payload for each in read_bag(path) if each.topic.endswith("/events/messages_lost")]
+    stats = [each for said in told for each in _types().deserialize_cdr(said, LOST_TYPE).messages_lost_statistics]
+    return {each.topic_name: each.messages_lost_in_transport for each in stats}
+
+
+def test_what_fills_a_gap_stands_where_it_was_made_and_once(tmp_path: Path) -> None:
+    now, wall = time.monotonic(), time.time()
+    made = [round((wall - ago) * 1e6) for ago in (30, 20, 10)]
+    with opened(tmp_path / "bag") as bag:
+        bag._run.clocks = lambda: {2: ClockOffset(5.0, 0.001, 0, 0.0, 1, 5.0, 0.0)}  # type: ignore[union-attr]
+        bag.receiver_event(Delivered(2, 0, message(3, 50), 0, Key(7, 40, 1), age_s=1.0), now)
+        oldest, old = Later(0, 0, made[0], message(1, 50)), Later(0, 1, made[1], message(2, 50), (30, 0))
+        came = Later(0, 2, made[2], message(3, 50), (40, 1))
+        bag.receiver_event(fills(old, came), now)
+        bag.receiver_event(fills(oldest, old), now + 1)
+        bag.receiver_event(fills(oldest), now + 1)
+        bag.receiver_event(Delivered(2, 0, message(2, 50), 0, Key(7, 30, 0)), now + 1)  # repaired after all
+        bag.receiver_event(fills(oldest, boot=8), now + 2)  # of another start
+        bag.receiver_event(Delivered(2, 0, message(3, 50), 0, Key(8, 40, 1), age_s=0.1), now)  # says the same
+    found = list(read_bag(tmp_path / "bag"))
+    assert [each.payload for each in found] == [message(number, 50) for number in (1, 1, 2, 3, 3)]
+    assert found[2].stamp_ns / 1e9 == pytest.approx(wall - 25, abs=0.1)
+    assert bag.filled == 3
+    assert lost_of(tmp_path / "bag") == {}
+
+
+def test_the_bag_says_what_is_missing_at_the_end(tmp_path: Path) -> None:
+    with opened(tmp_path / "bag") as bag:
+        for place in range(3):
+            bag.receiver_event(Lost(2, 0, "given_up", Key(7, 30, place)), 0.0)
+        bag.receiver_event(Lost(2, 0, "expired"), 0.0)
+        bag.receiver_event(Lost(2, 1, "expired", Key(7, 31, 0)), 0.0)
+        bag.receiver_event(fills(Later(0, 5, 0, message(1, 50), (30, 1)), Missing(0, 10), Missing(9, 3)), 0.0)
+    assert lost_of(tmp_path / "bag") == {"/rx_robot_2/chat": 2 + 1 + 10}
+
+
+def test_what_cannot_be_read_is_counted(tmp_path: Path) -> None:
+    with opened(tmp_path / "bag") as bag:
+        bag.receiver_event(Delivered(2, 2, b"\xffjunk", 0), 0.0)
+        bag.receiver_event(Delivered(2, 2, write_later([Later(0, 1, 2, bytes(9))])[:-1], 0), 0.0)
+        bag.receiver_event(fills(Later(77, 1, 2, bytes(9))), 0.0)
+        bag.receiver_event(fills(Later(0, 1, (1 << 64) - 1, message(1, 50))), 0.0)
+        bag.receiver_event(Delivered(2, 0, message(2, 50), 0, latency_s=3e9), 0.0)  # made before 1970
+    assert [each.payload for each in read_bag(tmp_path / "bag")] == [message(2, 50)]
+    assert bag.incomplete() == [f"bag {tmp_path / 'bag'}: robot 2 lacks 3 messages"]
 
 
 def test_a_topic_that_has_another_type_is_left_out_and_said(tmp_path: Path) -> None:

@@ -65,6 +65,10 @@ class LinkProcess:
         """The robots that it hears."""
         return {peer["robot"]: peer for peer in self.status().get("peers", ())}
 
+    def transmit(self, *, on: bool) -> None:
+        """Switch its sending off, as in an outage, or on again."""
+        self._process.send_signal(signal.SIGUSR2 if on else signal.SIGUSR1)
+
     def end(self, number: signal.Signals = signal.SIGINT) -> int:
         """Its status after a signal."""
         self._process.send_signal(number)

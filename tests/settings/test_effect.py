@@ -95,6 +95,12 @@ IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
         {},
         "leave it out",
     ),
+    (Scenario, "robots.*.backfill.topics"): (
+        {"robots": [{}, {"backfill": {"topics": ["odom"]}}]},
+        {},
+        {},
+        "leave it out",
+    ),
     (Scenario, "robots.*.publish.stamps"): ({"robots": [{}, {"publish": {"stamps": "mine"}}]}, {}, {}, "leave it out"),
     (LinkConfig, "publish.stamps"): (
         {"publish": {"stamps": "mine"}},
@@ -139,6 +145,9 @@ for cls in (ScenarioRobot, LinkConfig):
         for part in ("topics", "offer"):
             IDLE[cls, f"{part}.*.{option}"] = ({part: {"odom": given}}, {"compression": False}, {}, COMPRESSES)
     IDLE[cls, "offer"] = ({"offer": ["scan"]}, {"direction": "send"}, {}, "set direction: both")
+    for option in ("for_s", "memory_mb"):
+        of = {"backfill": {option: 60.0}}
+        IDLE[cls, f"backfill.{option}"] = (of, {}, {"backfill": {"topics": ["odom"]}}, "set backfill.topics")
     IDLE[cls, "expected_loss"] = ({"expected_loss": 0.5}, {"repair": "off"}, {"repair": "idle"}, "set repair to")
     IDLE[cls, "beacon_s"] = ({"beacon_s": 9.0}, {"direction": "send"}, {}, "set direction: both")
 for cls, beside in ((Scenario, TWO), (MediumConfig, {})):
@@ -157,7 +166,9 @@ for cls, values in ((CameraOptions, CAMERA), (DepthOptions, DEPTH)):
         IDLE[cls, name] = ({name: value}, {"off": True}, {}, "leave off out")
 for name, value in {"range": 30.0, "keep": "rgb", "fit": True}.items():
     IDLE[CloudOptions, name] = ({name: value}, {}, {"voxel": 0.1}, "set voxel above 0")
-NEVER = {(Scenario, f"robots.*.{name}") for name in ("state", "offer", "publish.stamps", "topics.*.via")}
+NEVER = {
+    (Scenario, f"robots.*.{name}") for name in ("state", "offer", "publish.stamps", "topics.*.via", "backfill.topics")
+}
 """Nothing makes them act."""
 
 

@@ -17,10 +17,10 @@ from typing import Protocol
 from gr_ros2.core.errors import CodecError, WireError
 from gr_ros2.link.events import Announced, Delivered, Lost
 from gr_ros2.link.fates import FATES, Fate
+from gr_ros2.link.key import Key
 from gr_ros2.link.v1.announced import AnnouncedTopics
 from gr_ros2.link.v1.delivery import UNKNOWN_S, DeliveryRules, for_all_in_order, passed_over
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.order import Order, Ready
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly

@@ -21,8 +21,8 @@ from math import inf
 from typing import NamedTuple
 
 from gr_ros2.link.fates import Fate
+from gr_ros2.link.key import Key
 from gr_ros2.link.queues import Dropped
-from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import SentPackets

@@ -217,6 +217,10 @@ class EndpointV1:
         return self._sending.urgent
 
     @property
+    def reported(self) -> int:
+        return self.window.peers.reported
+
+    @property
     def held_bytes(self) -> int:
         return sum(neighbour.inbox.held for neighbour in self.neighbours.all.values())
 

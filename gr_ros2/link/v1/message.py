@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import inf
 
+from gr_ros2.link.key import Key
 from gr_ros2.link.queues import Outgoing
-from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.wire.v1 import BROADCAST, MAX_BACK
 

@@ -208,7 +208,8 @@ class Outbox:
             raise ConfigError(f"topic id {topic_id} is not among the {len(self.topics or ())} topics that are sent")
         self._owner.submitted(topic_id, now)
         if not topic.queue:
-            self.packing.turns.join(topic_id)
+            if topic.has_turns:
+                self.packing.turns.join(topic_id)
         elif topic.is_stream and self._owner.behind(now):
             self.drop(list(topic.queue.shed(now)))
         if not (waited_s and topic.is_stream and self._owner.slow):

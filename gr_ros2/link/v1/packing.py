@@ -22,9 +22,9 @@ from heapq import heapify, heappop, heappush
 from math import inf
 
 from gr_ros2.link.events import SentEntry
+from gr_ros2.link.key import Key
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.freshness import RANK, Turns, value
-from gr_ros2.link.v1.key import Key
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.order import ALL

@@ -131,6 +131,7 @@ class Peers:
     :ivar proven: some peer may take packets up to this number for replays
     :ivar provens: the same of each peer, the highest first
     :ivar joined: how often a peer that has come, or has come back, has reported for the first time
+    :ivar reported: number of the newest packet that any report tells of, -1 for none
     :ivar in_vain: whether a peer waits for a packet in vain
     :ivar any_urgent: whether a packet may be urgent for some peer
     :ivar once: the newest packets that were neither sent again nor combined: what a report says arrived when it was
@@ -146,7 +147,7 @@ class Peers:
         self.loss = unreported.loss
         self.proven, self.provens = 0, [0]
         self.in_vain = False
-        self.joined = 0
+        self.joined, self.reported = 0, -1
         self.once: set[int] = set()
         self._packets, self._unreported, self._shared = packets, unreported, shared
         self._resend: list[int] = []
@@ -432,6 +433,7 @@ class Peers:
             if loss >= PROMPT and once:
                 peer.answers.append(took)
         peer.newest = max(peer.newest, number)
+        self.reported = max(self.reported, number)
         soon = bool(peer.answers) and max(peer.answers) <= _SOON * self._period
         peer.reports_soon = loss >= PROMPT and soon
 

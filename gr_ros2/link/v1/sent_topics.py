@@ -18,7 +18,7 @@ from gr_ros2.link.v1.message import Message
 from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import CALLS_TYPE, Topic
+from gr_ros2.settings.registry import BACKFILL_TYPE, CALLS_TYPE, Topic
 from gr_ros2.wire import QOS_BULK
 from gr_ros2.wire.ages import NO_AGE, age_code
 from gr_ros2.wire.table import AnnouncedTopic
@@ -99,6 +99,11 @@ class SentTopic:
         sets ``queue`` to fifo wants every message."""
         options = self.topic.options
         return self.topic.is_topic and not self.kept and not options.max_rate and options.queue != "fifo"
+
+    @property
+    def has_turns(self) -> bool:
+        """Whether a turn comes to it however much others have to send."""
+        return self.topic.type_name != BACKFILL_TYPE
 
     @property
     def kept_depth(self) -> int:

@@ -1,0 +1,288 @@
+"""What a robot keeps to send later, when nobody heard it or a newer message had to go first; and its bytes.
+
+Whether messages are heard is what reports say, by the numbers of packets. Where packets leave and no report of newer
+ones comes for several times as long as usual, nobody hears.
+
+Invariants: there is no clock and no IO here, the caller passes in the time; memory is bounded by bytes and by age, of
+more the oldest goes and is counted; a message is kept once; none that may have been heard is given up silently.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Iterable, Sequence
+from heapq import heappop, heappush
+from struct import Struct
+from typing import NamedTuple
+
+from gr_ros2.core.errors import EntryBoundsError, EntryKindError
+
+_MESSAGE, _MISSING = 1, 2
+_HEAD = Struct(">BBIQQBI")
+_COUNT = Struct(">BBQ")
+_LATEST_US = ((1 << 63) - 1) // 1000
+"""The last time that a bag can hold."""
+_NEVER = (1 << 64) - 1
+_SERIALS = (1 << 32) - 1
+_OVERHEAD = 400
+"""bytes of memory counted for each message, in addition to its payload."""
+PIECE = 8192
+"""bytes of messages that cross as one message: similar ones compress each other."""
+_PATIENCE_S, _TIMES = 1.0, 4
+"""s, and mean times from a packet to its report, after which nobody hears."""
+_FIRST_S = 0.5
+"""s from a packet to its report, until reports tell."""
+
+
+class Later(NamedTuple):
+    """A message that crosses later.
+
+    :param serial: its number among all messages that its sender has submitted since it started
+    :param made_us: when it was submitted, by its sender's clock, us since 1970
+    :param began: number of the packet in which it has begun to leave before, and its place there; None: it has not
+    """
+
+    topic_id: int
+    serial: int
+    made_us: int
+    payload: bytes
+    began: tuple[int, int] | None = None
+
+
+class Missing(NamedTuple):
+    """How many more messages of a topic its sender has given up."""
+
+    topic_id: int
+    count: int  # type: ignore[assignment]
+
+
+def write_later(messages: Iterable[Later | Missing]) -> bytes:
+    """The bytes of a message that fills gaps."""
+    parts = []
+    for message in messages:
+        if isinstance(message, Missing):
+            parts.append(_COUNT.pack(_MISSING, message.topic_id, message.count))
+        else:
+            number, place = (_NEVER, 0) if message.began is None else message.began
+            size = len(message.payload)
+            head = _HEAD.pack(
+                _MESSAGE, message.topic_id, message.serial & _SERIALS, message.made_us, number, place & 0xFF, size
+            )
+            parts += [head, message.payload]
+    return b"".join(parts)
+
+
+def read_later(data: bytes) -> list[Later | Missing]:
+    """The messages of these bytes.
+
+    :raises WireError: EntryBoundsError (cut off) or EntryKindError (of another kind)
+    """
+    found: list[Later | Missing] = []
+    at = 0
+    while at < len(data):
+        head = {_MESSAGE: _HEAD, _MISSING: _COUNT}.get(data[at])
+        if head is None:
+            raise EntryKindError(f"kind {data[at]} in what fills a gap")
+        if at + head.size > len(data):
+            raise EntryBoundsError(f"what fills a gap ends at byte {len(data)}")
+        _, topic_id, *values = head.unpack_from(data, at)
+        at += head.size
+        if head is _COUNT:
+            found.append(Missing(topic_id, values[0]))
+            continue
+        serial, made_us, number, place, size = values
+        if made_us > _LATEST_US:
+            raise EntryBoundsError(f"a message that fills a gap and was made {made_us} us after 1970")
+        if at + size > len(data):
+            raise EntryBoundsError(f"a message of {size} bytes that fills a gap ends at byte {len(data)}")
+        began = None if number == _NEVER else (number, place)
+        found.append(Later(topic_id, serial, made_us, data[at : at + size], began))
+        at += size
+    return found
+
+
+class _Kept(NamedTuple):
+    """A message, and when it was submitted, s."""
+
+    at: float
+    message: Later
+
+    @property
+    def size(self) -> int:
+        return len(self.message.payload) + _OVERHEAD
+
+    @property
+    def written(self) -> int:
+        return len(self.message.payload) + _HEAD.size
+
+
+class _Left(NamedTuple):
+    """Messages that have left whole under one serial: when, s, and with which packet the last part did."""
+
+    at: float
+    number: int
+    kept: Sequence[_Kept]
+
+
+class MessagesForLater:
+    """The messages of one robot that may have to cross later.
+
+    :param for_s: s for which one is kept
+    :param most_bytes: of them all
+    :ivar given_up: messages that were kept in vain and that nobody has been told of, by topic id
+    :ivar lost: how many were kept in vain so far
+    :ivar filled: how many have filled gaps
+    :ivar unheard: whether nobody hears this robot
+    """
+
+    def __init__(self, for_s: float, most_bytes: int) -> None:
+        self._for_s, self._most, self._bytes = for_s, most_bytes, 0
+        self._waiting: OrderedDict[int, Sequence[_Kept]] = OrderedDict()
+        """Messages that have not left whole, by serial."""
+        self._left: OrderedDict[int, _Left] = OrderedDict()
+        """Those that have, the newest departure last, until it is known whether somebody hears them."""
+        self._gaps: list[_Kept] = []
+        """Heap of those that fill gaps."""
+        self._taken: Sequence[_Kept] = ()
+        self._filling: dict[int, int] = {}
+        """How many messages are under way to fill gaps, by the serial under which they are."""
+        self._told = self._doubted = -1
+        self._mean_s = _FIRST_S
+        self.given_up: Counter[int] = Counter()
+        self.lost = self.filled = 0
+        self.unheard = False
+
+    def accepted(self, message: Later, now: float) -> None:
+        """A message was submitted."""
+        kept = _Kept(now, message)
+        self._waiting[message.serial] = (kept,)
+        self._bytes += kept.size
+        while self._bytes > self._most:
+            self._give_up(self._oldest())
+
+    def refused(self, serial: int, *, ever: bool = True) -> None:
+        """It will not be sent, or not all of it.
+
+        :param ever: whether it may be sent later
+        """
+        self._filling.pop(serial, None)
+        for kept in self._take_back(serial):
+            if ever:
+                heappush(self._gaps, kept)
+            else:
+                self._give_up(kept)
+
+    def left(self, serial: int, began: tuple[int, int], number: int, now: float, *, last: bool) -> None:
+        """A part of it leaves.
+
+        :param began: see :class:`Later`
+        :param number: of the packet
+        :param last: whether it is the last part
+        """
+        kept = self._waiting.get(serial, ())
+        if kept and serial not in self._filling and kept[0].message.began is None:
+            kept = self._waiting[serial] = [kept[0]._replace(message=kept[0].message._replace(began=began))]
+        if kept and last:
+            del self._waiting[serial]
+            self._left[serial] = _Left(now, number, kept)
+
+    def doubt(self) -> None:
+        """A robot has started anew: of what is under way it may have had a part before."""
+        self._doubted = max([self._doubted, *self._waiting, *self._left])
+
+    def heard(self, number: int, now: float) -> None:
+        """Decide what has become of what has left, and give up what is too old.
+
+        :param number: of the newest packet that any report tells of; -1 for none
+        """
+        while number > self._told and self._left and (first := next(iter(self._left.values()))).number <= number:
+            serial = next(iter(self._left))
+            if self.unheard or serial <= self._doubted:  # it may have left before somebody heard again
+                self._fill_later()
+            else:
+                del self._left[serial]
+                self.filled += self._filling.pop(serial, 0)
+                self._mean_s += (min(now - first.at, self.patience_s) - self._mean_s) / 8
+                self._bytes -= sum(kept.size for kept in first.kept)
+        if number > self._told:
+            self._told, self.unheard = number, False
+        if self._left and now - next(iter(self._left.values())).at > self.patience_s:
+            self.unheard = True
+            while self._left:
+                self._fill_later()
+        while self._gaps and self._gaps[0].at < now - self._for_s:
+            self._give_up(heappop(self._gaps))
+
+    @property
+    def patience_s(self) -> float:
+        """s after which nobody has heard what has left."""
+        return max(_PATIENCE_S, _TIMES * self._mean_s)
+
+    @property
+    def tries(self) -> bool:
+        """Whether something that fills a gap is under way, or what is not known to be heard."""
+        return bool(self._left)
+
+    def take(self, most: int = PIECE) -> list[Later]:
+        """The oldest messages that fill gaps, so many bytes of them, or one; :meth:`taken` says under which serial they
+        are submitted."""
+        taken: list[_Kept] = []
+        size = 0
+        while self._gaps and (not taken or size + self._gaps[0].written <= most):
+            taken.append(heappop(self._gaps))
+            size += taken[-1].written
+        self._taken = taken
+        return [kept.message for kept in taken]
+
+    def taken(self, serial: int) -> None:
+        """The messages taken last were submitted, as what fills gaps."""
+        if self._taken:
+            self._filling[serial] = len(self._taken)
+            self._waiting[serial], self._taken = self._taken, ()
+
+    def tell(self) -> list[Missing]:
+        """What has been given up since the last call."""
+        told = [Missing(topic_id, count) for topic_id, count in self.given_up.items()]
+        self.given_up.clear()
+        return told
+
+    def __len__(self) -> int:
+        return len(self._gaps) + sum(self._filling.values())
+
+    def _take_back(self, serial: int) -> Sequence[_Kept]:
+        waiting = self._waiting.pop(serial, ())
+        if waiting or serial not in self._left:
+            return waiting
+        return self._left.pop(serial).kept
+
+    def _fill_later(self) -> None:
+        """What has left first fills gaps later."""
+        serial, left = self._left.popitem(last=False)
+        self._filling.pop(serial, None)
+        for kept in left.kept:
+            heappush(self._gaps, kept)
+
+    def _oldest(self) -> _Kept:
+        """Take out what is to be given up first."""
+        if self._gaps:
+            return heappop(self._gaps)
+        if self._left:
+            serial, left = next(iter(self._left.items()))
+            kept = left.kept
+        else:
+            serial, kept = next(iter(self._waiting.items()))
+        first, *rest = kept
+        if serial in self._filling:
+            self._filling[serial] -= 1
+        if not rest:
+            self._take_back(serial)
+        elif serial in self._left:
+            self._left[serial] = self._left[serial]._replace(kept=rest)
+        else:
+            self._waiting[serial] = rest
+        return first
+
+    def _give_up(self, kept: _Kept) -> None:
+        self._bytes -= kept.size
+        self.given_up[kept.message.topic_id] += 1
+        self.lost += 1

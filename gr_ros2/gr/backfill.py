@@ -1,0 +1,169 @@
+"""Gaps of an outage filled later: what was superseded, or left while nobody heard it, crosses when the air has room.
+
+It crosses as messages of class bulk, oldest first, which wait for all others and have no turn of their own, and goes to
+those who record, not onto their graphs.
+
+Invariants: without ``backfill`` there is no thread, no topic and no work per message; what is kept is bounded; at most
+``WAITING`` messages of it wait to leave, and while nobody is known to hear, one ever more seldom; where airtime is
+limited, no more is offered than the limit allows in the long run, beside the topics. What leaves while nobody hears it
+is kept on.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from math import inf
+from typing import Any
+
+from gr_ros2.calls.backfill import PIECE, Later, MessagesForLater, write_later
+from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.sending import SendingBlock
+from gr_ros2.link.endpoint import OpenEndpoint
+from gr_ros2.link.events import Accepted, Refused, SenderEvent, SentPacket
+from gr_ros2.link.fates import Fate
+from gr_ros2.link.key import Key
+from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import BACKFILL_TYPE
+from gr_ros2.settings.robot import BackfillConfig, RobotConfig
+from gr_ros2.settings.topic_choice import TopicChoice
+
+WAITING = 2
+SELDOM_S = 60.0
+"""s from one try to the next at most, while nobody hears."""
+_LOOK_S, _BUSY_S = 0.2, 0.02
+"""s between two looks at what has become of messages, and while some wait for room."""
+
+
+class Backfill:
+    """What one endpoint keeps and fills later.
+
+    :param endpoint: its observer calls :meth:`note`
+    :param share: part of the time that its transmitter may send
+    :param chosen: whether what was lost of a topic is filled later
+    :param wall_s: the time of this computer at a time of the link, s since 1970
+    :ivar kept: what is kept
+    """
+
+    def __init__(
+        self,
+        config: BackfillConfig,
+        endpoint: OpenEndpoint,
+        *,
+        share: float,
+        chosen: Callable[[int], bool],
+        wall_s: Callable[[float], float],
+    ) -> None:
+        self._endpoint, self._share, self._chosen, self._wall_s = endpoint, share, chosen, wall_s
+        self.kept = MessagesForLater(config.for_s, round(config.memory_mb * 1e6))
+        self._allowed, self._looked = 0.0, inf
+        self._tried, self._pause_s = -inf, 0.0
+        self._starts: dict[int, int] = {}
+        """The newest start of each robot that was heard."""
+        options = SendOptions(qos="bulk", queue="fifo", queue_depth=2 * WAITING, reliability="reliable")
+        messages = endpoint.messages
+        self._topic_id = messages.add([("_backfill", BACKFILL_TYPE, options)])[-1].topic_id
+        used: Any = endpoint.used_air  # leaves topics out that are made to fit, as pictures are
+        used.leave_out(self._topic_id)
+        messages.offer(self._topic_id, offered=True)
+
+    def note(self, event: SenderEvent) -> None:
+        """An event of the sending half."""
+        if isinstance(event, Accepted):
+            if event.topic_id == self._topic_id:
+                self.kept.taken(event.serial)
+            elif self._chosen(event.topic_id):
+                made_us = round(self._wall_s(event.now) * 1e6)
+                self.kept.accepted(Later(event.topic_id, event.serial, made_us, event.payload), event.now)
+        elif isinstance(event, Refused):
+            self.kept.refused(event.serial, ever=event.reason != Fate.TOO_LARGE)
+        elif isinstance(event, SentPacket):
+            for entry in event.entries:
+                if not entry.repeat and isinstance(entry.key, Key):
+                    began = entry.key.number, entry.key.place
+                    self.kept.left(entry.serial, began, event.number, event.now, last=entry.total > 0)
+
+    def look(self, now: float) -> None:
+        """Let messages wait for what is left of the air."""
+        here = {peer.robot: peer.start for peer in self._endpoint.peers(now) if not peer.silent and not peer.hops}
+        if any(self._starts.get(robot, start) != start for robot, start in here.items()):
+            self.kept.doubt()
+        self._starts |= here
+        self.kept.heard(self._endpoint.reported, now)
+        if here:
+            self._fill(now)
+        self._looked = now
+
+    def _fill(self, now: float) -> None:
+        waiting = self._endpoint.messages.queued().get(self._topic_id, 0)
+        count, most = WAITING - waiting, PIECE
+        if not self.kept.unheard:
+            self._pause_s = 0.0
+        elif waiting or self.kept.tries or now < self._tried + self._pause_s:
+            return
+        else:  # one message tells whether somebody hears again, where nothing else leaves that would
+            count, most, self._tried = 1, 0, now
+            self._pause_s = min(max(1.0, 2 * self._pause_s), SELDOM_S)
+        if self._share < 1:
+            free = self._endpoint.used_air.free(now) * max(now - self._looked, 0.0)
+            self._allowed = min(self._allowed + free, 1e9)
+        while count > 0 and (self._share >= 1 or self._allowed > 0) and (found := self.kept.take(most)):
+            self._submit(write_later(found), now)
+            count -= 1
+        if count > 0 and not self.kept.unheard and not len(self.kept) and (missing := self.kept.tell()):
+            self._submit(write_later(missing), now)
+
+    def _submit(self, payload: bytes, now: float) -> None:
+        self._allowed -= len(payload)
+        self._endpoint.messages.submit(self._topic_id, payload, now)
+
+
+class LiveBackfill:
+    """The same of one robot's link.
+
+    :param share: see :class:`Backfill`
+    """
+
+    def __init__(self, config: RobotConfig, end: LiveEnd[OpenEndpoint], source: SendingBlock, *, share: float) -> None:
+        self._end, self._source, self._clock = end, source, source.clock
+        self._choice = TopicChoice(config.backfill.topics, config.namespace)
+        self._chosen: dict[int, bool] = {}
+        with end.lock:
+            self._backfill = source.keeper = Backfill(
+                config.backfill,
+                end.endpoint,
+                share=share,
+                chosen=self._is_chosen,
+                wall_s=lambda at: time.time() + at - self._clock(),
+            )
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="gr-ros2-backfill", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Fill nothing any more. Idempotent."""
+        self._closed.set()
+        self._thread.join()
+
+    def stats(self) -> dict[str, Any]:
+        """Messages that are kept for later, that have filled gaps, and that were given up."""
+        with self._end.lock:
+            kept = self._backfill.kept
+            return {"kept": len(kept), "filled": kept.filled, "given_up": kept.lost}
+
+    def _is_chosen(self, topic_id: int) -> bool:
+        chosen = self._chosen.get(topic_id)
+        if chosen is None:
+            named = {topic.topic_id: (name, topic) for name, topic in self._source.subscriptions.named()}
+            name, topic = named.get(topic_id, ("", None))
+            plain = topic is not None and not topic.as_frames and topic.options.to == AUTO
+            chosen = self._chosen[topic_id] = plain and bool(self._choice.of([name]))
+        return chosen
+
+    def _run(self) -> None:
+        while not self._closed.wait(_BUSY_S if len(self._backfill.kept) else _LOOK_S):
+            with self._end.lock:
+                self._backfill.look(self._clock())
+                self._end.wake()

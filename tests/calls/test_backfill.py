@@ -1,0 +1,191 @@
+"""What is kept for later: gaps, what was heard, bounds, and bytes from strangers."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from gr_ros2.calls.backfill import PIECE, Later, MessagesForLater, Missing, read_later, write_later
+from gr_ros2.core.errors import WireError
+
+HEARS_S = 0.1
+
+
+def later(serial: int, size: int = 100, topic_id: int = 3) -> Later:
+    return Later(topic_id, serial, serial * 1000, bytes(size))
+
+
+class Sent:
+    """Messages of one packet each; a report of the newest packet follows while somebody hears."""
+
+    def __init__(self, for_s: float = 600.0, most_bytes: int = 1_000_000) -> None:
+        self.kept = MessagesForLater(for_s, most_bytes)
+        self.now, self.number, self.serial = 0.0, -1, -1
+
+    def send(self, *, hears: bool, size: int = 100) -> Later:
+        self.serial, self.number = self.serial + 1, self.number + 1
+        message = later(self.serial, size)
+        self.kept.accepted(message, self.now)
+        self.kept.left(self.serial, (self.number, 0), self.number, self.now, last=True)
+        self.now += HEARS_S
+        self.kept.heard(self.number if hears else -1, self.now)
+        return message._replace(began=(self.number, 0))
+
+    def fill(self, *, hears: bool) -> list[Later]:
+        found = self.kept.take()
+        self.serial, self.number = self.serial + 1, self.number + 1
+        self.kept.taken(self.serial)
+        self.kept.left(self.serial, (self.number, 0), self.number, self.now, last=True)
+        self.now += HEARS_S if hears else 2 * self.kept.patience_s
+        self.kept.heard(self.number if hears else -1, self.now)
+        return found
+
+
+def test_what_is_heard_is_not_kept() -> None:
+    sent = Sent(most_bytes=1000)
+    for _ in range(100):
+        sent.send(hears=True)
+    assert (len(sent.kept), sent.kept.lost, sent.kept.unheard) == (0, 0, False)
+
+
+def test_what_left_in_an_outage_is_filled_once_and_oldest_first() -> None:
+    sent = Sent()
+    sent.send(hears=True)
+    away = [sent.send(hears=False) for _ in range(50)]
+    assert sent.kept.unheard
+    sent.send(hears=True)
+    assert not sent.kept.unheard
+    found = []
+    while len(sent.kept):
+        found += sent.fill(hears=True)
+    assert found[: len(away)] == away
+    assert len(found) <= len(away) + 1, "the message with which it is heard again may be among them"
+
+
+def test_what_fills_gaps_while_nobody_hears_is_kept_on_in_its_order() -> None:
+    sent = Sent()
+    away = [sent.send(hears=False) for _ in range(200)]
+    sent.now += 2 * sent.kept.patience_s
+    sent.kept.heard(-1, sent.now)
+    first = sent.fill(hears=False)
+    assert 0 < len(first) < len(away)
+    assert len(sent.kept) == len(away)
+    assert sent.fill(hears=True) == first
+
+
+def test_what_was_superseded_is_filled_and_what_is_too_large_is_given_up() -> None:
+    kept = MessagesForLater(600.0, 1_000_000)
+    kept.accepted(later(1), 0.0)
+    kept.accepted(later(2), 0.1)
+    kept.accepted(later(3), 0.1)
+    kept.refused(1)
+    kept.refused(3, ever=False)
+    assert kept.take() == [later(1)]
+    assert (kept.tell(), kept.tell()) == ([Missing(3, 1)], [])
+
+
+def test_a_message_of_which_a_part_has_left_says_where_it_began() -> None:
+    kept = MessagesForLater(600.0, 1_000_000)
+    kept.accepted(later(1), 0.0)
+    kept.left(1, (7, 2), 7, 0.1, last=False)
+    kept.heard(7, 0.15)
+    kept.left(1, (7, 2), 8, 0.2, last=False)
+    kept.refused(1)
+    assert kept.take() == [later(1)._replace(began=(7, 2))]
+
+
+@pytest.mark.parametrize("away", [False, True])
+def test_of_more_than_fits_the_oldest_are_given_up_and_counted(away: bool) -> None:
+    sent, count = Sent(most_bytes=30_000), 1000
+    for _ in range(count):
+        sent.send(hears=False)
+        if not away:
+            sent.kept.refused(sent.serial)
+    sent.now += 2 * sent.kept.patience_s
+    sent.kept.heard(-1, sent.now)
+    left = len(sent.kept)
+    assert 50 < left < 300
+    assert sent.kept.tell() == [Missing(3, count - left)]
+    assert sent.kept.take()[0].serial == count - left
+
+
+def test_a_message_larger_than_what_may_be_kept_is_given_up_alone() -> None:
+    sent = Sent(most_bytes=2000)
+    sent.kept.accepted(later(0, 5000), 0.0)
+    sent.kept.accepted(later(1), 0.0)
+    sent.kept.refused(0)
+    sent.kept.refused(1)
+    assert sent.kept.take() == [later(1)]
+    assert sent.kept.lost == 1
+
+
+def test_what_is_too_old_is_given_up() -> None:
+    kept = MessagesForLater(for_s=10.0, most_bytes=1_000_000)
+    for serial in range(5):
+        kept.accepted(later(serial), float(serial))
+        kept.refused(serial)
+    kept.heard(-1, 12.5)
+    assert [each.serial for each in kept.take()] == [3, 4]
+    assert kept.lost == 3
+
+
+def test_slow_reports_are_no_outage() -> None:
+    sent = Sent()
+    for period_s in [0.2, 0.5, 1.0, 2.0, 4.0, *[6.0] * 40]:
+        sent.send(hears=False)
+        sent.now += period_s
+        sent.kept.heard(sent.number, sent.now)
+    before = len(sent.kept)
+    for _ in range(20):
+        sent.send(hears=False)
+        sent.now += 6.0
+        sent.kept.heard(sent.number, sent.now)
+    assert len(sent.kept) == before
+
+
+def test_memory_is_counted_down_to_nothing() -> None:
+    rng, sent = random.Random(1), Sent(for_s=30.0, most_bytes=20_000)
+    for _ in range(2000):
+        hears = rng.random() < 0.5
+        if rng.random() < 0.3 and len(sent.kept):
+            sent.fill(hears=hears)
+        else:
+            sent.send(hears=hears, size=rng.randrange(300))
+            if rng.random() < 0.1:
+                sent.kept.refused(sent.serial)
+        assert sent.kept._bytes <= 20_000
+    while len(sent.kept) or sent.kept.tries:
+        sent.fill(hears=True)
+    assert (sent.kept._bytes, sent.kept._filling) == (0, {})
+    assert sent.kept.filled > 100
+
+
+def test_what_is_written_is_read() -> None:
+    messages = [later(1, 0), Missing(2, 1 << 40), later((1 << 32) - 1, 3000)._replace(began=(1 << 50, 255))]
+    assert read_later(write_later(messages)) == messages
+    assert read_later(b"") == []
+
+
+def test_bytes_of_strangers_raise_a_wire_error_or_mean_something() -> None:
+    rng = random.Random(2)
+    whole = write_later([later(1, 20), Missing(2, 3), later(9, 5)._replace(began=(4, 1))])
+    for _ in range(3000):
+        data = bytearray(whole[: rng.randrange(len(whole) + 1)])
+        for _ in range(rng.randrange(4)):
+            if data:
+                data[rng.randrange(len(data))] = rng.randrange(256)
+        try:
+            found = read_later(bytes(data))
+        except WireError:
+            continue
+        assert sum(len(each.payload) for each in found if isinstance(each, Later)) <= len(data)
+
+
+def test_a_piece_is_no_longer_than_it_says() -> None:
+    kept = MessagesForLater(600.0, 10_000_000)
+    for serial in range(100):
+        kept.accepted(later(serial, 700), 0.0)
+        kept.refused(serial)
+    while found := kept.take():
+        assert len(write_later(found)) <= PIECE

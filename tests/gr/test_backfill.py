@@ -1,0 +1,161 @@
+"""What fills gaps waits for everything else, and keeps to an airtime limit; losses and restarts take nothing of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+
+from gr_ros2.calls.backfill import Later, read_later
+from gr_ros2.gr.backfill import Backfill
+from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.robot import BackfillConfig
+from tests.link.v1.air import SLOT_S, Air, Robot
+
+ODOM, SCAN = range(2)
+TOPICS = Registry(
+    [
+        Topic(ODOM, "odom", "std_msgs/msg/String", SendOptions(queue="latest", reliability="best_effort")),
+        Topic(SCAN, "scan", "std_msgs/msg/String", SendOptions(queue="fifo", reliability="best_effort")),
+    ]
+)
+WHOLE = 51
+"""bytes of a message that fills a packet."""
+
+
+class Noted(list[SenderEvent | ReceiverEvent]):
+    """The events of a robot, of which what fills its gaps takes note."""
+
+    def __init__(self, robot: Filling) -> None:
+        super().__init__()
+        self._robot = robot
+
+    def append(self, event: SenderEvent | ReceiverEvent) -> None:
+        super().append(event)
+        if self._robot.backfill is not None:
+            self._robot.backfill.note(event)  # type: ignore[arg-type]
+
+
+class Filling(Robot):
+    """A robot that fills gaps of odometry."""
+
+    backfill: Backfill | None = None
+    share = 1.0
+
+    def start(self, boot: int | None = None) -> None:
+        self.events = Noted(self)
+        super().start(boot)
+        self.backfill = Backfill(
+            BackfillConfig(topics=("odom",)),
+            self.end,
+            share=self.share,
+            chosen=lambda topic: topic == ODOM,
+            wall_s=lambda at: at,
+        )
+
+
+class Pair:
+    """A robot that fills gaps, and one that reports.
+
+    :ivar away: whether they do not hear each other
+    """
+
+    def __init__(self, mode: SealMode = "none", share: float = 1.0, loss: float = 0.0) -> None:
+        settings: dict[str, Any] = {"packet_s": lambda: SLOT_S, "airtime_share": share} if share < 1 else {}
+        Filling.share = share
+        self.one, self.two = Filling(1, TOPICS, mode=mode, **settings), Robot(2, mode=mode)
+        self.air = Air(self.one, self.two, loss=loss)
+        lost = self.air.lost
+        self.away = False
+        self.air.lost = lambda sender, receiver: self.away or lost(sender, receiver)
+        self.made = 0
+
+    @property
+    def backfill(self) -> Backfill:
+        assert self.one.backfill is not None
+        return self.one.backfill
+
+    def slots(self, count: int, *, odom: int = 0, scans: int = 0) -> None:
+        """So many slots: a message of odometry in every so many of them, and so many scans in each."""
+        for slot in range(count):
+            for _ in range(scans):
+                self.one.end.messages.submit(SCAN, bytes(WHOLE), self.air.now)
+            if odom and not slot % odom:
+                self.one.end.messages.submit(ODOM, self.made.to_bytes(4, "big").ljust(WHOLE, b"."), self.air.now)
+                self.made += 1
+            self.backfill.look(self.air.now)
+            self.air.step()
+
+    def outage(self, slots: int = 600) -> None:
+        self.away = True
+        self.slots(slots, odom=4)
+        self.away = False
+
+    def later(self) -> list[int]:
+        """Numbers of the messages that came later."""
+        found = [
+            each.payload
+            for event in self.two.events
+            if isinstance(event, Delivered) and event.topic_id > SCAN
+            for each in read_later(event.payload)
+            if isinstance(each, Later)
+        ]
+        return [int.from_bytes(payload[:4], "big") for payload in found]
+
+    def live(self) -> list[int]:
+        found = [event for event in self.two.events if isinstance(event, Delivered) and event.topic_id == ODOM]
+        return [int.from_bytes(event.payload[:4], "big") for event in found]
+
+
+def test_nothing_crosses_later_while_others_fill_the_air() -> None:
+    pair = Pair()
+    pair.slots(200, odom=4)
+    pair.outage()
+    kept = len(pair.backfill.kept)
+    assert kept > 100
+    pair.slots(100, scans=2)
+    before = len(pair.later())
+    pair.slots(600, scans=2)
+    assert len(pair.later()) == before, "a turn came to it"
+    for _ in range(40):
+        pair.slots(200)
+    assert not len(pair.backfill.kept)
+    later = list(dict.fromkeys(pair.later()))  # one told several times whether somebody hears
+    assert len(later) >= kept
+    assert later == sorted(later), "oldest first"
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_what_an_outage_took_crosses_once_whoever_starts_again_meanwhile(mode: SealMode, loss: float) -> None:
+    pair = Pair(mode, loss=loss)
+    pair.slots(200, odom=4)
+    first = pair.made
+    pair.outage()
+    last = pair.made
+    pair.slots(40, odom=4)
+    pair.two.start()
+    for _ in range(100):
+        pair.slots(100, odom=20)
+        if not len(pair.backfill.kept):
+            break
+    later, live = pair.later(), pair.live()
+    assert set(range(first + 5, last - 5)) <= {*later, *live}
+    pair.one.start()
+    pair.outage()
+    assert len(pair.backfill.kept) > 100, "it keeps what its next start sends"
+
+
+def test_an_airtime_limit_holds_for_what_crosses_later() -> None:
+    pair = Pair(share=0.1)
+    pair.slots(200, odom=40)
+    pair.outage()
+    packets = pair.one.end.sent.packets
+    pair.slots(4000, odom=40)
+    assert len(pair.later()) > 50
+    assert pair.one.end.sent.packets - packets < 0.2 * 4000
