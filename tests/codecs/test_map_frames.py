@@ -98,6 +98,24 @@ def test_each_map_comes_out_exactly_and_costs_what_has_changed(loss: float) -> N
     assert len(follower.of(1, 0)) == len(MAPS)
 
 
+def test_a_report_that_is_kept_back_is_waited_for_and_one_that_tells_is_heeded() -> None:
+    """Reports become rare while nothing is lost; the first packet after a rest is reported at once all the same. So a
+    map is not followed by repairs, and a message that is lost behind one is repaired as soon as a report has come."""
+    mapper, follower = Robot(1, Registry([MAP, Topic(1, "stop", "std_msgs/msg/String")]), 128), Robot(2, None, 128)
+    air = Air(mapper, follower)
+    *maps, last = scenes.exploring(12, 1000)
+    costs_of(air, mapper, maps, 2)
+    repairs = [len(event.data) for event in mapper.events if isinstance(event, SentPacket) and event.kind == "repair"]
+    assert sum(repairs) < 100
+    costs_of(air, mapper, [last], 0.8)
+    lost = iter([True])
+    air.lost = lambda robot, _: robot is mapper and next(lost, False)
+    mapper.submit(1, b"stop", air.now)
+    air.run(air.now + 0.7)
+    assert next(lost, None) is None
+    assert [message for _, message in follower.of(1, 1)] == [b"stop"]
+
+
 def test_a_late_robot_gets_the_whole_map_by_asking_although_it_does_not_change() -> None:
     air = link()
     mapper, follower = air.robots

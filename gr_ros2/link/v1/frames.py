@@ -144,7 +144,7 @@ class SentFrames:
 
     def _heard(self, peer: Peer, now: float) -> bool:
         """Whether a robot has reported lately."""
-        return now - peer.heard <= max(SILENT_S, REPORTS * peer.interval)
+        return now - peer.heard <= max(SILENT_S, REPORTS * max(peer.interval, peer.calm))
 
     def _lags(self, topic_id: int, now: float) -> list[float]:
         """For how long each robot has lacked a frame, s. One that was heard lately lacks what it lacked then."""

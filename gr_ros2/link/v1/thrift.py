@@ -48,14 +48,14 @@ class Thrift:
             return len(window) * loss > len(under_way) * (1 - loss) + _ENOUGH
         for peer in peers:
             expected = 0.0 if peer.reports_soon else peer.loss
-            patience, doubt = peer.patience, peer.doubt
+            overdue, doubt = peer.overdue(), peer.doubt
             need = 0.0
             for record in window:
                 if not record.confirmed & peer.bit:
                     if record.number in peer.lost:
                         need += 1
                     else:
-                        need += doubt if now >= record.at + patience else expected
+                        need += doubt if now >= overdue(record.at) else expected
             since = now - peer.under_way(now)
             coming = sum([at > since for at in under_way])
             if need > coming * (1 - peer.loss) + _ENOUGH:
@@ -67,11 +67,11 @@ class Thrift:
         none is expected."""
         wait = min([peer.under_way(since) for peer in self._peers.all.values()], default=inf)
         soonest = next((at + wait for at, _, _ in self._flight if at + wait > since), inf)
-        waits = [(peer.bit, peer.patience) for peer in self._peers.all.values()]
+        waits = [(peer.bit, peer.overdue()) for peer in self._peers.all.values()]
         for record in reversed(self._packets.records.values()):
             if record.number <= self._packets.newest - MAX_WINDOW:
                 break
-            for bit, patience in waits:
-                if not record.confirmed & bit and since < record.at + patience < soonest:
-                    soonest = record.at + patience
+            for bit, overdue in waits:
+                if not record.confirmed & bit and since < (doubt := overdue(record.at)) < soonest:
+                    soonest = doubt
         return soonest

@@ -21,10 +21,10 @@ from tests.link.v1.invariants import PacketsEnd
 
 TOPICS = 3
 MESSAGES = 3_500
-SHORT, BEFORE, AFTER = 3_000, 2_000, 1_000
+SHORT, BEFORE, AFTER = 1_500, 2_000, 1_000
 HALF, ROUND = 1 << 15, 1 << 16
-"""Packets of a sender's lives: some are SHORT at most, others begin BEFORE half of the numbers, or all, and
-end AFTER."""
+"""Packets of a sender's lives: some are SHORT at most, so that the two lives before and after such a one fit into all
+messages whatever is drawn; others begin BEFORE half of the numbers, or all, and end AFTER."""
 
 
 def topics() -> Registry:
