@@ -178,7 +178,7 @@ class EndpointV1:
             pace,
             room=room,
             turn_s=settings.turn_s,
-            any_length=settings.any_length,
+            packet_len=settings.packet_len * settings.any_length,
             share=settings.airtime_share,
         )
         self.frames = SentFrames(

@@ -25,15 +25,15 @@ class UsedAir:
 
     :param room: bytes of the longest body
     :param turn_s: tells s from one packet to the next, 0 = not known
-    :param any_length: whether packets are only as long as they need
+    :param packet_len: bytes of the longest packet, where packets are only as long as they need; 0 where all are as long
     :param share: part of the time that this robot may send
     :ivar on: whether packets are counted
     """
 
-    def __init__(self, pace: Pace, *, room: int, turn_s: Callable[[], float], any_length: bool, share: float) -> None:
+    def __init__(self, pace: Pace, *, room: int, turn_s: Callable[[], float], packet_len: int, share: float) -> None:
         self.on = False
         self._pace, self._room, self._turn_s = pace, room, turn_s
-        self._any_length, self._share = any_length, share
+        self._packet_len, self._share = packet_len, share
         self._fitted: set[int] = set()
         self._window: deque[tuple[float, int, int]] = deque()
         """When a packet left, the bytes that it used, and those of them that are no repair."""
@@ -46,10 +46,14 @@ class UsedAir:
 
     def left(self, sent: SentPacket, now: float) -> None:
         """A packet has left."""
-        used = len(sent.data) if self._any_length else self._room
+        used = len(sent.data) if self._packet_len else self._room
         if sent.kind == "new":
-            entries = [entry for entry in sent.packet.entries if isinstance(entry, Part)]
-            used = sum(len(part.payload) + ENTRY for part in entries if part.topic_id not in self._fitted)
+            parts = [entry for entry in sent.packet.entries if isinstance(entry, Part)]
+            fitted = sum(len(part.payload) + ENTRY for part in parts if part.topic_id in self._fitted)
+            if self._packet_len:  # in bytes of a body: a short packet takes the air of its header, too
+                used = self._room * used // self._packet_len - fitted
+            else:
+                used = sum(len(part.payload) + ENTRY for part in parts) - fitted
         needed = 0 if sent.kind == "repair" else used
         self._window.append((now, used, needed))
         self._sum += used

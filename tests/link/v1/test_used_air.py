@@ -17,17 +17,20 @@ from gr_ros2.wire.v1 import Part
 ROOM, TURN_S = 100, 0.01
 
 
-def air(pace: Pace | None = None, *, turn_s: float = TURN_S, share: float = 1.0) -> UsedAir:
-    return UsedAir(pace or Pace(AUTO), room=ROOM, turn_s=lambda: turn_s, any_length=False, share=share)
+def air(pace: Pace | None = None, *, turn_s: float = TURN_S, share: float = 1.0, packet_len: int = 0) -> UsedAir:
+    return UsedAir(pace or Pace(AUTO), room=ROOM, turn_s=lambda: turn_s, packet_len=packet_len, share=share)
 
 
-def packet(kind: AirKind, *parts: tuple[int, int]) -> SentPacket:
-    """One with so many bytes of each topic."""
+def packet(kind: AirKind, *parts: tuple[int, int], size: int = 120) -> SentPacket:
+    """One with so many bytes of each topic.
+
+    :param size: bytes of all of it
+    """
 
     class Body:
         entries = tuple(Part(topic_id, bytes(size)) for topic_id, size in parts)
 
-    return SentPacket(bytes(120), cast("Any", Body()), 1, 7, 1, 0, (), 0.0, kind)
+    return SentPacket(bytes(size), cast("Any", Body()), 1, 7, 1, 0, (), 0.0, kind)
 
 
 def test_messages_take_of_what_is_free_and_repairs_fill_the_rest() -> None:
@@ -46,6 +49,14 @@ def test_what_is_made_to_fit_takes_nothing_from_others() -> None:
     for number in range(100):
         used.left(packet("new", (3, 90)), number * 0.01)
     assert used.free(1.0) == 10_000.0
+
+
+def test_a_short_packet_takes_the_air_of_its_header_and_what_fits_rides_with_it() -> None:
+    used = air(packet_len=120)
+    used.leave_out(3)
+    for number in range(100):
+        used.left(packet("new", (1, 28), (3, 14), size=60), number * 0.01)
+    assert used.rate(1.0) == pytest.approx((60 * ROOM / 120 - 14 - ENTRY) / 0.01, rel=0.05)
 
 
 def test_an_airtime_limit_and_a_packet_rate_bound_what_is_free() -> None:
