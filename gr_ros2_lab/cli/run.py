@@ -49,8 +49,8 @@ from gr_ros2_lab.run.outcome import Outcome
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
 
 _NEXT = (
-    "Next: gr-ros2 demo --dashboard (live, with sliders), plan demo (the forecast), doctor (what this machine has for "
-    "a link of your own), link --help"
+    "Next: gr-ros2 demo --camera --dashboard (live: what a robot sees, with sliders), plan demo (the forecast), doctor "
+    "(what this machine has for a link of your own), link --help"
 )
 
 _WIDEST = 1000
