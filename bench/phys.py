@@ -110,7 +110,7 @@ def _beside(name: str) -> list[Row]:
     ]  # fmt: skip
 
 
-def rates() -> list[Row]:
+def kernels() -> list[Row]:
     """Links with source and sink: OFDM on compiled kernels beside numpy and GNU Radio's blocks, in turn."""
     short = {kernels: _phy("ofdm", kernels=kernels) for kernels in ("auto", "numpy")}
     dense = [_phy("ofdm", 1500, kernels=kernels, payload_modulation="64qam") for kernels in ("auto", "numpy")]

@@ -23,7 +23,7 @@ from gr_ros2.mac import Slots
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import v1
-from gr_ros2.wire.control import ENCRYPTS, About, Ask, Control, Heard, Hello, Newest, Ping, Report, Waited
+from gr_ros2.wire.control import ENCRYPTS, About, Ask, Control, Heard, Hello, LeftOut, Newest, Ping, Report, Waited
 from gr_ros2.wire.mac_block import MAP_SLOTS, Block, write_block
 from gr_ros2.wire.relayed import MOST_HOPS, PLACES, Receipt, Relayed, write_carried, write_receipts, write_relayed
 from gr_ros2.wire.table import AnnouncedTopic, write_table
@@ -202,6 +202,7 @@ def _control(script: Script, echo: bytes) -> Control:
             script.pick((None, 0, 255)),
         ),
         lambda: Hello(script.byte(), script.byte(), script.byte(), script.byte()),
+        lambda: LeftOut(script.number(), script.number() | script.number() << 48, script.byte() & 1 > 0),
         lambda: Waited(bytes([script.byte() for _ in range(1 + script.byte() % 4)])),
     ]
     return script.pick(kinds)()

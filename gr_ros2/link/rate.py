@@ -7,16 +7,17 @@ so the MCS with the greatest expected goodput can be chosen. The SNR to count on
 - a correction ("outer loop"). Reports also tell the share of packets lost. Where it is greater than expected, the model
   does not fit the radio, or reports come too late for the channel.
 
-Invariants: a packet for several robots is sent with an MCS that suits the weakest of them; a packet for nobody who is
-known, and one for a robot that has fallen silent, is sent with the most robust MCS. A slower MCS is taken at once, a
-faster one at a report. There is no clock here: ``now`` is seconds, monotonic.
+Invariants: a packet for several robots is sent with an MCS that suits the weakest of them; losses of packets that were
+not for a robot say nothing of it; a packet for nobody who is known, and one for a robot that has fallen silent, is sent
+with the most robust MCS. A slower MCS is taken at once, a faster one at a report. There is no clock here: ``now`` is
+seconds, monotonic.
 
 ``python -m bench rate_rules`` measures each rule and constant: on some channel each rule gains 3 % or more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import exp, inf
@@ -129,15 +130,16 @@ class RateController:
         self.mcs_table = tuple(mcs_table)
         self._robots: dict[int, _Peer] = {}
 
-    def report(self, robot: int, snr_db: float, loss: float, now: float) -> None:
+    def report(self, robot: int, snr_db: float, loss: float, now: float, *, not_for: float = 0.0) -> None:
         """A robot has reported.
 
         :param snr_db: of the newest packets that it has heard
         :param loss: share of the packets that it has lost lately, 0..1
+        :param not_for: share of the packets that it should have lost because they were sent faster than it hears
         """
         known = self._robots.setdefault(robot, _Peer())
         gap = known.report(snr_db, now)
-        surplus = loss - (1 - self.mcs_table[known.mcs].pdr(known.snr_db(now)))
+        surplus = loss - not_for - (1 - not_for) * (1 - self.mcs_table[known.mcs].pdr(known.snr_db(now)))
         known.correction_db += gap * (CORRECTION_DB_S * surplus - known.correction_db / FORGET_S)
         self._choose(known, now, faster=True)
 
@@ -149,13 +151,27 @@ class RateController:
         """A robot is gone."""
         self._robots.pop(robot, None)
 
-    def sent(self, robot: int | None, now: float) -> int:
-        """A packet leaves for a robot, or for everybody (None). Returns the index of its MCS."""
-        known = self._robots.values() if robot is None else [self._robots.get(robot, _Peer())]
+    def chosen(self, now: float) -> dict[int, int]:
+        """The index of the MCS of a packet for each robot alone."""
+        return {robot: self._next(known, now) for robot, known in self._robots.items()}
+
+    def lost(self, robot: int, mcs: int, now: float) -> float:
+        """Share of the packets of an MCS that a robot is expected to lose."""
+        return 1 - self.mcs_table[mcs].pdr(self._robots.get(robot, _Peer()).snr_db(now))
+
+    def sent(self, robots: int | Collection[int] | None, now: float) -> int:
+        """A packet leaves for a robot, for some, or for everybody (None). Returns the index of its MCS."""
+        known: Collection[_Peer]
+        if robots is None:
+            known = self._robots.values()
+        else:
+            ids = [robots] if isinstance(robots, int) else robots
+            known = [self._robots.get(robot, _Peer()) for robot in ids]
+        for one in known:
+            one.unanswered += 1
         return min((self._next(one, now) for one in known), default=0)
 
     def _next(self, known: _Peer, now: float) -> int:
-        known.unanswered += 1
         if known.silent(now):
             known.mcs = 0
         else:

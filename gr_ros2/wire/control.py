@@ -12,7 +12,7 @@ from typing import NamedTuple
 from gr_ros2.core.errors import EncodeError, EntryBoundsError, EntryKindError
 from gr_ros2.wire.ages import age_in_words, age_of
 
-_WAITED, _HELLO, _ASK, _REPORT, _HEARD, _PING, _ABOUT, _NEWEST = range(0xF7, 0xFF)
+_LEFT_OUT, _WAITED, _HELLO, _ASK, _REPORT, _HEARD, _PING, _ABOUT, _NEWEST = range(0xF6, 0xFF)
 
 _heard = Struct(">B4sH")
 _hello = Struct(">QIBI")
@@ -21,6 +21,7 @@ _report = Struct(">BHHQB")
 _ping = Struct(">BHBHHQB")
 _about = Struct(">HII")
 _newest, _whole = Struct(">BBBH"), Struct(">BBBIB")
+_left_out = Struct(">HQB")
 _REPLY, _WANTS_ABOUT = 1, 2
 _UNKNOWN_SNR = 255
 _LEAST_SNR_DB, _MOST_SNR_DB, _SNR_STEPS = -40, 60, 2
@@ -39,6 +40,7 @@ NEWEST_LEN, WHOLE_LEN = 2 + _newest.size, 2 + _whole.size
 """Bytes of the newest message of a topic, and of one up to which all are there."""
 WAITED_LEN = 2
 """Bytes beside the ages."""
+LEFT_OUT_LEN = 2 + _left_out.size
 HELD_STEP_S = 1e-4
 ECHO_LEN = 4
 
@@ -242,12 +244,31 @@ class Waited(NamedTuple):
         return f"waited, {', '.join(told)}" if told else "waited, none"
 
 
+class LeftOut(NamedTuple):
+    """Packets of the sender for which no message waits: they were sent so that not all robots hear them, and carry
+    nothing that is delivered in order.
+
+    :param number: newest number that the map covers, mod 2^16
+    :param packets: bit i says that packet ``number - i`` is one of them, 64 bits
+    :param settled: nor does any message wait for a packet older than the map
+    """
+
+    number: int
+    packets: int
+    settled: bool
+
+    def describe(self) -> str:
+        """The entry in words."""
+        older = ", nothing older repaired" if self.settled else ""
+        return f"left out, number {self.number}, packets {self.packets:016x}{older}"
+
+
 def length_of(newest: Newest) -> int:
     """Bytes of an entry."""
     return NEWEST_LEN if newest.place is None else WHOLE_LEN
 
 
-Control = Hello | Ask | Report | Heard | Ping | About | Newest | Waited
+Control = Hello | Ask | Report | Heard | Ping | About | Newest | Waited | LeftOut
 
 
 def reportable(snr_db: float) -> float:
@@ -286,6 +307,8 @@ def write_control(entry: Control) -> bytes:
             if not entry.ages:
                 raise EncodeError(f"{entry}: it tells of no message")
             name, data = _WAITED, entry.ages
+        elif isinstance(entry, LeftOut):
+            name, data = _LEFT_OUT, _left_out.pack(*entry)
         elif isinstance(entry, About):
             name, data = _ABOUT, _about.pack(*entry[:3]) + entry.text
         else:
@@ -361,6 +384,11 @@ def _read_exchange(name: int, body: bytes, start: int, stop: int) -> Control | N
         if not size:
             raise EntryBoundsError("a note of how long messages have waited, of no bytes")
         return Waited(body[start:stop])
+    if name == _LEFT_OUT:
+        if size != _left_out.size:
+            raise EntryBoundsError(f"a note of packets left out, of {size} bytes")
+        number, packets, settled = _left_out.unpack_from(body, start)
+        return LeftOut(number, packets, settled & 1 != 0)
     if name == _ABOUT:
         if size < _about.size:
             raise EntryBoundsError(f"an about of {size} bytes")

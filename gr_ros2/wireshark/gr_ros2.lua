@@ -15,7 +15,7 @@ local QOS = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "default (11
 local QOS_V1 = { [0] = "default", [1] = "latency", [2] = "bulk", [3] = "a repair packet" }
 local KINDS = { [0] = "source", [1] = "repair", [2] = "control" }
 local PLACES = { [0] = "whole message", [1] = "first fragment", [2] = "middle fragment", [3] = "last fragment" }
-local CONTROLS = { [0xF7] = "waited", [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard", [0xFC] = "ping", [0xFD] = "about",
+local CONTROLS = { [0xF6] = "left out", [0xF7] = "waited", [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard", [0xFC] = "ping", [0xFD] = "about",
     [0xFE] = "newest" }
 local BROADCAST, MOST_BLOCK = 255, 12
 local CRC_LEN, HEADER_LEN, ENTRY_HEADER_LEN = 2, 5, 5
@@ -108,6 +108,9 @@ local f = {
     newest_topic_id = ProtoField.uint8("gr_ros2.newest.topic_id", "Topic id"),
     newest_number = ProtoField.uint32("gr_ros2.newest.number", "Its packet"),
     newest_place = ProtoField.uint8("gr_ros2.newest.place", "Place there, up to which all have come"),
+    left_out_number = ProtoField.uint16("gr_ros2.left_out.number", "Newest number of the map"),
+    left_out_packets = ProtoField.uint64("gr_ros2.left_out.packets", "Map of what nothing waits for", base.HEX),
+    left_out_settled = ProtoField.bool("gr_ros2.left_out.settled", "Nothing older is repaired", 8, nil, 0x01),
     waited_age = ProtoField.uint8("gr_ros2.waited.age", "A message has waited, code"),
     relayed_taker = ProtoField.uint8("gr_ros2.relayed.taker", "Taken on by robot"),
     relayed_origin = ProtoField.uint8("gr_ros2.relayed.origin", "Robot that made the message"),
@@ -340,6 +343,7 @@ local TABLE_TOPIC, RELAYED_TOPIC, CARRIED_TOPIC, RELAYED_LEN = 240, 241, 242, 11
 local MAX_MESSAGE, MAX_BACK = 0x1000000, 0x1FFFFF
 local HELLO_LEN, MARK_LEN, REPORT_LEN, HEARD_LEN, PING_LEN, ABOUT_LEN, NEWEST_LEN = 17, 5, 14, 7, 17, 10, 5
 local WHOLE_LEN = 8 -- a newest message of a reliable topic
+local LEFT_OUT_LEN = 11
 local MAX_SNR = 200 -- 60 dB
 
 -- CRC-32 of IEEE 802.3.
@@ -429,6 +433,7 @@ local function dissect_control(buffer, tree, at, limit)
         about = size >= ABOUT_LEN,
         newest = size == NEWEST_LEN or size == WHOLE_LEN,
         waited = size > 0,
+        ["left out"] = size == LEFT_OUT_LEN,
     }
     if sizes[name] == false then
         item:add_proto_expert_info(refused.overrun)
@@ -487,6 +492,10 @@ local function dissect_control(buffer, tree, at, limit)
         if whole then
             item:add(f.newest_place, buffer(start + 7, 1))
         end
+    elseif name == "left out" then
+        item:add(f.left_out_number, buffer(start, 2))
+        item:add(f.left_out_packets, buffer(start + 2, 8))
+        item:add(f.left_out_settled, buffer(start + 10, 1))
     elseif name == "waited" then
         for age = start, start + size - 1 do
             item:add(f.waited_age, buffer(age, 1))

@@ -187,8 +187,8 @@ def check_entries(vector: dict[str, Any], lines: list[str]) -> None:
             if entry["offset"]:
                 assert f"began {entry['back']} packets ago, bytes from {entry['offset']} on" in line
         else:
-            (kind,) = {"hello", "ask", "report", "heard", "ping", "about", "newest"} & entry.keys()
-            assert f": {'pong' if entry.get('reply') else kind}, " in line
+            (kind,) = {"hello", "ask", "report", "heard", "ping", "about", "newest", "left_out"} & entry.keys()
+            assert f": {'pong' if entry.get('reply') else kind.replace('_', ' ')}, " in line
             shown = str(entry.get("number", entry[kind]))
             if kind == "hello":
                 shown = f"boot {entry['hello'] >> 32}.{entry['hello'] & 0xFFFF_FFFF:08x}, "

@@ -66,6 +66,19 @@ def test_an_snr_that_is_wrong_is_corrected_by_the_losses() -> None:
     assert rate.sent(7, 200 * REPORT_S) >= 1
 
 
+def test_packets_that_were_not_for_a_robot_say_nothing_of_it() -> None:
+    rate = RateController(MCS_TABLE)
+    rate.meet(7)
+    for number in range(200):
+        rate.report(7, 9.4, 0.75, number * REPORT_S, not_for=0.75)
+        rate.sent([7], number * REPORT_S)
+    assert rate.chosen(200 * REPORT_S) == {7: 2}
+    for number in range(200, 400):
+        rate.report(7, 9.4, 0.98, number * REPORT_S, not_for=0.75)
+        rate.sent([7], number * REPORT_S)
+    assert rate.chosen(400 * REPORT_S)[7] < 2, "of the others it loses nearly all"
+
+
 def test_a_packet_for_everybody_serves_the_weakest() -> None:
     rate = RateController(MCS_TABLE)
     for robot in (1, 2):

@@ -162,6 +162,10 @@ def read_control(kind: int, content: bytes) -> dict[str, object] | None:
     def number(start: int, stop: int) -> int:
         return int.from_bytes(content[start:stop], "big")
 
+    if kind == 0xF6:
+        if len(content) != 11:
+            raise Refused("entry_bounds")
+        return {"left_out": number(0, 2), "packets": number(2, 10), "settled": content[10] & 1 == 1}
     if kind == 0xF7:
         if not content:
             raise Refused("entry_bounds")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gr_ros2.core.errors import EncodeError, WireError
 from gr_ros2.wire import is_sealed, v1
 from gr_ros2.wire.ages import NO_AGE
-from gr_ros2.wire.control import About, Ask, Heard, Hello, Newest, Ping, Report, Waited
+from gr_ros2.wire.control import About, Ask, Heard, Hello, LeftOut, Newest, Ping, Report, Waited
 from gr_ros2.wire.mac_block import MOST_LEN
 from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 from gr_ros2.wire.v1 import Header, PacketV1, Part, RepairHeader, decode, encode
@@ -46,6 +46,7 @@ controls = (
     | st.builds(Newest, U8, U8, U8, U16, st.none())
     | st.builds(Newest, U8, U8, U8, st.integers(0, 0xFFFF_FFFF), U8)
     | st.builds(Waited, st.binary(min_size=1, max_size=9))
+    | st.builds(LeftOut, st.integers(0, 2**16 - 1), st.integers(0, 2**64 - 1), st.booleans())
     | st.builds(Report, U8, U16, U16, U64, st.booleans(), st.integers(0, 127), SNRS)
 )
 entries = st.lists(parts() | controls, max_size=6).map(tuple)

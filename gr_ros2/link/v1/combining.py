@@ -67,7 +67,7 @@ class Combining:
             first, last = last + 1, min(last + MAX_WINDOW, packets.newest)
             if later := packets.live(first, last, now):
                 found = packets.live(later[0].number, min(later[0].number + MAX_WINDOW - 1, packets.newest), now)
-        return found[::-1]
+        return self.fitting(found[::-1], -1) if packets.parts else found[::-1]
 
     def around(self, number: int, now: float) -> list[Sent]:
         """The window around a number; only the oldest packet if all are newer."""
@@ -132,7 +132,7 @@ class Combining:
             return window
         for number in range(max(newest, proven) + 1, min(packets.newest, window[-1].number + MAX_WINDOW - 1) + 1):
             record = packets.records.get(number)
-            if record is not None and not packets.full(number):
+            if record is not None and not record.skipped and not packets.full(number):
                 return [record, *packets.live(newest + 1, number - 1, now)[::-1], *window]
         while window and packets.full(window[0].number):
             window = window[1:]

@@ -23,7 +23,7 @@ from gr_ros2.link.v1.order import Order, Ready, nobody
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
-from gr_ros2.wire.control import MAP, Control
+from gr_ros2.wire.control import MAP, Control, LeftOut
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import SPAN, TABLE_TOPIC, EntryV1, read_body
 
@@ -231,6 +231,14 @@ class Inbox:
         self.decoder.advance(number)
         if over:
             self.order.repaired_from(number + 1)
+        self._settle()
+
+    def left_out(self, told: LeftOut) -> None:
+        """No message waits for these packets."""
+        number = self.newest - ((self.newest - told.number) & 0xFFFF)
+        self.order.left_out(number, 1 << MAP | ~told.packets & (1 << MAP) - 1)
+        if told.settled:
+            self.order.repaired_from(number - MAP + 1)
         self._settle()
 
     def handle_timeout(self, now: float) -> None:

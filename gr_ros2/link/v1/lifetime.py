@@ -34,6 +34,7 @@ class Lifetime:
     :param left: whether it has left whole
     :param chained: whether it is of use only to who has followed so far: it is not kept for those out of range
     :param fresh: whether the next message of its topic is its repair on a channel that many share
+    :param completes: it is being sent again to robots for which it was sent too fast, and is not replaced meanwhile
     :param keys: the instances that it speaks of
     :param topic_id: its topic
     :param order: the packet in which it began, and its place there
@@ -46,13 +47,15 @@ class Lifetime:
     left: bool = False
     fresh: bool = False
     chained: bool = False
+    completes: bool = False
     keys: Keys = ALL
     topic_id: int = -1
     order: tuple[int, int] = (0, 0)
 
     def end(self) -> None:
         """It was replaced by a newer message, or needs no repair."""
-        self.expires = -inf
+        if not self.completes:
+            self.expires = -inf
 
 
 class Lifetimes:

@@ -20,6 +20,7 @@ class Message(Outgoing):
     :param numbers: the packets that carry a frame of a coded topic, as far as somebody lacks them
     :param left_at: when its last fragment left, s
     :param published: when it was submitted, s, where it is sent again for robots that join late
+    :param robots: those for which its packets are sent fast enough; None for all
     :param key: it needs no earlier message of its topic, and these are of no more use when it has left
     :param plain: the message before it was coded, where later ones may be merged with it
     :param carried: its topic and key at the robot that made it, while it is carried over others
@@ -33,6 +34,7 @@ class Message(Outgoing):
     plain: bytes = b""
     carried: tuple[int, Key] | None = None
     numbers: list[int] = field(default_factory=list)
+    robots: frozenset[int] | None = None
     left_at: float = inf
     published: float = inf
     key: bool = False

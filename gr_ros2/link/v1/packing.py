@@ -8,6 +8,9 @@ packets go last. Of the others the message with the largest value per byte sent 
 its age (``Waited``), behind all messages of the packet. So who hears it, and who gets it over others, counts from when
 it was made.
 
+*Robots that hear at different rates.* Of all pairs of a message and an MCS the one with the largest value per airtime
+leads, see ``audiences``; what goes along in its packet is for the same robots.
+
 *Fragments.* A message that fits goes whole. A fragment that is not the last one fills its packet. Its size follows from
 the free bytes of the packet; it is not fixed beforehand.
 
@@ -24,6 +27,7 @@ from math import inf
 from gr_ros2.link.events import SentEntry
 from gr_ros2.link.key import Key
 from gr_ros2.link.stats import SenderStats
+from gr_ros2.link.v1.audiences import Audience, Audiences
 from gr_ros2.link.v1.freshness import RANK, Turns, value
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
@@ -60,6 +64,8 @@ class Filling:
     used: int
     since: float
     """When the first of its messages that no ``max_rate`` holds back was submitted, s; infinite if there is none."""
+    robots: frozenset[int] | None
+    """Those for whom it is; None for all."""
 
 
 class Packing:
@@ -72,6 +78,7 @@ class Packing:
         that others leave in every packet
     :param slow: tells whether turns come so seldom that messages do not wait for rows of other topics
     :ivar turns: whose turn it is
+    :ivar audiences: chooses for whom a packet is, where robots hear at different rates; None where nobody does
     """
 
     def __init__(
@@ -86,10 +93,13 @@ class Packing:
         slow: Callable[[], bool] = lambda: False,
     ) -> None:
         self.turns = Turns()
+        self.audiences: Audiences | None = None
+        self._audience: Audience | None = None
+        """For whom the packet is that is being filled; None for all."""
         self._topics, self._stats, self._left = topics, stats, left
         self._boot = boot
         self._shares, self._slow = shares, slow
-        self._short = (1 if shares else LONG) * room
+        self.short = (1 if shares else LONG) * room
         """Bytes of a message above which others go before it."""
         self._open: dict[int, Sequence[Message]] = {}
         """Messages that may continue or start now, by topic."""
@@ -111,7 +121,8 @@ class Packing:
                 self._open[topic_id] = ready
         if not self._open:
             return None
-        heap = self._heap()
+        levels = () if self.audiences is None else self.audiences.of(now)
+        heap = self._chosen(self.audiences, levels) if self.audiences is not None and levels else self._heap()
         if len(heap) == 1 and not spare and heap[0][2] == TABLE_TOPIC and self.fills:
             return None
         picks: list[tuple[Message, int, int]] = []
@@ -131,9 +142,14 @@ class Packing:
             picks.append((message, taken, back))
             used, ages = used + size, told
             if taken == remaining and position + 1 < len(queue):
-                following = queue[position + 1]
-                before = self._topics[topic_id].newest if following.repeat else message.submitted
-                worth = value(following, before, ENTRY)
+                following, topic = queue[position + 1], self._topics[topic_id]
+                before = topic.newest if following.repeat else message.submitted
+                if self.audiences is None or self._audience is None:
+                    worth = value(following, before, ENTRY)
+                elif self.audiences.may_begin(topic, following, self._audience):
+                    worth = self.audiences.value(topic, following, self._audience, ENTRY, before)
+                else:
+                    continue
                 heappush(heap, (self._rank(following), -worth, topic_id, position + 1))
         if not picks:
             return None
@@ -192,11 +208,16 @@ class Packing:
         return topic is None or not topic.queue
 
     def _rank(self, message: Message) -> float:
-        return RANK[message.qos] + 0.5 * (len(message.payload) > self._short)
+        return RANK[message.qos] + 0.5 * (len(message.payload) > self.short)
+
+    def _turn(self) -> int:
+        """Whose turn it is; the table has none where it fills what others leave."""
+        return self.turns.holder(self._open.keys() - {TABLE_TOPIC} if self.fills else self._open)
 
     def _heap(self) -> list[tuple[float, float, int, int]]:
         """Topics that may send, the most urgent and most valuable first."""
-        holder = self._holder = self.turns.holder(self._open.keys() - {TABLE_TOPIC} if self.fills else self._open)
+        self._holder = holder = self._turn()
+        self._audience = None
         if len(self._open) == 1:  # nothing to choose
             (only,) = self._open
             return [(0, 0, only, 0)]
@@ -209,27 +230,54 @@ class Packing:
         heapify(heap)
         return heap
 
+    def _chosen(self, audiences: Audiences, levels: tuple[Audience, ...]) -> list[tuple[float, float, int, int]]:
+        """The same for those for whom the packet is worth most per airtime."""
+        waiting = self._open
+        holder = self._holder = self._turn()
+        best: tuple[float, float] = inf, 0.0
+        chosen: list[tuple[float, float, int, int]] = []
+        for level in levels:
+            heap: list[tuple[float, float, int, int]] = []
+            for topic_id, ready in waiting.items():
+                topic, head = self._topics[topic_id], ready[0]
+                if head.started:
+                    joins = audiences.level(head, levels) == level
+                else:
+                    joins = audiences.may_begin(topic, head, level)
+                if joins:
+                    rank = self._rank(head)
+                    worth = audiences.value(topic, head, level, ENTRY)
+                    heap.append((-1 if topic_id == holder else rank, -worth, topic_id, 0))
+            if heap:
+                heapify(heap)
+                worth_of_air = heap[0][0], heap[0][1] / level.airtime_s
+                if worth_of_air < best:
+                    best, chosen, self._audience = worth_of_air, heap, level
+        self._open = {topic_id: waiting[topic_id] for _, _, topic_id, _ in chosen}
+        return chosen
+
     def _take(self, picks: list[tuple[Message, int, int]], number: int, used: int, ages: bytes, now: float) -> Filling:
         parts: list[EntryV1] = []
         sent: list[SentEntry] = []
         lifetimes: list[Lifetime] = []
         stats, qos, since = self._stats, picks[0][0].qos, inf
+        robots = None if self._audience is None else self._audience.robots
         for place, (message, taken, back) in enumerate(picks):
             topic_id, offset, lifetime = message.topic_id, message.offset, message.lifetime
             topic, queue = self._topics[topic_id], self._topics[topic_id].queue
             if not message.index:
-                message.begin, message.place = number - back, -1 if back else place
+                message.begin, message.place, message.robots = number - back, -1 if back else place, robots
                 lifetime.chained = topic.coded
                 lifetime.expires, lifetime.keys = message.expires, message.keys
                 lifetime.topic_id, lifetime.order = topic_id, (message.begin, message.place if not back else ALL)
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
-                lifetime.long = len(message.payload) > self._short
+                lifetime.long = len(message.payload) > self.short
                 lifetime.fresh = not (lifetime.in_order or topic.kept or topic_id > TABLE_TOPIC)
                 queue.started(message, now)
             if message.submitted < since and not topic.topic.options.max_rate:
                 since = message.submitted
             lifetime.awaited = len(queue) > 1
-            if topic.coded:
+            if topic.coded or message.robots is not None:
                 message.numbers.append(number)
             payload = message.take(taken)
             last = message.offset == len(message.payload)
@@ -245,6 +293,8 @@ class Packing:
             if last:
                 lifetime.left, message.left_at = True, now
                 queue.popleft()
+                if self.audiences is not None and (topic.behind or message.robots is not None):
+                    self.audiences.left(topic, message)
                 if message.submitted > topic.newest and not (queue and queue[0].repeat):
                     topic.newest = message.submitted  # what is repeated together is worth the same
                 stats.sent[of] += not message.repeat
@@ -255,7 +305,7 @@ class Packing:
         if ages:
             parts.append(Waited(ages))
             used += WAITED_LEN + len(ages)
-        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, since)
+        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, since, robots)
 
 
 def _size(ages: bytes) -> int:

@@ -6,7 +6,7 @@ Invariant: what is told about a packet that was never sent changes nothing.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf, ldexp
@@ -279,17 +279,21 @@ class Peers:
         for back in range(MAP):
             record = records.get(number - back)
             if arrived >> back & 1:
-                if record is not None:
+                if record is not None and not (record.skipped & bit and record.number <= self._packets.told):
                     record.confirmed |= bit
+                    record.skipped &= ~bit
                     peer.lost.discard(record.number)
             elif record is None or not record.alive(now):
                 older = number - back
-                if older > 0 and (self._shared is None or self._shared.waits(older, now, self._period)):
+                if older > 0 and self._waits(older, number, now):
                     waits.append(older)
-            elif record.confirmed & bit:
+            elif (record.confirmed | record.skipped) & bit:
                 continue
             elif now - record.at >= delay:
-                missing.append(record)
+                if record.parted & bit:
+                    record.skipped |= bit
+                else:
+                    missing.append(record)
         self._lacks(peer, missing)
         peer.waits = min(waits, default=-1)
         peer.waits_since = min(peer.waits_since, now) if peer.waits >= 0 else inf
@@ -313,11 +317,21 @@ class Peers:
                 peer.lost.discard(number)
         self._packets.retire(now)
 
+    def _waits(self, older: int, number: int, now: float) -> bool:
+        """Whether a peer may wait for a packet that is not repaired.
+
+        :param number: newest number that its report covers
+        """
+        if self._shared is not None:
+            return self._shared.waits(older, now, self._period)
+        # The next message in order tells it of what was not sent to all.
+        return older not in self._packets.parted or older <= min(self._ordered, number - MAP // 2)
+
     def _settle(self, peer: Peer, number: int, needs: int) -> None:
         """A peer has all packets up to a number that are worth something, and needs none before another one."""
         records = self._packets.records
         for older in range(max(self._packets.oldest, peer.settled), number + 1):
-            if older in records:
+            if older in records and not records[older].skipped & peer.bit:
                 records[older].confirmed |= peer.bit
         peer.settled = max(peer.settled, needs)
         peer.lost = {lost for lost in peer.lost if lost >= peer.settled}
@@ -328,6 +342,8 @@ class Peers:
             if record.number not in peer.lost:
                 peer.lost.add(record.number)
                 heappush(self._resend, -record.number)
+                if record.number in self._packets.parted:
+                    continue  # nothing waits for it
                 if self._ordered < inf or any(lifetime.in_order for lifetime in record.lifetimes):
                     heappush(peer.urgent, (all(lifetime.long for lifetime in record.lifetimes), record.number))
                     self.any_urgent = True
@@ -382,18 +398,28 @@ class Peers:
                 peer.lost.discard(lost)
 
     def lost(self, now: float) -> Sent | None:
-        """The newest live packet that the only peer lacks and that has not been sent again since."""
-        if not self._resend or len(self.all) != 1:
+        """The newest live packet that the only peer lacks and that has not been sent again since; that some peer lacks,
+        where not all packets are for all of them, so that combinations are of no use."""
+        if not self._resend or not (len(self.all) == 1 or self._packets.parts):
             return None
-        (peer,) = self.all.values()
         while self._resend:
             number = -heappop(self._resend)
             record = self._packets.records.get(number)
-            if number in peer.lost and number > peer.proven:
+            lacking = [peer for peer in self.all.values() if number in peer.lost and number > peer.proven]
+            for peer in lacking:
                 peer.lost.discard(number)
-                if record is not None and not record.confirmed & peer.bit and record.alive(now):
-                    return record
+            if record is not None and record.alive(now) and any(not record.confirmed & peer.bit for peer in lacking):
+                return record
         return None
+
+    def lacking(self, record: Sent) -> list[int]:
+        """The peers that a packet was sent to and that have not confirmed it."""
+        have = record.confirmed | record.skipped
+        return [src_id for src_id, peer in self.all.items() if not have & peer.bit]
+
+    def bits(self, src_ids: Iterable[int]) -> int:
+        """The bits of some peers."""
+        return sum(self.all[src_id].bit for src_id in src_ids if src_id in self.all)
 
     def replayed(self, number: int) -> bool:
         """Whether a peer that may need a packet may take it for a replay."""

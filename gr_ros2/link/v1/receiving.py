@@ -56,6 +56,7 @@ from gr_ros2.wire.control import (
     Ask,
     Control,
     Hello,
+    LeftOut,
     Newest,
     Ping,
     Report,
@@ -284,7 +285,7 @@ class ReceivingSide:
         for entry in entries:
             if isinstance(entry, Hello):
                 self._greeted(neighbour)
-            elif isinstance(entry, (Ask, Report, Newest)):
+            elif isinstance(entry, (Ask, Report, Newest, LeftOut)):
                 self._entry(entry)
             elif isinstance(entry, (Ping, About)):
                 self._facts.append(Questioned(neighbour.src_id, entry))
@@ -333,6 +334,8 @@ class ReceivingSide:
         assert self._sender is not None
         if isinstance(entry, Report):
             self._reported(self._sender.src_id, entry)
+        elif isinstance(entry, LeftOut):
+            self._sender.inbox.left_out(entry)
         elif isinstance(entry, Newest):
             if entry.origin == self._settings.src_id:
                 self._has(self._sender.src_id, entry)

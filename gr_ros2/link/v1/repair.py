@@ -68,19 +68,22 @@ class RepairWindow:
         self.thrift = Thrift(self.packets, self.peers)
         self._combining = Combining(self.packets, room)
 
-    def sent(self, number: int, body: bytes, data: bytes, lifetimes: tuple[Lifetime, ...], now: float) -> None:
+    def sent(
+        self, number: int, body: bytes, data: bytes, lifetimes: tuple[Lifetime, ...], now: float, *, skipped: int = 0
+    ) -> None:
         """A source packet left.
 
         :param body: its entries, without padding
         :param data: the packet as it was sent
         :param lifetimes: lifetimes of the messages in it; () for a packet that is not worth repairing
+        :param skipped: bits of the peers for which it was sent too fast
         """
         self.peers.sent(number, lifetimes, now)
         if not self.peers.all:
             self._unreported.sent(number, lifetimes)
         elif self._shared is not None:
             self._shared.sent(number, lifetimes, self.peers.loss)
-        self.packets.add(number, body, data, lifetimes, now)
+        self.packets.add(number, body, data, lifetimes, now, skipped=skipped)
 
     @property
     def mode(self) -> RepairMode:
@@ -207,6 +210,11 @@ class RepairWindow:
         self._shared.combined(window, now)
         return window
 
+    def complete(self, record: Sent, now: float) -> Sent | Repair | None:
+        """What brings a packet to the peers for which it was sent too fast."""
+        record.skipped = 0
+        return self._bring(record, now)
+
     def _bring(self, record: Sent, now: float) -> Sent | Repair | None:
         """What brings a packet back that peers lack."""
         if self.peers.replayed(record.number):
@@ -229,6 +237,8 @@ class RepairWindow:
         if not self.peers.all:
             self._unreported.cover(combined, now)
         self._unreported.repaired()
+        if self.packets.parted:
+            self.packets.told = max(self.packets.told, repair.number)
         if self.mode == "thrifty":
             self.thrift.combined(now, first, repair.number)
         self.peers.once.difference_update(range(first, repair.number + 1))

@@ -9,10 +9,13 @@ from math import inf
 
 from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
+from gr_ros2.link.v1.audiences import Audiences
+from gr_ros2.link.v1.combining import Repair
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.packing import Packing
 from gr_ros2.link.v1.repair import RepairWindow
+from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.link.v1.writer import PacketWriter
 
 PATIENCE_S = 0.2
@@ -34,8 +37,16 @@ class RepairSlots:
     """The slots of one sender that carry repairs."""
 
     def __init__(
-        self, settings: Settings, pace: Pace, window: RepairWindow, *, writer: PacketWriter, hold: Hold
+        self,
+        settings: Settings,
+        pace: Pace,
+        window: RepairWindow,
+        *,
+        writer: PacketWriter,
+        hold: Hold,
+        audiences: Audiences | None = None,
     ) -> None:
+        self._audiences = audiences
         self._settings = settings
         self._pace, self._window, self._writer, self._hold = pace, window, writer, hold
         self._waits_until = -inf
@@ -86,7 +97,7 @@ class RepairSlots:
             if again is not None:
                 self._ahead -= waiting
                 self._repaired = newest
-                return self._writer.repair(again, now)
+                return self._writer.repair(again, now, self._lacking(again))
         if given_up < 0:
             return None
         self._repaired = newest
@@ -97,13 +108,15 @@ class RepairSlots:
         if self._window.peers.in_vain and (given_up := self._window.peers.given_up(now)) >= 0:
             return self._tell(given_up, now)
         self._waits_until = -inf
+        if self._audiences is not None and (late := self._late(self._audiences, now)) is not None:
+            return late
         chosen = self._window.next(now, self.held)
         held = self._waits_until > now
         self._calm_since = now if chosen is None and not held else -inf
         self._calm_number = self._window.packets.newest
         if chosen is not None:
             self._hold.repaired(waiting=held)
-            return self._writer.repair(chosen, now)
+            return self._writer.repair(chosen, now, self._lacking(chosen))
         lifetimes = () if held else self._window.exhausted(now)
         return self._writer.source([], lifetimes, 0, (), now) if lifetimes else None
 
@@ -112,15 +125,37 @@ class RepairSlots:
 
         :param waiting: something else waits for such a slot
         """
-        if waiting:
+        if waiting or (self._audiences is not None and self._audiences.due(now) is not None):
             return max(self._waits_until, now)
         mode = self._window.mode
         if mode == "off" or not self._window.packets.wanted(now):
             return inf
         return max(self._waits_until, now if mode == "idle" else self._next_look(now))
 
+    def _late(self, audiences: Audiences, now: float) -> SentPacket | None:
+        """What was sent too fast for some, sent as they hear it."""
+        record = audiences.due(now)
+        if record is None or self.held(now):
+            return None
+        peers = self._window.peers
+        robots = [src_id for src_id, peer in peers.all.items() if record.skipped & peer.bit]
+        audiences.sent_again(record, robots)
+        self._hold.repaired(waiting=False)
+        again = self._window.complete(record, now)
+        return None if again is None else self._writer.repair(again, now, robots)
+
+    def _lacking(self, chosen: Sent | Repair) -> list[int] | None:
+        """Those who lack a packet that is sent again as it was, where not all packets are for all; None for all."""
+        if self._audiences is None or isinstance(chosen, Repair) or not self._window.packets.parts:
+            return None
+        return self._window.peers.lacking(chosen) or None
+
     def _tell(self, number: int, now: float) -> SentPacket | None:
         """Say that a packet is not repaired any more."""
+        if (packets := self._window.packets).parts:
+            told = packets.left_out(now, number)
+            self._window.peers.announced(packets.told_of)
+            return self._writer.control([told], "repair", now)
         repair = self._window.tell(number, now)
         if repair is not None:
             return self._writer.repair(repair, now)

@@ -12,6 +12,7 @@ from math import inf
 from gr_ros2.link.events import SentPacket
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.rate import RateController
+from gr_ros2.link.v1.audiences import Audiences
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.facts import (
     Appeared,
@@ -33,13 +34,13 @@ from gr_ros2.link.v1.pings import Pings
 from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.repair_slots import RepairSlots
-from gr_ros2.link.v1.report_slots import ReportSlots
+from gr_ros2.link.v1.report_slots import LENGTH_LEN, ReportSlots
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.link.v1.writer import PacketWriter
 from gr_ros2.relay.gain import TOLD
-from gr_ros2.wire.control import NEWEST_LEN, Heard, Hello, Newest, Report, length_of
-from gr_ros2.wire.v1 import TABLE_TOPIC
+from gr_ros2.wire.control import LEFT_OUT_LEN, NEWEST_LEN, Heard, Hello, Newest, Report, length_of
+from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC
 
 MOST_REPEATS = 32
 """Most ``repeat_s`` from one repeat of the kept messages to the next, while nobody is heard though somebody could be:
@@ -83,7 +84,12 @@ class SendingSide:
         self._slowness = Slowness(pace)
         self.hellos = hellos
         self.pings = Pings(turn_s=settings.turn_s)
-        self.repairs = RepairSlots(settings, self._pace, window, writer=writer, hold=hold)
+        self._audiences: Audiences | None = None
+        if rate is not None and settings.dst_id == BROADCAST and not settings.shares and relaying is None:
+            packing = messages.packing
+            self._audiences = Audiences(rate, window.peers, window.packets, messages.sent, short=packing.short)
+            packing.audiences = self._audiences
+        self.repairs = RepairSlots(settings, pace, window, writer=writer, hold=hold, audiences=self._audiences)
         self.reports = ReportSlots(settings, neighbours.all.values(), writer)
         self.urgent = False
         self._heard_at = inf
@@ -147,6 +153,9 @@ class SendingSide:
             told = self._relaying.tells(now)
             room -= max(TOLD * NEWEST_LEN, sum(map(length_of, told))) + 1  # an entry that fills it needs its length now
         number = self._window.packets.newest + 1
+        parts = self._audiences is not None and self._parts()
+        if parts:  # who waits for what was not sent to all is told
+            room -= LEFT_OUT_LEN + LENGTH_LEN
         filling = self._messages.packing.fill(number, room - reports.reserved, now, spare=spare)
         if filling is None:
             return None
@@ -156,7 +165,20 @@ class SendingSide:
             reports.add(filling.parts, room - filling.used, due, now)
         filling.parts += told
         lifetimes = () if spare else filling.lifetimes
-        return self._writer.source(filling.parts, lifetimes, filling.qos, filling.sent, now)
+        if self._audiences is None:
+            return self._writer.source(filling.parts, lifetimes, filling.qos, filling.sent, now)
+        if parts and filling.robots is None and any(lifetime.in_order for lifetime in lifetimes):
+            filling.parts.append(self._window.packets.left_out(now))
+        skipped = self._audiences.skipped(filling.robots)
+        sent = self._writer.source(
+            filling.parts, lifetimes, filling.qos, filling.sent, now, robots=filling.robots, skipped=skipped
+        )
+        self._audiences.sent(filling.robots, sent.mcs, now)
+        return sent
+
+    def _parts(self) -> bool:
+        """Whether a message in order waits behind packets that were not sent to all."""
+        return self._window.packets.parts and any(one.in_order and one.queue for one in self._messages.sent.values())
 
     def tells(self, now: float) -> list[Newest]:
         """What is told of messages of others."""
@@ -217,12 +239,16 @@ class SendingSide:
 
     def _reported(self, robot: int, number: int, report: Report, now: float) -> None:
         loss = report.loss / 128
+        not_for = 0.0
+        if self._audiences is not None:
+            not_for = self._audiences.not_for(robot, number)
+            loss = max(loss - not_for, 0.0) / (1 - not_for)
         self._window.peers.report(robot, number, report.arrived, settled=report.settled, loss=loss, now=now)
         self.repairs.reported()
         if self._relaying is not None:
             self._relaying.custody.reported(robot, now)
         if self._rate is not None and report.snr_db is not None:
-            self._rate.report(robot, report.snr_db, loss, now)
+            self._rate.report(robot, report.snr_db, report.loss / 128, now, not_for=not_for)
 
     def _left(self, robot: int, now: float, *, ended: bool) -> None:
         peers = self._window.peers

@@ -14,9 +14,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.wire.control import MAP, LeftOut
 from gr_ros2.wire.v1 import REPAIR_IDS, SPAN
 
 _ALL_USED = (1 << REPAIR_IDS) - 1
+_PARTED = 1024
+"""Newest packets of which it is known whether they were sent to all."""
 
 
 @dataclass(slots=True, eq=False)
@@ -25,6 +28,8 @@ class Sent:
 
     :param at: when it was last sent, s
     :param confirmed: one bit per peer
+    :param skipped: bits of the peers for which it was sent too fast, as far as they have not got it since
+    :param parted: bits of those for which it was sent too fast at first
     :param covered: number of repairs of it while nobody reported, divided by the number that is enough
     """
 
@@ -34,6 +39,8 @@ class Sent:
     lifetimes: tuple[Lifetime, ...]
     at: float
     confirmed: int = 0
+    skipped: int = 0
+    parted: int = 0
     covered: float = 0.0
 
     @property
@@ -63,24 +70,42 @@ class SentPackets:
     :ivar needed: none before this is needed
     :ivar everybody: the bits of all peers that report
     :ivar away: the bits of those that did and are out of range
+    :ivar parted: the newest packets that were first sent so that not all peers hear them. They carry nothing that is
+        delivered in order
+    :ivar told: the newest packet of which peers were told that they need not wait for it
+    :ivar told_of: the packets of which they were told last whether they need to
     """
 
     def __init__(self, span: int = SPAN) -> None:
         self.newest = self.oldest = self.needed = 0
         self.records: dict[int, Sent] = {}
         self.everybody = self.away = 0
+        self.parted: set[int] = set()
+        self.told = 0
+        self.told_of = range(0)
         self._span = span
         self._repair_ids: dict[int, int] = {}
         """Repair ids already used, as bits, by number."""
         self._repair_id = 0
 
-    def add(self, number: int, body: bytes, data: bytes, lifetimes: tuple[Lifetime, ...], now: float) -> None:
-        """A source packet left."""
+    def add(
+        self, number: int, body: bytes, data: bytes, lifetimes: tuple[Lifetime, ...], now: float, *, skipped: int = 0
+    ) -> None:
+        """A source packet left.
+
+        :param skipped: the peers for which it was sent too fast
+        """
         self.newest = number
+        if skipped:
+            self.parted.add(number)
+        if self.parted:
+            self.parted.discard(number - _PARTED)
         if self.records or lifetimes:
             if not self.records:
                 self.oldest = self.needed = number
             record = self.records[number] = Sent(number, body, data, lifetimes, now)
+            if skipped:
+                record.skipped = record.parted = skipped
             if self.away and not record.in_order:
                 record.confirmed = self.away
             if number - self.oldest >= self._span:
@@ -100,6 +125,8 @@ class SentPackets:
         self.everybody &= ~bit
         self.away |= bit
         for record in self.records.values():
+            record.skipped &= ~bit
+            record.parted &= ~bit
             if not record.in_order:
                 record.confirmed |= bit
 
@@ -109,6 +136,8 @@ class SentPackets:
         self.away &= ~bit
         for record in self.records.values():
             record.confirmed &= ~bit
+            record.skipped &= ~bit
+            record.parted &= ~bit
 
     def retire(self, now: float) -> None:
         """Forget the oldest packets that are not alive."""
@@ -145,6 +174,30 @@ class SentPackets:
                 return number
         return last + 1
 
+    @property
+    def parts(self) -> bool:
+        """Whether some of the newest packets were not sent to all."""
+        return bool(self.parted) and any(
+            number in self.parted for number in range(self.newest - MAP + 1, self.newest + 1)
+        )
+
+    def left_out(self, now: float, first: int = 0) -> LeftOut:
+        """What peers are told of packets that they need not wait for.
+
+        :param first: the first packet of interest
+        """
+        self.retire(now)
+        records, newest = self.records, min(self.newest, first + MAP - 1) if first else self.newest
+        packets = 0
+        for back in range(MAP):
+            record = records.get(newest - back)
+            if record is None or not record.alive(now) or newest - back in self.parted:
+                packets |= 1 << back
+        settled = self.oldest > newest - MAP
+        self.told = max(self.told, newest)
+        self.told_of = range(0 if settled else newest - MAP + 1, newest + 1)
+        return LeftOut(newest & 0xFFFF, packets, settled)
+
     def unconfirmed(self, now: float) -> bool:
         """Whether anything is alive."""
         self.retire(now)
@@ -156,7 +209,7 @@ class SentPackets:
         return self.needed <= self.newest
 
     def live(self, first: int, last: int, now: float) -> list[Sent]:
-        """The packets from one number to another that are alive."""
+        """The packets from one number to another that are alive, and were sent to all."""
         found: list[Sent] = []
         records, here, everybody = self.records, self.everybody, self.everybody | self.away
         kept: Iterable[Sent] = records.values()
@@ -169,7 +222,7 @@ class SentPackets:
                 if now < lifetime.expires:
                     found.append(record)
                     break
-        return found
+        return [record for record in found if not record.skipped] if self.parted else found
 
     def take_repair_id(self, number: int) -> int | None:
         """A repair id that no repair packet at this number has used; None if all are used."""

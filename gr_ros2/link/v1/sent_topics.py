@@ -13,7 +13,7 @@ from gr_ros2.link.instances import ALL, InstanceKeys, InstancesOf, Keys, no_inst
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.queues import UNKNOWN_QOS, PublisherQos, TopicQueue, qos_class, queue_for
 from gr_ros2.link.v1.delivery import MAX_AGE_S
-from gr_ros2.link.v1.lifetime import Lifetimes
+from gr_ros2.link.v1.lifetime import Lifetime, Lifetimes
 from gr_ros2.link.v1.message import Message
 from gr_ros2.settings.commands import is_command
 from gr_ros2.settings.config import SendOptions
@@ -36,6 +36,19 @@ _STARTS = 2
 third one's."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Late:
+    """A message that left too fast for some robots.
+
+    :param submitted: when it was submitted, s
+    :param numbers: its packets
+    """
+
+    submitted: float
+    numbers: list[int]
+    lifetime: Lifetime
+
+
 @dataclass(slots=True, eq=False)
 class SentTopic:
     """One topic, or the rows of the table of topics.
@@ -50,6 +63,9 @@ class SentTopic:
     :param coded: whether its messages are frames (:mod:`gr_ros2.link.frames`)
     :param output: of frames, the type that comes out, '' = the topic's
     :param instances: what its messages speak of; None = all of the same
+    :ivar behind: the robots that did not get its newest message, as it was sent too fast for them, and when the newest
+        one that they got was submitted, s
+    :ivar late: the newest messages that some robots lack for that reason; an older one only while it is sent to them
     :ivar dst_id: the robot for which its messages are, 255 for all
     :ivar kept: whether its newest messages are kept for robots that lack them; commands never are
     :ivar in_order: whether its messages are delivered in order, each after all earlier ones
@@ -70,6 +86,8 @@ class SentTopic:
     coded: bool = False
     output: str = ""
     instances: InstanceKeys | None = None
+    behind: dict[int, float] = field(default_factory=dict)
+    late: list[Late] = field(default_factory=list)
     dst_id: int = field(init=False)
     kept: bool = field(init=False)
     in_order: bool = field(init=False)

@@ -6,7 +6,7 @@ Invariants: each number is used once for a source packet, and each repair id onc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from gr_ros2.link.events import AirKind, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.rate import RateController
@@ -94,16 +94,21 @@ class PacketWriter:
         qos: int,
         parts: tuple[SentEntry, ...],
         now: float,
+        *,
+        robots: frozenset[int] | None = None,
+        skipped: int = 0,
     ) -> SentPacket:
         """Write a packet with a number of its own.
 
         :param lifetimes: of the messages in it; () for a packet that is not worth repairing
         :param parts: what it carries of messages that are sent for the first time
+        :param robots: those for whom it is; None for all
+        :param skipped: the bits of the others
         """
         number = self._window.packets.newest + 1
         body = write_body(entries, self.room)
-        sent = self._close(qos, number, None, body, entries, kind="new", now=now, parts=parts)
-        self._window.sent(number, body, sent.data, lifetimes, now)
+        sent = self._close(qos, number, None, body, entries, kind="new", now=now, parts=parts, robots=robots)
+        self._window.sent(number, body, sent.data, lifetimes, now, skipped=skipped)
         if lifetimes:
             self._hold.left(now, self._window.peers.loss)
         return sent
@@ -118,12 +123,15 @@ class PacketWriter:
         fields = RepairHeader(repair_id, oldest=not window.packets.unconfirmed(now), clear=clear)
         return self._close(QOS_REPAIR, window.packets.newest, fields, body, entries, kind=kind, now=now)
 
-    def repair(self, chosen: Sent | Repair, now: float) -> SentPacket:
-        """Write a combination of packets, or a packet again as it was."""
+    def repair(self, chosen: Sent | Repair, now: float, robots: Collection[int] | None = None) -> SentPacket:
+        """Write a combination of packets, or a packet again as it was.
+
+        :param robots: those who lack it; None where that is to be heard by all
+        """
         if isinstance(chosen, Repair):
             number, mask, repair_id, oldest, combined = chosen
             fields = RepairHeader(repair_id, mask, oldest)
-            return self._close(QOS_REPAIR, number, fields, combined, (), kind="repair", now=now)
+            return self._close(QOS_REPAIR, number, fields, combined, (), kind="repair", now=now, robots=robots)
         if self._shares:  # with another block it is another packet, and needs a nonce of its own
             again = self._window.packets.take_repair_id(chosen.number)
             if again is None:
@@ -133,7 +141,9 @@ class PacketWriter:
         header = read_header(chosen.data, self._packet_len)
         entries = tuple(read_body(chosen.body, self.room))
         packet = PacketV1(header, entries, encrypted=self._encrypts)
-        return self._leave(chosen.data, packet, chosen.number, NOT_A_REPAIR, kind="repair", now=now, parts=())
+        return self._leave(
+            chosen.data, packet, chosen.number, NOT_A_REPAIR, kind="repair", now=now, parts=(), robots=robots
+        )
 
     def _close(
         self,
@@ -146,6 +156,7 @@ class PacketWriter:
         kind: AirKind,
         now: float,
         parts: tuple[SentEntry, ...] = (),
+        robots: Collection[int] | None = None,
     ) -> SentPacket:
         """Pad and seal a packet, which leaves."""
         header = Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, self._hop, self.block)
@@ -158,7 +169,7 @@ class PacketWriter:
             combined = body
         data = self._trailer.close(clear, body, number, repair_id, plain=plain)
         packet = PacketV1(header, tuple(entries), repair, combined, self._encrypts and not plain)
-        return self._leave(data, packet, number, repair_id, kind=kind, now=now, parts=parts)
+        return self._leave(data, packet, number, repair_id, kind=kind, now=now, parts=parts, robots=robots)
 
     def _leave(
         self,
@@ -170,6 +181,7 @@ class PacketWriter:
         kind: AirKind,
         now: float,
         parts: tuple[SentEntry, ...],
+        robots: Collection[int] | None,
     ) -> SentPacket:
         """A packet leaves."""
         stats = self._stats
@@ -177,7 +189,7 @@ class PacketWriter:
         stats.packets += 1
         mcs = 0
         if self._rate is not None:
-            mcs = self._rate.sent(None if self._dst_id == BROADCAST else self._dst_id, now)
+            mcs = self._rate.sent(robots if self._dst_id == BROADCAST else self._dst_id, now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
         sent = SentPacket(

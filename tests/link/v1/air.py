@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 from gr_ros2.link import AirPacket
 from gr_ros2.link.access import Access
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys, SealMode
@@ -43,6 +44,7 @@ class Robot:
 
     relays = False
     """Whether all send on what others make (``conftest.relaying``)."""
+    mcs_table: Sequence[Mcs] = ()
 
     def __init__(
         self,
@@ -85,6 +87,7 @@ class Robot:
             heard=dict(self.stored),
             save=lambda src_id, boot, floor: self.save(src_id, (boot, floor)),
             observer=self.events.append,
+            mcs_table=self.mcs_table,
         )
         self.end.pace.use_credit()
 
