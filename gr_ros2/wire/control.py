@@ -51,7 +51,8 @@ class Hello(NamedTuple):
     :param boot: number of this start of the robot, 0..2^64-1: a number greater than those of all earlier ones, and 32
         random bits
     :param turns: how often the 16-bit packet number has wrapped around, 0..2^32-1
-    :param capabilities: ``CAN_HEAR``, ``ENCRYPTS``, ``REPORTED`` and ``WANTS_PROOF``; other bits are ignored
+    :param capabilities: ``CAN_HEAR``, ``ENCRYPTS``, ``REPORTED``, ``WANTS_PROOF`` and ``READS_LEFT_OUT``; other bits
+        are ignored
     :param digest: sum of the marks of the rows in the robot's table of topics, 0 if it has none
     :param marks: (topic id, CRC-32 of the message as transmitted) of messages kept for robots that join late
     """
@@ -69,6 +70,7 @@ class Hello(NamedTuple):
         words += ["encrypts"] * (self.capabilities & ENCRYPTS != 0)
         words += ["is reported to"] * (self.capabilities & REPORTED != 0)
         words += ["wants proof"] * (self.capabilities & WANTS_PROOF != 0)
+        words += ["reads what is left out"] * (self.capabilities & READS_LEFT_OUT != 0)
         words += [f"table {self.digest:08x}"] * (self.digest != 0)
         words += [f"keeps topic {topic_id} {mark:08x}" for topic_id, mark in self.marks]
         return ", ".join(words)
@@ -82,6 +84,9 @@ REPORTED = 4
 """Robots report to this one what they hear: it repairs what they lack, or says that it does not."""
 WANTS_PROOF = 8
 """The robot hears another one that has not proven yet that it heard this start: who hears this answers with a hello."""
+
+READS_LEFT_OUT = 16
+"""The robot reads :class:`LeftOut`: packets may be sent that it cannot hear."""
 
 
 class Ask(NamedTuple):

@@ -79,6 +79,7 @@ local f = {
     hello_encrypts = ProtoField.bool("gr_ros2.hello.encrypts", "Encrypts", 8, nil, 0x02),
     hello_reported = ProtoField.bool("gr_ros2.hello.reported", "Gets reports", 8, nil, 0x04),
     hello_wants_proof = ProtoField.bool("gr_ros2.hello.wants_proof", "Wants proof", 8, nil, 0x08),
+    hello_reads_left_out = ProtoField.bool("gr_ros2.hello.reads_left_out", "Reads left out", 8, nil, 0x10),
     hello_digest = ProtoField.uint32("gr_ros2.hello.digest", "digest of the table of topics", base.HEX),
     hello_topic_id = ProtoField.uint8("gr_ros2.hello.topic_id", "Kept for late joiners, topic id"),
     hello_mark = ProtoField.uint32("gr_ros2.hello.mark", "CRC-32 of that message", base.HEX),
@@ -408,6 +409,7 @@ local function dissect_hello(buffer, tree, at, size)
     tree:add(f.hello_encrypts, buffer(at + 12, 1))
     tree:add(f.hello_reported, buffer(at + 12, 1))
     tree:add(f.hello_wants_proof, buffer(at + 12, 1))
+    tree:add(f.hello_reads_left_out, buffer(at + 12, 1))
     tree:add(f.hello_digest, buffer(at + 13, 4))
     for mark = at + HELLO_LEN, at + size - 1, MARK_LEN do
         tree:add(f.hello_topic_id, buffer(mark, 1))

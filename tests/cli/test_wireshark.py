@@ -211,7 +211,7 @@ def test_every_vector_of_version_1_is_shown_as_it_is(tmp_path: Path) -> None:
             for field, key in of_kind.items():
                 if field != name:
                     assert numbers(f"{name}.{key}") == [entry[field] for entry in said]
-        for bit, capability in enumerate(("hears", "encrypts", "reported", "wants_proof")):
+        for bit, capability in enumerate(("hears", "encrypts", "reported", "wants_proof", "reads_left_out")):
             said = [entry["capabilities"] >> bit & 1 for entry in entries if "hello" in entry]
             assert numbers(f"hello.{capability}") == said, vector["name"]
     assert not tshark(path, "-Y", "_ws.expert")

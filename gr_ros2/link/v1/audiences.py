@@ -13,7 +13,7 @@ is only one, nothing is chosen here.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from gr_ros2.link.rate import RateController
@@ -51,14 +51,23 @@ class Audiences:
     """What each robot lacks, and the packets that it cannot hear.
 
     :param topics: what is sent
+    :param reads: whether a robot reads which packets are left out; where one does not, as older programs do not, every
+        packet is for all
     :param short: bytes of the longest message that is not sent to all in any case
     """
 
     def __init__(
-        self, rate: RateController, peers: Peers, packets: SentPackets, topics: SentTopics, *, short: int
+        self,
+        rate: RateController,
+        peers: Peers,
+        packets: SentPackets,
+        topics: SentTopics,
+        *,
+        reads: Callable[[int], bool],
+        short: int,
     ) -> None:
         self._rate, self._peers, self._packets, self._topics = rate, peers, packets, topics
-        self._short = short
+        self._reads, self._short = reads, short
         self._robots: frozenset[int] = frozenset()
         self._got: dict[int, dict[int, float]] = {}
         """By topic: when the newest message was submitted that each of those got that are behind, s."""
@@ -73,7 +82,7 @@ class Audiences:
             return ()
         chosen = self._rate.chosen(now)
         levels = sorted(set(chosen.values()), reverse=True)
-        if len(levels) < 2:
+        if len(levels) < 2 or not all(map(self._reads, self._peers.all)):
             return ()
         self._got = {topic_id: self._newest(topic) for topic_id, topic in self._topics.items() if topic.behind}
         table = self._rate.mcs_table

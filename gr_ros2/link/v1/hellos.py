@@ -27,6 +27,7 @@ from gr_ros2.wire.control import (
     HEARD_LEN,
     HELLO_LEN,
     MARK_LEN,
+    READS_LEFT_OUT,
     REPORTED,
     WANTS_PROOF,
     Control,
@@ -79,7 +80,7 @@ class Hellos:
         self._settings = settings
         self._messages, self._window, self._neighbours = messages, window, neighbours
         self._boot = boot
-        self._capabilities = settings.hears * CAN_HEAR | encrypts * ENCRYPTS
+        self._capabilities = settings.hears * (CAN_HEAR | READS_LEFT_OUT) | encrypts * ENCRYPTS
         self._pause = self._period
         """s to the next hello."""
         self._starting: deque[float] = deque()

@@ -40,7 +40,7 @@ from gr_ros2.link.v1.peers import START
 from gr_ros2.link.v1.proofs import OwnHellos, Proofs
 from gr_ros2.link.v1.replays import Floor, Floors, Save
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Trailer
-from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, WANTS_PROOF, Heard, Hello
+from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, READS_LEFT_OUT, WANTS_PROOF, Heard, Hello
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
     EntryV1,
@@ -330,6 +330,11 @@ class Neighbours:
         """Whether two robots send under this number: both were there lately, in turns. A robot that restarts never
         comes back as it was before."""
         return now < self._doubled.get(src_id, -inf) + _DOUBLED_S
+
+    def reads_left_out(self, src_id: int) -> bool:
+        """Whether a robot says that it reads which packets are left out."""
+        neighbour = self.all.get(src_id)
+        return neighbour is not None and neighbour.hello.capabilities & READS_LEFT_OUT != 0
 
     def lacks_table(self, neighbour: Neighbour, now: float) -> bool:
         """Whether a robot has topics, and nothing of its table has come although it has been heard for long."""

@@ -87,7 +87,9 @@ class SendingSide:
         self._audiences: Audiences | None = None
         if rate is not None and settings.dst_id == BROADCAST and not settings.shares and relaying is None:
             packing = messages.packing
-            self._audiences = Audiences(rate, window.peers, window.packets, messages.sent, short=packing.short)
+            self._audiences = Audiences(
+                rate, window.peers, window.packets, messages.sent, reads=neighbours.reads_left_out, short=packing.short
+            )
             packing.audiences = self._audiences
         self.repairs = RepairSlots(settings, pace, window, writer=writer, hold=hold, audiences=self._audiences)
         self.reports = ReportSlots(settings, neighbours.all.values(), writer)

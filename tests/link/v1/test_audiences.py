@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import count, pairwise
+from typing import Any
 
 import pytest
 from hypothesis import example, given, settings
@@ -21,7 +22,7 @@ from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
-from gr_ros2.wire.control import LeftOut
+from gr_ros2.wire.control import READS_LEFT_OUT, LeftOut
 from tests.link.v1.air import Robot
 from tests.link.v1.invariants import PacketsEnd
 
@@ -220,6 +221,19 @@ def test_nobody_starves_and_what_is_reliable_reaches_all(
         assert many.numbers(robot, EVENTS) == list(range(many.made[EVENTS]))
         for topic in FULL:
             assert many.numbers(robot, topic) == sorted(set(many.numbers(robot, topic)))
+
+
+def test_a_robot_of_an_older_program_is_sent_nothing_faster_than_it_hears(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Inbox, "left_out", lambda *_: None)
+    three = Field({2: 30.0, 3: 3.0, 4: 10.0}, loss=0.1)
+    hellos: Any = three.others[3].end._sending.hellos
+    hellos._capabilities &= ~READS_LEFT_OUT
+    three.run(5.0, {**FULL, EVENTS: 2.0})
+    assert {packet.mcs for packet in three.sent[-20:] if packet.kind == "new"} == {0}
+    events = three.made[EVENTS]
+    three.run(20.0, {}, until=lambda: all(len(three.got[robot, EVENTS]) == events for robot in three.snrs_db))
+    for robot in three.snrs_db:
+        assert three.numbers(robot, EVENTS) == list(range(events))
 
 
 @pytest.mark.parametrize("snrs_db", [{2: 30.0}, {2: 3.0}, {2: 20.0, 3: 20.0}])
