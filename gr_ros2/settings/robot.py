@@ -308,16 +308,19 @@ def number_of(robot: int | str) -> int:
     return int(runs[-1])
 
 
+_PARTS = ("graph", "publish", "backfill")
+
+
 def robot_from(**given: Any) -> RobotConfig:
-    """A robot from settings in one list, as GRC has them: those of ``graph`` and ``publish`` may stand beside the
-    others as ``graph_domain_id``, ``publish_as``.
+    """A robot from settings in one list, as GRC has them: those of its parts may stand beside the others as
+    ``graph_domain_id``, ``publish_as``, ``backfill_topics``.
 
     :raises ConfigError: for an unknown setting, a value out of range, or settings that contradict each other
     """
-    values: dict[str, Any] = {"graph": {}, "publish": {}}
+    values: dict[str, Any] = {part: {} for part in _PARTS}
     for name, value in given.items():
         part, _, setting = name.partition("_")
-        if part in ("graph", "publish") and setting:
+        if part in _PARTS and setting:
             values[part] = {**values[part], setting: value}
         else:
             values[name] = value
