@@ -25,7 +25,7 @@ from gr_ros2.settings.config import (
     build,
     read_yaml,
 )
-from gr_ros2.settings.robot import GraphConfig, PublishConfig, PublishOptions, RobotConfig, number_of
+from gr_ros2.settings.robot import GraphConfig, PublishConfig, PublishOptions, RobotConfig, number_of, robot_from
 from gr_ros2_lab.run.scenario import scenario_from
 
 CONFIGS = (SendOptions, PublishOptions, PaperConfig, GraphConfig, PublishConfig, ChannelConfig, PhyConfig)
@@ -283,3 +283,9 @@ def test_a_share_of_nothing_is_not_answered_with_no_limit(share: float) -> None:
 def test_what_looks_like_auto_is_answered_with_auto(make: Callable[[Any], Any], values: Any, key: str) -> None:
     with pytest.raises(ConfigError, match=rf"{re.escape(key)}: write auto.*\Z"):
         make(values)
+
+
+def test_a_robot_from_a_list_has_the_settings_of_its_parts() -> None:
+    robot = robot_from(robot=1, graph_domain_id=7, publish_as="/far", backfill_topics=["odom"], backfill_for_s=9)
+    assert (robot.graph.domain_id, robot.publish.as_) == (7, "/far")
+    assert (list(robot.backfill.topics), robot.backfill.for_s) == (["odom"], 9)
