@@ -874,7 +874,7 @@ def optioned(kind: str, base: Mapping[str, Any], **changed: Any) -> list[bytes]:
             topic_id = end.messages.change(0, replace(options, **changed))[1].topic_id
         if step < 200 and step % 10 == 0:
             for topic in (topic_id, 1):
-                end.messages.submit(topic, payload or b"message %3d of %d" % (step, topic) * 12, now)
+                end.messages.submit(topic, payload or b"message %3d of %d" % (step, topic) * 20, now)
         while (packet := end.next_packet(now)) is not None:
             sent.append(packet.data)
     return sent

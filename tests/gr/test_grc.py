@@ -37,7 +37,7 @@ from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.radio import Radio, make_radio
 from gr_ros2.settings.fields import settings_of
-from gr_ros2.settings.robot import GraphConfig, PublishConfig, RobotConfig
+from gr_ros2.settings.robot import BackfillConfig, GraphConfig, PublishConfig, RobotConfig
 from tests.gr.probe import Probe
 from tests.once import once
 from tests.waiting import wait_for
@@ -109,7 +109,7 @@ def test_every_parameter_is_handed_over_and_every_callback_exists(name: str) -> 
 
 def test_ros_link_has_the_settings_of_a_robot_and_hands_them_over() -> None:
     loaded = description("ros2_link")
-    parts = {"graph": GraphConfig, "publish": PublishConfig}
+    parts = {"graph": GraphConfig, "publish": PublishConfig, "backfill": BackfillConfig}
     wanted = {setting.name for setting in settings_of(RobotConfig)} - set(parts)
     wanted |= {f"{part}_{setting.name}" for part, cls in parts.items() for setting in settings_of(cls)}
     offered = [parameter["id"] for parameter in loaded["parameters"]]
