@@ -1,6 +1,7 @@
 """A medium in real time that passes packets on as they are: for PHYs without samples, on the wall clock.
 
-Invariant: a packet leaves when its airtime is over and its path has delayed it, in this order, never earlier.
+Invariant: a packet leaves when its airtime is over, its path has delayed it and all robots have started, in this order,
+never earlier.
 """
 
 from __future__ import annotations
@@ -64,6 +65,8 @@ class PassedOn(LiveMedium):
                 self._changed.notify_all()
 
     def _pass_on(self) -> None:
+        if self._thread.ident is None:
+            return  # robots that have not started yet would get nothing
         given: dict[int, list[AirPacket]] = {}
         for reception in self.medium.receptions(self.now):
             given.setdefault(reception.receiver, []).append(reception.packet)
