@@ -27,6 +27,7 @@ from gr_ros2.calls.backfill import Missing, read_later
 from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import BagError, GrRos2Error, WireError
 from gr_ros2.core.files import make_folder
+from gr_ros2.core.names import link_node
 from gr_ros2.link.events import Announced, Delivered, Lost, ReceiverEvent, SenderEvent
 from gr_ros2.link.key import Key
 from gr_ros2.middleware.base import Qos
@@ -176,7 +177,7 @@ class OutputBag(Closing):
         """Say in the bag what is missing in it, as rosbag2 does."""
         lost = self._given_up + Counter(self._lost.values())
         if lost and self._run is not None:
-            node = f"gr_ros2_link_{next(iter(self._run.sources), '')}"
+            node = link_node(next(iter(self._run.sources)))
             where = self._recorder.channel(f"/{node}/events/messages_lost", LOST_TYPE, Qos(depth=_DEPTH))
             self._recorder.write(where, time.time_ns(), lost_event(node, lost))
 

@@ -284,7 +284,7 @@ def _live(running: RobotLink) -> LiveRun:
         airtime=running.phy.airtime if running.phy.has_airtime else None,
         received_as=running.sink.outputs.heard.name_of,
         announced=running.sink.outputs.heard.announced,
-        alarms=running.alarms,
+        alarms=running.findings.alarms,
         clocks=running.clocks,
         wishes=running.wishes if running.calls is not None else None,
         calls=running.calls,

@@ -32,6 +32,11 @@ _LONGEST_ID = 255
 _FOREIGN = re.compile(r"[^A-Za-z0-9_/]")
 
 
+def link_node(robot: int) -> str:
+    """The node name of a robot's link."""
+    return f"gr_ros2_link_{robot}"
+
+
 def first(names: Iterable[str]) -> list[str]:
     """The first names of many, for a message; then how many more there are."""
     found = list(names)

@@ -18,13 +18,13 @@ from math import inf
 from typing import Any
 
 from gr_ros2.calls.backfill import PIECE, Later, MessagesForLater, write_later
+from gr_ros2.gr.bulk_topic import add_bulk_topic
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.link.events import Accepted, Refused, SenderEvent, SentPacket
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.key import Key
-from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import BACKFILL_TYPE
 from gr_ros2.settings.robot import BackfillConfig, RobotConfig
@@ -62,12 +62,9 @@ class Backfill:
         self._tried, self._pause_s = -inf, 0.0
         self._starts: dict[int, int] = {}
         """The newest start of each robot that was heard."""
-        options = SendOptions(qos="bulk", queue="fifo", queue_depth=2 * WAITING, reliability="reliable")
-        messages = endpoint.messages
-        self._topic_id = messages.add([("_backfill", BACKFILL_TYPE, options)])[-1].topic_id
-        used: Any = endpoint.used_air  # leaves topics out that are made to fit, as pictures are
-        used.leave_out(self._topic_id)
-        messages.offer(self._topic_id, offered=True)
+        self._topic_id = add_bulk_topic(
+            endpoint, "_backfill", BACKFILL_TYPE, waiting=2 * WAITING, reliability="reliable"
+        )
 
     def note(self, event: SenderEvent) -> None:
         """An event of the sending half."""

@@ -35,7 +35,7 @@ from gr_ros2.link.events import Gone, Met
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceClient, ServiceGraph, ServiceServer
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import BACKFILL_TYPE, CALLS_TYPE, FILLER_TYPE, Topic
+from gr_ros2.settings.registry import CALLS_TYPE, FILLER_TYPE, INTERNAL_TYPES, Topic
 
 DEADLINE_S = 30.0
 """s that a call waits for its reply, unless ``deadline_s`` of its service says otherwise."""
@@ -107,7 +107,7 @@ class LiveCalls:
                 self._receive(event)
             elif type_name == FILLER_TYPE:
                 self.on_filler(event.src_id, event.payload)
-            return type_name in (CALLS_TYPE, FILLER_TYPE, BACKFILL_TYPE)
+            return type_name in INTERNAL_TYPES
         return False
 
     def learn(self, src_id: int, topics: Sequence[Topic]) -> None:

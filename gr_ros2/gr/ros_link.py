@@ -17,6 +17,7 @@ from typing import Any
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.core.names import link_node
 from gr_ros2.gr.backfill import LiveBackfill
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.factory import Start, make_endpoint, start_of
@@ -190,7 +191,7 @@ class RosLink(LinkBlock):
         sending = self.end = LiveEnd(lambda events: make(observer=events, calls=calls))
         if loops_back:
             self.end = LiveEnd(lambda events: make(observer=events, loops_back=True))
-        graph, self._leave = joined(self, middleware, config.graph, f"gr_ros2_link_{config.robot_id}")
+        graph, self._leave = joined(self, middleware, config.graph, link_node(config.robot_id))
         published = heard.with_options(config.publish.topics, announced=True)
         try:
             self.source = LinkSendingBlock(config, topics, sending, graph, backpressure=backpressure, **common)

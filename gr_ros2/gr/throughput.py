@@ -35,11 +35,11 @@ from gr_ros2.calls.throughput_frames import (
     write_measured,
 )
 from gr_ros2.core.errors import ConfigError, GrRos2Error, WireError
+from gr_ros2.gr.bulk_topic import add_bulk_topic
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.receiving import ReceivingBlock
 from gr_ros2.link.endpoint import OpenEndpoint
-from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import FILLER_TYPE
 from gr_ros2.settings.robot import RobotConfig
 
@@ -341,13 +341,10 @@ class LiveThroughput:
 
     def _announce(self) -> int:
         """Tell the other robots of the topic of these messages; returns its number."""
-        options = SendOptions(qos="bulk", queue="fifo", queue_depth=WAITING, reliability="best_effort")
         with self._end.lock:
-            messages = self._end.endpoint.messages
-            self._topic_id = messages.add([("_filler", FILLER_TYPE, options)])[-1].topic_id
-            used: Any = self._end.endpoint.used_air  # leaves topics out that are made to fit, as pictures are
-            used.leave_out(self._topic_id)
-            messages.offer(self._topic_id, offered=True)
+            self._topic_id = add_bulk_topic(
+                self._end.endpoint, "_filler", FILLER_TYPE, waiting=WAITING, reliability="best_effort"
+            )
             self._end.wake()
         return self._topic_id
 

@@ -292,6 +292,9 @@ class AirMeter(Protocol):
     def cost(self, size: float) -> float:
         """bytes that a message of so many bytes takes."""
 
+    def leave_out(self, topic_id: int) -> None:
+        """A topic is made to fit what others leave: what it uses does not count as used."""
+
 
 class Endpoint(PacketSide, Protocol):
     """An end, the same for every version of the wire format."""

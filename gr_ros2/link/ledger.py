@@ -24,6 +24,11 @@ class SenderLedger:
         self._observer = observer
         self.serial = 0
 
+    @property
+    def observed(self) -> bool:
+        """Whether somebody is told, who wants to know what is to come out."""
+        return self._observer is not None
+
     def new(self, topic_id: int) -> int:
         """Count a message that is submitted; returns its serial."""
         self._stats.submitted[topic_id] += 1

@@ -358,10 +358,6 @@ class RobotLink(Flowgraph):
             )
         return self._ros.link.throughput
 
-    def alarms(self) -> list[str]:
-        """See :meth:`LinkFindings.alarms`."""
-        return self.findings.alarms()
-
     def clocks(self) -> dict[int, ClockOffset]:
         """What is known of the clocks of the robots that are heard."""
         heard = peers(self.end, self._clock())

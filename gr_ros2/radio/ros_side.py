@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.names import link_node
 from gr_ros2.gr.ros_link import LinkBlock
 from gr_ros2.link.access import Access
 from gr_ros2.link.air import Air
@@ -56,7 +57,7 @@ class RosSide:
         front_end = min(front_ends, key=lambda each: each.airtime())
         loops_back = any(each.loops_back for each in front_ends)
         self._medium, self._front_end = config.medium, front_end
-        self.node_name = f"gr_ros2_link_{config.robot_id}"
+        self.node_name = link_node(config.robot_id)
         """The node name that ``ros2 node list`` shows."""
         self.shares = config.medium != "exclusive"
         """Whether other robots send on its channel."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from math import inf
 from typing import TYPE_CHECKING
 
-from gr_ros2.core.names import INFRASTRUCTURE
+from gr_ros2.core.names import INFRASTRUCTURE, link_node
 from gr_ros2.middleware import TopicInfo
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def shortcut(names: Iterable[str], own: int, heard: Iterable[int]) -> str | None
     others = sorted({int(match[1]) for match in found} - {own})
     if not others:
         return None
-    nodes = ", ".join(f"gr_ros2_link_{robot}" for robot in others)
+    nodes = ", ".join(map(link_node, others))
     also = ", which is heard by radio too" if set(others) & set(heard) else ""
     return (
         f"{nodes} is on this robot's ROS graph{also}: something other than the radio connects the robots, such as a "

@@ -40,7 +40,7 @@ FILLER_TYPE = "gr_ros2/throughput/Filler"
 """Type of the row that fills the air while the link is measured (:mod:`gr_ros2.gr.throughput`); no topic has it."""
 BACKFILL_TYPE = "gr_ros2/backfill/Message"
 """Type of the row in which gaps are filled (:mod:`gr_ros2.gr.backfill`); no topic has it."""
-_INTERNAL = (CALLS_TYPE, FILLER_TYPE, BACKFILL_TYPE)
+INTERNAL_TYPES = (CALLS_TYPE, FILLER_TYPE, BACKFILL_TYPE)
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:msg/)?([A-Za-z][A-Za-z0-9_]*)")
 _FEEDBACK = re.compile(r"[A-Za-z][A-Za-z0-9_]*/action/[A-Za-z][A-Za-z0-9]*_FeedbackMessage")
@@ -143,7 +143,7 @@ class Topic:
     @property
     def is_topic(self) -> bool:
         """Whether this row names a topic: neither a service, nor a row of this link's own."""
-        return self.type_name not in _INTERNAL and not self.is_service
+        return self.type_name not in INTERNAL_TYPES and not self.is_service
 
 
 NewTopic = tuple[str, str, SendOptions]
@@ -320,7 +320,7 @@ def announced(told: AnnouncedTopic, options: Mapping[str, PublishOptions]) -> To
     """
     if fault := topic_fault(told.name if told.name.startswith("/") else f"/{told.name}"):
         raise ConfigError(f"malformed topic name {told.name!r}: {fault}")
-    special = told.type_name in _INTERNAL or is_service(told.type_name)
+    special = told.type_name in INTERNAL_TYPES or is_service(told.type_name)
     offered = build(
         SendOptions, {"durability": "transient_local" if told.latched else "volatile", "depth": told.depth or AUTO}
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from gr_ros2.core.names import link_node
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
 from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.link.lateness import Lateness
@@ -256,6 +257,6 @@ class LiveRobots:
     def _graph(self, robot: RobotConfig, stack: ExitStack) -> Middleware:
         """The participant of a robot on its ROS graph, or the recording that its messages come from."""
         if not robot.sends or (path := self._scenario.bag_path) is None:
-            return stack.enter_context(join(robot.graph, f"gr_ros2_link_{robot.robot_id}"))
+            return stack.enter_context(join(robot.graph, link_node(robot.robot_id)))
         recorded_names(self._scenario, self._registry)  # raises if the recording has nothing for this link
         return stack.enter_context(BagMiddleware(path=path, speed=self._scenario.bag_speed))

@@ -103,7 +103,6 @@ class Outbox:
         self._room = room
         self._codec = codec
         self.ledger = SenderLedger(self.stats, observer)
-        self._observed = observer is not None
         self.asks: Counter[int] = Counter()
         self._kept_frames: dict[tuple[int, int], tuple[int, bytes]] = {}
         """Serial and bytes of the newest frame of each chain of a latched topic, which may be sent again."""
@@ -188,7 +187,7 @@ class Outbox:
         return None if self._codec is None or len(payload) < LARGE else self._coded(self._codec, topic_id, payload)
 
     def _coded(self, codec: MessageCodec, topic_id: int, payload: bytes) -> CodedMessage:
-        expected = codec.canonical(topic_id, payload) if self._observed else None
+        expected = codec.canonical(topic_id, payload) if self.ledger.observed else None
         return CodedMessage(topic_id, payload, codec.encode(topic_id, payload), expected)
 
     def submit(

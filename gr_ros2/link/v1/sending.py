@@ -167,15 +167,15 @@ class SendingSide:
             reports.add(filling.parts, room - filling.used, due, now)
         filling.parts += told
         lifetimes = () if spare else filling.lifetimes
-        if self._audiences is None:
-            return self._writer.source(filling.parts, lifetimes, filling.qos, filling.sent, now)
         if parts and filling.robots is None and any(lifetime.in_order for lifetime in lifetimes):
             filling.parts.append(self._window.packets.left_out(now))
-        skipped = self._audiences.skipped(filling.robots)
+        robots, audiences = filling.robots, self._audiences
+        skipped = 0 if audiences is None else audiences.skipped(robots)
         sent = self._writer.source(
-            filling.parts, lifetimes, filling.qos, filling.sent, now, robots=filling.robots, skipped=skipped
+            filling.parts, lifetimes, filling.qos, filling.sent, now, robots=robots, skipped=skipped
         )
-        self._audiences.sent(filling.robots, sent.mcs, now)
+        if audiences is not None:
+            audiences.sent(robots, sent.mcs, now)
         return sent
 
     def _parts(self) -> bool:
