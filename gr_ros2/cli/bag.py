@@ -8,8 +8,7 @@ What fills gaps of an outage (:mod:`gr_ros2.gr.backfill`) stands among the rest,
 said in the bag, in the way of rosbag2 on `events/messages_lost` of the link's node: messages of which a part has come,
 and those that their sender has given up.
 
-Invariants: the link never waits for the disk; what the disk cannot take is counted and said. A bag of a link that was
-killed has all but what was written last.
+Invariants: the link never waits for the disk; what the disk cannot take is counted and said.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.storage_mcap import (
     ChunkInfo,
@@ -175,8 +174,8 @@ class TwoTimes(McapWriter):
         self.chunk.bio.seek(0, os.SEEK_END)
         super().close_chunk()
 
-
-class BagWriter(Writer):
-    """rosbags' writer, with :class:`TwoTimes` for MCAP."""
-
-    STORAGE_PLUGINS = {**Writer.STORAGE_PLUGINS, StoragePlugin.MCAP: TwoTimes}  # noqa: RUF012
+    def flush(self) -> None:
+        """Write what has come so far into the file, as rosbags does after a megabyte."""
+        if self.chunk.bio.tell():
+            self.close_chunk()
+        self.bio.flush()

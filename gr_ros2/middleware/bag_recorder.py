@@ -2,35 +2,53 @@
 
 Invariants: one thread owns the file (sqlite3 requires it), so that publishing waits for the disk, or drops and counts a
 message, only when ``BACKLOG`` messages are waiting; after an error nothing more is written, further messages are
-counted, and every call raises the error.
+counted, and every call raises the error; a message is in the file ``UNWRITTEN_S`` after it came, if the disk keeps up,
+whatever becomes of this program then.
 """
 
 from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from functools import partial
+from math import inf
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.interfaces import Qos as Profile
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError
 from gr_ros2.middleware.bag_files import RecordedTopic, explained
-from gr_ros2.middleware.bag_mcap import BagWriter, TwoTimes
+from gr_ros2.middleware.bag_mcap import TwoTimes
+from gr_ros2.middleware.bag_sqlite import CommittedSqlite
 from gr_ros2.middleware.base import Qos
 from gr_ros2.middleware.type_definitions import Definition, definition, recorded_definition
 
 BACKLOG = 10_000
 """Messages that may wait for the disk before publishing blocks."""
+UNWRITTEN_S = 5.0
+"""s after which what has come is written into the file. Each time takes about 200 bytes of an MCAP file."""
 
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _METADATA_VERSION: Final = 8
 """Version of metadata.yaml; version 9 writes QoS in a form that Humble's rosbag2 does not read."""
 _FOREVER = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
+
+
+class _Writer(Writer):
+    """rosbags' writer, with files into which what has come so far can be written."""
+
+    STORAGE_PLUGINS = {StoragePlugin.MCAP: TwoTimes, StoragePlugin.SQLITE3: CommittedSqlite}  # noqa: RUF012
+
+    def flush(self) -> None:
+        """Write what has come so far."""
+        if isinstance(self.storage, TwoTimes | CommittedSqlite):
+            self.storage.flush()
 
 
 class BagChannel(NamedTuple):
@@ -84,7 +102,7 @@ class BagRecorder:
         self._definitions = dict(definitions)
         self._count = count
         self._lossless = lossless
-        self._writer = BagWriter(path, version=_METADATA_VERSION, storage_plugin=_STORAGES[storage])
+        self._writer = _Writer(path, version=_METADATA_VERSION, storage_plugin=_STORAGES[storage])
         # rosbag2 of Humble expects a mapping here, and rosbags writes none where nothing is set.
         self._writer.set_custom_data("recorded_by", "gr_ros2")
         self._channels: dict[tuple[str, tuple[Profile, ...]], BagChannel] = {}
@@ -177,33 +195,49 @@ class BagRecorder:
         return job.result.result()
 
     def _run(self) -> None:
-        while (request := self._queue.get()) is not None:
+        due = inf
+        while (request := self._next(due)) is not None:
             if isinstance(request, _Message):
                 self._write(request)
-                continue
-            try:
-                with explained(self.path, "written"):
-                    request.result.set_result(request.work())
-            except BagError as error:
-                request.result.set_exception(error)
+                due = min(due, time.monotonic() + UNWRITTEN_S)
+            elif isinstance(request, _Job):
+                try:
+                    with explained(self.path, "written"):
+                        request.result.set_result(request.work())
+                except BagError as error:
+                    request.result.set_exception(error)
+            if due <= time.monotonic():
+                due = inf
+                if self.error is None:
+                    self._attempt(self._writer.flush)
+        if self._writer.storage is not None:
+            self._attempt(self._writer.close)
+
+    def _next(self, due: float) -> _Message | _Job | Literal[False] | None:
+        """What is to be done next; False where nothing was until some time, in s."""
         try:
-            if self._writer.storage is not None:
-                with explained(self.path, "written"):
-                    self._writer.close()
+            return self._queue.get(timeout=None if due == inf else max(due - time.monotonic(), 0.0))
+        except queue.Empty:
+            return False
+
+    def _attempt(self, work: Callable[[], None]) -> None:
+        """Do something with the file; after its first error nothing more is written."""
+        try:
+            with explained(self.path, "written"):
+                work()
         except BagError as error:
             self.error = self.error or error
 
     def _write(self, message: _Message) -> None:
         if self.error is None:
-            try:
-                with explained(self.path, "written"):
-                    if isinstance(self._writer.storage, TwoTimes):
-                        self._writer.storage.sent_ns = message.sent_ns
-                    self._writer.write(message.channel.connection, message.stamp_ns, message.payload)
-                return
-            except BagError as error:
-                self.error = error
-        self._count(f"not_recorded:{message.channel.topic}", str(self.error))
+            self._attempt(partial(self._write_now, message))
+        if self.error is not None:
+            self._count(f"not_recorded:{message.channel.topic}", str(self.error))
+
+    def _write_now(self, message: _Message) -> None:
+        if isinstance(self._writer.storage, TwoTimes):
+            self._writer.storage.sent_ns = message.sent_ns
+        self._writer.write(message.channel.connection, message.stamp_ns, message.payload)
 
 
 def _profile(qos: Qos) -> Profile:

@@ -1,4 +1,4 @@
-"""The sqlite3 files of ROS 2 bags, in all versions of their schema, and also after a crash.
+"""The sqlite3 files of ROS 2 bags, read in all versions of their schema, and also after a crash.
 
 Invariants: reading changes nothing, neither the file nor its folder; the files that SQLite keeps next to the database
 (the write-ahead log of a writer that never closed) belong to it, and a database is refused where they cannot be used.
@@ -15,12 +15,20 @@ from urllib.parse import quote
 import apsw
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag2.metadata import parse_qos
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader, Sqlite3Writer
 
 from gr_ros2.core.errors import BagError
 
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 """By rosbag2's name; other names, such as its ``unknown``, mean that there is no definition."""
+
+
+class CommittedSqlite(Sqlite3Writer):
+    """rosbags' sqlite3 file, of which what has come so far can be kept."""
+
+    def flush(self) -> None:
+        """Write what has come so far into the file; rosbags does so at its end alone."""
+        self.conn.commit()
 
 
 class SqliteStorage(Sqlite3Reader):

@@ -275,6 +275,31 @@ def test_one_that_may_lose_messages_never_waits_for_the_disk(tmp_path: Path, mon
     assert len(list(read_bag(tmp_path / "out"))) == 10 - missing
 
 
+@both_storages
+def test_what_came_is_in_the_file_soon_whatever_becomes_of_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, storage: Storage
+) -> None:
+    monkeypatch.setattr(bag_recorder, "UNWRITTEN_S", 0.01)
+    recorder = BagRecorder(tmp_path / "out", storage, {}, lambda *_: None)
+    chat = recorder.channel("/chat", STRING, Qos())
+    came: list[bytes] = []
+
+    def is_there() -> bool:
+        shutil.rmtree(tmp_path / "killed", ignore_errors=True)
+        try:
+            killed = shutil.copytree(tmp_path / "out", tmp_path / "killed")
+            return [each.payload for each in read_bag(killed)] == came
+        except (BagError, shutil.Error):  # nothing is there yet, or it is just being written
+            return False
+
+    for number in range(3):
+        came.append(string(str(number)))
+        recorder.write(chat, number, came[-1])
+        wait_for(is_there, "the message in the file")
+    recorder.close()
+    assert [each.payload for each in read_bag(tmp_path / "out")] == came
+
+
 def test_equal_qos_is_parsed_once_whatever_the_number_of_topics(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
