@@ -36,6 +36,8 @@ _REQUEST_S = 2.0
 _PAUSE_S = 0.1
 _WAIT_S = 10.0
 """s that a client waits for the answer. The program draws its dashboard before it answers."""
+_OF_OTHERS = ("run/user/*/gr-ros2-*/*.sock", "run/gr-ros2/*/gr-ros2-*/*.sock")
+"""Where the programs of other users listen, and services (``gr-ros2@.service``); root alone can look there."""
 
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
@@ -72,9 +74,12 @@ class ControlSocket:
         self._thread = threading.Thread(target=self._serve, name="gr-ros2-control", daemon=True)
 
     def __enter__(self) -> ControlSocket:
-        self._path.unlink(missing_ok=True)
-        self._socket.bind(str(self._path))
+        # A client takes a socket that does not listen for that of a killed program, and removes it.
+        starting = self._path.with_suffix(".starting")
+        starting.unlink(missing_ok=True)
+        self._socket.bind(str(starting))
         self._socket.listen()
+        starting.replace(self._path)
         self._socket.setblocking(False)
         self._selector.register(self._socket, selectors.EVENT_READ)
         self._thread.start()
@@ -177,14 +182,19 @@ class _Client:
         self.line = b""
 
 
+def sockets() -> dict[int, Path]:
+    """The sockets of the programs that this user may ask, by process id: of its own ones, and for root of all users."""
+    others = [path for pattern in _OF_OTHERS for path in Path("/").glob(pattern)] if os.geteuid() == 0 else []
+    running = [path for path in others if Path("/proc", path.stem).exists()]
+    return {int(path.stem): path for path in [*running, *sorted(folder().glob("*.sock"))] if path.stem.isdecimal()}
+
+
 def running_programs() -> dict[int, str]:
-    """Names of this user's running programs, by process id."""
+    """Names of the running programs that this user may ask, by process id."""
     found = {}
-    for path in sorted(folder().glob("*.sock")):
+    for pid, path in sockets().items():
         try:
-            found[int(path.stem)] = str(_ask(path, {}).get("name", "?"))
-        except (ConnectionRefusedError, FileNotFoundError):
-            path.unlink(missing_ok=True)
+            found[pid] = str(_ask(path, {}).get("name", "?"))
         except (OSError, ValueError):
             continue
     return found
@@ -196,7 +206,7 @@ def request(pid: int, query: Mapping[str, Any]) -> Mapping[str, Any]:
     :raises RunError: when the program has ended, does not answer, or refuses
     """
     try:
-        reply = _ask(folder() / f"{pid}.sock", query)
+        reply = _ask(sockets().get(pid, folder() / f"{pid}.sock"), query)
     except (OSError, ValueError) as error:
         raise RunError(f"process {pid}: does not answer ({error}); has it ended?") from error
     if "error" in reply:
@@ -242,6 +252,11 @@ def _ask(path: Path, query: Mapping[str, Any]) -> Mapping[str, Any]:
     deadline = time.monotonic() + _WAIT_S
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.settimeout(_WAIT_S)
-        client.connect(str(path))
+        try:
+            client.connect(str(path))
+        except ConnectionRefusedError:  # it was killed
+            if path.parent == folder():
+                path.unlink(missing_ok=True)
+            raise
         client.sendall(json.dumps(query).encode() + b"\n")
         return parse(receive(client, _ANSWER, deadline, b"\n"))

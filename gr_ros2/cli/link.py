@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -236,7 +237,11 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
         return running.throughput.look()
 
     return {
-        STATUS: lambda _: {**running.stats(), "findings": running.findings.lines()},
+        STATUS: lambda _: {
+            **running.stats(),
+            "findings": running.findings.lines(),
+            "limits": asdict(running.config.diagnostics),
+        },
         PING: ping,
         SET: change,
         OFFERS: offers,

@@ -47,6 +47,7 @@ COMMANDS: Commands = {
     "run": ("gr_ros2_lab.cli.run:run", "One experiment: a built-in scenario or a YAML file."),
     "link": ("gr_ros2.cli.link:link", "One robot's end of a link, live: its ROS topics to the air and back."),
     "status": ("gr_ros2.cli.status:status", "What a running link does: who is heard, what crosses, what is dropped."),
+    "top": ("gr_ros2.cli.top:top", "All links that run on this machine, side by side, live."),
     "peers": ("gr_ros2.cli.status:peers", "The robots that a running link hears."),
     "set": ("gr_ros2.cli.status:set_live", "Change a setting of a running link, such as whom a topic is for."),
     "ping": ("gr_ros2.cli.ping:ping", "Ask another robot over the link: round trip, loss, SNR, clocks."),

@@ -21,6 +21,7 @@ from gr_ros2.settings.files import parse_override
 
 STATUS, PING, SET, OFFERS, WANT, MEASURE = "status", "ping", "set", "offers", "want", "measure"
 """Questions to the control socket of a link."""
+NO_LINK = "no link of yours runs; start one with gr-ros2 link"
 _EVERY_S = 0.5
 
 Stats = Mapping[str, Any]
@@ -83,8 +84,8 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
         clock = peer["clock"]
         table.add_row(
             str(peer["robot"]),
-            _peer_state(peer),
-            _seconds(peer["heard_s"]),
+            peer_state(peer),
+            in_seconds(peer["heard_s"]),
             "" if peer["snr_db"] is None else f"{peer['snr_db']:.1f} dB",
             f"{peer['lost']} ({peer['loss']:.1%} lately)",
             str(peer["topics"]),
@@ -94,7 +95,8 @@ def peer_table(peers: list[Mapping[str, Any]]) -> Table | str:
     return table
 
 
-def _peer_state(peer: Mapping[str, Any]) -> str:
+def peer_state(peer: Mapping[str, Any]) -> str:
+    """Whether a robot is heard, in a word or two."""
     if peer["doubled"]:
         return "two robots"
     if peer["silent"]:
@@ -109,8 +111,8 @@ def _topic_table(stats: Stats) -> Table | str:
         table.add_row(f"→ {name}", str(topic["sent"]), "", "", str(topic["queued"]), _reasons(lost))
     for name, topic in stats["sink"]["topics"].items():
         recent = topic["recent_latency_s"]
-        latency = "" if recent is None else _seconds(recent["p50"])
-        age = "" if topic["age_s"] is None else _seconds(topic["age_s"])
+        latency = "" if recent is None else in_seconds(recent["p50"])
+        age = "" if topic["age_s"] is None else in_seconds(topic["age_s"])
         table.add_row(f"← {name}", str(topic["delivered"]), age, latency, "", _reasons(topic["lost"]))
     return table if table.row_count else "no topics yet"
 
@@ -164,7 +166,8 @@ def _reasons(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
 
 
-def _seconds(value: float) -> str:
+def in_seconds(value: float) -> str:
+    """A duration with its unit."""
     return f"{value:.1f} s" if abs(value) >= 1 else f"{value * 1e3:.0f} ms"
 
 
@@ -179,7 +182,7 @@ def find_link(pid: int | None) -> int:
         return pid
     running = running_programs()
     if not running:
-        raise RunError("no link of yours runs; start one with gr-ros2 link")
+        raise RunError(NO_LINK)
     if len(running) > 1:
         several = ", ".join(f"{pid} ({name})" for pid, name in running.items())
         raise ConfigError(f"several run: {several}; say which with --pid")

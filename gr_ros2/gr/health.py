@@ -78,11 +78,27 @@ class Status:
             self.problems.append(f"{count - before} {what}")
 
 
+class Recent(NamedTuple):
+    """A link's figures over the last ``WINDOW_S``, or since it was judged first.
+
+    :ivar sent, received: packets/s
+    :ivar air: share of the time for which it sends, 0..1; of several radios, that of the busiest
+    :ivar delivered: share of the messages that came, 0..1; None where none was due
+    """
+
+    sent: float
+    received: float
+    air: float
+    delivered: float | None
+
+
 class _Snapshot(NamedTuple):
-    """The relevant counters at one moment. For each topic: messages delivered and messages lost."""
+    """The relevant counters at one moment. For each topic: messages delivered and messages lost; for each radio: s of
+    airtime sent."""
 
     now: float
     sent: int
+    airtimes: tuple[float, ...]
     received: int
     missing: int
     rejected: int
@@ -137,6 +153,22 @@ class LinkHealth:
         receiver.warn("messages not published", snapshot.unpublished, 0 if first else before.unpublished)
         transmitter.warn("messages lost on the ROS graph", snapshot.lost_on_graph, 0 if first else before.lost_on_graph)
         return [receiver, transmitter, *front_end, *self._radios(stats), *topics]
+
+    def recent(self) -> Recent:
+        """The figures between the snapshots judged."""
+        before, snapshot = self._snapshots[0], self._snapshots[-1]
+        delivered, lost = (
+            max(
+                sum(topic[part] for topic in snapshot.topics.values()) - sum(t[part] for t in before.topics.values()), 0
+            )
+            for part in (0, 1)
+        )
+        return Recent(
+            sent=_rate(snapshot.sent - before.sent, before, snapshot),
+            received=_rate(snapshot.received - before.received, before, snapshot),
+            air=_air(before, snapshot),
+            delivered=delivered / (delivered + lost) if delivered + lost else None,
+        )
 
     def _watch(self) -> Watch:
         return Watch(2 * self._config.period_s)
@@ -199,7 +231,7 @@ class LinkHealth:
         rate = _rate(snapshot.sent - before.sent, before, snapshot)
         status.judge("packets sent", rate, "1/s", 0)
         status.values["airtime of a packet (s)"] = f"{stats['phy']['airtime_s']:.3g}"
-        status.values["airtime used"] = f"{min(1.0, rate * stats['phy']['airtime_s']):.3g}"
+        status.values["airtime used"] = f"{_air(before, snapshot):.3g}"
         account = stats["airtime"]
         if not account["transmits"]:
             status.level = max(status.level, Level.WARN)
@@ -282,6 +314,7 @@ def _snapshot(stats: Stats, now: float) -> _Snapshot:
     return _Snapshot(
         now=now,
         sent=stats["packets"]["out"],
+        airtimes=tuple(radio["airtime"]["sent_s"] for radio in stats.get("radios", {"": stats}).values()),
         received=sink["packets"],
         missing=sink["packet_loss_est"],
         rejected=rejected,
@@ -296,5 +329,11 @@ def _snapshot(stats: Stats, now: float) -> _Snapshot:
     )
 
 
-def _rate(count: int, before: _Snapshot, snapshot: _Snapshot) -> float:
+def _air(before: _Snapshot, snapshot: _Snapshot) -> float:
+    """Share of the time for which the busiest radio sent. One that was opened again counts from 0 on."""
+    used = max(new - old if new >= old else new for new, old in zip(snapshot.airtimes, before.airtimes, strict=True))
+    return min(_rate(used, before, snapshot), 1.0)
+
+
+def _rate(count: float, before: _Snapshot, snapshot: _Snapshot) -> float:
     return count / (snapshot.now - before.now) if snapshot.now > before.now else 0.0

@@ -199,6 +199,7 @@ class Outputs:
             "src_id": key[0],
             "topic_id": key[1],
             "type": topic.type_name,
+            "latched": topic.latched,
             "delivered": output.published,
             "lost": {reason: count for (*whose, reason), count in lost.items() if tuple(whose) == key},
             "latency_s": None,

@@ -70,6 +70,7 @@ ONLY_PARSED = {
         for words in (
             "status",
             "peers",
+            "top",
             "ping 2",
             "ping 2 robot.yaml",
             "set topics.goal.to=7",

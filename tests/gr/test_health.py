@@ -131,11 +131,37 @@ def test_topics_are_judged_each() -> None:
 def test_the_transmitter_tells_airtime_queues_and_drops() -> None:
     health = make()
     parts(health, 0.0)
-    _, transmitter, _ = parts(health, 2.0, out=100, queued=9, depth=10)
+    _, transmitter, _ = parts(health, 2.0, out=100, queued=9, depth=10, airtime={"sent_s": 1.0})
     assert transmitter.level is Level.WARN
     assert transmitter.message == "fullest queue 0.9"
     assert transmitter.values["airtime used"] == "0.5"
     assert transmitter.values["messages dropped: stale"] == "3"
+
+
+def test_figures_of_the_last_seconds() -> None:
+    health = make()
+    parts(health, 0.0, out=5, packets=7, delivered=3, lost=3)
+    assert health.recent() == (0.0, 0.0, 0.0, None)
+    parts(health, 2.0, out=25, packets=17, delivered=9, lost=5, airtime={"sent_s": 0.5})
+    assert health.recent() == (10.0, 5.0, 0.25, 0.75)
+
+
+def test_of_several_radios_the_busiest_counts_also_one_that_was_opened_again() -> None:
+    health = make()
+
+    def judge(now: float, near_s: float, far_s: float) -> float:
+        shared = stats()
+        radio = {"present": True, "carries": True, "heard": {}, "sent": 0, "copied": 0, "skipped": 0, "came": 0}
+        shared["radios"] = {
+            name: {**radio, "copies": 0, "airtime": {"sent_s": sent_s}}
+            for name, sent_s in (("near", near_s), ("far", far_s))
+        }
+        health.judge(shared, now)
+        return health.recent().air
+
+    assert judge(0.0, 3.0, 5.0) == 0.0
+    assert judge(2.0, 3.5, 6.0) == 0.5
+    assert judge(4.0, 0.4, 6.0) == 0.25
 
 
 @pytest.mark.parametrize("queue", [{"depth": 0}, {"depth": 1, "queue": "latest"}])
