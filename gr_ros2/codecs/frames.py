@@ -304,8 +304,9 @@ class FrameSender:
     def next(self, now: float) -> Job | None:
         """A message that is to be encoded now. ``done`` has to follow."""
         for topic_id, sent in self._sent.items():
+            asks, reports = self._frames.asks(topic_id), self._frames.reports
             for number, chain in list(sent.chains.items()):
-                if not chain.pull.waits(now):
+                if not chain.pull.waits(now, asks, reports):
                     continue
                 share = sent.weight / sum(
                     other.weight for other in self._sent.values() if other is sent or other.lives(now)

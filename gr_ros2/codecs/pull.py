@@ -77,25 +77,19 @@ class StatePull:
         self._newest, self._came = message, now
         return superseded
 
-    def waits(self, now: float) -> bool:
-        """Whether a message may be coded now, if somebody needs it."""
-        return self._newest is not None and not self._coding and now >= self._taken + self.period_s
+    def waits(self, now: float, asks: int, reports: bool) -> bool:
+        """Whether a message is to be coded as soon as the air allows it: somebody needs it."""
+        if asks != self._asks:
+            self._key, self._asks = True, asks
+        needed = self._new or self._key or (not reports and now >= self._taken + REPEAT_S)
+        return needed and self._newest is not None and not self._coding and now >= self._taken + self.period_s
 
     def pull(self, now: float, progress: FrameState, share: float = 1.0) -> Pull | None:
-        """The message to be coded now, None if there is none yet. ``done`` has to follow."""
+        """The message to be coded now, if it ``waits``; None if there is none yet. ``done`` has to follow."""
         rate = progress.rate * share
-        if (
-            self._newest is None
-            or not self.waits(now)
-            or progress.waiting > (rate * self._coding_s if rate < inf else 0)
-        ):
+        if self._newest is None or progress.waiting > (rate * self._coding_s if rate < inf else 0):
             return None
-        if progress.asks != self._asks:
-            self._key, self._asks = True, progress.asks
-        alone = not progress.reports
-        if not (self._new or self._key or (alone and now >= self._taken + REPEAT_S)):
-            return None
-        request = Pull(self._newest, self._came, None, self._key or alone)
+        request = Pull(self._newest, self._came, None, self._key or not progress.reports)
         self._new = self._key = False
         self._coding, self._taken, self._pulled = True, now, self._newest
         return request
@@ -145,7 +139,7 @@ class FramePull:
         self._newest, self._came = message, now
         return superseded
 
-    def waits(self, now: float) -> bool:
+    def waits(self, now: float, _asks: int = 0, _reports: bool = True) -> bool:
         """Whether a message waits that may be coded now, if the air and the receivers allow it."""
         opens = self._taken + self.period_s - self._period / 2
         return self._newest is not None and not self._coding and now >= opens

@@ -31,7 +31,6 @@ class FrameState(NamedTuple):
         reports, until it had left
     :param joined: how often a robot that may report has come, or has come back, or has asked for a key frame
     :param reports: whether any robot reports
-    :param asks: how often a robot has asked for the topic, within what is answered
     """
 
     rate: float
@@ -42,7 +41,6 @@ class FrameState(NamedTuple):
     age: float
     joined: int
     reports: bool
-    asks: int = 0
 
 
 class FrameSide(Protocol):
@@ -62,8 +60,15 @@ class FrameSide(Protocol):
     def end(self, topic_id: int) -> None:
         """No frame of a topic follows, and those that have left are of no more use."""
 
+    def asks(self, topic_id: int) -> int:
+        """How often a robot has asked for the topic, within what is answered."""
+
+    @property
+    def reports(self) -> bool:
+        """Whether any robot reports."""
+
     def progress(self, topic_id: int, now: float) -> FrameState:
-        """How it stands."""
+        """How it stands. It is work: what waits and what is confirmed is looked through."""
 
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool, chain: int = 0) -> bool:
         """Send a frame. Returns whether it is sent: one that is longer than a message may be is not.

@@ -91,16 +91,24 @@ class SentFrames:
         while sent:
             sent.popleft().lifetime.end()
 
+    def asks(self, topic_id: int) -> int:
+        """How often a robot has asked for the topic, within what is answered."""
+        return self._outlet.asks[topic_id]
+
+    @property
+    def reports(self) -> bool:
+        """Whether any robot reports."""
+        return bool(self._peers)
+
     def progress(self, topic_id: int, now: float) -> FrameState:
         """How it stands."""
         queue = self._topics[topic_id].queue
         waiting = sum(message.remaining for message in queue)
         lags = self._lags(topic_id, now)
         silent = bool(lags) and not any(self._heard(peer, now) for peer in self._reporting)
-        asks, age = self._outlet.asks[topic_id], self._ages[topic_id]
-        joined = self._peers.joined + asks
+        joined = self._peers.joined + self.asks(topic_id)
         lacked, behind = min(lags, default=0.0), max(lags, default=0.0)
-        return FrameState(self._free(now), waiting, lacked, behind, silent, age, joined, bool(self._peers), asks)
+        return FrameState(self._free(now), waiting, lacked, behind, silent, self._ages[topic_id], joined, self.reports)
 
     def submit(self, topic_id: int, frame: bytes, came: float, now: float, *, key: bool, chain: int = 0) -> bool:
         """Send a frame; False where it is too large. A key frame ends those that somebody has long lacked."""
