@@ -27,7 +27,8 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import BackendName, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.ping import check
-from gr_ros2.cli.status import MEASURE, OFFERS, PING, SET, STATUS, WANT, airtime_words, tables
+from gr_ros2.cli.spectrum import LONGEST_S
+from gr_ros2.cli.status import LISTEN, MEASURE, OFFERS, PING, SET, STATUS, WANT, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.guard import Guard
@@ -205,6 +206,13 @@ class _Measure:
     for_s: int = 10
 
 
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class _Listen:
+    """s for which the link is silent and listens; without, what has come of it."""
+
+    for_s: Annotated[float, Field(gt=0, le=LONGEST_S, allow_inf_nan=False)] | None = None
+
+
 def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
     """What clients may ask a running link, by the names of :mod:`gr_ros2.cli.status`."""
     from gr_ros2.radio.live_settings import LiveSettings
@@ -236,6 +244,12 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
             running.throughput.measure(asked.robot, asked.for_s)
         return running.throughput.look()
 
+    def listen(asks: Any) -> dict[str, Any]:
+        asked = build(_Listen, asks, LISTEN)
+        if asked.for_s is not None:
+            running.listening.measure(asked.for_s)
+        return running.listening.look()
+
     return {
         STATUS: lambda _: {
             **running.stats(),
@@ -247,6 +261,7 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
         OFFERS: offers,
         WANT: want,
         MEASURE: measure,
+        LISTEN: listen,
     }
 
 

@@ -53,6 +53,7 @@ COMMANDS: Commands = {
     "ping": ("gr_ros2.cli.ping:ping", "Ask another robot over the link: round trip, loss, SNR, clocks."),
     "topics": ("gr_ros2.cli.wishes:topics", "What another robot would send if somebody asked: rates and bytes."),
     "throughput": ("gr_ros2.cli.throughput:throughput", "What the link carries each way beside the topics that run."),
+    "spectrum": ("gr_ros2.cli.spectrum:spectrum", "What the front end hears while nothing is sent: where it is busy."),
     "want": ("gr_ros2.cli.wishes:want", "Ask another robot to send a topic for a while, or give it up."),
     "sound": ("gr_ros2.cli.sound:sound", "Sound cards as radios: devices, levels, echoes, and what fits."),
     "medium": ("gr_ros2_lab.cli.medium:medium", "One simulated channel for several links with front end zmq."),

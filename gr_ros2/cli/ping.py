@@ -50,12 +50,15 @@ def without_topics(settings: LinkConfig) -> LinkConfig:
 
 
 @contextmanager
-def opened(settings: LinkConfig) -> Iterator[RobotLink]:
-    """A link that runs without topics."""
+def opened(settings: LinkConfig, *, instrumented: bool = False) -> Iterator[RobotLink]:
+    """A link that runs without topics.
+
+    :param instrumented: see :class:`RobotLink`
+    """
     with uninterrupted():
         from gr_ros2.radio.robot_link import RobotLink
 
-    link = RobotLink(without_topics(settings))
+    link = RobotLink(without_topics(settings), instrumented=instrumented)
     try:
         link.start()
         yield link

@@ -19,7 +19,7 @@ from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.settings.files import parse_override
 
-STATUS, PING, SET, OFFERS, WANT, MEASURE = "status", "ping", "set", "offers", "want", "measure"
+STATUS, PING, SET, OFFERS, WANT, MEASURE, LISTEN = "status", "ping", "set", "offers", "want", "measure", "listen"
 """Questions to the control socket of a link."""
 NO_LINK = "no link of yours runs; start one with gr-ros2 link"
 _EVERY_S = 0.5

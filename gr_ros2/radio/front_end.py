@@ -73,6 +73,8 @@ class FrontEnd(ABC):
     """Whether bursts may have different lengths. If not, all bursts and packets are as long as the longest."""
     carries_packets: ClassVar[bool] = False
     """Whether it carries packets and not samples, because the device behind it modulates them itself."""
+    hears_always: ClassVar[bool] = True
+    """Whether its samples, where it has some, are those of all the time, and not of bursts alone."""
     may_return: ClassVar[bool] = False
     """Whether a device that has vanished can be opened again in this process."""
     find_with: ClassVar[str] = ""

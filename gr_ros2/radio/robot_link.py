@@ -39,6 +39,7 @@ from gr_ros2.radio.mismatch import Mismatch
 from gr_ros2.radio.one_radio import OneRadio, together
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.ros_side import RosSide
+from gr_ros2.radio.spectrum import Listening
 from gr_ros2.radio.switch import TransmitSwitch
 from gr_ros2.radio.wish_service import WishService
 from gr_ros2.settings.registry import Registry
@@ -98,6 +99,9 @@ class RobotLink(Flowgraph):
                 )
                 for number, own in enumerate(config.own_radios)
             ]
+            self.listening = Listening(self.radios)
+            """What is on the air while it is silent; of an instrumented link."""
+            self._stack.callback(self.listening.close)
             self._open(middleware, self._observers if observer is not None else None, block)
         except BaseException:
             self._stack.close()
@@ -246,6 +250,7 @@ class RobotLink(Flowgraph):
 
         :raises ConfigError: where it only receives
         """
+        self.listening.overruled()
         for one in self.radios:
             one.radio.transmit(on=on)
         _log.warning("link %s: sending is %s", self.config.name, "on" if on else "off")

@@ -18,6 +18,7 @@ class SimFrontEnd(FrontEnd):
 
     name = "sim"
     loops_back = True
+    hears_always = False
     timing_error_s = 0.005
     any_length = True
 

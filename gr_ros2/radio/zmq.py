@@ -157,6 +157,7 @@ class ZmqFrontEnd(FrontEnd):
     """Bursts published to other processes, and those of others."""
 
     name = "zmq"
+    hears_always = False
     Options = ZmqOptions
     timing_error_s = 0.005
     any_length = True

@@ -65,7 +65,10 @@ def goes_on(robot: Robot) -> None:
         ({SET: [["topic\nx\x1b[1m", 7]]}, r"topic x\\x1b\[1m cannot change"),
         ({SET: [["topics.a\nb.to", 7]]}, r"topics: 'a\\nb' '\\n' may not stand in a ROS name"),
         ({"p\nong": 7}, "p ong: no question here"),
-        ({"pong": 7}, "pong: no question here; known are address, measure, offers, ping, port, set, status, want"),
+        (
+            {"pong": 7},
+            "pong: no question here; known are address, listen, measure, offers, ping, port, set, status, want",
+        ),
         ({"address": "127.0.0.1", "port": 70000}, "dashboard: port = 70000: .* 65535"),
         ({"address": "127.0.0.1"}, "dashboard: port"),
     ],

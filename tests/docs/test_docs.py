@@ -76,6 +76,10 @@ ONLY_PARSED = {
             "set topics.goal.to=7",
         )
     },
+    **{
+        ("docs/how-to/radios.md", f"gr-ros2 spectrum{config}"): "needs a USRP; tests/cli/test_spectrum.py"
+        for config in ("", " robot.yaml")
+    },
     ("docs/how-to/radios.md", "gr-ros2 throughput 2"): "needs two running links; tests/e2e/test_throughput.py",
     **{
         ("docs/how-to/radios.md", f"gr-ros2 link --robot {own} --radio zmq --listen 5551 --peer 10.0.0.{other}:5551"): (

@@ -52,9 +52,11 @@ class Robot:
         front_end: dict[str, Any],
         hears: tuple[int, ...] = (),
         observer: LinkObserver | None = None,
+        *,
+        instrumented: bool = False,
         **values: Any,
     ) -> None:
-        self.link = RobotLink(config(number, front_end, **values), observer=observer)
+        self.link = RobotLink(config(number, front_end, **values), observer=observer, instrumented=instrumented)
         self.heard: list[bytes] = []
         self._graph = MemoryMiddleware(domain_id=domain(number))
         self._chat = self._graph.advertise(f"/robot_{number}/chat", CUSTOM, QOS)
