@@ -1,9 +1,8 @@
-"""Every row of docs/reference/parameters.md has an effect, or is refused where it has none.
+"""Every row of docs/reference/parameters.md has an effect.
 
-``EFFECTS`` has an entry for every row: an experiment whose outcome the setting changes; the test elsewhere that shows
-its effect, where that takes processes, real time or a module that few machines have; or settings of a scenario that
-refuses it. A row without an entry fails, and so does an entry whose two outcomes are equal, and one whose test is not
-there or does not name the setting.
+``EFFECTS`` has an entry for every row: an experiment whose outcome the setting changes; or the test elsewhere that
+shows its effect, where that takes processes, real time or a module that few machines have. A row without an entry
+fails, and so does an entry whose two outcomes are equal, and one whose test is not there or does not name the setting.
 """
 
 from __future__ import annotations
@@ -163,10 +162,6 @@ class Elsewhere(str):
     """The test that shows the effect of the setting, ``file::function`` below this folder; it names the setting."""
 
 
-class Refused(tuple[str, ...]):
-    """Settings of a scenario that takes the setting nowhere, since it has no effect in one."""
-
-
 def differs(experiment: Callable[..., Any], *beside: str, **changed: Any) -> Outcomes:
     """The outcome of an experiment without and with a change."""
     return lambda: (experiment(*beside), experiment(*beside, **changed))
@@ -204,10 +199,10 @@ DRIVE = (
 )
 BURSTS = "channel.burst_loss={{p_good_to_bad: 0.1, p_bad_to_good: 0.3{}}}"
 
-EFFECTS: dict[Row, Outcomes | Elsewhere | Refused] = {}
+EFFECTS: dict[Row, Outcomes | Elsewhere] = {}
 
 
-def effects(section: str, **entries: Outcomes | Elsewhere | Refused) -> None:
+def effects(section: str, **entries: Outcomes | Elsewhere) -> None:
     """Add the entries of a section."""
     EFFECTS.update({(section, name): entry for name, entry in entries.items()})
 
@@ -220,7 +215,6 @@ effects(
     deadline_s=run(OPTION + "scan.deadline_s=0.2"),
     weight=run(OPTION + "odom.weight=1"),
     max_rate=run(OPTION + "odom.max_rate=5"),
-    max_age_s=run(OPTION + "odom.max_age_s=2", "key=fleet.key"),
     codec=run(OPTION + "odom.codec=zstd"),
     to=run(OPTION + "odom.to=3"),
     keep_s=Elsewhere("link/v1/test_latest_state.py::test_keep_s_says_how_long_a_robot_out_of_range_can_still_get_it"),
@@ -693,16 +687,15 @@ effects(
 
 def test_every_row_of_the_page_has_an_entry() -> None:
     found = list(rows())
-    assert len(found) > 250
+    assert len(found) > 200
     assert [row for row in found if row not in EFFECTS] == [], "a new setting needs an experiment that shows its effect"
     assert [row for row in EFFECTS if row not in found] == []
 
 
-def of_kind(*kinds: type[Any]) -> list[Row]:
-    return [row for row, entry in EFFECTS.items() if isinstance(entry, kinds)]
+ELSEWHERE = [row for row, entry in EFFECTS.items() if isinstance(entry, Elsewhere)]
 
 
-@pytest.mark.parametrize("row", of_kind(Elsewhere), ids=": ".join)
+@pytest.mark.parametrize("row", ELSEWHERE, ids=": ".join)
 def test_a_test_elsewhere_shows_the_effect_of_the_setting(row: Row) -> None:
     file, _, name = str(EFFECTS[row]).partition("::")
     assert name in (sources := sources_in(file)), f"{file} has no {name}"
@@ -722,18 +715,10 @@ def sources_in(file: str) -> dict[str, str]:
     }
 
 
-@pytest.mark.parametrize("row", of_kind(Refused), ids=": ".join)
-def test_a_setting_that_has_no_effect_is_refused(row: Row) -> None:
-    entry = EFFECTS[row]
-    assert isinstance(entry, Refused)
-    with pytest.raises(ConfigError, match=rf"{row[1]} = .*leave it out"):
-        load_scenario("six-topics-paced", entry)
-
-
-@pytest.mark.parametrize("row", [row for row in EFFECTS if row not in of_kind(Elsewhere, Refused)], ids=": ".join)
+@pytest.mark.parametrize("row", [row for row in EFFECTS if row not in ELSEWHERE], ids=": ".join)
 def test_a_setting_has_an_effect(row: Row) -> None:
     entry = EFFECTS[row]
-    assert not isinstance(entry, Elsewhere | Refused)
+    assert not isinstance(entry, Elsewhere)
     without, with_it = entry()
     assert without != with_it
 
@@ -766,7 +751,7 @@ def other(setting: Setting) -> Any:
 
 OF_LINKS = [
     *("key", "seal", "state", "services", "commands", "beacon_s", "repair", "expected_loss", "hold_s", "max_age_s"),
-    *(f"topics.odom.{name}" for name in ("queue", "deadline_s", "weight", "max_rate", "max_age_s", "keep_s", "to")),
+    *(f"topics.odom.{name}" for name in ("queue", "deadline_s", "weight", "max_rate", "keep_s", "to")),
     *("topics.odom.instance", "topics.odom.camera", "topics.odom.depth_image"),
     *("publish.topics.odom.deadline_s", "publish.topics.odom.max_age_s", "compression", "offer"),
 ]

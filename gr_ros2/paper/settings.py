@@ -24,7 +24,6 @@ _OF_TOPICS = (
     "deadline_s",
     "weight",
     "max_rate",
-    "max_age_s",
     "keep_s",
     "to",
     "instance",

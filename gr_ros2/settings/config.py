@@ -219,8 +219,6 @@ class SendOptions:
     """what a second of this topic's age counts beside other topics, 0.001..1000"""
     max_rate: Annotated[float, Field(ge=0, le=1_000_000, allow_inf_nan=False)] = 0.0
     """messages/s at most, the newest unless `queue` is set; 0 unlimited"""
-    max_age_s: Annotated[Seconds | Auto, Field(title="Oldest sealed message (s)")] = AUTO
-    """auto = as the receiver has it, 0 = any time; above 0 every receiver takes its own"""
     keep_s: Seconds = 0.0
     """s for which robots that lack its newest message get it, though not transient-local (an e-stop, a mode). Commands
     are never kept"""

@@ -201,7 +201,7 @@ class RobotConfig:
     """readable log of headers, topic ids and entries"""
     conditions: ClassVar[tuple[ActsWhere, ...]] = (
         ActsWhere(
-            ("seal", "max_age_s", "topics.*.max_age_s", "offer.*.max_age_s", "publish.topics.*.max_age_s"),
+            ("seal", "max_age_s", "publish.topics.*.max_age_s"),
             lambda robot: bool(robot.key),
             "nothing is sealed without a key; set key, or leave it out",
         ),

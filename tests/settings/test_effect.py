@@ -132,8 +132,6 @@ for cls in (ScenarioRobot, LinkConfig):
     for name, given in (
         ("seal", {"seal": "authenticate"}),
         ("max_age_s", {"max_age_s": 5.0}),
-        ("topics.*.max_age_s", {"topics": {"odom": {"max_age_s": 5.0}}}),
-        ("offer.*.max_age_s", {"offer": {"odom": {"max_age_s": 5.0}}}),
         ("publish.topics.*.max_age_s", {"publish": {"topics": {"odom": {"max_age_s": 5.0}}}}),
     ):
         IDLE[cls, name] = (given, {}, {"key": "fleet.key"}, "set key")

@@ -107,8 +107,6 @@ class SentTopic:
         reliable = self.publishers.reliable if options.reliability == AUTO else options.reliability == "reliable"
         self.in_order = self.coded or (reliable and (self.queue.policy != "latest" or self.shared))
         self.fresh = self.queue.deadline_s > 0 or self.topic.type_name == CALLS_TYPE
-        if options.max_age_s != AUTO:
-            self.fresh = options.max_age_s > 0
         self.limit_s = min(self.queue.deadline_s or inf, MAX_AGE_S if self.fresh else inf)
 
     @property
