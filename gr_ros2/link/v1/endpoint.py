@@ -39,7 +39,7 @@ from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import Keys
 from gr_ros2.link.v1.sending import SendingSide
 from gr_ros2.link.v1.used_air import UsedAir
-from gr_ros2.link.v1.writer import PacketWriter, room_of
+from gr_ros2.link.v1.writer import PacketWriter, SendSlot, room_of
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import TAG_LEN
@@ -280,11 +280,12 @@ class EndpointV1:
         self._now = now if now > self._now else self._now
         if not self.answers or not self.pace.may_leave(now):
             return None
-        if self._access is not None and not self._may_begin(self._access, now):
+        slot = SendSlot(now) if self._access is None else self._slot(self._access, now)
+        if slot is None:
             return None
-        sent = self._sending.packet(now)
-        if sent is None and self._writer.block:
-            sent = self._writer.control(self._sending.tells(now), "report", now)  # who sends nothing in a slot loses it
+        sent = self._sending.packet(slot)
+        if sent is None and slot.block:
+            sent = self._writer.control(self._sending.tells(now), "report", slot)  # who sends nothing in one loses it
         if sent is None:
             return None
         self.pace.left(now, waiting=True)
@@ -292,16 +293,15 @@ class EndpointV1:
             self.used_air.left(sent, now)
         return sent
 
-    def _may_begin(self, access: Access, now: float) -> bool:
-        """Whether a packet is to be composed now; says when it begins, and takes the block that it carries."""
+    def _slot(self, access: Access, now: float) -> SendSlot | None:
+        """The slot for which a packet is to be composed now; None where it is too early for one."""
         begins = access.departure(now)
         if now < begins - access.lead_s - _EARLY_S:
-            return False
+            return None
         relaying = self._receiving.relaying
         block = access.block(1 if relaying is None else relaying.gains.weight, fills=self.frames.fill(now))
         self._sending.hellos.named = access.named
-        self._writer.block, self._writer.leave_at = block or b"", max(begins, now)
-        return block is not None
+        return None if block is None else SendSlot(now, max(begins, now), block)
 
     def next_departure(self, *, credited: bool = False) -> float | None:
         if (self.pace.out_of_credit and not credited) or not self.answers:

@@ -16,7 +16,7 @@ from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.packing import Packing
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sent_packets import Sent
-from gr_ros2.link.v1.writer import PacketWriter
+from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 
 PATIENCE_S = 0.2
 """s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
@@ -70,12 +70,12 @@ class RepairSlots:
         """A report has come."""
         self._calm_since = -inf
 
-    def first(self, now: float, packing: Packing) -> SentPacket | None:
+    def first(self, slot: SendSlot, packing: Packing) -> SentPacket | None:
         """What goes before new messages: what a receiver lacks or waits for in vain, so that later messages wait.
 
         :param packing: knows which messages wait
         """
-        newest = self._window.packets.newest
+        now, newest = slot.now, self._window.packets.newest
         if not self._window.pressing:
             return None
         if not packing.urgent:
@@ -97,18 +97,19 @@ class RepairSlots:
             if again is not None:
                 self._ahead -= waiting
                 self._repaired = newest
-                return self._writer.repair(again, now, self._lacking(again))
+                return self._writer.repair(again, slot, self._lacking(again))
         if given_up < 0:
             return None
         self._repaired = newest
-        return self._tell(given_up, now)
+        return self._tell(given_up, slot)
 
-    def spare(self, now: float) -> SentPacket | None:
+    def spare(self, slot: SendSlot) -> SentPacket | None:
         """What a slot carries that nothing else needs."""
+        now = slot.now
         if self._window.peers.in_vain and (given_up := self._window.peers.given_up(now)) >= 0:
-            return self._tell(given_up, now)
+            return self._tell(given_up, slot)
         self._waits_until = -inf
-        if self._audiences is not None and (late := self._late(self._audiences, now)) is not None:
+        if self._audiences is not None and (late := self._late(self._audiences, slot)) is not None:
             return late
         chosen = self._window.next(now, self.held)
         held = self._waits_until > now
@@ -116,9 +117,9 @@ class RepairSlots:
         self._calm_number = self._window.packets.newest
         if chosen is not None:
             self._hold.repaired(waiting=held)
-            return self._writer.repair(chosen, now, self._lacking(chosen))
+            return self._writer.repair(chosen, slot, self._lacking(chosen))
         lifetimes = () if held else self._window.exhausted(now)
-        return self._writer.source([], lifetimes, 0, (), now) if lifetimes else None
+        return self._writer.source([], lifetimes, 0, (), slot) if lifetimes else None
 
     def next(self, now: float, *, waiting: bool = False) -> float:
         """When ``spare`` may have something, s; inf for never.
@@ -132,17 +133,17 @@ class RepairSlots:
             return inf
         return max(self._waits_until, now if mode == "idle" else self._next_look(now))
 
-    def _late(self, audiences: Audiences, now: float) -> SentPacket | None:
+    def _late(self, audiences: Audiences, slot: SendSlot) -> SentPacket | None:
         """What was sent too fast for some, sent as they hear it."""
-        record = audiences.due(now)
-        if record is None or self.held(now):
+        record = audiences.due(slot.now)
+        if record is None or self.held(slot.now):
             return None
         peers = self._window.peers
         robots = [src_id for src_id, peer in peers.all.items() if record.skipped & peer.bit]
         audiences.sent_again(record, robots)
         self._hold.repaired(waiting=False)
-        again = self._window.complete(record, now)
-        return None if again is None else self._writer.repair(again, now, robots)
+        again = self._window.complete(record, slot.now)
+        return None if again is None else self._writer.repair(again, slot, robots)
 
     def _lacking(self, chosen: Sent | Repair) -> list[int] | None:
         """Those who lack a packet that is sent again as it was, where not all packets are for all; None for all."""
@@ -150,16 +151,16 @@ class RepairSlots:
             return None
         return self._window.peers.lacking(chosen) or None
 
-    def _tell(self, number: int, now: float) -> SentPacket | None:
+    def _tell(self, number: int, slot: SendSlot) -> SentPacket | None:
         """Say that a packet is not repaired any more."""
         if (packets := self._window.packets).parts:
-            told = packets.left_out(now, number)
+            told = packets.left_out(slot.now, number)
             self._window.peers.announced(packets.told_of)
-            return self._writer.control([told], "repair", now)
-        repair = self._window.tell(number, now)
+            return self._writer.control([told], "repair", slot)
+        repair = self._window.tell(number, slot.now)
         if repair is not None:
-            return self._writer.repair(repair, now)
-        return None if self._window.packets.unconfirmed(now) else self._writer.control([], "repair", now)
+            return self._writer.repair(repair, slot)
+        return None if self._window.packets.unconfirmed(slot.now) else self._writer.control([], "repair", slot)
 
     def _next_look(self, now: float) -> float:
         """When a thrifty sender may want to repair something."""

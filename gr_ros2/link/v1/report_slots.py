@@ -10,7 +10,7 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.requests import Requests
-from gr_ros2.link.v1.writer import PacketWriter
+from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 from gr_ros2.wire.control import MAP, REPORT_LEN
 from gr_ros2.wire.v1 import EntryV1
 
@@ -106,24 +106,24 @@ class ReportSlots:
         entries += self.requests.entries(free, now)
         self._unasked = (self._unasked + 1) * self.requests.crowded
 
-    def packet(self, due: Iterable[Reporter], now: float) -> SentPacket | None:
+    def packet(self, due: Iterable[Reporter], slot: SendSlot) -> SentPacket | None:
         """A packet with reports, and with requests where there is room; None if there are none."""
         entries: list[EntryV1] = []
         free = self._writer.room
         for report in due:
             if free >= report.size:
                 free -= report.size
-                entries.append(report.make(now))
-        entries += self.requests.entries(free, now)
+                entries.append(report.make(slot.now))
+        entries += self.requests.entries(free, slot.now)
         self._unheard = self._unasked = 0
-        return self._writer.control(entries, "report", now) if entries else None
+        return self._writer.control(entries, "report", slot) if entries else None
 
-    def asks(self, now: float) -> SentPacket | None:
+    def asks(self, slot: SendSlot) -> SentPacket | None:
         """A packet with requests, if there are any."""
-        asks = self.requests.entries(self._writer.room, now)
-        return self._writer.control(asks, "hello", now) if asks else None
+        asks = self.requests.entries(self._writer.room, slot.now)
+        return self._writer.control(asks, "hello", slot) if asks else None
 
-    def early(self, now: float) -> SentPacket | None:
+    def early(self, slot: SendSlot) -> SentPacket | None:
         """A packet with reports that help though they are not due, if there are any."""
         early = [report for n in self._neighbours if (report := n.inbox.reports).helps]
-        return self.packet(early, now) if early else None
+        return self.packet(early, slot) if early else None

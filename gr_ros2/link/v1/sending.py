@@ -37,7 +37,7 @@ from gr_ros2.link.v1.repair_slots import RepairSlots
 from gr_ros2.link.v1.report_slots import LENGTH_LEN, ReportSlots
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.slowness import Slowness
-from gr_ros2.link.v1.writer import PacketWriter
+from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 from gr_ros2.relay.gain import TOLD
 from gr_ros2.wire.control import LEFT_OUT_LEN, NEWEST_LEN, Heard, Hello, Newest, Report, length_of
 from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC
@@ -105,10 +105,11 @@ class SendingSide:
         self._repeats = 1
         self._beacon_at = self._table_at = -inf
 
-    def packet(self, now: float) -> SentPacket | None:
+    def packet(self, slot: SendSlot) -> SentPacket | None:
         """The next packet, None if there is nothing to send."""
+        now = slot.now
         if self.settings.beacon_s and self._alone(now):
-            return self._beacon(now)
+            return self._beacon(slot)
         self.urgent = False
         if not self._started:
             self._start(now)
@@ -116,40 +117,40 @@ class SendingSide:
         if now >= hellos.due:
             idle = packing.next_timeout(now) > now
             if hellos.urgent(now, idle=idle, latency=packing.urgent, heard=bool(self._window.peers)):
-                return self._hello(now)
+                return self._hello(slot)
         if now >= self.pings.due:
             snrs_db = {n.src_id: n.inbox.reports.snr.snr_db for n in self._neighbours.all.values()}
-            return self._writer.control(self.pings.entries(self._writer.room, snrs_db, now), "hello", now)
+            return self._writer.control(self.pings.entries(self._writer.room, snrs_db, now), "hello", slot)
         if now >= self._repeat_at:
             self._repeat(now)
         if messages.sent.deadlines:
             messages.expire(now, self._pace.sure_interval(now))
         due = reports.due(now, last=packing.awaits_row)
-        if reports.overdue and (told := reports.packet(due, now)) is not None:
+        if reports.overdue and (told := reports.packet(due, slot)) is not None:
             return told
-        if (repair := self.repairs.first(now, packing)) is not None:
+        if (repair := self.repairs.first(slot, packing)) is not None:
             return repair
         if self._relaying is not None:
-            leaves = now if self._writer.leave_at is None else max(now, self._writer.leave_at)
+            leaves = now if slot.leave_at is None else slot.leave_at
             self._relaying.sent_on.offer(messages.sent, now, leaves)
             self._relaying.custody.offer(now, leaves)
-        if (sent := self._fill(due, now)) is not None:
+        if (sent := self._fill(due, slot)) is not None:
             return sent
         if now >= hellos.due:  # it let messages go first, and none of them is worth sending any more
-            return self._hello(now)
+            return self._hello(slot)
         if due:
-            return reports.packet(due, now)
-        asks = reports.asks(now) if now >= reports.requests.check_at else None
-        return asks or self.repairs.spare(now) or self._rows(now) or reports.early(now)
+            return reports.packet(due, slot)
+        asks = reports.asks(slot) if now >= reports.requests.check_at else None
+        return asks or self.repairs.spare(slot) or self._rows(slot) or reports.early(slot)
 
-    def _rows(self, now: float) -> SentPacket | None:
+    def _rows(self, slot: SendSlot) -> SentPacket | None:
         """Rows of the table in a packet that nothing else needs."""
-        wait = not self._messages.packing.fills or self.repairs.held(now, repairs=False)
-        return None if wait else self._fill([], now, spare=True)
+        wait = not self._messages.packing.fills or self.repairs.held(slot.now, repairs=False)
+        return None if wait else self._fill([], slot, spare=True)
 
-    def _fill(self, due: list[Reporter], now: float, *, spare: bool = False) -> SentPacket | None:
+    def _fill(self, due: list[Reporter], slot: SendSlot, *, spare: bool = False) -> SentPacket | None:
         """A packet with messages."""
-        reports, room = self.reports, self._writer.room
+        now, reports, room = slot.now, self.reports, self._writer.room
         told: list[Newest] = []
         if self._relaying is not None:
             told = self._relaying.tells(now)
@@ -172,7 +173,7 @@ class SendingSide:
         robots, audiences = filling.robots, self._audiences
         skipped = 0 if audiences is None else audiences.skipped(robots)
         sent = self._writer.source(
-            filling.parts, lifetimes, filling.qos, filling.sent, now, robots=robots, skipped=skipped
+            filling.parts, lifetimes, filling.qos, filling.sent, slot, robots=robots, skipped=skipped
         )
         if audiences is not None:
             audiences.sent(robots, sent.mcs, now)
@@ -303,13 +304,13 @@ class SendingSide:
         """Whether nobody has been heard for so long that only beacons leave."""
         return 0 < self.settings.beacon_s <= now - self._heard_at
 
-    def _beacon(self, now: float) -> SentPacket | None:
+    def _beacon(self, slot: SendSlot) -> SentPacket | None:
         """What leaves while nobody is heard for long."""
-        self._messages.expire(now, self._pace.sure_interval(now))
-        if now < self._beacon_at:
+        self._messages.expire(slot.now, self._pace.sure_interval(slot.now))
+        if slot.now < self._beacon_at:
             return None
-        self._beacon_at = now + self.settings.beacon_s
-        return self._hello(now)
+        self._beacon_at = slot.now + self.settings.beacon_s
+        return self._hello(slot)
 
     def _start(self, now: float) -> None:
         self._started = True
@@ -330,13 +331,13 @@ class SendingSide:
         if not self._window.peers:
             self._messages.kept.announce(now)
 
-    def _hello(self, now: float) -> SentPacket:
-        window, kept, newest = self._window, self._messages.kept, self._window.packets.newest
+    def _hello(self, slot: SendSlot) -> SentPacket:
+        now, window, kept, newest = slot.now, self._window, self._messages.kept, self._window.packets.newest
         again = newest == self._hello_number and not self.hellos.starting
         if again and not window.peers and self._writer.sealed:
             self._hello_number = -1
             # A receiver that restarts takes nothing below the number that it had stored.
-            return self._writer.source([], (), 0, (), now)
+            return self._writer.source([], (), 0, (), slot)
         self._hello_number = newest
         said = self._messages.stats.sent.total()
         self.hellos.talks, self._said = said > self._said, said
@@ -346,10 +347,10 @@ class SendingSide:
             self._table_at = now + kept.table_packets * self._pace.interval / TABLE_SHARE
             kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
-        sent = self._writer.control(entries, "hello", now, clear=isinstance(entries[0], Hello))
+        sent = self._writer.control(entries, "hello", slot, clear=isinstance(entries[0], Hello))
         proving = [entry.src_id for entry in entries if isinstance(entry, Heard)]
         starts = frozenset((src_id, self._neighbours.all[src_id].boot) for src_id in proving)
-        self._neighbours.own_hellos.said(sent.data, now, starts, self._writer.leave_at)
+        self._neighbours.own_hellos.said(sent.data, now, starts, slot.leave_at)
         for entry in entries:
             if isinstance(entry, Heard):
                 since, wanted = self._neighbours.since(entry.src_id)

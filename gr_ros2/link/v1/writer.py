@@ -7,6 +7,7 @@ Invariants: each number is used once for a source packet, and each repair id onc
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from typing import NamedTuple
 
 from gr_ros2.link.events import AirKind, SenderEvent, SentEntry, SentPacket
 from gr_ros2.link.rate import RateController
@@ -39,6 +40,19 @@ HOP = 1
 """Hop count of addressed packets: robots send messages on, not packets."""
 
 
+class SendSlot(NamedTuple):
+    """When a packet is composed, and when it leaves.
+
+    :param now: when it is composed, s
+    :param leave_at: s, when its burst has to begin; None for as soon as possible
+    :param block: tells others about slots, see :mod:`gr_ros2.wire.mac_block`; empty where the channel is not shared
+    """
+
+    now: float
+    leave_at: float | None = None
+    block: bytes = b""
+
+
 class PacketWriter:
     """Writes the packets of one robot.
 
@@ -49,8 +63,6 @@ class PacketWriter:
     :param hold: is told of new packets
     :param observer: called with every packet
     :param shares: packets carry blocks for medium access
-    :ivar block: that of the next packet
-    :ivar leave_at: s, when its burst has to begin; None for as soon as possible
     :ivar room: bytes of the longest body
     :ivar sealed: whether packets are sealed
     """
@@ -68,8 +80,6 @@ class PacketWriter:
         observer: Callable[[SenderEvent], None] | None,
         shares: bool = False,
     ) -> None:
-        self.block = b""
-        self.leave_at: float | None = None
         self._shares = shares
         self._src_id, self._boot, self._dst_id = settings.src_id, boot, settings.dst_id
         self._hop = HOP if settings.dst_id != BROADCAST else 0
@@ -93,7 +103,7 @@ class PacketWriter:
         lifetimes: tuple[Lifetime, ...],
         qos: int,
         parts: tuple[SentEntry, ...],
-        now: float,
+        slot: SendSlot,
         *,
         robots: frozenset[int] | None = None,
         skipped: int = 0,
@@ -107,23 +117,23 @@ class PacketWriter:
         """
         number = self._window.packets.newest + 1
         body = write_body(entries, self.room)
-        sent = self._close(qos, number, None, body, entries, kind="new", now=now, parts=parts, robots=robots)
-        self._window.sent(number, body, sent.data, lifetimes, now, skipped=skipped)
+        sent = self._close(qos, number, None, body, entries, kind="new", slot=slot, parts=parts, robots=robots)
+        self._window.sent(number, body, sent.data, lifetimes, slot.now, skipped=skipped)
         if lifetimes:
-            self._hold.left(now, self._window.peers.loss)
+            self._hold.left(slot.now, self._window.peers.loss)
         return sent
 
-    def control(self, entries: Sequence[EntryV1], kind: AirKind, now: float, *, clear: bool = False) -> SentPacket:
+    def control(self, entries: Sequence[EntryV1], kind: AirKind, slot: SendSlot, *, clear: bool = False) -> SentPacket:
         """Write a packet of entries that are not messages; it stands at the newest number."""
         window = self._window
         repair_id = window.packets.take_repair_id(window.packets.newest)
         if repair_id is None:
-            return self.source([], window.exhausted(now), 0, (), now)
+            return self.source([], window.exhausted(slot.now), 0, (), slot)
         body = write_body(entries, self.room)
-        fields = RepairHeader(repair_id, oldest=not window.packets.unconfirmed(now), clear=clear)
-        return self._close(QOS_REPAIR, window.packets.newest, fields, body, entries, kind=kind, now=now)
+        fields = RepairHeader(repair_id, oldest=not window.packets.unconfirmed(slot.now), clear=clear)
+        return self._close(QOS_REPAIR, window.packets.newest, fields, body, entries, kind=kind, slot=slot)
 
-    def repair(self, chosen: Sent | Repair, now: float, robots: Collection[int] | None = None) -> SentPacket:
+    def repair(self, chosen: Sent | Repair, slot: SendSlot, robots: Collection[int] | None = None) -> SentPacket:
         """Write a combination of packets, or a packet again as it was.
 
         :param robots: those who lack it; None where that is to be heard by all
@@ -131,18 +141,18 @@ class PacketWriter:
         if isinstance(chosen, Repair):
             number, mask, repair_id, oldest, combined = chosen
             fields = RepairHeader(repair_id, mask, oldest)
-            return self._close(QOS_REPAIR, number, fields, combined, (), kind="repair", now=now, robots=robots)
+            return self._close(QOS_REPAIR, number, fields, combined, (), kind="repair", slot=slot, robots=robots)
         if self._shares:  # with another block it is another packet, and needs a nonce of its own
             again = self._window.packets.take_repair_id(chosen.number)
             if again is None:
-                return self.control([], "repair", now)
+                return self.control([], "repair", slot)
             body = combine([(chosen.number, chosen.body)], again)
-            return self._close(QOS_REPAIR, chosen.number, RepairHeader(again, 1), body, (), kind="repair", now=now)
+            return self._close(QOS_REPAIR, chosen.number, RepairHeader(again, 1), body, (), kind="repair", slot=slot)
         header = read_header(chosen.data, self._packet_len)
         entries = tuple(read_body(chosen.body, self.room))
         packet = PacketV1(header, entries, encrypted=self._encrypts)
         return self._leave(
-            chosen.data, packet, chosen.number, NOT_A_REPAIR, kind="repair", now=now, parts=(), robots=robots
+            chosen.data, packet, chosen.number, NOT_A_REPAIR, kind="repair", slot=slot, parts=(), robots=robots
         )
 
     def _close(
@@ -154,12 +164,12 @@ class PacketWriter:
         entries: Sequence[EntryV1],
         *,
         kind: AirKind,
-        now: float,
+        slot: SendSlot,
         parts: tuple[SentEntry, ...] = (),
         robots: Collection[int] | None = None,
     ) -> SentPacket:
         """Pad and seal a packet, which leaves."""
-        header = Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, self._hop, self.block)
+        header = Header(qos, self.sealed, self._src_id, number & 0xFFFF, self._dst_id, self._hop, slot.block)
         clear, repair_id, combined, plain = write_header(header), NOT_A_REPAIR, b"", False
         if repair is not None:
             clear += write_repair_header(repair)
@@ -169,7 +179,7 @@ class PacketWriter:
             combined = body
         data = self._trailer.close(clear, body, number, repair_id, plain=plain)
         packet = PacketV1(header, tuple(entries), repair, combined, self._encrypts and not plain)
-        return self._leave(data, packet, number, repair_id, kind=kind, now=now, parts=parts, robots=robots)
+        return self._leave(data, packet, number, repair_id, kind=kind, slot=slot, parts=parts, robots=robots)
 
     def _leave(
         self,
@@ -179,7 +189,7 @@ class PacketWriter:
         repair_id: int,
         *,
         kind: AirKind,
-        now: float,
+        slot: SendSlot,
         parts: tuple[SentEntry, ...],
         robots: Collection[int] | None,
     ) -> SentPacket:
@@ -189,11 +199,11 @@ class PacketWriter:
         stats.packets += 1
         mcs = 0
         if self._rate is not None:
-            mcs = self._rate.sent(robots if self._dst_id == BROADCAST else self._dst_id, now)
+            mcs = self._rate.sent(robots if self._dst_id == BROADCAST else self._dst_id, slot.now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
         sent = SentPacket(
-            data, packet, self._src_id, self._boot, number, repair_id, parts, now, kind, mcs, self.leave_at
+            data, packet, self._src_id, self._boot, number, repair_id, parts, slot.now, kind, mcs, slot.leave_at
         )
         if self._observer is not None:
             self._observer(sent)

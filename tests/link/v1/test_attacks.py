@@ -15,6 +15,7 @@ from gr_ros2.link.fates import Fate
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Seal, SealMode, subkey
 from gr_ros2.link.v1.unreported import MEETING_S
+from gr_ros2.link.v1.writer import SendSlot
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.wire.control import Ask, Report
 from gr_ros2.wire.v1 import (
@@ -396,7 +397,7 @@ def test_forged_requests_take_a_share_of_the_air() -> None:
     air.run(10.0)
     sent, begin = len(of(air, one)), air.now
     while air.now < begin + 60.0:
-        ask = forger.end._sending._writer.control([Ask(1, b"\x00\x00\xf0")], "hello", air.now)
+        ask = forger.end._sending._writer.control([Ask(1, b"\x00\x00\xf0")], "hello", SendSlot(air.now))
         one.receive(ask.data, air.now)
         air.run(0.1)
     assert one.end.received.dropped["asked_too_often"] > 0

@@ -9,6 +9,7 @@ from gr_ros2.link.v1.delivery import DeliveryRules
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.link.v1.writer import SendSlot
 from gr_ros2.relay.gain import EXPIRES_S
 from gr_ros2.relay.routes import STALE_S, Routes
 from gr_ros2.wire.relayed import Relayed, write_relayed
@@ -20,7 +21,7 @@ from tests.link.v1.test_relayed_reliable import Cell, cell
 
 def repair_of(sender: Robot, number: int, now: float) -> bytes:
     """A packet of a sender once more, in a packet for repair."""
-    return sender.end._writer.repair(sender.end.window.packets.records[number], now).data
+    return sender.end._writer.repair(sender.end.window.packets.records[number], SendSlot(now)).data
 
 
 def over(one: Robot, origin: Robot, number: int, text: bytes, now: float) -> list[bytes]:
