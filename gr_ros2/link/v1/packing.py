@@ -181,8 +181,9 @@ class Packing:
     @property
     def awaits_row(self) -> bool:
         """Whether the next packet brings a row of the table that messages wait for, where turns are rare."""
-        table = self._topics.get(TABLE_TOPIC)
-        return self._slow() and table is not None and any(row.started or not self._later(row) for row in table.queue)
+        if not self._slow() or (table := self._topics.get(TABLE_TOPIC)) is None:
+            return False
+        return any(row.started or not self._later(row) for row in table.queue)
 
     @property
     def urgent(self) -> bool:

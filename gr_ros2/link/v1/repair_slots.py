@@ -75,9 +75,9 @@ class RepairSlots:
 
         :param packing: knows which messages wait
         """
-        now, newest = slot.now, self._window.packets.newest
         if not self._window.pressing:
             return None
+        now, newest = slot.now, self._window.packets.newest
         if not packing.urgent:
             self._yielded = 0
         elif self._yielded < YIELDS:
