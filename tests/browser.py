@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("selenium", reason="needs selenium")
-
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 

@@ -20,6 +20,7 @@ from gr_ros2_lab.record.result import Result
 from tests import domains
 from tests.company import pytest_runtest_makereport, pytest_runtest_protocol  # noqa: F401
 from tests.lab.record.results import RESULT
+from tests.missing import pytest_pycollect_makemodule  # noqa: F401
 from tests.outcomes import (  # noqa: F401
     pytest_addoption,
     pytest_configure,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("gnuradio")
-
 from bench import gate, port
 from bench.rows import Row
 

@@ -18,25 +18,22 @@ import fuzz.calls
 import fuzz.compression
 import fuzz.control_socket
 import fuzz.endpoint
+import fuzz.framing
 import fuzz.insider
+import fuzz.kernels
 import fuzz.loop
 import fuzz.mac
+import fuzz.medium
+import fuzz.pings
 import fuzz.receiver
 import fuzz.relay
+import fuzz.sigmf
 import fuzz.structure
 import fuzz.type_description
+import fuzz.wifi
 import fuzz.wire
 import fuzz.wire_v1
 from fuzz.loop import Harness, inputs, run, within, work
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
-import fuzz.framing
-import fuzz.kernels
-import fuzz.medium
-import fuzz.pings
-import fuzz.sigmf
-import fuzz.wifi
 
 ROOT = Path(__file__).parents[1]
 HARNESSES = {

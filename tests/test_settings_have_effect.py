@@ -22,8 +22,6 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.codecs.messages import CLOUD
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.factory import Start, make_endpoint

@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.calls.backfill import Later, Missing, write_later
 from gr_ros2.cli.bag import OutputBag
 from gr_ros2.core.errors import BagError

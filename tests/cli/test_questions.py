@@ -13,8 +13,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.cli.console import console
 from gr_ros2.cli.control_socket import folder, parse, request
 from gr_ros2.cli.dashboard import audience

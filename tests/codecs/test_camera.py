@@ -8,12 +8,9 @@ from pathlib import Path
 from shutil import which
 from typing import Any
 
+import av
 import numpy as np
 import pytest
-
-pytest.importorskip("av", reason="needs PyAV: pip install 'gr-ros2[video]'")
-
-import av
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -7,8 +7,6 @@ from contextlib import suppress
 
 import pytest
 
-pytest.importorskip("av", reason="needs PyAV: pip install 'gr-ros2[video]'")
-
 from gr_ros2.codecs import CODECS, Coded
 from gr_ros2.codecs.base import KEY_TIMES
 from gr_ros2.codecs.messages import VIDEO, read

@@ -7,9 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("av", reason="needs PyAV: pip install 'gr-ros2[video]'")
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("av", reason="needs PyAV")
-
 from gr_ros2.codecs import CodedTopic
 from gr_ros2.codecs.messages import CAMERA_INFO, GRID, IMAGE, VIDEO, read
 from gr_ros2.codecs.received_frames import MOST_BYTES_S, MOST_DECODERS, FrameReceiver

@@ -7,8 +7,6 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-
-pytest.importorskip("av", reason="needs PyAV: pip install 'gr-ros2[video]'")
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

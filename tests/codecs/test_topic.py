@@ -6,8 +6,6 @@ import sys
 
 import pytest
 
-pytest.importorskip("av", reason="needs PyAV: pip install 'gr-ros2[video]'")
-
 from gr_ros2.codecs import CODECS, CodedTopic
 from gr_ros2.codecs.messages import CLOUD, GRID, IMAGE
 from gr_ros2.core.errors import ConfigError

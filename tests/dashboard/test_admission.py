@@ -16,7 +16,6 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from bokeh.document import Document

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
-pytest.importorskip("bokeh", reason="needs Bokeh")
-
 from bokeh.events import ButtonClick
 from bokeh.models import Button, Div, InlineStyleSheet, Select, Spinner
 

@@ -16,9 +16,6 @@ from typing import Any
 import pytest
 
 pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-pytest.importorskip("selenium", reason="needs selenium")
-
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 

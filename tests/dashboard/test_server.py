@@ -11,7 +11,6 @@ from urllib.request import urlopen
 
 import pytest
 
-pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from bokeh.document import Document

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.record.result import Result, read_result
 from gr_ros2_lab.record.team import Team, read_team

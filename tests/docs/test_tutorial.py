@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2_lab.record.result import read_result
 from tests.docs.pages import blocks, commands
 from tests.docs.test_docs import here

@@ -8,10 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.observe.positions import humble_types
 from gr_ros2.state.keys import new_key_file

@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.cli import main as command
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.core.errors import ConfigError, CrcError, RunError

@@ -6,8 +6,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.calls.backfill import Later, read_later
 from gr_ros2.gr.backfill import Backfill
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent

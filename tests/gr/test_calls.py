@@ -11,8 +11,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.calls.throughput_frames import MEASURE, REPORT
 from gr_ros2.gr import RosLink
 from gr_ros2.link import AirPacket

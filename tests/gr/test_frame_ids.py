@@ -15,13 +15,9 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from gr_ros2.link import AirPacket
-from tests.packets import data_of
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.frame_ids import MAX_STATIC, TF_TYPE, FramePrefix, MergedTransforms, StaticTransforms, prefixed_frame
+from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Accepted
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
@@ -36,6 +32,7 @@ from gr_ros2.settings.robot import PublishConfig, robot_from
 from tests.domains import free_domains
 from tests.gr.ends import link
 from tests.gr.probe import Hears
+from tests.packets import data_of
 from tests.waiting import wait_for
 
 STORE = typestore()

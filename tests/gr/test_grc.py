@@ -17,9 +17,6 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import yaml
 from gnuradio import gr
 from gnuradio.grc.core.platform import Platform

@@ -8,9 +8,6 @@ from contextlib import ExitStack, closing
 from typing import Any
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gnuradio import gr
 
 from gr_ros2.link.events import Announced

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import pmt
 from hypothesis import given
 from hypothesis import strategies as st

@@ -11,13 +11,8 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import pytest
-
-from tests.packets import data_of
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import pmt
+import pytest
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError, MiddlewareError
@@ -30,6 +25,7 @@ from gr_ros2.paper.sender import Sender
 from gr_ros2.paper.settings import paper_from
 from gr_ros2.settings.registry import Registry
 from tests.gr.probe import Hears, Probe
+from tests.packets import data_of
 from tests.waiting import PATIENCE_S, wait_for
 
 REGISTRY = Registry.from_rows(

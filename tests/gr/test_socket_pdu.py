@@ -7,9 +7,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gnuradio import gr, network
 
 from gr_ros2.middleware import Qos

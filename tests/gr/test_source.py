@@ -8,11 +8,8 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import pmt
+import pytest
 from gnuradio import gr
 
 from gr_ros2.compression.link_codec import TopicCodec

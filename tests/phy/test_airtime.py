@@ -8,9 +8,6 @@ from math import inf
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy.airtime import AirtimeGate
 from gr_ros2.phy.flowgraph import Flowgraph

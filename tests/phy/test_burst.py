@@ -6,11 +6,8 @@ import random
 import zlib
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
+import pytest
 
 from gr_ros2.phy import PHY
 from gr_ros2.phy.burst import BurstReceiver, DemodulatedPacket, Frames, Samples, whitening

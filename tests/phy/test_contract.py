@@ -5,12 +5,9 @@ from __future__ import annotations
 import random
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
 import pmt
+import pytest
 from gnuradio import blocks, gr
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError

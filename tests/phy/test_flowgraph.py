@@ -7,9 +7,6 @@ import weakref
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gnuradio import blocks, gr
 
 from gr_ros2.core.errors import PhyError

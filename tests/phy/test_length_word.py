@@ -5,11 +5,8 @@ from __future__ import annotations
 import random
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
+import pytest
 
 from gr_ros2.phy import PHY
 from gr_ros2.phy.length_word import LENGTHS, LengthWord, header_bits, header_crc

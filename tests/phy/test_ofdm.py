@@ -7,11 +7,8 @@ import random
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
+import pytest
 from gnuradio import blocks, gr
 from scipy.signal import resample_poly
 

@@ -8,12 +8,9 @@ from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
 import pmt
+import pytest
 from gnuradio import gr
 from hypothesis import given
 from hypothesis import strategies as st

@@ -5,11 +5,8 @@ from __future__ import annotations
 from math import log10
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
+import pytest
 
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.burst import BurstReceiver

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
+import pytest
 
 from gr_ros2.phy.ofdm_layout import BITS, constellation
 from gr_ros2.phy.soft import BitOrder, Points, spread_about

@@ -5,11 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import pmt
+import pytest
 from gnuradio import blocks, gr
 
 from gr_ros2.link.events import AirPacket

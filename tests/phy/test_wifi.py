@@ -7,21 +7,15 @@ import sys
 import zlib
 from typing import Any
 
-import pytest
-
-from gr_ros2.link import AirPacket
-from tests.packets import data_of
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
 import pmt
+import pytest
 from gnuradio import blocks, gr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError
-from gr_ros2.link import Delivered
+from gr_ros2.link import AirPacket, Delivered
 from gr_ros2.paper.receiver import Receiver
 from gr_ros2.paper.sender import Sender
 from gr_ros2.paper.settings import paper_from
@@ -37,6 +31,7 @@ from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from tests.gr.probe import Probe
+from tests.packets import data_of
 from tests.waiting import wait_for
 
 try:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError

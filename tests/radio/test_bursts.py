@@ -6,11 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import pmt
+import pytest
 from gnuradio import blocks, gr
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -11,10 +11,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
-pytest.importorskip("av", reason="needs PyAV")
-
 from gr_ros2.codecs.messages import CAMERA_INFO, IMAGE, read
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware

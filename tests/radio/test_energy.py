@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from collections.abc import Sequence
 
+import numpy as np
+import pytest
 from gnuradio import blocks, gr
 from numpy.typing import NDArray
 

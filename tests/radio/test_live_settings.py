@@ -6,9 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError

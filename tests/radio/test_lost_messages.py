@@ -12,8 +12,6 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
 from rosbags.typesys.store import Typestore
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.middleware.memory import MemoryMiddleware

@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.radio.radio import make_radio
 from tests.radio.cables import Direwolves, SerialCable, free_ports

@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.radio import PRESETS
 from gr_ros2.radio.one_line import one_line
 from tests.radio.packet_radios import Channel, LoraUart, Radio, Sik, SlowTnc, Tnc

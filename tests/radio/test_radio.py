@@ -6,9 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gnuradio import gr
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError, PhyError, RadioError

@@ -12,8 +12,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.cli.link import status_line
 from gr_ros2.core.errors import BackendMissingError, ConfigError, RegistryError
 from gr_ros2.link import Delivered

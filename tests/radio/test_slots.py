@@ -12,9 +12,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-pytest.importorskip("zmq", reason="needs pyzmq")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.ros_link import make_link
 from gr_ros2.link.access import Access

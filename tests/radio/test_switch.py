@@ -6,8 +6,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.gr.health import Level
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware

@@ -14,8 +14,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import RadioError
 from gr_ros2.radio import robot_link
 from tests.radio.cables import free_ports

@@ -13,10 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-pytest.importorskip("zmq", reason="needs pyzmq")
-
 import zmq
 
 from gr_ros2.core.errors import ConfigError, RadioError

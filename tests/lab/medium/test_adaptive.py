@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import ReceiverEvent, SenderEvent, SentPacket
 from gr_ros2.observe.observers import RunObservers

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.phy import Phy, measure
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.settings.config import ChannelConfig

@@ -17,9 +17,6 @@ import numpy as np
 import pytest
 import yaml
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-pytest.importorskip("zmq", reason="needs pyzmq")
-
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.radio.zmq import HEADER, MAGIC, MediumClock
 from gr_ros2_lab.medium.process import MediumProcess, load_medium

@@ -13,8 +13,6 @@ from typing import Any
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-pytest.importorskip("distributed", reason="needs Dask: pip install 'gr-ros2[sweep]'")
-
 import dask
 import distributed
 

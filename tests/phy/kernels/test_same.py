@@ -9,11 +9,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
+import pytest
 
 from gr_ros2.phy.burst import BurstModem, Samples
 from gr_ros2.phy.theory import half_point
