@@ -12,7 +12,6 @@ import pytest
 from gnuradio import gr
 
 from gr_ros2.cli import main as command
-from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.paper import RosSink, RosSource
 from gr_ros2.settings.registry import Registry
@@ -210,23 +209,3 @@ def test_garbage_from_the_phy_is_counted_and_nothing_else_is_lost(version: int) 
         assert set(stats["rejected"]) <= reasons
         assert stats["rejected"]["length"] == 6
     assert stats["handler_failed"] == stats["publish_failed"] == 0
-
-
-def test_a_port_that_nobody_reads_is_said_and_counted(caplog: pytest.LogCaptureFixture) -> None:
-    domain, _ = free_domains()
-    with ExitStack() as stack:
-        robot = stack.enter_context(DdsMiddleware(domain_id=domain, node_name="robot", localhost_only=True))
-        graph = stack.enter_context(DdsMiddleware(domain_id=domain, node_name="source", localhost_only=True))
-        source = RosSource(Registry.from_rows({"chatter": STRING}), middleware=graph, robot=1, graph_namespace="")
-        stack.callback(source.close)
-        publisher = robot.advertise("/chatter", STRING, Qos("reliable", "transient_local", 100))
-        flowgraph = gr.top_block()
-        unread = Probe()
-        flowgraph.msg_connect(unread, "credit", source, "credit")
-        flowgraph.start()
-        stack.callback(flowgraph.wait)
-        stack.callback(flowgraph.stop)
-        unread.message_port_pub(pmt.intern("credit"), pmt.from_long(1))
-        publisher.publish(message(1))
-        wait_for(lambda: source.stats()["unread"] >= 1, "packets to be counted")
-    assert "nothing reads message port `pdus`; connect it" in caplog.text

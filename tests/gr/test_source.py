@@ -257,7 +257,7 @@ def test_a_port_that_nobody_reads_is_said_and_counted(rig: Rig, caplog: pytest.L
     source = rig.make()
     rig.top.msg_connect((rig.probe, "credit"), (source, "credit"))
     rig.top.start()
-    wait_for(lambda: "nothing reads" in caplog.text)
+    wait_for(lambda: "nothing reads message port `pdus`; connect it" in caplog.text)
     rig.publish(bytes(40), count=5)
     rig.probe.message_port_pub(pmt.intern("credit"), pmt.PMT_T)
     wait_for(lambda: source.stats()["unread"] > 0)

@@ -164,3 +164,30 @@ def test_what_is_on_the_graph_now_is_planned(
     (line,) = (line.split() for line in capsys.readouterr().out.splitlines() if "/robot_1/odom" in line)
     assert float(line[1]) == pytest.approx(20, rel=0.3)
     assert line[2] == "724"
+
+
+def test_a_plan_forecasts_repair_and_reports(capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        run(
+            [
+                "plan",
+                "paper-ofdm-paced",
+                "--duration",
+                "4",
+                "--no-advice",
+                "--set",
+                "robots=[{}, {topics: []}]",
+                "--set",
+                "channel.packet_loss=0.2",
+            ]
+        )
+        == 0
+    )
+    printed = capsys.readouterr().out
+    told = re.search(r"Air in use: the channel of robot 1 (\d+)% .*; the channel back (\d+)% of the time", printed)
+    assert told is not None, printed
+    new, repair = (int(re.search(rf"{kind} (\d+)%", told[0])[1]) for kind in ("new messages", "repair"))  # type: ignore[index]
+    assert new / 6 < repair < new
+    assert int(told[1]) == pytest.approx(new + repair, abs=3)
+    assert int(told[2]) > 0
+    assert re.search(r"/robot_1/odom .* (1\.00|0\.99) ", printed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.cli.main import run
 from gr_ros2.middleware.bag_files import read_bag
 from tests.lab.run.test_replay import COUNT, make_bag
+
+REPORTS, LOSS = "robots=[{}, {topics: []}]", "channel.packet_loss=0.2"
 
 
 @pytest.fixture(autouse=True)
@@ -65,3 +68,17 @@ def test_wrong_settings_of_losses_are_one_line(
     message = capsys.readouterr().err
     assert complaint in message
     assert message.count("\n") == 1
+
+
+def test_replay_repairs_what_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = make_bag(tmp_path / "in", {"/a": "std_msgs/msg/String"})
+    command = ["replay", str(source), "--scenario", "paper-ofdm-paced", "--topics", "a"]
+    assert run([*command, str(tmp_path / "out.mcap"), "--set", REPORTS, "--set", LOSS]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"the channel of robot 1 \d+% of the time \(new messages \d+%, repair \d+%", printed), printed
+    assert re.search(r"the channel back \d+% of the time \(reports \d+%", printed)
+    assert " first Topic sent try repaired " in printed
+    assert len(list(read_bag(tmp_path / "out.mcap"))) == COUNT
+    assert run([*command, str(tmp_path / "lost.mcap"), "--set", "paper={}", "--set", "topics=auto", "--set", LOSS]) == 0
+    assert "repair " not in capsys.readouterr().out
+    assert len(list(read_bag(tmp_path / "lost.mcap"))) < COUNT

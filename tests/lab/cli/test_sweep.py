@@ -113,3 +113,21 @@ def test_a_sweep_that_is_stopped_ends_and_can_be_continued(
     assert (process.returncode, errors) == (INTERRUPTED, "")
     kept = len(list(out.glob("runs/*.json")))
     assert f"stopped with {kept} of 180 runs kept in {out}; the same command goes on from there" in said
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_a_sweep_tabulates_repaired_messages_and_the_air(tmp_path: Path) -> None:
+    fixed = {"robots": [{}, {"topics": []}], "duration_s": 4}
+    path = write_sweep_file(
+        tmp_path, scenario="paper-ofdm-paced", set=fixed, grid={"channel.packet_loss": [0.0, 0.2]}, repetitions=1
+    )
+    out = tmp_path / "out"
+    assert run(["sweep", str(path), "--workers", "1", "--out", str(out)]) == 0
+    table = pa_parquet.ParquetFile(out / "sweep.parquet").read().to_pylist()
+    rows = [row for row in table if row["topic"] == "/robot_1/odom"]
+    clean, lossy = sorted(rows, key=lambda row: row["channel.packet_loss"])
+    assert clean["pdr"] == 1
+    assert lossy["pdr"] >= 0.99
+    assert clean["ledger_repaired"] == 0 < lossy["ledger_repaired"]
+    assert clean["packets_air_repair"] == 0 < lossy["packets_air_repair"]

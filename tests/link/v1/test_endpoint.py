@@ -8,7 +8,7 @@ import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import AirPacket
-from gr_ros2.link.events import Announced, Delivered, Gone, Lost, Met, Refused, SentPacket
+from gr_ros2.link.events import Announced, Delivered, Lost, Met, Refused, SentPacket
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.receiving import GIVE_UP_S
@@ -367,21 +367,6 @@ def test_a_sender_starts_before_its_receiver_and_the_other_way_round() -> None:
         robots[0].end.messages.submit(ODOM, text(1), air.now)
         air.run(1.0)
         assert text(1) in robots[1].delivered()
-
-
-def test_reports_lost_for_a_minute_cost_no_message() -> None:
-    one, two = Robot(1, registry()), Robot(2)
-    air = Air(one, two, loss=0.1)
-    air.run(1.0)
-    usual = air.lost
-    air.lost = lambda sender, receiver: sender is two or usual(sender, receiver)
-    for number in range(600):
-        one.end.messages.submit(ODOM, text(number), air.now)
-        air.run(0.1)
-    air.lost = usual
-    air.run(3.0)
-    assert len(two.delivered()) >= 599
-    assert any(isinstance(event, Gone) for event in one.events)
 
 
 def test_packet_numbers_come_round() -> None:
