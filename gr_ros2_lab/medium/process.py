@@ -323,7 +323,7 @@ class MediumProcess:
             return
         self._links[number].sends = self.config.time == "lockstep"
         earliest = self._now if self.config.time == "real" else self._handed
-        told = at if isfinite(at) and at < self._now + GONE_S else earliest
+        told = at if isfinite(at) and at < self._now + GONE_S else self._now  # what the robot knew as it sent
         start = max(told, earliest, self._busy[number])  # a robot sends one burst after the other
         end = start + len(samples) / self._rate
         self.counted["bursts"] += 1

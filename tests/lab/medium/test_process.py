@@ -293,6 +293,29 @@ def test_what_is_no_burst_is_refused_and_counted(tmp_path: Path) -> None:
         process.close()
 
 
+def test_a_burst_that_says_no_time_begins_at_the_time_its_robot_was_told(tmp_path: Path) -> None:
+    """It had been composed at that time, and was received 2 ms before its airtime was over."""
+    path = tmp_path / "medium.yaml"
+    path.write_text(yaml.safe_dump(settings(tmp_path)))
+
+    def heard_at(at: Callable[[MediumProcess], float]) -> float:
+        process = MediumProcess(load_medium(path))
+        try:
+            process._step()
+            process._hand_over()
+            process._step()
+            samples = np.ones(int(0.003 * RATE), "<c8").tobytes()
+            process._arrived(0, HEADER.pack(MAGIC, 1, 0, RATE, at(process)) + samples)
+            while True:
+                process._step()
+                for start, _ in process.medium.received(1, process.now):
+                    return start
+        finally:
+            process.close()
+
+    assert heard_at(lambda _: nan) == heard_at(lambda process: process.now) > heard_at(lambda _: 0.0)
+
+
 def test_positions_and_gains_decide_who_hears_whom(tmp_path: Path) -> None:
     path = tmp_path / "medium.yaml"
     gains = {"gains_db": [[None, -90.0, None], [-90.0, None, -90.0], [None, -90.0, None]], "channel": {}}
