@@ -132,6 +132,25 @@ def test_levels_follow_the_trace(tmp_path: Path, time: str) -> None:
     assert topic.age_s.peak == pytest.approx(1.1, abs=0.15)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("measured", ["loss", "snr_db", "capacity"])
+def test_traces_act_in_real_time_as_in_simulated_time(tmp_path: Path, measured: str) -> None:
+    """Good for the first of each two seconds; with a capacity, one opportunity each 130 ms."""
+    if measured == "capacity":
+        path = written(tmp_path, "".join(f"{ms}\n" for ms in range(130, 2601, 130)), "uplink")
+    else:
+        good, bad = {"loss": (0, 1), "snr_db": (30, -10)}[measured]
+        path = written(tmp_path, f"t_s,{measured}\n" + "".join(f"{t},{bad if t % 2 else good}\n" for t in range(4)))
+    phy = {"name": "psk", "sample_rate": 100e3} if measured == "snr_db" else {"name": "direct"}
+    real, simulated = (
+        arrived(scenario(path, phy=phy, packet_len=128, duration_s=6, time=time)) for time in ("real", "packets")
+    )
+    assert real.pdr == pytest.approx(simulated.pdr, abs=0.1)
+    assert simulated.pdr == pytest.approx(1.0 if measured == "capacity" else 0.5, abs=0.1)
+    if measured == "capacity":
+        assert min(real.latency_s.p50, simulated.latency_s.p50) > 0.05  # half of the time between two opportunities
+
+
 def test_each_path_may_have_a_trace_of_its_own(tmp_path: Path) -> None:
     path = written(tmp_path, "t_s,loss\n0,1\n1,1\n")
     chosen = scenario(path, channel={}, robots=2, paths=[{"from": 1, "to": 2, "trace": str(path)}])
