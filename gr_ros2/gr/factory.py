@@ -65,18 +65,10 @@ def start_of(robot: RobotConfig) -> Start:
 
     :raises ConfigError: for a key file or a state file that cannot be read or understood
     """
-    keys = keys_of(robot)
+    keys = Keys(read_key_file(robot.key), robot.seal) if robot.key else None
     path = state_file(robot.state, robot.robot_id)
     file = BootFile(path, time.time(), secrets.randbits(RANDOM_BITS), sealed=keys is not None)
     return Start(file.boot, keys, file.heard, file.save, file.close)
-
-
-def keys_of(robot: RobotConfig) -> Keys | None:
-    """The keys of a robot, None where it has no key file.
-
-    :raises ConfigError: for a key file that cannot be read or understood
-    """
-    return Keys(read_key_file(robot.key), robot.seal) if robot.key else None
 
 
 def keys_of_run(robot: RobotConfig) -> Keys | None:

@@ -1,21 +1,23 @@
 """What a robot finds on its ROS graph: topics and services that no registry names, and types of what it sends.
 
 Invariants: what cannot be sent or offered is said once; what is only to be sent when somebody asks for it (``offer`` of
-the settings) is not subscribed before. One thread at a time changes what is sent.
+the settings) is not subscribed before. One thread at a time changes what is sent. The thread that looks ends when it
+is closed, when its graph is closed, or with the process.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from gr_ros2.core.errors import ConfigError, GrRos2Error
+from gr_ros2.core.errors import ConfigError, GrRos2Error, MiddlewareError
 from gr_ros2.gr.offers import OpenTopic
 from gr_ros2.gr.subscriptions import OpenSubscriptions
-from gr_ros2.gr.topic_search import TopicSearch
 from gr_ros2.middleware import Middleware, TopicInfo
+from gr_ros2.middleware.graph_search import GraphSearch
 from gr_ros2.middleware.services import OTHER_RMW, ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.settings.config import SendOptions
@@ -23,6 +25,44 @@ from gr_ros2.settings.registry import DEFAULT_OPTIONS, MAX_TOPICS, NewTopic, Top
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.settings.service_rows import ServiceRow, is_service, parts, rows_of
 from gr_ros2.settings.topic_choice import TopicChoice
+
+LOOK_S = 0.2
+"""s between two looks, at least. Messages that are published before the next look are missed, unless their publisher
+keeps them."""
+_SHARE = 0.05
+"""Largest share of time that may be spent looking."""
+_log = logging.getLogger(__name__)
+
+
+class TopicSearch(GraphSearch):
+    """Calls a function with what is on a graph, at once and then every ``LOOK_S`` seconds.
+
+    :param found: called with all topics that are there, and with the types of all services by name, without those of
+        this participant; must not raise
+    :param services: whether to look for services too. On a graph that has topics only, there are none
+    """
+
+    def __init__(
+        self,
+        middleware: Middleware,
+        found: Callable[[Sequence[TopicInfo], Mapping[str, str]], None],
+        *,
+        services: bool = False,
+    ) -> None:
+        self._middleware = middleware
+        self._services = middleware if services and isinstance(middleware, ServiceGraph) else None
+        self._found = found
+        super().__init__("gr-ros2-topic-search", LOOK_S, _SHARE)
+
+    def _look(self) -> float:
+        infos = self._middleware.discover()
+        services = {} if self._services is None else self._services.discover_services()
+        begin = time.monotonic()
+        self._found(infos, services)
+        return time.monotonic() - begin
+
+    def _failed(self, error: MiddlewareError) -> None:
+        _log.warning("no further topics are looked for: %s", error)
 
 
 class FoundTopics:

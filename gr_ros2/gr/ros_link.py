@@ -171,7 +171,9 @@ class RosLink(LinkBlock):
         bond: Bond | None = None,
     ) -> None:
         super().__init__(config, 1 if bond is None else len(bond.carries))
-        known = registry if registry is not None else read_registry(config.registry)
+        known = registry
+        if known is None:
+            known = Registry.from_csv(config.registry) if config.registry else Registry.empty()
         topics = known if config.sends else Registry.empty()
         calls = config.direction == "both" and not loops_back and (len(topics) < MAX_TOPICS or bool(topics.services))
         if config.offer and not calls:
@@ -219,14 +221,6 @@ class RosLink(LinkBlock):
         super().close()
         self._leave()
         self._start.close()
-
-
-def read_registry(path: str) -> Registry:
-    """The registry in a file, or an empty one without a file.
-
-    :raises RegistryError: for a wrong file; the message names file, line and problem
-    """
-    return Registry.from_csv(path) if path else Registry.empty()
 
 
 def make_link(

@@ -1,17 +1,47 @@
-"""Version 0 chooses the fragments of the next packet as the paper has it (section 5.2).
+"""Version 0 cuts messages into fragments, equal ones but for the last, and chooses those of the next packet, as the
+paper has it (section 5.2).
 
-Invariant: the scheduler only plans. It changes only its own order of topics and the cut of waiting messages that is not
-fixed yet. The sender executes the last plan or asks for another one.
+Invariants: the number of fragments of a message is fixed when its first one is sent, since every entry carries
+``total``; fragments are taken in order and together are the message. The scheduler only plans: it changes only its own
+order of topics and the cut of waiting messages that is not fixed yet. The sender executes the last plan or asks for
+another one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from gr_ros2.paper.fragment import Fragmented
+from gr_ros2.link.queues import Outgoing
 from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.wire.v0 import V0
+
+
+@dataclass(slots=True, eq=False)
+class Fragmented(Outgoing):
+    """A message being sent.
+
+    :param entry_id: its number on the wire, -1 until its first fragment leaves
+    :param cut: most bytes that any remaining fragment needs to carry, 0 until the message is cut
+    :param total: number of its fragments, 0 until the message is cut
+    """
+
+    entry_id: int = -1
+    cut: int = 0
+    total: int = 0
+
+    def plan(self, cut: int) -> int:
+        """Fix an equal cut if it is still open; returns the payload length of the next fragment."""
+        if not self.index:
+            self.cut = cut
+            self.total = max(-(-len(self.payload) // cut), 1)
+        return min(self.cut, self.remaining)
+
+    @property
+    def done(self) -> bool:
+        """Whether the last fragment has left."""
+        return 0 < self.total <= self.index
 
 
 class Plan(NamedTuple):

@@ -22,8 +22,7 @@ from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos, TopicQueue, qos_class
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.paper.fragment import Fragmented
-from gr_ros2.paper.schedule import PaperScheduler, Plan
+from gr_ros2.paper.schedule import Fragmented, PaperScheduler, Plan
 from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.settings.config import QueuePolicy, replaced
 from gr_ros2.settings.fields import AUTO, Auto

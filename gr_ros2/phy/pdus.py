@@ -108,28 +108,12 @@ def pdu_heard(packet: AirPacket) -> Any:
     return pdu_of(packet.data, metadata)
 
 
-def mcs_of(message: Any) -> int | None:
-    """The MCS that the metadata of a PDU says; None if it says none."""
-    mcs = _said(message, _MCS)
-    return int(pmt.to_long(mcs)) if pmt.is_integer(mcs) else None
-
-
-def leave_at_of(message: Any) -> float | None:
-    """The time in s at which the burst of a PDU has to begin; None if its metadata says none."""
-    return _number(message, _LEAVE_AT)
-
-
-def _number(message: Any, key: Any) -> float | None:
-    value = _said(message, key)
+def _number(metadata: Any, key: Any) -> float | None:
+    value = pmt.dict_ref(metadata, key, pmt.PMT_NIL)
     if not pmt.is_number(value) or pmt.is_complex(value):
         return None
     number = float(pmt.to_double(value))
     return number if isfinite(number) else None
-
-
-def _said(message: Any, key: Any) -> Any:
-    metadata = pmt.car(message) if pmt.is_pair(message) else _NO_METADATA
-    return pmt.dict_ref(metadata, key, pmt.PMT_NIL) if pmt.is_dict(metadata) else pmt.PMT_NIL
 
 
 def packets_of(message: Any) -> tuple[list[AirPacket], str]:
@@ -143,9 +127,10 @@ def packets_of(message: Any) -> tuple[list[AirPacket], str]:
     metadata = pmt.car(message)
     if not pmt.is_dict(metadata) or pmt.eq(metadata, _NO_METADATA):
         return [AirPacket(data)], ""
-    received_at = _number(message, _RECEIVED_AT)
-    at = _number(message, _BEGINS_AT) if received_at is None else received_at
-    return [AirPacket(data, at, leave_at_of(message), mcs_of(message), _number(message, _SNR_DB))], ""
+    mcs, received_at = pmt.dict_ref(metadata, _MCS, pmt.PMT_NIL), _number(metadata, _RECEIVED_AT)
+    at = _number(metadata, _BEGINS_AT) if received_at is None else received_at
+    number = int(pmt.to_long(mcs)) if pmt.is_integer(mcs) else None
+    return [AirPacket(data, at, _number(metadata, _LEAVE_AT), number, _number(metadata, _SNR_DB))], ""
 
 
 class _OutPort:

@@ -106,7 +106,8 @@ class Diagnostics:
             statuses.append(Status(f"{self._node_name}: clocks", Level.WARN, jumps))
         for src_id, state in self._health.links(stats, judged[0]).items():
             if not self._stop.is_set():
-                self._link(src_id).publish(diagnostic_status(state, self._node_name))
+                status = _status(state, self._node_name)
+                self._link(src_id).publish(bytes(typestore().serialize_cdr(status, STATUS_TYPE)))
         array = diagnostic_array(statuses, self._node_name, time.time_ns())
         messages: list[tuple[Publisher, bytes]] = [(self._array, array), (self._counters, statistics(stats))]
         if self._events is not None and (lost := self._lost.event(stats)) is not None:
@@ -159,11 +160,6 @@ def diagnostic_array(statuses: list[Status], hardware_id: str, stamp_ns: int) ->
         status=[_status(status, hardware_id) for status in statuses],
     )
     return bytes(typestore().serialize_cdr(message, DIAGNOSTICS_TYPE))
-
-
-def diagnostic_status(status: Status, hardware_id: str) -> bytes:
-    """A diagnostic_msgs/DiagnosticStatus, serialized."""
-    return bytes(typestore().serialize_cdr(_status(status, hardware_id), STATUS_TYPE))
 
 
 def _status(status: Status, hardware_id: str) -> Any:

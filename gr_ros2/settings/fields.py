@@ -86,10 +86,10 @@ class Setting:
     @property
     def limits(self) -> tuple[str, str]:
         """Text before and after a name in an expression of its range, ``0 <= `` and `` < 255``; '' without a limit."""
-        low = f"{_number(self.above)} < " if self.above is not None else ""
-        high = f" < {_number(self.below)}" if self.below is not None else ""
-        low = f"{_number(self.least)} <= " if self.least is not None else low
-        return low, f" <= {_number(self.most)}" if self.most is not None else high
+        low = f"{self.above!r} < " if self.above is not None else ""
+        high = f" < {self.below!r}" if self.below is not None else ""
+        low = f"{self.least!r} <= " if self.least is not None else low
+        return low, f" <= {self.most!r}" if self.most is not None else high
 
     @property
     def kinds(self) -> tuple[Any, ...]:
@@ -189,7 +189,3 @@ def _marks(hint: Any) -> Iterator[Any]:
     elif get_origin(hint) in (Union, UnionType):
         for part in get_args(hint):
             yield from _marks(part)
-
-
-def _number(value: float | None) -> str:
-    return repr(value)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -290,10 +291,10 @@ def write_trace(trace: Trace, directory: Path) -> list[Path]:
     :return: their paths
     :raises ConfigError: when they cannot be written
     """
-    written = []
+    written, checked = [], partial(pa_parquet.write_table, write_page_checksum=True)
     for name, table in trace.tables.items():
         marked = table.replace_schema_metadata({_T_END: repr(trace.t_end)})
-        written.append(write_whole(directory / f"{name}.parquet", marked, _write_parquet))
+        written.append(write_whole(directory / f"{name}.parquet", marked, checked))
     written.append(write_whole(directory / f"{MESSAGES}.csv", trace.tables[MESSAGES], write_csv))
     return written
 
@@ -340,10 +341,6 @@ def _read(path: Path) -> Any:
     except (pa.ArrowException, OSError) as error:
         why = str(error).splitlines()[0].split(": ")[-1].rstrip(".") if str(error) else type(error).__name__
         raise ConfigError(f"{path}: damaged or half-written, no Parquet ({why}); run the experiment again") from error
-
-
-def _write_parquet(table: Any, path: Path) -> None:
-    pa_parquet.write_table(table, path, write_page_checksum=True)
 
 
 def _message_columns(book: TopicLedger, topic: str, t0: float) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def choose_axes(plan: SweepPlan) -> Axes:
     """The axes that the sweep defines, or otherwise axes chosen from its keys."""
     sweep = plan.sweep
     keys = [key for key in plan.keys if len(places(plan, key)) > 1] or list(plan.keys[:1])
-    numeric = [key for key in keys if _numeric(plan, key)]
+    numeric = [key for key in keys if all(map(_is_number, places(plan, key)))]
     candidates = [*(key for key in numeric if key == _SNR), *numeric, *keys]
     x = sweep.x if sweep.x != AUTO else next(key for key in candidates if key != sweep.y or len(keys) == 1)
     rest = [key for key in keys if key != x]
@@ -109,11 +109,7 @@ def heat_panels(
 def places(plan: SweepPlan, key: str) -> list[Place]:
     """Every value of a key. Numbers are in ascending order, other values in the order of the cells."""
     found = list(dict.fromkeys(cell.values[key] for cell in plan.cells))
-    return sorted(found) if all(_is_number(value) for value in found) else found
-
-
-def _numeric(plan: SweepPlan, key: str) -> bool:
-    return all(_is_number(value) for value in places(plan, key))
+    return sorted(found) if all(map(_is_number, found)) else found
 
 
 def _is_number(value: object) -> bool:
