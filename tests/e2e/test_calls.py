@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 pytest.importorskip("zmq", reason="needs pyzmq")
 pytest.importorskip("cyclonedds.domain", reason="the Python part of cyclonedds does not import", exc_type=ImportError)
 

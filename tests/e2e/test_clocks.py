@@ -11,8 +11,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.observe.positions import humble_types
 from gr_ros2.radio.clocks import MAGIC, SAMPLE

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.cli.main import run
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware

@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from tests.e2e.links import LinkProcess, Links
 from tests.waiting import wait_for
 

@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2_lab.medium import FixedPaths, Medium, RadioPath, make_medium

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig

@@ -8,8 +8,6 @@ from math import sqrt
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig

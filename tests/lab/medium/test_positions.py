@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import ChannelConfig, ScenarioChannel, build
 from gr_ros2_lab.medium import make_medium

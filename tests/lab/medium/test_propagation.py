@@ -7,8 +7,6 @@ import math
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.settings.config import ScenarioChannel
 from gr_ros2_lab.medium.propagation import LIGHT_M_S, Shadowing, doppler_hz, path_loss_db, snr_over_db
 

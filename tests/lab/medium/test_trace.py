@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.medium.trace import QUEUE_S, Capacity, MeasuredLosses, read_trace
 from gr_ros2_lab.run.runner import run_scenario

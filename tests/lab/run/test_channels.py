@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.observe.result import TopicResult
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario

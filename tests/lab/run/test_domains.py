@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.middleware.free_domains import ReservedDomain
 from gr_ros2_lab.record.result import read_result
 from gr_ros2_lab.run.domains import on_own_domains

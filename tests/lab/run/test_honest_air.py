@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.arrays import Floats
 from gr_ros2.link.airtime import LEAD_S, OUTSTANDING
 from gr_ros2_lab.run.outcome import Outcome

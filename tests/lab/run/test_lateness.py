@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2_lab.record.result import Result, read_result
 from gr_ros2_lab.record.trace import read_trace
 from gr_ros2_lab.report.explain import explanation

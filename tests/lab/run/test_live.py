@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import Middleware, Qos, join_graph
 from gr_ros2.middleware.bag_files import bag_contents

@@ -8,9 +8,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.record.repetitions import REPETITIONS_FILE, run_folders, summarize
 from gr_ros2_lab.record.result import Result

@@ -7,9 +7,6 @@ import struct
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from rosbags.highlevel import AnyReader
 
 from gr_ros2.core.errors import BagError, ConfigError

@@ -11,9 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import yaml
 
 from gr_ros2.cli.main import run as command

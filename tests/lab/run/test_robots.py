@@ -7,8 +7,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.settings.config import replaced
 from gr_ros2_lab.medium import Surroundings

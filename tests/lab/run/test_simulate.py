@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import RunError
 from gr_ros2.gr.factory import message_codec

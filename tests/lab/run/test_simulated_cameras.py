@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.codecs.messages import IMAGE, read
 from gr_ros2.link import Delivered
 from gr_ros2.settings.registry import Registry

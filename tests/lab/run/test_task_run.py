@@ -12,8 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.record.team_numbers import TEAM_VALUES, team_numbers

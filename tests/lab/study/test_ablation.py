@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.record.result import read_result
 from gr_ros2_lab.run.scenario import load_scenario

@@ -8,8 +8,6 @@ import time
 import numpy as np
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.factory import message_codec
 from gr_ros2_lab.run.runner import run_scenario

@@ -10,11 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 import dask
 import distributed
+import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.observe.result import TopicResult

@@ -10,8 +10,6 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pa_parquet
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 from gr_ros2.observe.result import AgeResult, LatencyResult, TopicResult
 from gr_ros2_lab.record.result import ReceiverResult, Result
 from gr_ros2_lab.record.statistics import share

@@ -7,11 +7,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, get_args
 
-import pytest
-
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 import numpy as np
+import pytest
 
 from gr_ros2.phy import PHY
 from gr_ros2.phy.fec import CodeName, Codes

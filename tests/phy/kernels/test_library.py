@@ -11,9 +11,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
-
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.phy import PHY, configured, kernels
 from gr_ros2.phy.kernels import library

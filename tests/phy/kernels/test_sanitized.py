@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-
 ROOT = Path(__file__).resolve().parents[3]
 SKIPPED = 77
 
