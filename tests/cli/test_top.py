@@ -44,7 +44,7 @@ def test_links_that_begin_hang_are_killed_and_end(ends: Ends) -> None:  # noqa: 
     first = ends.link(1, "--set", "airtime.duty_cycle=0.5")
     wait_for(lambda: len(rows(ends)) == 1, "the first link")
     second = ends.link(2)
-    wait_for(lambda: [len(row["peers"]) for row in rows(ends)] == [1, 1], "both")
+    wait_for(lambda: [len(row.get("peers", ())) for row in rows(ends)] == [1, 1], "both")
     one, two = rows(ends)
     assert (one["pid"], one["name"], one["robot"], one["front_end"], one["phy"]) == (
         first.pid,
@@ -53,7 +53,7 @@ def test_links_that_begin_hang_are_killed_and_end(ends: Ends) -> None:  # noqa: 
         "udp",
         "modem",
     )
-    assert (two["peers"][0]["robot"], two["answers"]) == (1, True)
+    assert two["peers"][0]["robot"] == 1
     assert one["sent"] >= 0
     assert 0 <= one["air"] <= 1
     first.send_signal(signal.SIGUSR1)
@@ -61,13 +61,12 @@ def test_links_that_begin_hang_are_killed_and_end(ends: Ends) -> None:  # noqa: 
     shown = ends.run("top", "--once").stdout
     assert "one: transmitter: sending is off" in shown
     second.send_signal(signal.SIGSTOP)
-    hangs = rows(ends)
+    wait_for(lambda: [row["answers"] for row in rows(ends)] == [True, False], "one that does not answer")
+    assert rows(ends)[-1]["warnings"][0].startswith("has not answered for ")
     second.send_signal(signal.SIGCONT)
-    assert [row["answers"] for row in hangs] == [True, False]
-    assert hangs[1]["warnings"][0].startswith("has not answered for ")
     second.send_signal(signal.SIGKILL)
     second.wait(PATIENCE_S)
-    assert [row["robot"] for row in rows(ends)] == [1]
+    wait_for(lambda: [row.get("robot") for row in rows(ends)] == [1], "the one that is left")
     assert [path.stem for path in (ends.folder / f"gr-ros2-{os.getuid()}").iterdir()] == [str(first.pid)]
 
 
