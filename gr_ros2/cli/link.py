@@ -309,6 +309,7 @@ def _live(running: RobotLink) -> LiveRun:
         wishes=running.wishes if running.calls is not None else None,
         calls=running.calls,
         wants_key=partial(_key_frame, running),
+        hears_always=running.phy.has_samples and running.front_end.hears_always,
     )
 
 

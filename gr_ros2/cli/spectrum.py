@@ -22,6 +22,7 @@ from gr_ros2.cli.status import LISTEN, ask_link, find_link, json_option, pid_opt
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import RunError
 from gr_ros2.radio.config import LinkConfig, load_link
+from gr_ros2.radio.occupancy import SELDOM, busy_words
 
 _LOOK_S = 0.2
 LONGEST_S = 600
@@ -29,8 +30,6 @@ _WIDTH = 40
 """Columns of the bar of the strongest part."""
 _LEAST_DB = 20.0
 """dB over the noise for which a bar is as wide as that, at least."""
-_SELDOM = 0.005
-"""Share of the time up to which a part is not said to be busy: what no link notices."""
 
 Told = Mapping[str, Any]
 
@@ -119,7 +118,7 @@ def spectrum_table(radio: Told) -> Group:
             f"{(part['from_hz'] + part['to_hz']) / 2 / unit:,.4f}",
             f"{mean:.0f} dB",
             f"{peak:.0f} dB",
-            f"{part['busy']:.1%}" if part["busy"] > _SELDOM else "",
+            f"{part['busy']:.1%}" if part["busy"] > SELDOM else "",
             Text("█" * wide + "░" * (wider - wide)),
         )
     seen = radio["blocks"] + radio["zeros"] + radio["not_finite"]
@@ -134,23 +133,3 @@ def spectrum_table(radio: Told) -> Group:
         busy_words(parts, unit, name),
         *left_out,
     )
-
-
-def busy_words(parts: list[Told], unit: float, name: str) -> str:
-    """Where the band is busy, neighbouring parts together, each with the share of the time of the busiest."""
-    runs: list[list[Told]] = []
-    for part in parts:
-        if part["busy"] <= _SELDOM:
-            continue
-        if runs and runs[-1][-1]["to_hz"] == part["from_hz"]:
-            runs[-1].append(part)
-        else:
-            runs.append([part])
-    if not runs:
-        return "nothing stands out of the noise"
-    where = (
-        f"{run[0]['from_hz'] / unit:,.4f} to {run[-1]['to_hz'] / unit:,.4f} {name} for "
-        f"{max(part['busy'] for part in run):.1%} of the time"
-        for run in runs
-    )
-    return f"busy: {'; '.join(where)}"

@@ -299,6 +299,7 @@ class LivePage:
                 "khz": _small(radio.frequencies / 1000),
                 "db": _small(radio.spectrum_db),
             }
+            self._spectrum_title.text = radio.busy
 
     # -- the channel --------------------------------------------------------------------------------------------
 
@@ -367,6 +368,9 @@ class LivePage:
         )
         constellation.scatter("re", "im", source=sources["constellation"], size=2.5, color=_SENT, alpha=0.35)
         spectrum = _plot("spectrum", "", "frequency [kHz]", "power [dB]", y_range=Range1d(-50, 3))
+        self._spectrum_title = spectrum.title
+        self._spectrum_title.text_color, self._spectrum_title.text_font_size = _SOFT, "11px"
+        self._spectrum_title.text_font_style = "normal"
         spectrum.varea("khz", -200, "db", source=sources["spectrum"], color=_SENT, alpha=0.15)
         spectrum.line("khz", "db", source=sources["spectrum"], color=_SENT, line_width=1.2)
         latency = _plot("latency", "name", "latency [ms]", "share", x_axis_type="log", y_range=Range1d(0, 1.03))

@@ -24,10 +24,13 @@ from gr_ros2.link.events import ReceiverEvent, SenderEvent
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.observe.observers import Change, LiveLink, LiveRun, Wishes
 from gr_ros2.observe.result import RunResult
+from gr_ros2.radio.occupancy import Occupancy, busy_words, in_parts
 from gr_ros2.settings.config import ChannelConfig
 
 TICK_S = 0.5
 """s between two snapshots."""
+_LOOKS = 200
+"""Newest looks at the received signal that say where the band is busy: 20 s."""
 _NEWEST = 200
 """Late moments that are looked at: more do not fit into the last seconds."""
 
@@ -44,6 +47,7 @@ class RadioView:
     :param snr_db: SNR of the newest packets received, dB over the sampled band; None if the PHY does not measure it
     :param frequencies: frequency of each power in ``spectrum_db``, Hz; None if there is no signal
     :param symbols: equalised payload symbols, None if the PHY gives none
+    :param busy: which frequencies were busy lately, and for which share of the time; '' if that is not known
     """
 
     channel: ChannelConfig | None = None
@@ -55,6 +59,7 @@ class RadioView:
     frequencies: Floats | None = None
     spectrum_db: Floats | None = None
     symbols: npt.NDArray[np.complex64] | None = None
+    busy: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,9 @@ class RunMonitor:
         self._run: LiveRun | None = None
         self._state: DashboardState | None = None
         self._spectrum: Spectrum | None = None
+        self._occupancy: Occupancy | None = None
+        """Of the newest samples; None where they are those of bursts alone."""
+        self._newest: npt.NDArray[np.complex64] = np.empty(0, np.complex64)
         self._ticking = Lock()
 
     # -- the run's side -----------------------------------------------------------------------------------------
@@ -92,6 +100,7 @@ class RunMonitor:
     def run_started(self, run: LiveRun) -> None:
         sampled = [link.phy for link in run.links if link.phy.has_samples]  # a run in simulated time has no link
         self._spectrum = Spectrum(sampled[0].sample_rate) if sampled else None
+        self._occupancy = Occupancy(_LOOKS) if sampled and run.hears_always else None
         self._state = DashboardState(
             run.registry,
             run.topics,
@@ -131,8 +140,12 @@ class RunMonitor:
         """Add the newest samples of the received signal to the spectrum."""
         run, spectrum = self._run, self._spectrum
         samples = None if run is None or spectrum is None else run.links[0].samples()
-        if spectrum is not None and samples is not None:
-            spectrum.add(samples)
+        if spectrum is None or samples is None or np.array_equal(samples, self._newest, equal_nan=True):
+            return
+        self._newest = samples
+        spectrum.add(samples)
+        if self._occupancy is not None:
+            self._occupancy.add(samples)
 
     def tick(self) -> Snapshot:
         """Make the next snapshot. Without a run, the last snapshot stays."""
@@ -140,6 +153,10 @@ class RunMonitor:
             if self._run is not None and self._state is not None:
                 self._tick(self._run, self._state)
         return self.snapshot
+
+    def _busy(self, sample_rate: float) -> str:
+        found = None if self._occupancy is None else self._occupancy.found()
+        return "" if found is None else busy_words(in_parts(found, sample_rate, 0.0), 1e3, "kHz")
 
     def _tick(self, run: LiveRun, state: DashboardState) -> None:
         for src_id, source in run.sources.items():
@@ -172,6 +189,7 @@ class RunMonitor:
             frequencies=None if spectrum is None else spectrum.frequencies,
             spectrum_db=None if spectrum is None else spectrum.decibels(),
             symbols=run.links[0].symbols(),
+            busy=self._busy(run.links[0].phy.sample_rate),
         )
 
     @property

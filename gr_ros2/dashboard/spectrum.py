@@ -29,8 +29,10 @@ class Spectrum:
         self._power: Floats | None = None
 
     def add(self, samples: npt.NDArray[np.complex64]) -> None:
-        """Add consecutive samples, in blocks of ``BINS``. An incomplete block is ignored."""
+        """Add consecutive samples, in blocks of ``BINS``. An incomplete block is ignored, and one with a sample that is
+        no finite number."""
         blocks = samples[: len(samples) // BINS * BINS].reshape(-1, BINS)
+        blocks = blocks[np.isfinite(blocks).all(axis=1)]
         if not len(blocks):
             return
         power = (np.abs(np.fft.fftshift(np.fft.fft(blocks * self._window), axes=1)) ** 2).mean(axis=0)

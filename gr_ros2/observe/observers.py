@@ -152,6 +152,7 @@ class LiveRun:
     :param wishes: asks other robots for topics; None where nobody can be asked
     :param calls: calls services of other robots; None where none can be called
     :param changed: told of each change that somebody makes while it runs
+    :param hears_always: whether the samples of the first of ``links`` are those of all the time, not of bursts alone
     """
 
     name: str
@@ -174,6 +175,7 @@ class LiveRun:
     wishes: Wishes | None = None
     calls: FarServices | None = None
     changed: Callable[[Change], None] = lambda _: None
+    hears_always: bool = False
 
 
 class RunObserver(LinkObserver, Protocol):

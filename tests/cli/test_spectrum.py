@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.cli.spectrum import busy_words
+from gr_ros2.radio.occupancy import busy_words
 from tests.cli.test_status import Ends, ends  # noqa: F401 - a fixture
 from tests.radio.test_spectrum import RATE, carrier, noise, recording
 from tests.waiting import wait_for
@@ -34,7 +34,7 @@ def test_the_front_end_of_a_file_is_heard_and_nothing_is_sent(ends: Ends, tmp_pa
     shown = ends.run("spectrum", str(file), "--for", "0.5", "--set", f"front_end.write={tmp_path / 'sent'}")
     assert (shown.returncode, shown.stderr) == (0, "")
     assert "file, 1,000,000 samples/s; noise -" in shown.stdout
-    assert "busy: 250.0000 to 281.2500 kHz for 100.0% of the time" in shown.stdout
+    assert "busy: 250 to 281.25 kHz for 100.0% of the time" in shown.stdout
     assert "█" * 40 in shown.stdout
     assert not list(tmp_path.glob("sent*"))
     told = ends.run("spectrum", str(file), "--for", "0.5", "--json")
@@ -85,10 +85,11 @@ def test_a_recording_that_cannot_be_read_and_one_without_a_signal(ends: Ends, tm
     assert "no samples, or zeros in 0.2 s" in silent.stderr
 
 
-def test_neighbours_are_said_together() -> None:
-    busy = [0.0, 0.1, 0.3, 0.0, 0.004, 0.2]
+def test_the_busiest_is_said_first_with_neighbours_that_are_like_it() -> None:
+    busy = [0.02, 0.25, 0.3, 0.02, 0.004, 0.5, 0.01]
     parts = [{"from_hz": n * 1e3, "to_hz": (n + 1) * 1e3, "busy": share} for n, share in enumerate(busy)]
     assert busy_words(parts, 1e3, "kHz") == (
-        "busy: 1.0000 to 3.0000 kHz for 30.0% of the time; 5.0000 to 6.0000 kHz for 20.0% of the time"
+        "busy: 5 to 6 kHz for 50.0% of the time; 1 to 3 kHz for 30.0% of the time; 0 to 1 kHz for 2.0% of the time; "
+        "3 to 4 kHz for 2.0% of the time"
     )
-    assert busy_words(parts[:1], 1e3, "kHz") == "nothing stands out of the noise"
+    assert busy_words(parts[4:5], 1e3, "kHz") == "nothing stands out of the noise"

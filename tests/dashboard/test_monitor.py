@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
+from gr_ros2.cli.link import _live
 from gr_ros2.core.errors import RunError
 from gr_ros2.dashboard.monitor import RunMonitor
 from gr_ros2.link.events import Delivered, ReceiverEvent
@@ -16,6 +18,8 @@ from gr_ros2.observe.observers import LiveRun
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
+from tests.radio.robots import Robot
+from tests.radio.test_spectrum import carrier, noise, robot
 from tests.waiting import wait_for
 
 ENDS = ("graph.middleware=memory",)
@@ -159,3 +163,29 @@ def test_a_run_that_fails_is_said_to_have_failed(monkeypatch: pytest.MonkeyPatch
     with pytest.raises(RunError, match="did not find each other"):
         run_scenario(scenario, observers=[monitor])
     assert monitor.snapshot.phase == "failed"
+
+
+def test_of_a_front_end_that_hears_always_it_is_said_where_the_band_is_busy(tmp_path: Path) -> None:
+    monitor = RunMonitor()
+    samples = noise(400, np.random.default_rng(1))
+    samples += carrier(400, 24)
+    with robot(tmp_path / "in", samples) as one:
+        monitor.run_started(_live(one.link))
+
+        def said() -> bool:
+            monitor.look()
+            monitor.tick()
+            return monitor.radio.busy.startswith("busy: 250 to 281.25 kHz for 100.0% of the time")
+
+        wait_for(said, "the carrier")
+        monitor.run_ended(None)
+
+
+def test_of_bursts_alone_it_is_not_said(tmp_path: Path) -> None:
+    monitor = RunMonitor()
+    phy = {"name": "psk", "sample_rate": 1e6}
+    with Robot(1, {"name": "sim"}, phy=phy, instrumented=True, state=str(tmp_path / "state")) as one:
+        monitor.run_started(_live(one.link))
+        wait_for(lambda: [monitor.look(), monitor.tick(), monitor.radio.spectrum_db is not None][-1], "a spectrum")
+        assert monitor.radio.busy == ""
+        monitor.run_ended(None)

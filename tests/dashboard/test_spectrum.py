@@ -42,3 +42,13 @@ def test_too_few_samples_and_silence_are_no_error() -> None:
     decibels = spectrum.decibels()
     assert decibels is not None
     assert np.isfinite(decibels).all()
+
+
+def test_what_is_no_number_does_not_stay() -> None:
+    spectrum = Spectrum(1e5)
+    broken = tone(-12_500, 1e5)
+    broken[BINS + 3] = np.nan
+    spectrum.add(broken)
+    decibels = spectrum.decibels()
+    assert decibels is not None
+    assert np.isfinite(decibels).all()

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.radio.spectrum import PARTS, Listening, Occupancy
+from gr_ros2.radio.occupancy import PARTS, Occupancy
+from gr_ros2.radio.spectrum import Listening
 from tests.radio.robots import Robot
 from tests.waiting import wait_for
 
