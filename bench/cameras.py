@@ -124,11 +124,14 @@ class Fixed(Scheme):
         return number.to_bytes(4, "big") + b"".join(bytes(packet) for packet in self.writer.encode(picture))
 
     def shown(self, message: bytes) -> tuple[int, Any] | None:
-        """After a frame that the queue dropped nothing until the next key frame."""
+        """After a frame that the queue dropped, or that cannot be read, nothing until the next key frame."""
         number, data = int.from_bytes(message[:4], "big"), message[4:]
         self.broken = (self.broken or number != self.last + 1) and b"\0\0\1\x65" not in data
         self.last = number
-        found = self.reader.decode(av.Packet(data))
+        try:
+            found = self.reader.decode(av.Packet(data))
+        except av.error.InvalidDataError:  # too much before it is missing
+            self.broken, found = True, []
         return None if self.broken or not found else (number, _grey(found[-1].to_ndarray(format="rgb24")))
 
 
@@ -185,7 +188,7 @@ def judged(run: Run) -> Judged:
     after = at > OUTAGE[1]
     fresh = at[after][age[after] < 200]
     return Judged(
-        float(np.sum(times > JUDGED_FROM_S) / (SECONDS - JUDGED_FROM_S)),
+        float(np.sum((times > JUDGED_FROM_S) & (times < np.inf)) / (SECONDS - JUDGED_FROM_S)),
         float(age.mean()),
         float(np.percentile(age, 95)),
         float(np.mean(quality)) if quality else 0.0,
@@ -236,7 +239,10 @@ def _mean(kind: str, kbit_s: float, loss: float) -> Judged:
 
 
 def _behind(pull: Judged, peer: Judged) -> float:
-    """The part by which a peer is better, in what it is better most; below 0 where it is worse in everything."""
+    """The part by which a peer is better, in what it is better most; below 0 where it is worse in everything, or shows
+    nothing at all."""
+    if not peer.per_s:
+        return -1.0
     per_s = pull.per_s / min(peer.per_s, FPS)
     return max(pull.mean_ms / peer.mean_ms - 1, 1 - per_s, 1 - pull.now_db / peer.now_db)
 
