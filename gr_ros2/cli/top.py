@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import click
 from rich import box
-from rich.console import Group
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -43,7 +43,7 @@ _LATE_S = 3.0
 
 
 class Watched:
-    """A program with a control socket, which is asked again and again until ``gone`` is set."""
+    """A program with a control socket, which is asked again and again until ``gone`` is set or it is closed."""
 
     def __init__(self, pid: int) -> None:
         self._pid, self._answered_at = pid, time.monotonic()
@@ -53,7 +53,13 @@ class Watched:
         self._looks = 0
         self._refuses = False
         self.gone = threading.Event()
-        threading.Thread(target=self._watch, name=f"gr-ros2-top-{pid}", daemon=True).start()
+        self._thread = threading.Thread(target=self._watch, name=f"gr-ros2-top-{pid}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ask no more. Who does not answer is not waited for."""
+        self.gone.set()
+        self._thread.join(_POLL_S)
 
     def row(self) -> dict[str, Any] | None:
         """Its row of the table; None while nothing is known, and for a run."""
@@ -121,10 +127,19 @@ class Watched:
 
 
 class Links:
-    """All links that this user may ask."""
+    """All links that this user may ask, from when it is entered until it is left."""
 
     def __init__(self) -> None:
         self._watched: dict[int, Watched] = {}
+
+    def __enter__(self) -> Links:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for watched in self._watched.values():
+            watched.gone.set()
+        for watched in self._watched.values():
+            watched.close()
 
     def look(self) -> list[dict[str, Any]]:
         """Their rows, by robot and name: links that have begun since are asked from now on, those that have ended are
@@ -227,22 +242,28 @@ def top(*, once: bool, as_json: bool) -> None:
 
     Key q ends it. Root sees the links of all users, and services. Of runs there is gr-ros2 dashboard.
     """
-    console, links = make_console(), Links()
-    links.look()
-    while not links.settled:
-        time.sleep(_POLL_S)
+    console = make_console()
+    with Links() as links:
         links.look()
-    rows = links.look()
-    if not rows:
-        raise RunError(NO_LINK)
-    if as_json:
-        click.echo(json.dumps(rows))
-    elif once or not console.is_terminal:
-        console.print(link_table(rows), soft_wrap=True)
-    else:
-        with _keys() as key, Live(link_table(rows), console=console, auto_refresh=False, screen=True) as shown:
-            try:
-                while key(_EVERY_S) != _LEAVE:
-                    shown.update(link_table(links.look()), refresh=True)
-            except KeyboardInterrupt:
-                return
+        while not links.settled:
+            time.sleep(_POLL_S)
+            links.look()
+        rows = links.look()
+        if not rows:
+            raise RunError(NO_LINK)
+        if as_json:
+            click.echo(json.dumps(rows))
+        elif once or not console.is_terminal:
+            console.print(link_table(rows), soft_wrap=True)
+        else:
+            _show(console, links, rows)
+
+
+def _show(console: Console, links: Links, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Show them again and again, until key q or Ctrl-C."""
+    with _keys() as key, Live(link_table(rows), console=console, auto_refresh=False, screen=True) as shown:
+        try:
+            while key(_EVERY_S) != _LEAVE:
+                shown.update(link_table(links.look()), refresh=True)
+        except KeyboardInterrupt:
+            return

@@ -125,19 +125,20 @@ def test_a_run_is_no_link_and_an_answer_of_another_release_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    links = Links()
-    with audience(None, console(), "a run"):
-        links.look()
-        wait_for(lambda: links.settled, "its refusal")
+    with Links() as links:
+        with audience(None, console(), "a run"):
+            links.look()
+            wait_for(lambda: links.settled, "its refusal")
+            assert links.look() == []
         assert links.look() == []
-    assert links.look() == []
-    for told in ({}, {"name": "x"}, 7, None, "\n"):
-        with ControlSocket("strange", lambda _, told=told: {"status": told}):
-            wait_for(links.look, "its answer")
-            (row,) = links.look()
-            assert row["warnings"][0].startswith("its answer is not understood (")
-            assert "\n" not in row["warnings"][0]
-        assert links.look() == []
+        for told in ({}, {"name": "x"}, 7, None, "\n"):
+            with ControlSocket("strange", lambda _, told=told: {"status": told}):
+                wait_for(links.look, "its answer")
+                (row,) = links.look()
+                assert row["warnings"][0].startswith("its answer is not understood (")
+                assert "\n" not in row["warnings"][0]
+            assert links.look() == []
+    wait_for(lambda: not any(one.name.startswith("gr-ros2-top") for one in threading.enumerate()), "its threads to end")
 
 
 def test_words_of_another_program_are_no_markup() -> None:
