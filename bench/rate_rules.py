@@ -108,7 +108,7 @@ def run(snr: Snr, link: Link, seed: int) -> float:
         while under_way and under_way[0][0] <= now:
             at, snr_db, loss = under_way.popleft()
             rate.report(2, snr_db, loss, at)
-        mcs = rate.sent(2, now)
+        mcs = rate.sent([2], now)
         end = now + MCS_TABLE[mcs].airtime_s
         air += end - now
         report(now, end - 1e-9)

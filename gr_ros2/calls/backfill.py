@@ -10,7 +10,7 @@ more the oldest goes and is counted; a message is kept once; none that may have 
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from heapq import heappop, heappush
 from struct import Struct
 from typing import NamedTuple
@@ -102,18 +102,21 @@ def read_later(data: bytes) -> list[Later | Missing]:
 
 
 class _Kept(NamedTuple):
-    """A message, and when it was submitted, s."""
+    """A message that may have to cross later: when it was submitted, s, and see :class:`Later`."""
 
     at: float
-    message: Later
+    topic_id: int
+    serial: int
+    payload: bytes
+    began: tuple[int, int] | None = None
 
     @property
     def size(self) -> int:
-        return len(self.message.payload) + _OVERHEAD
+        return len(self.payload) + _OVERHEAD
 
     @property
     def written(self) -> int:
-        return len(self.message.payload) + _HEAD.size
+        return len(self.payload) + _HEAD.size
 
 
 class _Left(NamedTuple):
@@ -152,10 +155,10 @@ class MessagesForLater:
         self.lost = self.filled = 0
         self.unheard = False
 
-    def accepted(self, message: Later, now: float) -> None:
+    def accepted(self, topic_id: int, serial: int, payload: bytes, now: float) -> None:
         """A message was submitted."""
-        kept = _Kept(now, message)
-        self._waiting[message.serial] = (kept,)
+        kept = _Kept(now, topic_id, serial, payload)
+        self._waiting[serial] = (kept,)
         self._bytes += kept.size
         while self._bytes > self._most:
             self._give_up(self._oldest())
@@ -180,8 +183,8 @@ class MessagesForLater:
         :param last: whether it is the last part
         """
         kept = self._waiting.get(serial, ())
-        if kept and serial not in self._filling and kept[0].message.began is None:
-            kept = self._waiting[serial] = [kept[0]._replace(message=kept[0].message._replace(began=began))]
+        if kept and serial not in self._filling and kept[0].began is None:
+            kept = self._waiting[serial] = [kept[0]._replace(began=began)]
         if kept and last:
             del self._waiting[serial]
             self._left[serial] = _Left(now, number, kept)
@@ -223,16 +226,22 @@ class MessagesForLater:
         """Whether something that fills a gap is under way, or what is not known to be heard."""
         return bool(self._left)
 
-    def take(self, most: int = PIECE) -> list[Later]:
+    def take(self, wall_s: Callable[[float], float], most: int = PIECE) -> list[Later]:
         """The oldest messages that fill gaps, so many bytes of them, or one; :meth:`taken` says under which serial they
-        are submitted."""
+        are submitted.
+
+        :param wall_s: s since 1970 at a time of ``now``, by the clock as it stands: it may have been set in the outage
+        """
         taken: list[_Kept] = []
         size = 0
         while self._gaps and (not taken or size + self._gaps[0].written <= most):
             taken.append(heappop(self._gaps))
             size += taken[-1].written
         self._taken = taken
-        return [kept.message for kept in taken]
+        return [
+            Later(one.topic_id, one.serial, max(round(wall_s(one.at) * 1e6), 0), one.payload, one.began)
+            for one in taken
+        ]
 
     def taken(self, serial: int) -> None:
         """The messages taken last were submitted, as what fills gaps."""
@@ -284,5 +293,5 @@ class MessagesForLater:
 
     def _give_up(self, kept: _Kept) -> None:
         self._bytes -= kept.size
-        self.given_up[kept.message.topic_id] += 1
+        self.given_up[kept.topic_id] += 1
         self.lost += 1

@@ -61,7 +61,6 @@ class OutputBag(Closing):
         self.name = f"bag {path}"
         self.missed: Counter[str] = Counter()
         self._run: LiveRun | None = None
-        self.filled = 0
         self._given_up: Counter[str] = Counter()
         """Messages of each topic that nobody has any more."""
         self._lost: dict[_Name, str] = {}
@@ -151,7 +150,7 @@ class OutputBag(Closing):
                 known = self._is_known(name) or known
             if not known:
                 made = each.made_us * 1e-6 - (0.0 if clock is None else clock.ahead_s)
-                self.filled += self._write(run, (event.src_id, each.topic_id), made, came, each.payload)
+                self._write(run, (event.src_id, each.topic_id), made, came, each.payload)
 
     def _is_known(self, name: _Name) -> bool:
         """Whether a message of this name is in the bag; from now on it is."""
@@ -180,12 +179,11 @@ class OutputBag(Closing):
             where = self._recorder.channel(f"/{node}/events/messages_lost", LOST_TYPE, Qos(depth=_DEPTH))
             self._recorder.write(where, time.time_ns(), lost_event(node, lost))
 
-    def _write(self, run: LiveRun, key: tuple[int, int], made: float, came: float, payload: bytes) -> bool:
-        """Write a message of a topic; returns whether there is such a topic."""
+    def _write(self, run: LiveRun, key: tuple[int, int], made: float, came: float, payload: bytes) -> None:
+        """Write a message of a topic, if there is such a topic."""
         channel = self._channel(run, key)
         if channel is not None:
             self._recorder.write(channel, max(0, round(made * 1e9)), payload, round(came * 1e9))
-        return channel is not None
 
     def _channel(self, run: LiveRun, key: tuple[int, int]) -> BagChannel | None:
         """The channel of a topic; None for what is no topic, or has another type than one of the same name."""

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any
 
-from gr_ros2.calls.backfill import PIECE, Later, MessagesForLater, write_later
+from gr_ros2.calls.backfill import Later, MessagesForLater, Missing, write_later
 from gr_ros2.gr.bulk_topic import add_bulk_topic
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.sending import SendingBlock
@@ -34,7 +34,7 @@ WAITING = 2
 SELDOM_S = 60.0
 """s from one try to the next at most, while nobody hears."""
 _LOOK_S, _BUSY_S = 0.2, 0.02
-"""s between two looks at what has become of messages, and while some wait for room."""
+"""s between two looks at what has become of messages, and while some wait for room and somebody hears."""
 
 
 class Backfill:
@@ -62,9 +62,7 @@ class Backfill:
         self._tried, self._pause_s = -inf, 0.0
         self._starts: dict[int, int] = {}
         """The newest start of each robot that was heard."""
-        self._topic_id = add_bulk_topic(
-            endpoint, "_backfill", BACKFILL_TYPE, waiting=2 * WAITING, reliability="reliable"
-        )
+        self._topic_id = add_bulk_topic(endpoint, "_backfill", BACKFILL_TYPE, waiting=WAITING, reliability="reliable")
 
     def note(self, event: SenderEvent) -> None:
         """An event of the sending half."""
@@ -72,8 +70,7 @@ class Backfill:
             if event.topic_id == self._topic_id:
                 self.kept.taken(event.serial)
             elif self._chosen(event.topic_id):
-                made_us = round(self._wall_s(event.now) * 1e6)
-                self.kept.accepted(Later(event.topic_id, event.serial, made_us, event.payload), event.now)
+                self.kept.accepted(event.topic_id, event.serial, event.payload, event.now)
         elif isinstance(event, Refused):
             self.kept.refused(event.serial, ever=event.reason != Fate.TOO_LARGE)
         elif isinstance(event, SentPacket):
@@ -94,25 +91,28 @@ class Backfill:
         self._looked = now
 
     def _fill(self, now: float) -> None:
-        waiting = self._endpoint.messages.queued().get(self._topic_id, 0)
-        count, most = WAITING - waiting, PIECE
-        if not self.kept.unheard:
-            self._pause_s = 0.0
-        elif waiting or self.kept.tries or now < self._tried + self._pause_s:
-            return
-        else:  # one message tells whether somebody hears again, where nothing else leaves that would
-            count, most, self._tried = 1, 0, now
-            self._pause_s = min(max(1.0, 2 * self._pause_s), SELDOM_S)
         if self._share < 1:
             free = self._endpoint.used_air.free(now) * max(now - self._looked, 0.0)
             self._allowed = min(self._allowed + free, 1e9)
-        while count > 0 and (self._share >= 1 or self._allowed > 0) and (found := self.kept.take(most)):
-            self._submit(write_later(found), now)
-            count -= 1
-        if count > 0 and not self.kept.unheard and not len(self.kept) and (missing := self.kept.tell()):
-            self._submit(write_later(missing), now)
+        if not self.kept.unheard:
+            self._pause_s = 0.0
+            while self._may_submit and (found := self.kept.take(self._wall_s)):
+                self._submit(found, now)
+            if self._may_submit and not len(self.kept) and (missing := self.kept.tell()):
+                self._submit(missing, now)
+        elif self.kept.tries or now < self._tried + self._pause_s or not self._may_submit:
+            return
+        elif found := self.kept.take(self._wall_s, most=0):
+            # One message tells whether somebody hears again, where nothing else leaves that would.
+            self._tried, self._pause_s = now, min(max(1.0, 2 * self._pause_s), SELDOM_S)
+            self._submit(found, now)
 
-    def _submit(self, payload: bytes, now: float) -> None:
+    @property
+    def _may_submit(self) -> bool:
+        return self._endpoint.messages.has_space(self._topic_id) and (self._share >= 1 or self._allowed > 0)
+
+    def _submit(self, messages: Sequence[Later | Missing], now: float) -> None:
+        payload = write_later(messages)
         self._allowed -= len(payload)
         self._endpoint.messages.submit(self._topic_id, payload, now)
 
@@ -160,7 +160,8 @@ class LiveBackfill:
         return chosen
 
     def _run(self) -> None:
-        while not self._closed.wait(_BUSY_S if len(self._backfill.kept) else _LOOK_S):
+        kept = self._backfill.kept
+        while not self._closed.wait(_BUSY_S if len(kept) and not kept.unheard else _LOOK_S):
             with self._end.lock:
                 self._backfill.look(self._clock())
                 self._end.wake()

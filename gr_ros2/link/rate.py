@@ -159,14 +159,9 @@ class RateController:
         """Share of the packets of an MCS that a robot is expected to lose."""
         return 1 - self.mcs_table[mcs].pdr(self._robots.get(robot, _Peer()).snr_db(now))
 
-    def sent(self, robots: int | Collection[int] | None, now: float) -> int:
-        """A packet leaves for a robot, for some, or for everybody (None). Returns the index of its MCS."""
-        known: Collection[_Peer]
-        if robots is None:
-            known = self._robots.values()
-        else:
-            ids = [robots] if isinstance(robots, int) else robots
-            known = [self._robots.get(robot, _Peer()) for robot in ids]
+    def sent(self, robots: Collection[int] | None, now: float) -> int:
+        """A packet leaves for some robots, or for everybody (None). Returns the index of its MCS."""
+        known = self._robots.values() if robots is None else [self._robots.get(robot, _Peer()) for robot in robots]
         for one in known:
             one.unanswered += 1
         return min((self._next(one, now) for one in known), default=0)

@@ -34,7 +34,7 @@ def settled(snr_db: float, *, reports: int = 200, noise_db: float = 0.0, seed: i
     for number in range(reports):
         now = number * REPORT_S
         rate.report(7, snr_db + draw.gauss(0, noise_db), 1 - MCS_TABLE[rates[-1]].pdr(snr_db), now)
-        rates.append(rate.sent(7, now))
+        rates.append(rate.sent([7], now))
     return rates
 
 
@@ -61,9 +61,9 @@ def test_an_snr_that_is_wrong_is_corrected_by_the_losses() -> None:
     mcs = 0
     for number in range(200):
         rate.report(7, 11.0, 0.5 if mcs > 1 else 0.0, number * REPORT_S)  # this radio needs 2 dB more for 16-QAM
-        mcs = rate.sent(7, number * REPORT_S)
+        mcs = rate.sent([7], number * REPORT_S)
     assert mcs <= 2
-    assert rate.sent(7, 200 * REPORT_S) >= 1
+    assert rate.sent([7], 200 * REPORT_S) >= 1
 
 
 def test_packets_that_were_not_for_a_robot_say_nothing_of_it() -> None:
@@ -87,7 +87,7 @@ def test_a_packet_for_everybody_serves_the_weakest() -> None:
         now = number * REPORT_S
         rate.report(1, 30.0, 0.0, now)
         rate.report(2, 5.0, 0.0, now)
-    assert (rate.sent(1, now), rate.sent(2, now), rate.sent(None, now)) == (4, 1, 1)
+    assert (rate.sent([1], now), rate.sent([2], now), rate.sent(None, now)) == (4, 1, 1)
     rate.meet(3)
     assert rate.sent(None, now) == 0, "nothing is known of the third"
     rate.forget(3)
@@ -101,19 +101,19 @@ def test_a_robot_that_falls_silent_gets_the_most_robust_rate() -> None:
     for number in range(100):
         rate.report(7, 30.0, 0.0, number * REPORT_S)
     now = 99 * REPORT_S
-    assert rate.sent(7, now) == 4
-    assert rate.sent(7, now + MOST_SILENT_S / 2) == 4, "nothing was sent that it could have reported"
+    assert rate.sent([7], now) == 4
+    assert rate.sent([7], now + MOST_SILENT_S / 2) == 4, "nothing was sent that it could have reported"
     for _ in range(20):
-        rate.sent(7, now + MOST_SILENT_S / 2)
-    assert rate.sent(7, now + MOST_SILENT_S / 2) == 0
+        rate.sent([7], now + MOST_SILENT_S / 2)
+    assert rate.sent([7], now + MOST_SILENT_S / 2) == 0
     rate.report(7, 30.0, 0.0, now + MOST_SILENT_S / 2)
-    assert rate.sent(7, now + MOST_SILENT_S / 2) == 4, "it is heard again"
-    assert rate.sent(7, now + 2 * MOST_SILENT_S) == 0
+    assert rate.sent([7], now + MOST_SILENT_S / 2) == 4, "it is heard again"
+    assert rate.sent([7], now + 2 * MOST_SILENT_S) == 0
 
 
 def test_nobody_known_gets_the_most_robust_rate() -> None:
     rate = RateController(MCS_TABLE)
-    assert rate.sent(None, 0.0) == rate.sent(9, 0.0) == 0
+    assert rate.sent(None, 0.0) == rate.sent([9], 0.0) == 0
 
 
 @pytest.mark.parametrize("mcs_table", [(), MCS_TABLE[::-1], (MCS_TABLE[0], MCS_TABLE[0])])
@@ -138,7 +138,7 @@ def test_any_course_of_events_gives_a_rate_of_the_table(events: list[tuple[str, 
             rate.meet(robot)
         elif kind == "f":
             rate.forget(robot)
-        assert rate.sent(None, now) <= rate.sent(robot, now) < len(MCS_TABLE) or not rate.sent(robot, now)
+        assert rate.sent(None, now) <= rate.sent([robot], now) < len(MCS_TABLE) or not rate.sent([robot], now)
 
 
 def faded(depth_db: float, *, slope_db_s: float = 150.0, report_s: float = 0.006) -> tuple[RateController, float, int]:
@@ -150,18 +150,18 @@ def faded(depth_db: float, *, slope_db_s: float = 150.0, report_s: float = 0.006
         now += report_s
         swing = abs((number * report_s * slope_db_s) % (2 * depth_db) - depth_db)
         rate.report(7, 20.0 - swing, 0.1, now)
-        rate.sent(7, now)
+        rate.sent([7], now)
     for number in range(6):
         now += report_s
         rate.report(7, 20.0 - slope_db_s * number * report_s, 0.1, now)
-        mcs = rate.sent(7, now)
+        mcs = rate.sent([7], now)
     return rate, now, mcs
 
 
 def test_in_a_fade_the_rate_goes_down_though_no_report_comes() -> None:
     rate, now, mcs = faded(12.0)
     assert mcs >= 2
-    after = [rate.sent(7, now + wait / 1000) for wait in range(1, 52, 3)]
+    after = [rate.sent([7], now + wait / 1000) for wait in range(1, 52, 3)]
     assert after == sorted(after, reverse=True)
     assert after[0] > after[3] > after[-1] == 0
 
@@ -171,12 +171,12 @@ def test_in_a_constant_channel_the_rate_stays_for_the_same_time() -> None:
     rate.meet(7)
     for number in range(400):
         rate.report(7, 20.0, 0.0, number * 0.006)
-    assert {rate.sent(7, 399 * 0.006 + wait / 1000) for wait in range(1, 40, 3)} == {3}
+    assert {rate.sent([7], 399 * 0.006 + wait / 1000) for wait in range(1, 40, 3)} == {3}
 
 
 def test_after_a_fade_the_rate_rises_with_the_next_report() -> None:
     rate, now, _ = faded(12.0)
     for wait in range(10):
-        assert rate.sent(7, now + 0.1 + wait / 1000) <= 1
+        assert rate.sent([7], now + 0.1 + wait / 1000) <= 1
     rate.report(7, 20.0, 0.2, now + 0.12)
-    assert rate.sent(7, now + 0.12) == 3
+    assert rate.sent([7], now + 0.12) == 3

@@ -199,7 +199,7 @@ class PacketWriter:
         stats.packets += 1
         mcs = 0
         if self._rate is not None:
-            mcs = self._rate.sent(robots if self._dst_id == BROADCAST else self._dst_id, slot.now)
+            mcs = self._rate.sent(robots if self._dst_id == BROADCAST else (self._dst_id,), slot.now)
             if kind in {"hello", "report"}:  # they are also for robots that are not known yet
                 mcs = 0
         sent = SentPacket(
