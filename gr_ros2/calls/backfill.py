@@ -1,10 +1,11 @@
 """What a robot keeps to send later, when nobody heard it or a newer message had to go first; and its bytes.
 
 Whether messages are heard is what reports say, by the numbers of packets. Where packets leave and no report of newer
-ones comes for several times as long as usual, nobody hears.
+ones comes for several times as long as usual, nobody seems to hear, and filling pauses. What left before a silence of
+``GONE_S`` fills gaps whatever the next report says: a robot does not wait for what was sent before it came back.
 
 Invariants: there is no clock and no IO here, the caller passes in the time; memory is bounded by bytes and by age, of
-more the oldest goes and is counted; a message is kept once; none that may have been heard is given up silently.
+more the oldest goes and is counted; a message is kept once; none that nobody has is given up silently.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from heapq import heappop, heappush
+from math import inf
 from struct import Struct
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from gr_ros2.core.errors import EntryBoundsError, EntryKindError
 
@@ -29,9 +31,13 @@ _OVERHEAD = 400
 PIECE = 8192
 """bytes of messages that cross as one message: similar ones compress each other."""
 _PATIENCE_S, _TIMES = 1.0, 4
-"""s, and mean times from a packet to its report, after which nobody hears."""
-_FIRST_S = 0.5
-"""s from a packet to its report, until reports tell."""
+"""s, and mean times from a packet to its report, after which nobody seems to hear."""
+_FIRST_S, _MOST_S = 0.5, 1.25
+"""s from a packet to its report, until reports tell, and in their mean at most."""
+GONE_S = 8.0
+"""s without a report, shorter than those after which robots take each other for gone."""
+REPAIRED = 64
+"""Newer packets that a report covers, after which one that was lost is not repaired any more in time."""
 
 
 class Later(NamedTuple):
@@ -120,11 +126,21 @@ class _Kept(NamedTuple):
 
 
 class _Left(NamedTuple):
-    """Messages that have left whole under one serial: when, s, and with which packet the last part did."""
+    """Messages that have left whole under one serial: when, s, and the packets that must have come."""
 
     at: float
-    number: int
+    first: int
+    last: int
     kept: Sequence[_Kept]
+
+
+class HeardPackets(Protocol):
+    """Which packets others have: see :class:`gr_ros2.link.endpoint.PacketReceipts`."""
+
+    newest: int
+
+    def have(self, first: int, last: int) -> bool:
+        """Whether somebody has each packet from one to another."""
 
 
 class MessagesForLater:
@@ -135,7 +151,7 @@ class MessagesForLater:
     :ivar given_up: messages that were kept in vain and that nobody has been told of, by topic id
     :ivar lost: how many were kept in vain so far
     :ivar filled: how many have filled gaps
-    :ivar unheard: whether nobody hears this robot
+    :ivar unheard: whether nobody seems to hear this robot
     """
 
     def __init__(self, for_s: float, most_bytes: int) -> None:
@@ -149,8 +165,12 @@ class MessagesForLater:
         self._taken: Sequence[_Kept] = ()
         self._filling: dict[int, int] = {}
         """How many messages are under way to fill gaps, by the serial under which they are."""
+        self._missing = 0
+        """Messages that have left and may have to cross later: those that a report names as lost, and that may still be
+        repaired, and all while nobody seems to hear."""
         self._told = self._doubted = -1
-        self._mean_s = _FIRST_S
+        self._mean_s, self._since = _FIRST_S, inf
+        """The mean time from a packet to its report, and since when none has come of what has left, s."""
         self.given_up: Counter[int] = Counter()
         self.lost = self.filled = 0
         self.unheard = False
@@ -187,44 +207,53 @@ class MessagesForLater:
             kept = self._waiting[serial] = [kept[0]._replace(began=began)]
         if kept and last:
             del self._waiting[serial]
-            self._left[serial] = _Left(now, number, kept)
+            # What fills gaps comes in order: it is repaired until it is there, if its last packet was for somebody.
+            first = number if serial in self._filling or kept[0].began is None else kept[0].began[0]
+            self._left[serial] = _Left(now, first, number, kept)
+            self._since = min(self._since, now)
 
     def doubt(self) -> None:
         """A robot has started anew: of what is under way it may have had a part before."""
         self._doubted = max([self._doubted, *self._waiting, *self._left])
 
-    def heard(self, number: int, now: float) -> None:
-        """Decide what has become of what has left, and give up what is too old.
-
-        :param number: of the newest packet that any report tells of; -1 for none
-        """
-        while number > self._told and self._left and (first := next(iter(self._left.values()))).number <= number:
-            serial = next(iter(self._left))
-            if self.unheard or serial <= self._doubted:  # it may have left before somebody heard again
-                self._fill_later()
-            else:
+    def heard(self, receipts: HeardPackets, now: float) -> None:
+        """Decide what has become of what has left, and give up what is too old."""
+        newest, told, gone = receipts.newest, self._told, now - self._since > GONE_S
+        before = now - self.patience_s if gone else -inf
+        self._missing = 0
+        for serial, left in list(self._left.items()):
+            if left.last > newest and left.at > before:
+                break
+            if serial <= self._doubted or (gone and (newest > told or left.at <= before)):
+                self._fill_later(serial)
+            elif receipts.have(left.first, left.last):
                 del self._left[serial]
                 self.filled += self._filling.pop(serial, 0)
-                self._mean_s += (min(now - first.at, self.patience_s) - self._mean_s) / 8
-                self._bytes -= sum(kept.size for kept in first.kept)
-        if number > self._told:
-            self._told, self.unheard = number, False
-        if self._left and now - next(iter(self._left.values())).at > self.patience_s:
+                self._bytes -= sum(kept.size for kept in left.kept)
+            elif left.last <= newest - REPAIRED or now - left.at > GONE_S:
+                self._fill_later(serial)
+            else:
+                self._missing += serial not in self._filling
+        if newest > told:
+            if self._since < inf:
+                self._mean_s += (min(now - self._since, _MOST_S) - self._mean_s) / 8
+            self._told, self.unheard = newest, False
+            self._since = next((left.at for left in self._left.values() if left.last > newest), inf)
+        elif now - self._since > self.patience_s:
             self.unheard = True
-            while self._left:
-                self._fill_later()
+            self._missing = sum(serial not in self._filling for serial in self._left)
         while self._gaps and self._gaps[0].at < now - self._for_s:
             self._give_up(heappop(self._gaps))
 
     @property
     def patience_s(self) -> float:
-        """s after which nobody has heard what has left."""
+        """s after which nobody seems to hear."""
         return max(_PATIENCE_S, _TIMES * self._mean_s)
 
     @property
     def tries(self) -> bool:
-        """Whether something that fills a gap is under way, or what is not known to be heard."""
-        return bool(self._left)
+        """Whether something that fills a gap waits or is under way."""
+        return bool(self._filling)
 
     def take(self, wall_s: Callable[[float], float], most: int = PIECE) -> list[Later]:
         """The oldest messages that fill gaps, so many bytes of them, or one; :meth:`taken` says under which serial they
@@ -232,6 +261,8 @@ class MessagesForLater:
 
         :param wall_s: s since 1970 at a time of ``now``, by the clock as it stands: it may have been set in the outage
         """
+        if self.unheard and not self._gaps and self._left:
+            self._fill_later(next(iter(self._left)))
         taken: list[_Kept] = []
         size = 0
         while self._gaps and (not taken or size + self._gaps[0].written <= most):
@@ -256,7 +287,7 @@ class MessagesForLater:
         return told
 
     def __len__(self) -> int:
-        return len(self._gaps) + sum(self._filling.values())
+        return len(self._gaps) + sum(self._filling.values()) + self._missing
 
     def _take_back(self, serial: int) -> Sequence[_Kept]:
         waiting = self._waiting.pop(serial, ())
@@ -264,11 +295,10 @@ class MessagesForLater:
             return waiting
         return self._left.pop(serial).kept
 
-    def _fill_later(self) -> None:
-        """What has left first fills gaps later."""
-        serial, left = self._left.popitem(last=False)
+    def _fill_later(self, serial: int) -> None:
+        """What has left fills gaps later."""
         self._filling.pop(serial, None)
-        for kept in left.kept:
+        for kept in self._left.pop(serial).kept:
             heappush(self._gaps, kept)
 
     def _oldest(self) -> _Kept:

@@ -85,7 +85,7 @@ class Backfill:
         if any(self._starts.get(robot, start) != start for robot, start in here.items()):
             self.kept.doubt()
         self._starts |= here
-        self.kept.heard(self._endpoint.reported, now)
+        self.kept.heard(self._endpoint.receipts, now)
         if here:
             self._fill(now)
         self._looked = now

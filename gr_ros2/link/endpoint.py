@@ -346,6 +346,16 @@ class Endpoint(PacketSide, Protocol):
         """The robots that are known, if the version tells."""
 
 
+class PacketReceipts(Protocol):
+    """Which packets of a robot others have, as they report."""
+
+    newest: int
+    """Number of the newest packet that any report covers, -1 for none."""
+
+    def have(self, first: int, last: int) -> bool:
+        """Whether somebody has each packet from one to another."""
+
+
 class OpenEndpoint(Endpoint, Protocol):
     """An end that announces its topics, asks other robots and may carry services."""
 
@@ -369,8 +379,8 @@ class OpenEndpoint(Endpoint, Protocol):
         """How much of the air it uses."""
 
     @property
-    def reported(self) -> int:
-        """Number of the newest packet that the report of any robot tells of: somebody hears; -1 for none."""
+    def receipts(self) -> PacketReceipts:
+        """Which of its packets others have, as they report from the first call on."""
 
     @property
     def questions(self) -> Questions:

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from gr_ros2.calls.backfill import PIECE, Later, MessagesForLater, Missing, read_later, write_later
+from gr_ros2.calls.backfill import PIECE, REPAIRED, Later, MessagesForLater, Missing, read_later, write_later
 from gr_ros2.core.errors import WireError
 
 HEARS_S = 0.1
@@ -24,20 +24,42 @@ def take(kept: MessagesForLater) -> list[Later]:
     return kept.take(lambda _: 0.0)
 
 
+class Heard(set[int]):
+    """The packets that others have."""
+
+    newest = -1
+
+    def have(self, first: int, last: int) -> bool:
+        return self.issuperset(range(first, last + 1))
+
+    def report(self, number: int, *missing: int) -> Heard:
+        """A report covers all packets up to one."""
+        self |= set(range(self.newest + 1, number + 1)) - set(missing)
+        self.newest = number
+        return self
+
+
 class Sent:
     """Messages of one packet each; a report of the newest packet follows while somebody hears."""
 
     def __init__(self, for_s: float = 600.0, most_bytes: int = 1_000_000) -> None:
         self.kept = MessagesForLater(for_s, most_bytes)
         self.now, self.number, self.serial = 0.0, -1, -1
+        self.receipts = Heard()
 
     def send(self, *, hears: bool, size: int = 100) -> Later:
         self.serial, self.number = self.serial + 1, self.number + 1
         accept(self.kept, self.serial, self.now, size)
         self.kept.left(self.serial, (self.number, 0), self.number, self.now, last=True)
         self.now += HEARS_S
-        self.kept.heard(self.number if hears else -1, self.now)
+        self.look(hears=hears)
         return later(self.serial, size, (self.number, 0))
+
+    def look(self, *, hears: bool) -> None:
+        if hears:
+            self.receipts.newest = self.number - 1
+            self.receipts.report(self.number)
+        self.kept.heard(self.receipts, self.now)
 
     def fill(self, *, hears: bool) -> list[Later]:
         found = take(self.kept)
@@ -45,7 +67,7 @@ class Sent:
         self.kept.taken(self.serial)
         self.kept.left(self.serial, (self.number, 0), self.number, self.now, last=True)
         self.now += HEARS_S if hears else 2 * self.kept.patience_s
-        self.kept.heard(self.number if hears else -1, self.now)
+        self.look(hears=hears)
         return found
 
 
@@ -74,7 +96,7 @@ def test_what_fills_gaps_while_nobody_hears_is_kept_on_in_its_order() -> None:
     sent = Sent()
     away = [sent.send(hears=False) for _ in range(200)]
     sent.now += 2 * sent.kept.patience_s
-    sent.kept.heard(-1, sent.now)
+    sent.look(hears=False)
     first = sent.fill(hears=False)
     assert 0 < len(first) < len(away)
     assert len(sent.kept) == len(away)
@@ -96,7 +118,7 @@ def test_a_message_of_which_a_part_has_left_says_where_it_began() -> None:
     kept = MessagesForLater(600.0, 1_000_000)
     accept(kept, 1, 0.0)
     kept.left(1, (7, 2), 7, 0.1, last=False)
-    kept.heard(7, 0.15)
+    kept.heard(Heard().report(7), 0.15)
     kept.left(1, (7, 2), 8, 0.2, last=False)
     kept.refused(1)
     assert take(kept) == [later(1, began=(7, 2))]
@@ -110,7 +132,7 @@ def test_of_more_than_fits_the_oldest_are_given_up_and_counted(away: bool) -> No
         if not away:
             sent.kept.refused(sent.serial)
     sent.now += 2 * sent.kept.patience_s
-    sent.kept.heard(-1, sent.now)
+    sent.look(hears=False)
     left = len(sent.kept)
     assert 50 < left < 300
     assert sent.kept.tell() == [Missing(3, count - left)]
@@ -132,7 +154,7 @@ def test_what_is_too_old_is_given_up() -> None:
     for serial in range(5):
         accept(kept, serial, float(serial))
         kept.refused(serial)
-    kept.heard(-1, 12.5)
+    kept.heard(Heard(), 12.5)
     assert [each.serial for each in take(kept)] == [3, 4]
     assert kept.lost == 3
 
@@ -142,13 +164,46 @@ def test_slow_reports_are_no_outage() -> None:
     for period_s in [0.2, 0.5, 1.0, 2.0, 4.0, *[6.0] * 40]:
         sent.send(hears=False)
         sent.now += period_s
-        sent.kept.heard(sent.number, sent.now)
+        sent.look(hears=True)
     before = len(sent.kept)
     for _ in range(20):
         sent.send(hears=False)
         sent.now += 6.0
-        sent.kept.heard(sent.number, sent.now)
+        sent.look(hears=True)
     assert len(sent.kept) == before
+
+
+def test_a_single_message_that_is_lost_and_not_repaired_is_filled() -> None:
+    kept, receipts = MessagesForLater(600.0, 1_000_000), Heard()
+    for number in range(2 * REPAIRED):
+        accept(kept, number, number * HEARS_S)
+        kept.left(number, (number, 0), number, number * HEARS_S, last=True)
+        kept.heard(receipts.report(number, 5, 6), (number + 1) * HEARS_S)
+        if number == REPAIRED:
+            assert len(kept) == 2
+            assert take(kept) == []
+            receipts.add(6)  # repaired
+    assert take(kept) == [later(5, began=(5, 0))]
+
+
+def test_of_a_message_of_several_packets_every_one_counts() -> None:
+    kept, receipts = MessagesForLater(600.0, 1_000_000), Heard()
+    accept(kept, 0, 0.0)
+    for number in range(3):
+        kept.left(0, (0, 0), number, 0.0, last=number == 2)
+    kept.heard(receipts.report(2 + REPAIRED, 1), 1.0)
+    assert take(kept) == [later(0, began=(0, 0))]
+
+
+def test_a_robot_that_comes_back_after_long_tells_nothing_of_what_left_before() -> None:
+    kept, receipts = MessagesForLater(600.0, 1_000_000), Heard()
+    count = 20
+    for number in range(count):
+        accept(kept, number, number)
+        kept.left(number, (number, 0), number, number, last=True)
+        kept.heard(receipts, number)
+    kept.heard(receipts.report(count - 1), count)
+    assert [each.serial for each in take(kept)] == list(range(count))
 
 
 def test_memory_is_counted_down_to_nothing() -> None:

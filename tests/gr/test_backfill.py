@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import random
+from typing import Any, Literal
 
 import pytest
 
@@ -10,10 +11,12 @@ from gr_ros2.calls.backfill import Later, read_later
 from gr_ros2.gr.backfill import Backfill
 from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.mac import Slots
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.settings.robot import BackfillConfig
-from tests.link.v1.air import SLOT_S, Air, Robot
+from tests.link.v1.air import SLOT_S, Air, Robot, registry
+from tests.link.v1.test_relaying import Line
 
 ODOM, SCAN = range(2)
 TOPICS = Registry(
@@ -162,6 +165,37 @@ def test_an_airtime_limit_holds_for_what_crosses_later() -> None:
     pair.slots(4000, odom=40)
     assert len(pair.later()) > 50
     assert pair.one.end.sent.packets - packets < 0.2 * 4000
+
+
+def test_single_messages_that_were_lost_cross_later() -> None:
+    pair = Pair(loss=0.2)
+    pair.slots(200, odom=4)
+    first = pair.made
+    pair.slots(2000, odom=4)
+    last = pair.made
+    live = set(pair.live())
+    pair.slots(1000, odom=4)
+    assert len(set(range(first, last)) - live) > 10
+    assert set(range(first, last)) <= {*pair.later(), *pair.live()}
+    assert len(pair.later()) < (last - first) / 2, "not all that was repaired, too"
+
+
+@pytest.mark.parametrize("reliability", ["best_effort", "reliable"])
+def test_in_slots_where_reports_are_rare_not_all_crosses_twice(reliability: Literal["best_effort", "reliable"]) -> None:
+    topics = registry(odom=SendOptions(queue="latest", reliability=reliability))
+
+    def slots(src_id: int) -> dict[str, Any]:
+        return {"access": Slots(src_id, SLOT_S, random.Random(src_id), period_s=0.0), "packet_len": 220}
+
+    one, two = Filling(1, topics, hears=True, **slots(1)), Robot(2, topics, hears=True, **slots(2))
+    line = Line(one, two)
+    for _ in range(600):
+        assert one.backfill is not None
+        one.backfill.look(line.now)
+        line.run(0.1)
+    fills = [event for event in two.events if isinstance(event, Delivered) and event.topic_id > 0]
+    again = sum(len(read_later(event.payload)) for event in fills)
+    assert again < 0.25 * len(two.delivered(1))
 
 
 @pytest.mark.parametrize("ahead_s", [1e6, -1e6])

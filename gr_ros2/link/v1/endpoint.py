@@ -33,6 +33,7 @@ from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.outbox import Outbox
 from gr_ros2.link.v1.pings import Pings
+from gr_ros2.link.v1.receipts import Receipts
 from gr_ros2.link.v1.receiving import ReceivingSide
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.replays import Save
@@ -217,8 +218,11 @@ class EndpointV1:
         return self._sending.urgent
 
     @property
-    def reported(self) -> int:
-        return self.window.peers.reported
+    def receipts(self) -> Receipts:
+        peers = self.window.peers
+        if peers.receipts is None:
+            peers.receipts = Receipts()
+        return peers.receipts
 
     @property
     def held_bytes(self) -> int:

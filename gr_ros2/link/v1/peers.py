@@ -12,6 +12,7 @@ from heapq import heappop, heappush
 from math import inf, ldexp
 
 from gr_ros2.link.v1.lifetime import Lifetime
+from gr_ros2.link.v1.receipts import Receipts
 from gr_ros2.link.v1.sent_packets import Sent, SentPackets
 from gr_ros2.link.v1.shared import SharedRepairs, newest_of
 from gr_ros2.link.v1.unreported import Unreported
@@ -145,7 +146,7 @@ class Peers:
     :ivar proven: some peer may take packets up to this number for replays
     :ivar provens: the same of each peer, the highest first
     :ivar joined: how often a peer that has come, or has come back, has reported for the first time
-    :ivar reported: number of the newest packet that any report tells of, -1 for none
+    :ivar receipts: the packets that any of them has; None while nobody asks for them
     :ivar in_vain: whether a peer waits for a packet in vain
     :ivar any_urgent: whether a packet may be urgent for some peer
     :ivar once: the newest packets that were neither sent again nor combined: what a report says arrived when it was
@@ -161,7 +162,8 @@ class Peers:
         self.loss = unreported.loss
         self.proven, self.provens = 0, [0]
         self.in_vain = False
-        self.joined, self.reported = 0, -1
+        self.joined = 0
+        self.receipts: Receipts | None = None
         self.once: set[int] = set()
         self._packets, self._unreported, self._shared = packets, unreported, shared
         self._resend: list[int] = []
@@ -267,6 +269,9 @@ class Peers:
             peer.lost.clear()  # what it was expected to lack
         self._note_times(peer, number, loss, now)
         records, bit, delay = self._packets.records, peer.bit, peer.delay
+        if self.receipts is not None:
+            alive = lambda older: older in records and records[older].alive(now)  # noqa: E731
+            self.receipts.report(number, arrived, alive, self._packets.told)
         if settled:
             lacks = ~arrived & (1 << MAP) - 1
             needs = number - lacks.bit_length() + 1
@@ -478,7 +483,6 @@ class Peers:
             if loss >= PROMPT and once:
                 peer.answers.append(took)
         peer.newest = max(peer.newest, number)
-        self.reported = max(self.reported, number)
         soon = bool(peer.answers) and max(peer.answers) <= _SOON * self._period
         peer.reports_soon = loss >= PROMPT and soon
 

@@ -237,8 +237,7 @@ class RepairWindow:
         if not self.peers.all:
             self._unreported.cover(combined, now)
         self._unreported.repaired()
-        if self.packets.parted:
-            self.packets.told = max(self.packets.told, repair.number)
+        self.packets.told = max(self.packets.told, repair.number)
         if self.mode == "thrifty":
             self.thrift.combined(now, first, repair.number)
         self.peers.once.difference_update(range(first, repair.number + 1))
