@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from gr_ros2.observe.result import RunResult
 
 _DEPTH = 10
+_LONGEST_S = 86400.0
+"""s for which a message can have been under way."""
 _REMEMBERED = 100_000
 _Name = tuple[int, ...]
 """Of a message: its robot, the start of that, and where it began, or its serial number there."""
@@ -104,7 +106,8 @@ class OutputBag(Closing):
             if fills and self._is_known(_name(event.src_id, event.key)):
                 return
             took = event.latency_s
-            if took is None:  # one that was repaired may have been under way for any time up to its age
+            if took is None or not 0 <= took <= _LONGEST_S:  # a stamp of simulated time, or of a bag that is played
+                # One that was repaired may have been under way for any time up to its age.
                 took = 0.0 if event.repaired else event.age_s
             self._write(self._run, (event.src_id, event.topic_id), came - took, came, event.message)
 

@@ -63,6 +63,15 @@ def test_messages_lie_in_the_order_in_which_they_were_made(tmp_path: Path) -> No
     assert bag.incomplete() == []
 
 
+@pytest.mark.parametrize("latency_s", [1.7e9, 7 * 86400.0, -60.0])
+def test_a_stamp_that_is_not_of_the_clock_does_not_move_a_message(tmp_path: Path, latency_s: float) -> None:
+    now, wall = time.monotonic(), time.time()
+    with opened(tmp_path / "bag") as bag:
+        bag.receiver_event(Delivered(2, 0, message(1, 50), 0, age_s=2.0, latency_s=latency_s), now)
+    (found,) = read_bag(tmp_path / "bag")
+    assert found.stamp_ns / 1e9 == pytest.approx(wall - 2.0, abs=0.1)
+
+
 def fills(*messages: Later | Missing, boot: int = 7) -> Delivered:
     return Delivered(2, 2, write_later(messages), 0, Key(boot, 100, 0))
 
@@ -110,7 +119,7 @@ def test_what_cannot_be_read_is_counted(tmp_path: Path) -> None:
         bag.receiver_event(Delivered(2, 2, write_later([Later(0, 1, 2, bytes(9))])[:-1], 0), 0.0)
         bag.receiver_event(fills(Later(77, 1, 2, bytes(9))), 0.0)
         bag.receiver_event(fills(Later(0, 1, (1 << 64) - 1, message(1, 50))), 0.0)
-        bag.receiver_event(Delivered(2, 0, message(2, 50), 0, latency_s=3e9), 0.0)  # made before 1970
+        bag.receiver_event(Delivered(2, 0, message(2, 50), 0, age_s=3e9), 0.0)  # made before 1970
     assert [each.payload for each in read_bag(tmp_path / "bag")] == [message(2, 50)]
     assert bag.incomplete() == [f"bag {tmp_path / 'bag'}: robot 2 lacks 3 messages"]
 
