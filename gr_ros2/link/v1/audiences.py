@@ -2,8 +2,9 @@
 
 A packet for all is sent as the weakest robot needs it, so one far robot would slow down everybody. Where the newest
 message of a topic alone counts, the others need not wait for the far one: message and MCS are chosen together, by what
-they make younger per airtime, summed over the robots that hear this MCS. The far one's age grows until it weighs more
-than theirs, so nobody starves; and what it lacks of the newest message of a topic is sent to it when the air is free.
+they make younger per airtime, summed over the robots that hear this MCS, as often as these do. The far one's age grows
+until it weighs more than theirs, so nobody starves; and what it lacks of the newest message of a topic is sent to it
+when the air is free.
 
 Everything else is sent to all: what is delivered in order, kept, or speaks of several instances, and long messages.
 
@@ -40,11 +41,13 @@ class Audience(NamedTuple):
 
     :param airtime_s: s that the longest packet takes with it
     :param robots: None for all
+    :param hears: share of such packets that each robot is expected to hear
     """
 
     mcs: int
     airtime_s: float
     robots: frozenset[int] | None
+    hears: dict[int, float]
 
 
 class Audiences:
@@ -53,6 +56,7 @@ class Audiences:
     :param topics: what is sent
     :param reads: whether a robot reads which packets are left out; where one does not, as older programs do not, every
         packet is for all
+    :param room: bytes of the longest body
     :param short: bytes of the longest message that is not sent to all in any case
     """
 
@@ -64,10 +68,11 @@ class Audiences:
         topics: SentTopics,
         *,
         reads: Callable[[int], bool],
+        room: int,
         short: int,
     ) -> None:
         self._rate, self._peers, self._packets, self._topics = rate, peers, packets, topics
-        self._reads, self._short = reads, short
+        self._reads, self._room, self._short = reads, room, short
         self._robots: frozenset[int] = frozenset()
         self._got: dict[int, dict[int, float]] = {}
         """By topic: when the newest message was submitted that each of those got that are behind, s."""
@@ -92,6 +97,7 @@ class Audiences:
                 level,
                 table[level].airtime_s,
                 None if level == levels[-1] else frozenset(robot for robot, mcs in chosen.items() if mcs >= level),
+                {robot: 1 - self._rate.lost(robot, level, now) for robot in chosen},
             )
             for level in levels
         )
@@ -114,7 +120,8 @@ class Audiences:
     def value(
         self, topic: SentTopic, message: Message, audience: Audience, cost: int, before: float | None = None
     ) -> float:
-        """The value of a message per byte sent, see ``freshness``: the sum over the robots that get it.
+        """The value of a message per byte sent, see ``freshness``: the sum over the robots that get it, with the
+        probability that all the rest of it comes.
 
         :param cost: bytes that it takes in addition to its payload
         :param before: when the message before it was submitted, s, where that is in the same packet
@@ -123,11 +130,13 @@ class Audiences:
         if (some := message.robots if message.started else audience.robots) is not None:
             robots &= some
         got, total = self._got.get(message.topic_id, {}), 0.0
+        size = message.remaining + cost
+        packets = -(-size // self._room)
         for robot in robots or (NOBODY,):
             newest = got.get(robot, topic.newest) if before is None else before
             younger = min(message.submitted - newest, NEVER_S)
-            total += younger * younger
-        return message.weight * total / (message.remaining + cost)
+            total += younger * younger * audience.hears.get(robot, 1.0) ** packets
+        return message.weight * total / size
 
     def _for(self, message: Message) -> frozenset[int]:
         """The robots that are known for which a message is."""

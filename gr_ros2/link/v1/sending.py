@@ -88,7 +88,13 @@ class SendingSide:
         if rate is not None and settings.dst_id == BROADCAST and not settings.shares and relaying is None:
             packing = messages.packing
             self._audiences = Audiences(
-                rate, window.peers, window.packets, messages.sent, reads=neighbours.reads_left_out, short=packing.short
+                rate,
+                window.peers,
+                window.packets,
+                messages.sent,
+                reads=neighbours.reads_left_out,
+                room=writer.room,
+                short=packing.short,
             )
             packing.audiences = self._audiences
         self.repairs = RepairSlots(settings, pace, window, writer=writer, hold=hold, audiences=self._audiences)

@@ -19,6 +19,7 @@ from gr_ros2.link.events import Delivered, SentPacket
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.audiences import Audiences
 from gr_ros2.link.v1.inbox import Inbox
+from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
@@ -308,3 +309,19 @@ def test_packets_left_out_are_not_waited_for() -> None:
     inbox.heard(newest + 140, 9.1)
     inbox.left_out(LeftOut(newest + 140 & 0xFFFF, 0, settled=True))
     assert inbox.order.wanted == newest + 77
+
+
+@pytest.mark.parametrize(("length", "packets"), [(20, 1), (200, 4)])
+def test_a_message_counts_as_often_as_all_its_packets_come(length: int, packets: int) -> None:
+    field = Field({2: 30.0, 3: 7.0})
+    field.run(3.0, {ODOM: 10.0})
+    audiences = field.sender.end._sending._audiences
+    assert audiences is not None
+    *_, to_all = audiences.of(field.now)
+    topic, message = audiences._topics[ODOM], Message(0, ODOM, bytes(length), 1, field.now, 1.0)
+
+    def worth(share: float) -> float:
+        return audiences.value(topic, message, to_all._replace(hears={2: 1.0, 3: share}), 0)
+
+    assert worth(0.5) - worth(0.0) == pytest.approx(0.5**packets * (worth(1.0) - worth(0.0)))
+    assert worth(1.0) > worth(0.0) > 0
