@@ -12,11 +12,11 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from math import floor, inf
-from typing import Any
+from typing import Any, NamedTuple
 
 from gr_ros2.calls import Request
 from gr_ros2.calls.wish_frames import (
@@ -50,10 +50,20 @@ from gr_ros2.settings.robot import RobotConfig
 LOOK_S = 1.0
 """s between two looks at whether what is sent has another type now, and at whether a robot is heard again."""
 _MOST_WAITING = 256
+"""Requests of each robot that wait to be looked at."""
 _log = logging.getLogger(__name__)
 
 Told = Callable[[bool, str], None]
 """Takes whether a wish is fulfilled, and what became of it in words."""
+
+
+class _Asked(NamedTuple):
+    """A request of a robot, or of one of its starts."""
+
+    robot: int
+    boot: int
+    ticket: int
+    request: LinkRequest
 
 
 @dataclass(slots=True)
@@ -90,7 +100,7 @@ class LiveWishes:
         self._due = threading.Condition()
         """Its lock protects everything below."""
         self._held, self._own = HeldWishes(), OwnWishes()
-        self._inbox: list[tuple[int, int, Request]] = []
+        self._inbox: list[_Asked] = []
         self._lists: dict[int, _List] = {}
         self._asks: set[int] = set()
         """Robots that are to be asked what they offer."""
@@ -229,8 +239,13 @@ class LiveWishes:
 
     def _called(self, robot: int, boot: int, request: Request) -> None:
         with self._due:
-            if len(self._inbox) < _MOST_WAITING:
-                self._inbox.append((robot, boot, request))
+            try:
+                asked = _Asked(robot, boot, request.ticket, read_request(request.payload))
+            except WireError:
+                self._counters["malformed"] += 1
+                return
+            if sum(waits.robot == robot for waits in self._inbox) < _MOST_WAITING:
+                self._inbox.append(asked)
                 self._wake()
             else:
                 self._counters["too_many"] += 1
@@ -241,12 +256,17 @@ class LiveWishes:
             self._own.met(robot, self._clock())
             self._due.notify_all()
 
-    def _serve(self, robot: int, boot: int, request: Request) -> None:
-        try:
-            asked = read_request(request.payload)
-        except WireError:
-            self._counters["malformed"] += 1
-            return
+    def _measure(self, inbox: Sequence[_Asked]) -> None:
+        """Measure all topics at once that are wanted anew: one after the other, 20 take longer than an answer may."""
+        new: dict[str, OpenTopic] = {}
+        for robot, boot, _, wish in inbox:
+            if isinstance(wish, WishRequest) and not self._held.holds(robot, boot, wish, self._clock()):
+                offered = self._found.offers.get(wish.name)
+                if offered is not None and offered.options.to in (AUTO, robot) and not offered.fits:
+                    new[wish.name] = offered
+        self._measurements.measure(new.values())
+
+    def _serve(self, robot: int, boot: int, ticket: int, asked: LinkRequest) -> None:
         match asked:
             case ListRequest():
                 reply = write_offers(self._rows())
@@ -259,7 +279,7 @@ class LiveWishes:
                 answer = self._answer(robot, boot, asked)
                 self._counters[answer.outcome.name.lower()] += 1
                 reply = write_answer(answer)
-        self._calls.answer(request.ticket, reply)
+        self._calls.answer(ticket, reply)
 
     def _rows(self) -> list[OfferRow]:
         offers = sorted(self._found.offers.items())[:MOST_OFFERS]
@@ -284,7 +304,9 @@ class LiveWishes:
         if offered.options.to not in (AUTO, robot):
             return WishAnswer(WishOutcome.NOT_FOR_YOU)
         renewed = self._held.holds(robot, boot, wish, self._clock())
-        answer = WishAnswer(WishOutcome.SENT, wish.rate) if renewed else self._cost(offered, wish.rate)
+        answer = (
+            WishAnswer(WishOutcome.SENT, offered.at(wish.rate).max_rate) if renewed else self._cost(offered, wish.rate)
+        )
         if answer.outcome != WishOutcome.SENT:
             return answer
         with self._due:
@@ -356,7 +378,8 @@ class LiveWishes:
                 if self._closed.is_set():
                     return
                 inbox, self._inbox = self._inbox, []
-            steps: list[Callable[[], None]] = [partial(self._serve, *asked) for asked in inbox]
+            steps: list[Callable[[], None]] = [partial(self._measure, inbox)]
+            steps += [partial(self._serve, *asked) for asked in inbox]
             for step in [*steps, self._apply, self._ask]:
                 try:
                     step()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("zmq", reason="needs pyzmq")
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr.offers import OpenTopic
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.services import ServiceClient
 from gr_ros2.radio.config import link_from
@@ -306,6 +307,34 @@ def request_of(values: dict[str, dict[str, Any]]) -> bytes:
     request = store.types["gr_ros2/msg/SetParameters_Request"]
     parameters = [parameter(name=name, value=made(value)) for name, value in values.items()]
     return bytes(store.serialize_cdr(request(parameters=parameters), "gr_ros2/msg/SetParameters_Request"))
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_many_wishes_at_a_time_are_measured_at_once(robots: Robots, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"scan_{number}" for number in range(6)]
+    wishes, sender = robots.links[1].wishes, robots.links[2].wishes
+    measured: list[int] = []
+    measure = sender._measurements.measure
+
+    def counted(offers: Iterable[OpenTopic]) -> Any:
+        topics = list(offers)
+        if topics and not measured:  # others come while the first is looked at
+            wait_for(lambda: len(sender._inbox) + len(topics) == len(names), "the wishes to arrive")
+        before = len(sender._measurements._measured)
+        found = measure(topics)
+        measured.append(len(sender._measurements._measured) - before)
+        return found
+
+    monkeypatch.setattr(sender._measurements, "measure", counted)
+    with talking(robots, *(f"/robot_2/{name}" for name in names)):
+        meet(robots)
+        offered(robots, *names)
+        for name in names:
+            wishes.want(2, name, 1.0)
+        wait_for(lambda: all(wishes.wish(2, name)["state"] == "sent" for name in names), "the answers")
+    assert sum(measured) == len(names)
+    assert sum(map(bool, measured)) <= 2
 
 
 @pytest.mark.slow
