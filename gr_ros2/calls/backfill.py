@@ -108,21 +108,18 @@ def read_later(data: bytes) -> list[Later | Missing]:
 
 
 class _Kept(NamedTuple):
-    """A message that may have to cross later: when it was submitted, s, and see :class:`Later`."""
+    """A message that may have to cross later: when it was submitted, s, and see :class:`Later`. There is no ``payload``
+    where memory was short."""
 
     at: float
     topic_id: int
     serial: int
-    payload: bytes
+    payload: bytes | None
     began: tuple[int, int] | None = None
 
     @property
     def size(self) -> int:
-        return len(self.payload) + _OVERHEAD
-
-    @property
-    def written(self) -> int:
-        return len(self.payload) + _HEAD.size
+        return 0 if self.payload is None else len(self.payload) + _OVERHEAD
 
 
 class _Left(NamedTuple):
@@ -160,6 +157,8 @@ class MessagesForLater:
         """Messages that have not left whole, by serial."""
         self._left: OrderedDict[int, _Left] = OrderedDict()
         """Those that have, the newest departure last, until it is known whether somebody hears them."""
+        self._whole: OrderedDict[int, None] = OrderedDict()
+        """The serials of both, as far as there was memory, the oldest first."""
         self._gaps: list[_Kept] = []
         """Heap of those that fill gaps."""
         self._taken: Sequence[_Kept] = ()
@@ -180,20 +179,21 @@ class MessagesForLater:
         kept = _Kept(now, topic_id, serial, payload)
         self._waiting[serial] = (kept,)
         self._bytes += kept.size
-        while self._bytes > self._most:
-            self._give_up(self._oldest())
+        self._whole[serial] = None
+        while self._bytes > self._most and (self._gaps or self._whole):
+            self._make_room()
 
     def refused(self, serial: int, *, ever: bool = True) -> None:
         """It will not be sent, or not all of it.
 
         :param ever: whether it may be sent later
         """
-        self._filling.pop(serial, None)
-        for kept in self._take_back(serial):
-            if ever:
-                heappush(self._gaps, kept)
-            else:
-                self._give_up(kept)
+        kept = self._take_back(serial)
+        if ever:
+            self._gap(kept)
+        else:
+            for each in kept:
+                self._give_up(each)
 
     def left(self, serial: int, began: tuple[int, int], number: int, now: float, *, last: bool) -> None:
         """A part of it leaves.
@@ -227,9 +227,8 @@ class MessagesForLater:
             if serial <= self._doubted or (gone and (newest > told or left.at <= before)):
                 self._fill_later(serial)
             elif receipts.have(left.first, left.last):
-                del self._left[serial]
-                self.filled += self._filling.pop(serial, 0)
-                self._bytes -= sum(kept.size for kept in left.kept)
+                self.filled += self._filling.get(serial, 0)
+                self._bytes -= sum(kept.size for kept in self._take_back(serial))
             elif left.last <= newest - REPAIRED or now - left.at > GONE_S:
                 self._fill_later(serial)
             else:
@@ -265,20 +264,23 @@ class MessagesForLater:
             self._fill_later(next(iter(self._left)))
         taken: list[_Kept] = []
         size = 0
-        while self._gaps and (not taken or size + self._gaps[0].written <= most):
+        found: list[Later] = []
+        while self._gaps:
+            at, topic_id, serial, payload, began = self._gaps[0]
+            size += _HEAD.size + len(payload or b"")
+            if taken and size > most:
+                break
             taken.append(heappop(self._gaps))
-            size += taken[-1].written
+            found.append(Later(topic_id, serial, max(round(wall_s(at) * 1e6), 0), payload or b"", began))
         self._taken = taken
-        return [
-            Later(one.topic_id, one.serial, max(round(wall_s(one.at) * 1e6), 0), one.payload, one.began)
-            for one in taken
-        ]
+        return found
 
     def taken(self, serial: int) -> None:
         """The messages taken last were submitted, as what fills gaps."""
         if self._taken:
             self._filling[serial] = len(self._taken)
             self._waiting[serial], self._taken = self._taken, ()
+            self._whole[serial] = None
 
     def tell(self) -> list[Missing]:
         """What has been given up since the last call."""
@@ -290,6 +292,9 @@ class MessagesForLater:
         return len(self._gaps) + sum(self._filling.values()) + self._missing
 
     def _take_back(self, serial: int) -> Sequence[_Kept]:
+        """The messages of a serial, which waits or is under way no more."""
+        self._filling.pop(serial, None)
+        self._whole.pop(serial, None)
         waiting = self._waiting.pop(serial, ())
         if waiting or serial not in self._left:
             return waiting
@@ -297,29 +302,35 @@ class MessagesForLater:
 
     def _fill_later(self, serial: int) -> None:
         """What has left fills gaps later."""
-        self._filling.pop(serial, None)
-        for kept in self._left.pop(serial).kept:
-            heappush(self._gaps, kept)
+        self._gap(self._take_back(serial))
 
-    def _oldest(self) -> _Kept:
-        """Take out what is to be given up first."""
+    def _gap(self, kept: Iterable[_Kept]) -> None:
+        """These messages fill gaps, as far as there was memory for them."""
+        for each in kept:
+            if each.payload is None:
+                self._give_up(each)
+            else:
+                heappush(self._gaps, each)
+
+    def _make_room(self) -> None:
+        """Give up the oldest message that fills a gap; where there is none, forget what the oldest one says that may
+        still be heard: it is given up only if it is not."""
         if self._gaps:
-            return heappop(self._gaps)
-        if self._left:
-            serial, left = next(iter(self._left.items()))
-            kept = left.kept
-        else:
-            serial, kept = next(iter(self._waiting.items()))
-        first, *rest = kept
+            self._give_up(heappop(self._gaps))
+            return
+        serial, _ = self._whole.popitem(last=False)
         if serial in self._filling:
-            self._filling[serial] -= 1
-        if not rest:
-            self._take_back(serial)
-        elif serial in self._left:
-            self._left[serial] = self._left[serial]._replace(kept=rest)
+            for each in self._take_back(serial):
+                self._give_up(each)
+            return
+        left = self._left.get(serial)
+        kept = self._waiting[serial] if left is None else left.kept
+        self._bytes -= sum(each.size for each in kept)
+        kept = [each._replace(payload=None) for each in kept]
+        if left is None:
+            self._waiting[serial] = kept
         else:
-            self._waiting[serial] = rest
-        return first
+            self._left[serial] = left._replace(kept=kept)
 
     def _give_up(self, kept: _Kept) -> None:
         self._bytes -= kept.size

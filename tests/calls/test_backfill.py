@@ -139,6 +139,33 @@ def test_of_more_than_fits_the_oldest_are_given_up_and_counted(away: bool) -> No
     assert take(sent.kept)[0].serial == count - left
 
 
+def test_what_waits_longer_than_there_is_memory_and_is_heard_was_not_lost() -> None:
+    kept, receipts = MessagesForLater(600.0, 2000), Heard()
+    for serial in range(100):
+        accept(kept, serial, 0.0)
+    kept.refused(50)
+    for serial in range(50):
+        kept.left(serial, (serial, 0), serial, 1.0, last=True)
+    kept.heard(receipts.report(49 + REPAIRED, 7), 1.0)
+    assert kept.tell() == [Missing(3, 2)], "one that was refused, and one that was lost"
+    assert len(kept._waiting) == 49
+    assert take(kept) == []
+
+
+def test_a_try_of_which_nothing_is_kept_any_more_hinders_no_other() -> None:
+    sent = Sent(most_bytes=2000)
+    for _ in range(3):
+        sent.send(hears=False)
+        sent.kept.refused(sent.serial)
+    assert sent.kept.take(lambda _: 0.0, most=0)
+    sent.kept.taken(1000)
+    sent.kept.left(1000, (3, 0), 3, sent.now, last=True)
+    assert sent.kept.tries
+    for _ in range(100):
+        sent.send(hears=False)
+    assert not sent.kept.tries
+
+
 def test_a_message_larger_than_what_may_be_kept_is_given_up_alone() -> None:
     sent = Sent(most_bytes=2000)
     accept(sent.kept, 0, 0.0, 5000)

@@ -97,7 +97,8 @@ def test_who_records_starts_again_and_gets_what_was_sent_meanwhile(tmp_path: Pat
 
 def test_what_does_not_fit_is_given_up_and_the_bag_says_so(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    with Links(tmp_path, PLACE, {**PLACE, "backfill": {"topics": ["place"], "memory_mb": 0.01}}) as links:
+    newest = {"topics": {"place": {"queue": "latest"}}}
+    with Links(tmp_path, PLACE, {**newest, "backfill": {"topics": ["place"], "memory_mb": 0.01}}) as links:
         one = links.start(1, "1", "0", "--bag", str(bag), command=PEER)
         two = links.start(2, "2", "0", command=PEER)
         links.meet()
