@@ -29,6 +29,8 @@ FOR_S = 60.0
 _MOST = 64
 """Parameters of a request that are read."""
 _REQUEST, _RESPONSE = "gr_ros2/msg/SetParameters_Request", "gr_ros2/msg/SetParameters_Response"
+_DIGITS = 9
+"""Digits of a number that are read; Python refuses those of thousands."""
 _NOT_SET, _INTEGER, _DOUBLE, _DOUBLES = 0, 2, 3, 8
 
 
@@ -81,7 +83,7 @@ class WishService:
         robot, _, topic = parameter.name.partition("/")
         value = parameter.value
         try:
-            if not robot.isdecimal() or not topic:
+            if not (robot.isdecimal() and len(robot) <= _DIGITS) or not topic:
                 raise ConfigError(f"{parameter.name!r}: write the number of a robot and a topic of it, such as 2/scan")
             if value.type == _NOT_SET:
                 self._wishes.give_up(int(robot), topic)

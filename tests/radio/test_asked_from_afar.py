@@ -282,10 +282,13 @@ def test_a_ros_service_asks_and_gives_up(robots: Robots) -> None:
         wait_for(lambda: SCAN in sent(robots), "it to begin")
         assert ask(2, **{"2__scan": {}}) == [(True, "scan of robot 2 is given up")]
         wait_for(lambda: SCAN not in sent(robots), "it to end")
-        wrong = ask(3, **{"2__scan": {"type": 8, "double_array_value": [0.0, 30.0]}, "scan": {}, "7__scan": {}})
-        assert [result[0] for result in wrong] == [True, False, False]
-        assert "write the number of a robot and a topic of it, such as 2/scan" in wrong[1][1]
-        assert wrong[2][1].startswith("robot 7 is not heard")
+        long = f"{'7' * 5000}__scan"
+        fast = {"2__scan": {"type": 8, "double_array_value": [0.0, 30.0]}}
+        wrong = ask(3, **fast, **{"scan": {}, long: {}, "7__scan": {}})
+        assert [result[0] for result in wrong] == [True, False, False, False]
+        for result in wrong[1:3]:
+            assert "write the number of a robot and a topic of it, such as 2/scan" in result[1]
+        assert wrong[3][1].startswith("robot 7 is not heard")
         client.call(4, b"\0\1\0\0\xff\xff\xff\xff junk")
         assert ask(5) == []
 
