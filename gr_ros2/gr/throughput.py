@@ -299,6 +299,7 @@ class LiveThroughput:
             if run.refused:
                 break
             if run.sends_at == inf:
+                self._calls.check_heard(run.robot)  # who goes away meanwhile does not answer
                 if now > run.began + PATIENCE_S:
                     run.refused = f"robot {run.robot} has not answered in {PATIENCE_S:.0f} s: an older gr-ros2 does not"
                 continue

@@ -73,4 +73,4 @@ def test_who_does_not_answer_is_named(tmp_path: Path) -> None:
         assert one.ask("throughput", "2", "--for", "99")[0] == 2
         two.close()
         status, said = one.ask("throughput", "2", "--for", "1")
-        assert (status, "robot 2" in said) == (1, True)
+        assert (status, "robot 2 is not heard" in said) == (1, True)
