@@ -304,7 +304,6 @@ class EndpointV1:
             return None
         relaying = self._receiving.relaying
         block = access.block(1 if relaying is None else relaying.gains.weight, fills=self.frames.fill(now))
-        self._sending.hellos.named = access.named
         return None if block is None else SendSlot(now, max(begins, now), block)
 
     def next_departure(self, *, credited: bool = False) -> float | None:

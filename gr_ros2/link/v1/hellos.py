@@ -90,12 +90,10 @@ class Hellos:
         self._answering = False
         self.due = -inf
         """When the next hello is due, s."""
-        self.named = False
-        """Whether somebody has named this robot since it entered, on a channel that others share."""
-        self.rests = 0
+        self._yields = 0
         """Packets of messages, if any wait, that leave before the next hello, unless this answers another robot."""
-        self.talks = False
-        """Whether messages have left since the last hello."""
+        self._talks, self._said = False, 0
+        """Whether messages had left when a hello was written last, since the one before; and how many in all."""
 
     def start(self, now: float) -> None:
         """The first packet may be sent now."""
@@ -144,10 +142,19 @@ class Hellos:
             return late >= latency * LATENCY_S and not rests
         return late > (SELDOM_S if heard else OFTEN_S / 2) * self._settings.slower + latency * LATENCY_S
 
+    def yielded(self) -> None:
+        """A packet of messages leaves."""
+        self._yields -= self._yields > 0
+
+    def begin(self) -> None:
+        """A hello is written next."""
+        said = self._messages.stats.sent.total()
+        self._talks, self._said = said > self._said, said
+
     @property
     def lone(self) -> bool:
         """Whether nothing of any robot comes, though it could, and nothing is said for robots that only listen."""
-        return self._settings.hears and not self.talks and not self._hears_others
+        return self._settings.hears and not self._talks and not self._hears_others
 
     @property
     def _hears_others(self) -> bool:
@@ -159,7 +166,8 @@ class Hellos:
         and prove it."""
         heard = [neighbour for neighbour in self._neighbours.all.values() if not neighbour.silent]
         met = all(neighbour.knows and neighbour.proven for neighbour in heard)
-        return bool(heard) and (met or (self.rests > 0 and self.named))
+        access = self._settings.access
+        return bool(heard) and (met or (self._yields > 0 and access is not None and access.named))
 
     @property
     def _period(self) -> float:
@@ -184,7 +192,7 @@ class Hellos:
         """
         window, neighbours = self._window, self._neighbours
         wants = neighbours.unproven
-        self._answering, self.rests = False, RESTS
+        self._answering, self._yields = False, RESTS
         if self._apart:
             apart, self._apart = self._apart, []
             self.due = self._next(now, wants=wants)

@@ -106,7 +106,6 @@ class SendingSide:
         self._writer = writer
         self._started = False
         self._hello_number = -1
-        self._said = 0
         self._repeat_at = inf
         self._repeats = 1
         self._beacon_at = self._table_at = -inf
@@ -168,7 +167,7 @@ class SendingSide:
         filling = self._messages.packing.fill(number, room - reports.reserved, now, spare=spare)
         if filling is None:
             return None
-        self.hellos.rests -= self.hellos.rests > 0
+        self.hellos.yielded()
         self._slowness.waited(filling.since, now)
         if due or now >= reports.requests.check_at:
             reports.add(filling.parts, room - filling.used, due, now)
@@ -345,8 +344,7 @@ class SendingSide:
             # A receiver that restarts takes nothing below the number that it had stored.
             return self._writer.source([], (), 0, (), slot)
         self._hello_number = newest
-        said = self._messages.stats.sent.total()
-        self.hellos.talks, self._said = said > self._said, said
+        self.hellos.begin()
         starting = self.hellos.starting
         often = starting or (now >= self._table_at and not self.hellos.lone)
         if often and not window.peers and kept.digest:  # no report says whether it has arrived
