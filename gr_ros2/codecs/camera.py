@@ -1,8 +1,7 @@
 """The codec of pictures that are looked at: H.264 within a budget for each frame.
 
-An image is resized by factors of two until the budget is at least ``LEAST_PER_BLOCK`` bytes for each 16 × 16 pixels: a
-smaller picture is better than a coarser one then. What comes out has the size that was sent, in the type and encoding
-that came in, or as one of three types of compressed pictures; ``scaled_camera_info`` fits a CameraInfo to it.
+An image is resized to what its budget is enough for (``sizes``). What comes out has the size that was sent, in the type
+and encoding that came in, or as one of three types of compressed pictures; ``scaled_camera_info`` fits a CameraInfo.
 
 Invariants: stamp and frame of the header stay; depth, and any encoding that is not in ``ENCODINGS``, is not made a
 picture (UnfitError); frames form a chain, and one that is missing is never concealed.
@@ -35,14 +34,13 @@ from gr_ros2.codecs.messages import (
     text,
     write,
 )
-from gr_ros2.codecs.video import BLOCK, MAX_PIXELS, Pixels, VideoDecoder, VideoEncoder
+from gr_ros2.codecs.sizes import AUTO, FULL, MAX_PIXELS, FittingSize, blocks, halved
+from gr_ros2.codecs.video import Pixels, VideoDecoder, VideoEncoder
 from gr_ros2.compression.zstd_frames import read_varint
-from gr_ros2.core.errors import ConfigError, DamagedError, UnfitError
+from gr_ros2.core.errors import ConfigError, DamagedError, OtherKindError, UnfitError
 from gr_ros2.wire import varint
 
 _BAYER = "bayer"
-LEAST_PER_BLOCK = 3
-"""Bytes."""
 ENCODINGS = {
     "rgb8": ("rgb24", 3),
     "bgr8": ("bgr24", 3),
@@ -63,17 +61,11 @@ ENCODINGS = {
 """ROS's name of an encoding: FFmpeg's, and bytes of a pixel."""
 OUTPUTS = {"CompressedImage": COMPRESSED_IMAGE, "CompressedVideo": VIDEO, "FFMPEGPacket": PACKET}
 """Types that come out where they are asked for."""
-SAME, AUTO, FULL = "same", "auto", "full"
+SAME = "same"
 _USUAL_PER_BLOCK = 8
 """Bytes where no budget is given."""
-_SLOWLY, _CLEARLY = 8, 1.5
-"""The size follows the mean of about so many budgets, once it would be wrong by this factor."""
 _MOST_SEEN = 1 << 25
 """Pixels of a picture of this robot's camera; those that leave are fewer."""
-_OUTER = 1024
-"""Bytes of an image beside its pixels, at most, but for the longest names of frames."""
-_SMALLEST = 64
-"""Pixels of the shorter side, below which no image is halved."""
 _FORM = 1
 
 
@@ -125,63 +117,27 @@ class CameraEncoder:
         self._options = options
         self._video = VideoEncoder(_FORM)
         self._resize = VideoReformatter()
-        self._mean = 0.0
-        self._halved: int | None = None
-        self._of = (0, 0)
+        self._size = FittingSize(options.size)
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:
         picture = _compressed(message) if self._options.type_name == COMPRESSED_IMAGE else _image(message)
         width, height = picture.width, picture.height
         if budget is None:
-            budget = _USUAL_PER_BLOCK * _blocks(width, height)
+            budget = _USUAL_PER_BLOCK * blocks(width, height)
         bytes_each = ENCODINGS[picture.label][1] if self._options.output == IMAGE else 0
-        halved = self._halvings(width, height, bytes_each, budget, key)
-        shown = _shown(width, height, halved)
+        times = self._size.halvings(width, height, bytes_each, budget, key)
+        shown = halved(width, height, times)
         frame = picture.frame
         if frame.format.name.startswith(_BAYER):
             frame = self._resize.reformat(frame, format="rgb24")
         coded = self._resize.reformat(frame, _even(shown[0]), _even(shown[1]), "yuv420p", interpolation="AREA")
         head = b"".join([*map(varint, shown), text(picture.label), text(picture.origin.frame_id)])
-        said = f"H.264 of {shown[0]} × {shown[1]} pixels" + f", of {width} × {height}" * bool(halved)
+        said = f"H.264 of {shown[0]} × {shown[1]} pixels" + f", of {width} × {height}" * bool(times)
         said += ", without alpha" * any(component.is_alpha for component in picture.frame.format.components)
         return self._video.encode(coded, head, picture.origin.stamp(), budget, key)._replace(said=said)
 
     def confirmed(self, name: int) -> None:
         """Do nothing: no frame needs a confirmed one."""
-
-    def _halvings(self, width: int, height: int, bytes_each: int, budget: int, key: bool) -> int:
-        """How often each side is halved.
-
-        :param bytes_each: of a pixel where it comes out; 0 where the picture comes out packed
-        """
-        sizes = [0]
-        while not _makes(*_shown(width, height, sizes[0]), bytes_each):
-            sizes[0] += 1
-        while min(_shown(width, height, sizes[-1] + 1)) >= _SMALLEST:
-            sizes.append(sizes[-1] + 1)
-        if self._options.size == FULL:
-            return sizes[0]
-        if self._options.size != AUTO:
-            most = tuple(map(int, self._options.size.split("x")))
-            fitting = [n for n in sizes if all(a <= b for a, b in zip(_shown(width, height, n), most, strict=True))]
-            return fitting[0] if fitting else sizes[-1]
-        if self._halved is None or self._of != (width, height):
-            self._halved, self._of, self._mean, key = None, (width, height), budget, True
-        else:
-            self._mean += (budget - self._mean) / _SLOWLY
-
-        def needs(halved: int) -> int:
-            return LEAST_PER_BLOCK * _blocks(*_shown(width, height, halved))
-
-        wanted = next((n for n in sizes if needs(n) <= self._mean), sizes[-1])
-        if (
-            self._halved is None
-            or key
-            or (wanted > self._halved and needs(self._halved) > _CLEARLY * self._mean)
-            or (wanted < self._halved and needs(wanted) * _CLEARLY < self._mean)
-        ):
-            self._halved = wanted
-        return self._halved
 
 
 class CameraDecoder:
@@ -239,11 +195,6 @@ class CameraDecoder:
         return message
 
 
-def _makes(width: int, height: int, bytes_each: int) -> bool:
-    """Whether a receiver makes a picture of this size."""
-    return width * height <= MAX_PIXELS and width * height * bytes_each + _OUTER <= MAX_SIZE
-
-
 def scaled_camera_info(message: bytes, width: int, height: int) -> bytes:
     """A CameraInfo for the image after resizing; the same bytes where it has that size already.
 
@@ -269,7 +220,7 @@ def scaled_camera_info(message: bytes, width: int, height: int) -> bytes:
 def _image(message: bytes) -> _Picture:
     image = read(IMAGE, message)
     if image.encoding not in ENCODINGS:
-        raise UnfitError(f"image: encoding {image.encoding!r} is not one of pictures: {', '.join(ENCODINGS)}")
+        raise OtherKindError(f"image: encoding {image.encoding!r} is not one of pictures: {', '.join(ENCODINGS)}")
     kind, size = ENCODINGS[image.encoding]
     rows, width = rows_of(image, size, _MOST_SEEN), image.width
     if kind.startswith(_BAYER):
@@ -303,10 +254,10 @@ def _compressed(message: bytes) -> _Picture:
     data = bytes(image.data)
     codec = {b"\xff\xd8": "mjpeg", b"\x89P": "png"}.get(data[:2])
     if codec is None or "compressedDepth" in image.format:
-        raise UnfitError(f"image: format {image.format!r} is not JPEG or PNG")
+        raise OtherKindError(f"image: format {image.format!r} is not JPEG or PNG")
     picture = video.still(codec, data, _MOST_SEEN)
     if "16" in picture.format.name or "48" in picture.format.name or "64" in picture.format.name:
-        raise UnfitError(f"image: a picture of 16 bits for each colour ({picture.format.name})")
+        raise UnfitError(f"image: format {image.format!r} with 16 bits for each colour ({picture.format.name})")
     return _Picture(Origin(image.header), picture, picture.width, picture.height, str(image.format))
 
 
@@ -336,14 +287,6 @@ def _jpeg_label(label: str) -> str:
     if "jp" in label:
         return label
     return label.replace("png", "jpeg") if "png" in label else f"{label}; jpeg compressed bgr8"
-
-
-def _blocks(width: int, height: int) -> int:
-    return -(-width // BLOCK) * -(-height // BLOCK)
-
-
-def _shown(width: int, height: int, halved: int) -> tuple[int, int]:
-    return -(-width // (1 << halved)), -(-height // (1 << halved))
 
 
 def _even(pixels: int) -> int:

@@ -1,8 +1,9 @@
 """The codec of depth images, whose numbers are distances and never colours.
 
 What is sent is the inverse of the distance, in equal steps between the nearest and the farthest: near things are finer
-than far ones, as a sensor measures them. Within a budget it is the luma of H.264, and a mask of blocks of 4 × 4 pixels
-says where there is depth; without one it has 8, 10 or 12 bits, differences of neighbours by zstd, and an exact mask.
+than far ones, as a sensor measures them. Within a budget it is the luma of H.264, of a size that the budget is enough
+for (``sizes``), and a mask of blocks of 4 × 4 pixels or more says where there is depth; without one it has 8, 10 or 12
+bits, differences of neighbours by zstd, and an exact mask.
 
 Invariants: pixels without depth come out without depth (16UC1: 0, 32FC1: NaN), in video by blocks; with bits, 1/z of a
 pixel is within half a step of 1/z of what went in, beside the rounding to the unit, unless it is nearer or farther than
@@ -36,9 +37,10 @@ from gr_ros2.codecs.messages import (
     write,
 )
 from gr_ros2.codecs.pack import Packer
-from gr_ros2.codecs.video import MAX_PIXELS, VideoDecoder, VideoEncoder
+from gr_ros2.codecs.sizes import MAX_PIXELS, FittingSize
+from gr_ros2.codecs.video import VideoDecoder, VideoEncoder
 from gr_ros2.compression.zstd_frames import read_varint
-from gr_ros2.core.errors import CodecError, ConfigError, DamagedError, UnfitError
+from gr_ros2.core.errors import CodecError, ConfigError, DamagedError, OtherKindError, UnfitError
 from gr_ros2.wire import varint
 
 Values = npt.NDArray[Any]
@@ -59,8 +61,10 @@ _MARGIN = 1.15
 _OUTSIDE = 0.005
 _SAMPLE = 7
 """Every so many pixels are looked at to find the distances."""
-_CELL = 4
-"""Pixels of the side of a block of the mask beside video."""
+_CELLS = (4, 8, 16, 32)
+"""Pixels of the side of a block of the mask beside video: the least with which it takes no more than ..."""
+_MASK_PART = 4
+"""... this part of the budget. Of a sensor whose images have many holes it would be several budgets."""
 _VIDEO, _BITS = 1, 2
 _RANGE = Struct("<ff")
 _CONFIG = Struct("<iff")
@@ -115,26 +119,25 @@ class DepthEncoder:
     def __init__(self, options: DepthCodec) -> None:
         self._options = options
         self._video = VideoEncoder(_VIDEO)
+        self._size = FittingSize()
         self._packer = Packer()
         self._range = (0.0, 0.0)
 
     def encode(self, message: bytes, budget: int | None = None, key: bool = False) -> Coded:
         mode = str(self._options.mode)
+        image = _image_of(self._options.type_name, message)
         if mode == EXACT:
             raise UnfitError("")
-        depth = _read(self._options.type_name, message)
+        depth = _read(self._options.type_name, image)
         mask = depth.metres > 0
         near, far = self._distances(depth.metres, mask, key)
-        height, width = mask.shape
-        head = b"".join(
-            [varint(width), varint(height), text(depth.label), text(depth.origin.frame_id), _RANGE.pack(near, far)]
-        )
         said = f"inverse depth from {near:.2f} to {far:.2f} m"
         if mode == AUTO and budget is not None:
-            luma = np.rint(_steps(depth.metres, mask, near, far, 255)).astype(np.uint8)
-            side = depth.origin.stamp() + self._packer.pack(_cells(mask))
-            coded = self._video.encode(video.from_luma(_filled(luma, mask)), head, side, budget, key)
-            return coded._replace(said=f"{said} as H.264")
+            metres = self._fitting(depth, budget, key)
+            coded = self._as_video(depth._replace(metres=metres), near, far, budget, key)
+            of, shown = (f"{each.shape[1]} × {each.shape[0]}" for each in (depth.metres, metres))
+            return coded._replace(said=f"{said} as H.264 of {shown} pixels" + f", of {of}" * (of != shown))
+        head = _head(depth, near, far)
         bits = _USUAL_BITS if mode == AUTO else int(mode)
         values = np.rint(_steps(depth.metres, mask, near, far, (1 << bits) - 1)).astype(np.int32)[mask]
         body = depth.origin.stamp() + head + bytes([bits]) + self._packer.pack(_differences(values, mask))
@@ -142,6 +145,25 @@ class DepthEncoder:
 
     def confirmed(self, name: int) -> None:
         """Do nothing: no frame needs a confirmed one."""
+
+    def _fitting(self, depth: _Depth, budget: int, key: bool) -> Values:
+        """The distances of every pixel, or of every second of both sides and so on. No mean is made of them: between a
+        near and a far one there is nothing."""
+        height, width = depth.metres.shape
+        bytes_each = {"16UC1": 2, "mono16": 2, "32FC1": 4}[depth.label] if self._options.type_name == IMAGE else 0
+        each = 1 << self._size.halvings(width, height, bytes_each, budget, key)
+        padded = np.pad(depth.metres, ((0, -height % each), (0, -width % each)), mode="edge")
+        return padded[each // 2 :: each, each // 2 :: each]
+
+    def _as_video(self, depth: _Depth, near: float, far: float, budget: int, key: bool) -> Coded:
+        mask = depth.metres > 0
+        luma = np.rint(_steps(depth.metres, mask, near, far, 255)).astype(np.uint8)
+        for cell in _CELLS:
+            packed = self._packer.pack(_cells(mask, cell))
+            if _MASK_PART * len(packed) <= budget:
+                break
+        side = depth.origin.stamp() + bytes([cell]) + packed
+        return self._video.encode(video.from_luma(_filled(luma, mask)), _head(depth, near, far), side, budget, key)
 
     def _distances(self, metres: Values, mask: Values, key: bool) -> tuple[float, float]:
         """The nearest and the farthest distance of the steps, m, as float32 has them."""
@@ -167,9 +189,12 @@ class DepthDecoder:
         self._most = min(MAX_PIXELS, max_size)
         self._video = VideoDecoder(self._most)
         self._packer = Packer()
+        self.size: tuple[int, int] | None = None
+        """Width and height of the newest picture that came as video."""
 
     def decode(self, data: bytes) -> bytes:
         form, before, body = opened(data)
+        self.size = None
         try:
             if form == _VIDEO:
                 return self._of_video(data)
@@ -186,15 +211,19 @@ class DepthDecoder:
         width, height, label, frame_id, near, far, _ = self._head(head)
         if picture is None or (width + width % 2, height + height % 2) != self._video.size:
             raise DamagedError("damaged depth: its size is not that of the video")
-        across, down = -(-width // _CELL), -(-height // _CELL)
-        cells = np.frombuffer(self._packer.unpack(side[8:], self._max_size), np.uint8)
+        stamp, (cell,) = stamp_of(side), take(side[8:], 1)[0]
+        if cell not in _CELLS:
+            raise DamagedError(f"damaged depth: a mask of blocks of {cell} pixels")
+        across, down = -(-width // cell), -(-height // cell)
+        cells = np.frombuffer(self._packer.unpack(side[9:], self._max_size), np.uint8)
         if len(cells) != -(-across * down // 8):
             raise DamagedError("damaged depth: a mask of another size")
         known = np.unpackbits(cells)[: across * down].reshape(down, across).astype(bool)
-        mask = known.repeat(_CELL, 0).repeat(_CELL, 1)[:height, :width]
+        mask = known.repeat(cell, 0).repeat(cell, 1)[:height, :width]
         luma = video.to_rows(picture, width)[:height]
         metres = np.where(mask, _metres(np.arange(256), near, far, 255).astype(np.float32)[luma], 0)
-        return self._written(stamp_of(side), frame_id, label, metres)
+        self.size = width, height
+        return self._written(stamp, frame_id, label, metres)
 
     def _of_bits(self, body: bytes) -> bytes:
         stamp = stamp_of(body)
@@ -259,12 +288,28 @@ class DepthDecoder:
         return write(COMPRESSED_IMAGE, header=header, format=format_, data=content)
 
 
-def _read(type_name: str, message: bytes) -> _Depth:
+def _image_of(type_name: str, message: bytes) -> Any:
+    """The message as a value.
+
+    :raises OtherKindError: for one that is not of depth
+    """
     image = read(type_name, message)
+    if type_name == IMAGE and image.encoding not in UNITS:
+        raise OtherKindError(f"image: encoding {image.encoding!r} is neither of pictures nor of depth")
+    if type_name == COMPRESSED_IMAGE and "compressedDepth" not in image.format:
+        raise OtherKindError(f"image: format {image.format!r} is neither of pictures nor of depth")
+    return image
+
+
+def _head(depth: _Depth, near: float, far: float) -> bytes:
+    height, width = depth.metres.shape
+    size, origin = varint(width) + varint(height), text(depth.label) + text(depth.origin.frame_id)
+    return size + origin + _RANGE.pack(near, far)
+
+
+def _read(type_name: str, image: Any) -> _Depth:
     if type_name == COMPRESSED_IMAGE:
         return _read_compressed(image)
-    if image.encoding not in UNITS:
-        raise UnfitError(f"image: encoding {image.encoding!r} is neither of pictures nor of depth")
     kind = "f4" if image.encoding == "32FC1" else "u2"
     rows = rows_of(image, int(kind[1]))[:, : image.width * int(kind[1])]
     values = np.ascontiguousarray(rows).view((">" if image.is_bigendian else "<") + kind)
@@ -274,8 +319,8 @@ def _read(type_name: str, message: bytes) -> _Depth:
 def _read_compressed(image: Any) -> _Depth:
     data, label = bytes(image.data), str(image.format)
     kind = label[:5]
-    if "compressedDepth" not in label or kind not in UNITS or data[_CONFIG.size : _CONFIG.size + 2] != b"\x89P":
-        raise UnfitError(f"image: format {label!r} is neither a picture nor depth as PNG")
+    if kind not in UNITS or data[_CONFIG.size : _CONFIG.size + 2] != b"\x89P":
+        raise UnfitError(f"image: format {label!r} is not depth as PNG")
     _, a, b = _CONFIG.unpack_from(data)
     picture = video.still("png", data[_CONFIG.size :])
     if picture.format.name != "gray16be":
@@ -324,13 +369,16 @@ def _filled(luma: Values, mask: Values) -> Values:
     return np.pad(filled, ((0, height % 2), (0, width % 2)), mode="edge")
 
 
-def _cells(mask: Values) -> bytes:
-    """Which blocks have depth in most of their pixels, 8 in a byte."""
+def _cells(mask: Values, cell: int) -> bytes:
+    """Which blocks have depth in most of their pixels, 8 in a byte.
+
+    :param cell: pixels of the side of a block
+    """
     height, width = mask.shape
-    padded = np.pad(mask, ((0, -height % _CELL), (0, -width % _CELL)))
-    down, across = (side // _CELL for side in padded.shape)
-    counts = padded.reshape(down, _CELL, across, _CELL).sum((1, 3))
-    return np.packbits(counts > _CELL * _CELL // 2).tobytes()
+    padded = np.pad(mask, ((0, -height % cell), (0, -width % cell)))
+    down, across = (side // cell for side in padded.shape)
+    counts = padded.reshape(down, cell, across, cell).sum((1, 3))
+    return np.packbits(counts > cell * cell // 2).tobytes()
 
 
 def _differences(values: Values, mask: Values) -> bytes:

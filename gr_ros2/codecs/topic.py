@@ -16,7 +16,7 @@ from typing import Any
 from gr_ros2.codecs.base import MAX_SIZE, Codec, Coded, Decoder, Encoder
 from gr_ros2.codecs.messages import CLOUD, COMPRESSED_IMAGE, GRID, IMAGE
 from gr_ros2.core.backends import Backend, BackendTable
-from gr_ros2.core.errors import BackendMissingError, ConfigError, DamagedError, UnfitError
+from gr_ros2.core.errors import BackendMissingError, ConfigError, DamagedError, OtherKindError, UnfitError
 
 
 @dataclass(frozen=True)
@@ -167,6 +167,9 @@ class TopicEncoder:
         for number, encoder in self._made.items():
             try:
                 coded = encoder.encode(message, budget and budget - 1, key)
+            except OtherKindError as error:
+                said = said or str(error)
+                continue
             except UnfitError as error:
                 said = str(error)
                 continue

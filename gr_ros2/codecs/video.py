@@ -23,14 +23,11 @@ import numpy.typing as npt
 
 from gr_ros2.codecs.base import KEY_TIMES, Coded, frame, name_of, opened
 from gr_ros2.codecs.messages import take
+from gr_ros2.codecs.sizes import MAX_PIXELS
 from gr_ros2.compression.zstd_frames import read_varint
 from gr_ros2.core.errors import DamagedError, MissingFrameError
 from gr_ros2.wire import varint
 
-MAX_PIXELS = 1 << 23
-"""Of a picture: 3840 × 2160 and a little more."""
-BLOCK = 16
-"""Pixels of the side of a block, the unit that H.264 codes."""
 _FPS = 10
 """Nominal; the bit rate of a budget counts with it."""
 _TOP = 40_000_000

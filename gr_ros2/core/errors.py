@@ -13,6 +13,7 @@
     │   └── EncodeError
     ├── CodecError (ValueError)         a coded message that cannot be decoded here; ``fate`` names why
     │   └── UnknownDictionaryError · DamagedError · MissingFrameError · UnfitError
+    │           └── OtherKindError
     ├── MiddlewareError (RuntimeError)  the ROS side failed
     │   ├── BagError                    a bag cannot be read or written
     │   └── DescriptionError            a node's description of a type cannot be used
@@ -225,6 +226,10 @@ class MissingFrameError(CodecError):
 
 class UnfitError(CodecError):
     """A message that a codec of its type does not code, such as an image in an unknown encoding. It passes exactly."""
+
+
+class OtherKindError(UnfitError):
+    """The same, of a message that may be another codec's, such as depth for that of pictures."""
 
 
 class MiddlewareError(GrRos2Error, RuntimeError):

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gr_ros2.codecs import CodedTopic, video
+from gr_ros2.codecs import CODECS, CodedTopic, video
 from gr_ros2.codecs.base import KEY_TIMES
 from gr_ros2.codecs.camera import ENCODINGS, scaled_camera_info
 from gr_ros2.codecs.messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, PACKET, VIDEO, read, write
@@ -118,6 +118,30 @@ def test_pictures_that_are_neither_jpeg_nor_png_pass_exactly() -> None:
         coded = topic.encoder().encode(message)
         assert topic.decoder().decode(coded.data) == message
         assert label in coded.said
+
+
+@pytest.mark.parametrize(
+    ("shape", "encoding", "said"),
+    [
+        ((6000, 6000), "mono8", "6000 × 6000 pixels"),
+        ((4000, 4000), "16UC1", "4000 × 4000 pixels"),
+        ((1, 1), "bayer_rggb8", "no Bayer pattern"),
+        ((8, 8), "16UC3", "encoding '16UC3'"),
+    ],
+)
+def test_the_reason_why_a_picture_passes_exactly_is_that_of_its_own_codec(
+    shape: tuple[int, int], encoding: str, said: str
+) -> None:
+    size = {"16UC1": 2, "16UC3": 6}.get(encoding, 1)
+    coded = CodedTopic(IMAGE).encoder().encode(image(np.zeros((*shape, size), np.uint8), encoding))
+    assert coded.data[0] == CODECS["exact"].number
+    assert said in coded.said
+
+
+@pytest.mark.parametrize(("width", "height"), [(30_000, 1), (1, 30_000), (16_386, 64)])
+def test_a_picture_of_a_side_that_no_encoder_takes_is_halved(width: int, height: int) -> None:
+    out, _ = through(image(np.zeros((height, width, 1), np.uint8), "mono8"), size="full")
+    assert (out.width, out.height) == (-(-width // 2), -(-height // 2))
 
 
 def broken(**change: Any) -> Callable[[], bytes]:

@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.codecs import CODECS, CodedTopic, video
+from gr_ros2.codecs.base import KEY_TIMES
 from gr_ros2.codecs.messages import COMPRESSED_IMAGE, IMAGE, read
+from gr_ros2.codecs.sizes import LEAST_PER_BLOCK
 from gr_ros2.core.errors import ConfigError
 from tests.codecs.scenes import Array, compressed, header, image, room
 
@@ -71,6 +73,37 @@ def test_video_of_depth_is_near_what_came_in_and_is_grey() -> None:
         assert np.mean((metres > 0) != (shown > 0)) < 0.05
         errors.append(np.median(np.abs(shown - metres)[both]))
     assert max(errors) < 0.03
+
+
+def holes(number: int, width: int, height: int) -> Array:
+    """A room as a sensor sees it that has no depth beside edges and at many small places, mm."""
+    metres = room(number, width, height)
+    edges = np.abs(np.diff(metres, axis=1, prepend=metres[:, :1])) > 0.05
+    metres[edges | np.roll(edges, -4, 1)] = 0
+    rng = np.random.default_rng(number)
+    for row, column in zip(rng.integers(0, height, 300), rng.integers(0, width, 300), strict=True):
+        metres[row : row + 6, column : column + 8] = 0
+    return np.rint(metres * 1000).astype("<u2")
+
+
+@pytest.mark.parametrize("budget", [240, 400, 800, 1600, 3800])
+def test_depth_with_many_holes_is_within_its_budget_and_smaller_where_that_is_short(budget: int) -> None:
+    topic = CodedTopic(IMAGE)
+    encoder, decoder = topic.encoder(), topic.decoder()
+    share = []
+    for number in range(12):
+        pixels = holes(number, 640, 480)
+        coded = encoder.encode(image(pixels, "16UC1", number), budget)
+        out = read(IMAGE, decoder.decode(coded.data))
+        share.append(len(coded.data) / budget / (1 if coded.before else KEY_TIMES))
+        assert decoder.size == (out.width, out.height)
+        assert out.width * out.height / 256 * LEAST_PER_BLOCK <= budget or out.height == 120
+        shown, step = out.data.view("<u2").reshape(out.height, out.width), 640 // out.width
+        given = pixels[step // 2 :: step, step // 2 :: step].astype(int)
+        both = (shown > 0) & (given > 0)
+        assert both.mean() > 0.75
+        assert np.median(np.abs(shown - given)[both]) < 100
+    assert max(share) <= 1.1, share
 
 
 @pytest.mark.parametrize("big", [False, True])
