@@ -414,6 +414,7 @@ BACKFILL = Elsewhere("e2e/test_backfill.py::test_what_nobody_heard_in_an_outage_
 effects(
     "Backfill",
     topics=BACKFILL,
+    robots=Elsewhere("gr/test_backfill.py::test_what_one_who_records_has_not_heard_crosses_later_whoever_else_has"),
     for_s=Elsewhere("calls/test_backfill.py::test_what_is_too_old_is_given_up"),
     memory_mb=Elsewhere("e2e/test_backfill.py::test_what_does_not_fit_is_given_up_and_the_bag_says_so"),
 )

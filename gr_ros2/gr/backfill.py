@@ -56,6 +56,7 @@ class Backfill:
         chosen: Callable[[int], bool],
         wall_s: Callable[[float], float],
     ) -> None:
+        self._receipts, self._robots = endpoint.receipts_of(config.robots), config.robots
         self._endpoint, self._share, self._chosen, self._wall_s = endpoint, share, chosen, wall_s
         self.kept = MessagesForLater(config.for_s, round(config.memory_mb * 1e6))
         self._allowed, self._looked = 0.0, inf
@@ -81,11 +82,15 @@ class Backfill:
 
     def look(self, now: float) -> None:
         """Let messages wait for what is left of the air."""
-        here = {peer.robot: peer.start for peer in self._endpoint.peers(now) if not peer.silent and not peer.hops}
+        here = {
+            peer.robot: peer.start
+            for peer in self._endpoint.peers(now)
+            if not (peer.silent or peer.hops) and (not self._robots or peer.robot in self._robots)
+        }
         if any(self._starts.get(robot, start) != start for robot, start in here.items()):
             self.kept.doubt()
         self._starts |= here
-        self.kept.heard(self._endpoint.receipts, now)
+        self.kept.heard(self._receipts, now)
         if here:
             self._fill(now)
         self._looked = now

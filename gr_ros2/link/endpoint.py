@@ -11,7 +11,7 @@ them before any observer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import inf
 from typing import Any, NamedTuple, Protocol
@@ -378,9 +378,8 @@ class OpenEndpoint(Endpoint, Protocol):
     def used_air(self) -> AirMeter:
         """How much of the air it uses."""
 
-    @property
-    def receipts(self) -> PacketReceipts:
-        """Which of its packets others have, as they report from the first call on."""
+    def receipts_of(self, robots: Collection[int]) -> PacketReceipts:
+        """Which of its packets one of some robots has, or any robot where none is named, as they report from now on."""
 
     @property
     def questions(self) -> Questions:

@@ -28,6 +28,7 @@ from gr_ros2.settings.config import (
     NamespaceForm,
     PacketLen,
     Repairs,
+    RobotId,
     Seconds,
     SendOptions,
     TopicForm,
@@ -102,6 +103,8 @@ class BackfillConfig:
 
     topics: Annotated[tuple[str, ...], AfterValidator(checked_words), Field(title="Topics filled later")] = ()
     """names (with * and ?) of topics: what was superseded, or sent while nobody heard, crosses later; [] = none"""
+    robots: Annotated[tuple[RobotId, ...], Field(title="Robots that record")] = ()
+    """numbers of those who record: what none of them has heard crosses later; [] = what no robot has"""
     for_s: Annotated[float, Field(gt=0, le=86400, title="Kept for filling (s)")] = 600.0
     """s for which a message is kept to cross later"""
     memory_mb: Annotated[float, Field(gt=0, le=65536, title="Memory for filling (MB)")] = 64.0
@@ -216,7 +219,7 @@ class RobotConfig:
             "nobody can ask over a link that goes one way; leave it out, or set direction: both",
         ),
         ActsWhere(
-            ("backfill.for_s", "backfill.memory_mb"),
+            ("backfill.robots", "backfill.for_s", "backfill.memory_mb"),
             lambda robot: bool(robot.backfill.topics),
             "nothing is kept; set backfill.topics, or leave it out",
         ),

@@ -47,6 +47,7 @@ class Filling(Robot):
 
     backfill: Backfill | None = None
     share = 1.0
+    records: tuple[int, ...] = ()
     ahead_s = 0.0
     """s by which its clock is ahead of the time of the link."""
 
@@ -54,7 +55,7 @@ class Filling(Robot):
         self.events = Noted(self)
         super().start(boot)
         self.backfill = Backfill(
-            BackfillConfig(topics=("odom",)),
+            BackfillConfig(topics=("odom",), robots=self.records),
             self.end,
             share=self.share,
             chosen=lambda topic: topic == ODOM,
@@ -211,3 +212,23 @@ def test_a_clock_that_is_set_in_an_outage_leaves_what_was_kept_in_order(ahead_s:
     assert len(made) > 100
     assert made == sorted(made)
     assert made[-1] - made[0] < 1e6 * 700 * SLOT_S
+
+
+@pytest.mark.parametrize("records", [(), (2,)])
+def test_what_one_who_records_has_not_heard_crosses_later_whoever_else_has(
+    monkeypatch: pytest.MonkeyPatch, records: tuple[int, ...]
+) -> None:
+    monkeypatch.setattr(Filling, "records", records)
+    pair = Pair()
+    other = Robot(3)
+    pair.air.robots.append(other)
+    pair.air.lost = lambda sender, receiver: pair.away and other not in (sender, receiver)
+    pair.slots(200, odom=4)
+    first = pair.made
+    pair.outage(1200)
+    last = pair.made
+    for _ in range(20):
+        pair.slots(200, odom=20)
+    missing = set(range(first, last)) - {*pair.later(), *pair.live()}
+    assert bool(missing) != bool(records)
+    assert not len(pair.backfill.kept)

@@ -141,8 +141,8 @@ for cls in (ScenarioRobot, LinkConfig):
         for part in ("topics", "offer"):
             IDLE[cls, f"{part}.*.{option}"] = ({part: {"odom": given}}, {"compression": False}, {}, COMPRESSES)
     IDLE[cls, "offer"] = ({"offer": ["scan"]}, {"direction": "send"}, {}, "set direction: both")
-    for option in ("for_s", "memory_mb"):
-        of = {"backfill": {option: 60.0}}
+    for option, value in {"robots": [2], "for_s": 60.0, "memory_mb": 60.0}.items():
+        of = {"backfill": {option: value}}
         IDLE[cls, f"backfill.{option}"] = (of, {}, {"backfill": {"topics": ["odom"]}}, "set backfill.topics")
     IDLE[cls, "expected_loss"] = ({"expected_loss": 0.5}, {"repair": "off"}, {"repair": "idle"}, "set repair to")
     IDLE[cls, "beacon_s"] = ({"beacon_s": 9.0}, {"direction": "send"}, {}, "set direction: both")

@@ -11,7 +11,7 @@ the boot number and the stored state.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from typing import Any
@@ -217,12 +217,9 @@ class EndpointV1:
     def urgent(self) -> bool:
         return self._sending.urgent
 
-    @property
-    def receipts(self) -> Receipts:
-        peers = self.window.peers
-        if peers.receipts is None:
-            peers.receipts = Receipts()
-        return peers.receipts
+    def receipts_of(self, robots: Collection[int]) -> Receipts:
+        receipts = self.window.peers.receipts = Receipts(robots)
+        return receipts
 
     @property
     def held_bytes(self) -> int:

@@ -271,7 +271,7 @@ class Peers:
         records, bit, delay = self._packets.records, peer.bit, peer.delay
         if self.receipts is not None:
             alive = lambda older: older in records and records[older].alive(now)  # noqa: E731
-            self.receipts.report(number, arrived, alive, self._packets.told)
+            self.receipts.report(src_id, number, arrived, alive, self._packets.told)
         if settled:
             lacks = ~arrived & (1 << MAP) - 1
             needs = number - lacks.bit_length() + 1

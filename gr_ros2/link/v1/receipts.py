@@ -1,8 +1,8 @@
-"""Which of one sender's packets some robot has, as reports tell."""
+"""Which of one sender's packets some robot has, or one of those that count, as reports tell."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from gr_ros2.wire.control import MAP
 from gr_ros2.wire.v1 import SPAN
@@ -17,20 +17,24 @@ class Receipts:
     packet says whether it has come, unless its robot was told before that it need not wait; otherwise those do that
     come while it is repaired.
 
+    :param robots: those that count; none for any
     :ivar newest: number of the newest packet that any report covers, -1 for none
     """
 
-    def __init__(self) -> None:
+    def __init__(self, robots: Collection[int] = ()) -> None:
+        self._robots = frozenset(robots)
         self.newest = -1
         self._covered = self._came = 0
         """Bit i stands for packet ``newest - i``: a report has covered it; it has come."""
 
-    def report(self, number: int, arrived: int, repaired: Callable[[int], bool], told: int) -> None:
+    def report(self, robot: int, number: int, arrived: int, repaired: Callable[[int], bool], told: int) -> None:
         """A robot has reported; see ``Peers.report``.
 
         :param repaired: whether a packet is still repaired
         :param told: the newest packet of which robots were told whether they need to wait for it
         """
+        if self._robots and robot not in self._robots:
+            return
         newer = number - self.newest
         if newer > 0:
             self._covered = self._covered << newer & _ALL if newer < SPAN else 0

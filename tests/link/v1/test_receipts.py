@@ -9,8 +9,10 @@ from gr_ros2.wire.v1 import SPAN
 ALL = (1 << MAP) - 1
 
 
-def report(receipts: Receipts, number: int, *missing: int, repaired: bool = True, told: int = -1) -> None:
-    receipts.report(number, ALL & ~sum(1 << number - one for one in missing), lambda _: repaired, told)
+def report(
+    receipts: Receipts, number: int, *missing: int, robot: int = 2, repaired: bool = True, told: int = -1
+) -> None:
+    receipts.report(robot, number, ALL & ~sum(1 << number - one for one in missing), lambda _: repaired, told)
 
 
 def test_a_packet_has_come_if_the_first_report_says_so_or_one_while_it_is_repaired() -> None:
@@ -52,3 +54,14 @@ def test_what_another_robot_lacks_has_come_if_one_has_it() -> None:
     report(receipts, 100)
     report(receipts, 100, 95, 96)
     assert receipts.have(95, 96)
+
+
+def test_robots_that_do_not_count_tell_nothing() -> None:
+    receipts = Receipts((3, 4))
+    report(receipts, 100)
+    assert receipts.newest == -1
+    report(receipts, 50, 40, robot=3)
+    report(receipts, 50, 41, robot=4)
+    report(receipts, 100)
+    assert receipts.newest == 50
+    assert receipts.have(41, 50)
