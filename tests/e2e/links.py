@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import subprocess
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
@@ -19,45 +18,29 @@ from unittest.mock import patch
 from gr_ros2.cli.main import run
 from tests.e2e.support import COMMAND
 from tests.radio.cables import free_ports
-from tests.waiting import PATIENCE_S, wait_for
+from tests.spoken import Spoken
+from tests.waiting import wait_for
 
 
-class LinkProcess:
+class LinkProcess(Spoken):
     """One of them.
 
     :param command: what runs the link, before the name of its file
-    :ivar said: lines of its output so far
     """
 
     def __init__(self, file: Path, env: Mapping[str, str], command: Sequence[str], *more: str) -> None:
-        self.said: list[str] = []
         self._env = env
-        self._process = subprocess.Popen(
-            [*command, str(file), *more],
-            env={**os.environ, **env},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def tell(self, line: str) -> None:
-        """Write a line to its input."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{line}\n")
-        self._process.stdin.flush()
+        super().__init__([*command, str(file), *more], env={**os.environ, **env}, stderr=subprocess.STDOUT)
 
     def ask(self, *words: str) -> tuple[int, str]:
         """How a command that asks this link ends, and what it says."""
         with patch.dict(os.environ, self._env), redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
-            status = run([*words, "--pid", str(self._process.pid)])
+            status = run([*words, "--pid", str(self.process.pid)])
         return status, out.getvalue() + err.getvalue()
 
     def status(self) -> Any:
         """What it counts; {} before it answers."""
-        assert self._process.poll() is None, "\n".join(self.said)
+        assert self.process.poll() is None, "\n".join(self.said)
         status, said = self.ask("status", "--json")
         return {} if status else json.loads(said)
 
@@ -67,24 +50,11 @@ class LinkProcess:
 
     def transmit(self, *, on: bool) -> None:
         """Switch its sending off, as in an outage, or on again."""
-        self._process.send_signal(signal.SIGUSR2 if on else signal.SIGUSR1)
-
-    def end(self, number: signal.Signals = signal.SIGINT) -> int:
-        """Its status after a signal."""
-        self._process.send_signal(number)
-        status = self._process.wait(PATIENCE_S)
-        self._reader.join(PATIENCE_S)
-        return status
+        self.process.send_signal(signal.SIGUSR2 if on else signal.SIGUSR1)
 
     def close(self) -> None:
-        self._process.kill()
-        self._process.wait()
-        self._reader.join()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self.said.append(line.rstrip("\n"))
+        self.process.kill()
+        super().close()
 
 
 class Links:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,7 +18,8 @@ from gr_ros2_lab.race.namespaces import Namespace, check_means, inside
 from tests.e2e import link_peer
 from tests.e2e.support import COMMAND
 from tests.middleware.support import CUSTOM
-from tests.waiting import PATIENCE_S, wait_for
+from tests.spoken import Spoken
+from tests.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 CABLE = "air"
@@ -27,46 +27,26 @@ SOME = 10
 """Messages that show that a direction works, or would have come if it did."""
 
 
-class Process:
+class Process(Spoken):
     """One in a namespace; the numbers it says are kept by their word."""
 
     def __init__(self, namespace: Namespace, command: Sequence[str]) -> None:
-        self.said: dict[str, list[int]] = {"sent": [], "got": []}
-        self.output = ""
-        self.process = inside(
-            namespace.path,
-            lambda: subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT
-            ),
-        )
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
+        self.numbers: dict[str, list[int]] = {"sent": [], "got": []}
+        inside(namespace.path, lambda: super(Process, self).__init__(command, stderr=subprocess.STDOUT, cwd=ROOT))
 
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            word, _, number = line.strip().partition(" ")
-            if word in self.said and number.isdigit():
-                self.said[word].append(int(number))
-            else:
-                self.output += line
+    def take(self, line: str) -> None:
+        word, _, number = line.strip().partition(" ")
+        if word in self.numbers and number.isdigit():
+            self.numbers[word].append(int(number))
+        else:
+            super().take(line)
 
     def newest(self, word: str) -> int:
-        return self.said[word][-1] if self.said[word] else -1
-
-    def end(self, number: signal.Signals) -> int:
-        """Send a signal; the exit status."""
-        self.process.send_signal(number)
-        status = self.process.wait(PATIENCE_S)
-        self._reader.join(PATIENCE_S)
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
-        return status
+        return self.numbers[word][-1] if self.numbers[word] else -1
 
     def close(self) -> None:
-        if self.process.poll() is None:
-            self.end(signal.SIGKILL)
+        self.process.kill()
+        super().close()
 
 
 def ip(namespace: Namespace, *words: str) -> None:
@@ -128,7 +108,7 @@ def both_hear_news(robots: Sequence[Robot], after: str) -> None:
 
     def heard() -> bool:
         news = [
-            sum(number > before for number in robot.programs.said["got"])
+            sum(number > before for number in robot.programs.numbers["got"])
             for robot, before in zip(robots, sent_before, strict=True)
         ]
         return min(news) >= SOME
@@ -136,7 +116,7 @@ def both_hear_news(robots: Sequence[Robot], after: str) -> None:
     try:
         wait_for(heard, f"both to hear each other after {after}")
     except AssertionError as error:
-        raise AssertionError(f"{error}: {[(robot.link.output, robot.programs.output) for robot in robots]}") from error
+        raise AssertionError(f"{error}: {[(robot.link.said, robot.programs.said) for robot in robots]}") from error
 
 
 def programs_go_on(*programs: Process) -> None:
@@ -172,8 +152,8 @@ def test_both_ways_at_once_through_kills_and_a_pulled_plug(robots: list[Robot]) 
     both_hear_news(robots, "the plug was in again")
 
     for robot in robots:
-        heard = robot.programs.said["got"]
+        heard = robot.programs.numbers["got"]
         assert len(heard) == len(set(heard)), "a message came twice"
         assert heard == sorted(heard), "a message came after a later one"
-        assert robot.link.end(signal.SIGINT) == 0, robot.link.output
-        assert "received" in robot.link.output.splitlines()[-1]
+        assert robot.link.end(signal.SIGINT) == 0, robot.link.said
+        assert "received" in robot.link.said[-1]

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
+import signal
 import struct
-import subprocess
 import sys
-import threading
 from collections.abc import Hashable
-from contextlib import suppress
 from pathlib import Path
 
 from gr_ros2.middleware.services import ServiceGraph
-from tests.waiting import PATIENCE_S
+from tests.spoken import Spoken
 
 ADD = "example_interfaces/srv/AddTwoInts"
 LOOPBACK = (
@@ -69,35 +67,21 @@ class Caller:
         self.there = there
 
 
-class Program:
+class Program(Spoken):
     """``service_peer.py`` in a process; see there."""
 
     def __init__(self, domain: int, service: str, role: str) -> None:
-        self.said: list[list[str]] = []
-        peer = Path(__file__).with_name("service_peer.py")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", f"tests.middleware.{peer.stem}", str(domain), service, role],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            bufsize=1,
-            cwd=Path(__file__).parents[2],
-            env={**os.environ, "CYCLONEDDS_URI": LOOPBACK},
-        )
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        self.said.extend(line.split() for line in self.process.stdout)
+        command = [sys.executable, "-m", "tests.middleware.service_peer", str(domain), service, role]
+        super().__init__(command, cwd=Path(__file__).parents[2], env={**os.environ, "CYCLONEDDS_URI": LOOPBACK})
 
     def heard(self, word: str) -> list[list[int]]:
         """The numbers said behind a word, line by line."""
-        return [[int(number) for number in line[1:]] for line in list(self.said) if line[0] == word]
+        lines = [line.split() for line in list(self.said)]
+        return [[int(number) for number in line[1:]] for line in lines if line[0] == word]
 
     @property
     def ready(self) -> bool:
-        return ["ready"] in self.said
+        return "ready" in self.said
 
     @property
     def there(self) -> bool:
@@ -106,24 +90,8 @@ class Program:
 
     def call(self, number: int) -> None:
         """Have a client ask for ``number`` + 1000."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{number} 1000\n")
+        self.tell(f"{number} 1000")
 
     def kill(self) -> None:
         """End it without a word to the graph, which misses it some seconds later."""
-        self.process.kill()
-        self.close()
-
-    def close(self) -> None:
-        """End of input makes it leave the graph; if it does not, it is ended."""
-        assert self.process.stdin is not None and self.process.stdout is not None
-        if not self.process.stdin.closed:
-            with suppress(BrokenPipeError):
-                self.process.stdin.close()
-        try:
-            self.process.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        self._thread.join(PATIENCE_S)
-        self.process.stdout.close()
+        self.end(signal.SIGKILL)
