@@ -251,7 +251,7 @@ class Waited(NamedTuple):
 
 class LeftOut(NamedTuple):
     """Packets of the sender for which no message waits: they were sent so that not all robots hear them, and carry
-    nothing that is delivered in order.
+    nothing that is delivered in order, or they are not repaired any more.
 
     :param number: newest number that the map covers, mod 2^16
     :param packets: bit i says that packet ``number - i`` is one of them, 64 bits

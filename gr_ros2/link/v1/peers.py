@@ -288,7 +288,7 @@ class Peers:
                     record.confirmed |= bit
                     record.skipped &= ~bit
                     peer.lost.discard(record.number)
-            elif record is None or not record.alive(now):
+            elif record is None or not self._packets.repaired(record, now):
                 older = number - back
                 if older > 0 and self._waits(older, number, now):
                     waits.append(older)

@@ -25,6 +25,7 @@ from gr_ros2.link.v1.shared import SharedRepairs
 from gr_ros2.link.v1.thrift import Thrift
 from gr_ros2.link.v1.unreported import Unreported
 from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.wire.control import LeftOut
 from gr_ros2.wire.v1 import SPAN
 
 RepairMode = Literal["idle", "thrifty", "off"]
@@ -61,7 +62,7 @@ class RepairWindow:
         pace: Pace | None = None,
     ) -> None:
         self._repair, self._pace = repair, pace
-        self.packets = SentPackets(span)
+        self.packets = SentPackets(span, shares=shares)
         self._unreported = Unreported(expected_loss, proves=proves, slower=slower)
         self._shared = SharedRepairs(self.packets) if shares else None
         self.peers = Peers(self.packets, self._unreported, self._shared, slower=slower)
@@ -154,17 +155,21 @@ class RepairWindow:
             return peers.in_vain or peers.any_urgent
         return self._unreported.due(self.packets.newest)
 
-    def tell(self, number: int, now: float) -> Repair | None:
-        """A repair from which peers learn that a packet is not repaired any more, or that brings it back; None if there
-        is none."""
+    def tell(self, number: int, now: float) -> Repair | LeftOut | None:
+        """What tells peers that a packet is not repaired any more, or brings it back; None if there is nothing."""
         packets = self.packets
         packets.retire(now)
         if self._shared is None:
             self.peers.announced(range(packets.newest + 1))
             window = self._combining.around(number, now)
         else:
+            window = self._combining.fitting(self._shared.window(now, number), number)
+            if not window or number not in self._shared.spanned(window):
+                told = packets.left_out(now, number)
+                self.peers.announced(packets.told_of)
+                self._shared.tells(packets.told_of, now)
+                return told
             window = self._of_all(now, number)
-            self.peers.announced((number,))  # also where it stands beyond the window; a report calls for it again
         spans = bool(window) and window[0].number >= number >= window[-1].number
         record = packets.records.get(number)
         if record is not None and (not spans or self.peers.replayed(number)):

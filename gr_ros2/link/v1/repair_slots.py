@@ -17,6 +17,7 @@ from gr_ros2.link.v1.packing import Packing
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.link.v1.writer import PacketWriter, SendSlot
+from gr_ros2.wire.control import LeftOut
 
 PATIENCE_S = 0.2
 """s for which a receiver waits in vain for a packet before it is told so in front of new messages."""
@@ -153,13 +154,16 @@ class RepairSlots:
 
     def _tell(self, number: int, slot: SendSlot) -> SentPacket | None:
         """Say that a packet is not repaired any more."""
+        told: Repair | LeftOut | None
         if (packets := self._window.packets).parts:
             told = packets.left_out(slot.now, number)
             self._window.peers.announced(packets.told_of)
+        else:
+            told = self._window.tell(number, slot.now)
+        if isinstance(told, LeftOut):
             return self._writer.control([told], "repair", slot)
-        repair = self._window.tell(number, slot.now)
-        if repair is not None:
-            return self._writer.repair(repair, slot)
+        if told is not None:
+            return self._writer.repair(told, slot)
         return None if self._window.packets.unconfirmed(slot.now) else self._writer.control([], "repair", slot)
 
     def _next_look(self, now: float) -> float:

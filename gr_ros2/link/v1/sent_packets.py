@@ -64,6 +64,7 @@ class SentPackets:
     """What a sender keeps of its packets.
 
     :param span: numbers that are kept at most
+    :param shares: whether others send on the same channel
     :ivar newest: number of the last source packet; 0 before the first
     :ivar oldest: no older packet is kept
     :ivar records: all packets from ``oldest`` on that may be alive, by number and in this order
@@ -76,14 +77,14 @@ class SentPackets:
     :ivar told_of: the packets of which they were told last whether they need to
     """
 
-    def __init__(self, span: int = SPAN) -> None:
+    def __init__(self, span: int = SPAN, *, shares: bool = False) -> None:
         self.newest = self.oldest = self.needed = 0
         self.records: dict[int, Sent] = {}
         self.everybody = self.away = 0
         self.parted: set[int] = set()
         self.told = 0
         self.told_of = range(0)
-        self._span = span
+        self._span, self._shares = span, shares
         self._repair_ids: dict[int, int] = {}
         """Repair ids already used, as bits, by number."""
         self._repair_id = 0
@@ -191,12 +192,16 @@ class SentPackets:
         packets = 0
         for back in range(MAP):
             record = records.get(newest - back)
-            if record is None or not record.alive(now) or newest - back in self.parted:
+            if record is None or not self.repaired(record, now) or newest - back in self.parted:
                 packets |= 1 << back
         settled = self.oldest > newest - MAP
         self.told = max(self.told, newest)
         self.told_of = range(0 if settled else newest - MAP + 1, newest + 1)
         return LeftOut(newest & 0xFFFF, packets, settled)
+
+    def repaired(self, record: Sent, now: float) -> bool:
+        """Whether a packet is repaired: on a channel that others share, not for what the next message replaces."""
+        return record.lasts(now) if self._shares else record.alive(now)
 
     def unconfirmed(self, now: float) -> bool:
         """Whether anything is alive."""

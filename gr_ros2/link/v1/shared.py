@@ -83,11 +83,14 @@ class SharedRepairs:
 
     def combined(self, window: list[Sent], now: float) -> None:
         """A combination of these packets leaves."""
-        self._since = 0
         self._owed = max(self._owed - 1, 0.0)
-        self._told, self._told_at = self.spanned(window), now
+        self.tells(self.spanned(window), now)
         for record in window:
             record.at = now
+
+    def tells(self, numbers: range, now: float) -> None:
+        """A packet leaves that says what of these numbers is not repaired any more."""
+        self._since, self._told, self._told_at = 0, numbers, now
 
     def window(self, now: float, lost: int) -> list[Sent]:
         """All that is worth a combination up to the newest packet in order, newest first; what is around a packet that

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -81,6 +82,19 @@ def test_what_was_lost_is_repaired(loss: float, size: int, medium: str, mode: Se
         came = other.delivered(1)
         assert [payload for payload in came if payload in texts] == texts
         assert len(came) > 100
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_best_effort_keeps_nothing_back(mode: SealMode) -> None:
+    """Its packets are alive for long, and where turns are rare, nothing repairs them."""
+    topics = registry(joy=replace(LATENCY, reliability="best_effort"), text=SendOptions())
+    one, other = busy(1, "slots", mode, topics), plain(2, "slots", mode)
+    between = air("slots", one, other, loss=0.3)
+    between.run(5)
+    for n in range(20):
+        one.end.messages.submit(TEXT, b"text %d" % n, between.now)
+        between.run(2)
+        assert b"text %d" % (n - 2) in other.delivered(1) or n < 2
 
 
 @pytest.mark.parametrize("medium", MEDIA)

@@ -78,7 +78,7 @@ def test_short_packets_that_relay_leave_turns_for_repairs_and_reports(mode: Seal
     seed 9 two robots wait in vain for packets beyond the window of a repair."""
     everybody = Cell(*(robot(src_id, mode, TOPICS, packet_len=64) for src_id in (1, 2, 3, 4)), loss=0.3)
     everybody._rng = random.Random(seed)
-    everybody.invariant.bound = 250
+    everybody.invariant.bound = 300
     everybody.run(5)
     goals = [b"goal %29d" % n for n in range(40)]
     for goal in goals:
@@ -87,6 +87,25 @@ def test_short_packets_that_relay_leave_turns_for_repairs_and_reports(mode: Seal
         everybody.run(0.8)
     rest(everybody, 20, goals)
     assert whole(everybody, goals)
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_a_robot_out_of_reach_does_not_delay_rare_messages_to_another_one(mode: SealMode) -> None:
+    """Since it lacks an old message, no repair says of all newer packets which of them need not be waited for."""
+    topics = registry(odom=SendOptions(queue="latest", reliability="best_effort"), goal=SendOptions())
+    everybody = Cell(*(robot(src_id, mode, topics, relay=False) for src_id in (1, 2, 3)), loss=0.2)
+    one, two, _ = everybody.robots
+    everybody.run(6)
+    everybody.apart = lambda one, other: 2 in (one, other)
+    one.end.messages.submit(1, b"goal that robot 3 lacks", everybody.now)
+    everybody.run(14)
+    for goal in (b"goal 1", b"goal 2", b"goal 3"):
+        one.end.messages.submit(1, goal, everybody.now)
+        everybody.run(4)
+        assert goal in two.delivered(1)
+        for _ in range(300):
+            one.end.messages.submit(0, b"odometry", everybody.now)
+            everybody.run(0.1)
 
 
 def one_way_first(now: float, one: int, other: int) -> bool:

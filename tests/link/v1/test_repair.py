@@ -15,6 +15,7 @@ from gr_ros2.link.v1.gf256 import combine
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.repair import RepairMode, RepairWindow
 from gr_ros2.link.v1.sent_packets import Sent
+from gr_ros2.wire.control import LeftOut
 from gr_ros2.wire.v1 import MAX_WINDOW, REPAIR_IDS
 
 ROOM = 24
@@ -383,8 +384,28 @@ def test_a_receiver_is_told_of_what_is_over_between_packets_that_others_lack(sha
     sender.peers.meet(2, 7.0)
     sender.peers.meet(3, 7.0)
     told = sender.tell(300, 7.0)
-    assert isinstance(told, Repair)
-    assert told.number - told.mask.bit_length() < 300 <= told.number
+    if shares:  # no combination that fits spans it; so many of its neighbours are told of with it
+        assert isinstance(told, LeftOut)
+        assert told == LeftOut(363, (1 << 64) - 1, settled=False)
+    else:
+        assert isinstance(told, Repair)
+        assert told.number - told.mask.bit_length() < 300 <= told.number
+
+
+def test_where_turns_are_rare_a_receiver_is_told_of_what_the_next_message_replaces() -> None:
+    """Such a packet is alive for long, and no repair names it."""
+    sender = RepairWindow("thrifty", ROOM, shares=True)
+    sender.peers.meet(2, 0.0)
+    for number in range(1, 41):
+        fresh = number in {5, 9}
+        sender.sent(number, body(number), b"", (Lifetime(in_order=not fresh, fresh=fresh, left=True),), number / 10)
+    lacks = 1 << 40 - 5 | 1 << 40 - 9
+    sender.peers.report(2, 40, (1 << 64) - 1 ^ lacks, settled=True, loss=0.1, now=5.0)
+    assert sender.urgent(5.0) is None
+    assert sender.peers.given_up(5.0) == 5
+    told = sender.tell(5, 5.0)
+    assert isinstance(told, LeftOut)
+    assert told.packets >> told.number - 5 & 1 and told.packets >> told.number - 9 & 1
 
 
 @pytest.mark.parametrize("shares", [False, True])
