@@ -71,7 +71,7 @@ class ByGain:
         self._gains.own(0, 0, number, now)
         stream, _ = self._gains.best(now)
         stream = stream or own
-        self._gains.sent(stream, now)
+        self._gains.sent(stream, self._gains.has(stream), now)
         self.relays = stream != own
         if not self.relays:
             message = Relayed(self._src_id, 0, number, 0, 0, 0, _stamp.pack(made))

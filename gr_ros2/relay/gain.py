@@ -36,6 +36,9 @@ LIKELY = 0.5
 """Messages by which all neighbours together are taken to be behind, from which on one is likely to lack the newest."""
 UNKNOWN_S = 10.0
 """By how much younger a stream's first message is taken to make a robot."""
+KNOWN_S = 1.0
+"""By how much younger a table makes a robot at most that knows it: it tells only that its robot is still there. Without
+this, tables that are sent again starved those that a robot lacks, for ever where there is no room for all."""
 FIRST_PERIOD_S = 0.1
 """s from one number of a stream to the next, before two are known."""
 ARRIVALS = 16
@@ -68,7 +71,7 @@ class Stream(NamedTuple):
 class _State:
     """A stream, and who has what of it."""
 
-    __slots__ = ("arrivals", "came", "has", "newest", "period")
+    __slots__ = ("arrivals", "came", "has", "known", "newest", "period")
 
     def __init__(self) -> None:
         self.newest = -1
@@ -77,6 +80,8 @@ class _State:
         self.arrivals: deque[tuple[int, float]] = deque(maxlen=ARRIVALS)
         self.has: dict[int, float] = {}
         """The newest number that a neighbour is taken to have."""
+        self.known: set[int] = set()
+        """The neighbours that had any, as they have shown."""
 
 
 class _Heard:
@@ -124,6 +129,9 @@ class Gains:
         robot = self._heard.get(src_id)
         if robot is None:
             robot = self._heard[src_id] = _Heard()
+        if not self.near(robot.at, now):  # it may have forgotten others since
+            for state in self._streams.values():
+                state.known.discard(src_id)
         robot.at = now
         robot.packets += 1
         for name in names:
@@ -160,6 +168,7 @@ class Gains:
         state = self._state(stream)
         new = stream.origin != self.src_id and self._arrived(state, number, now, now if made is None else made)
         state.has[via] = max(number, state.has.get(via, number))
+        state.known.add(via)
         robot = self._heard.get(via)
         for name in () if robot is None else robot.named:
             if name in self._heard and name != self.src_id:
@@ -172,6 +181,7 @@ class Gains:
         if state is not None:
             ahead = (newest.number - state.newest + _HALF & 0xFFFF) - _HALF
             state.has[via] = state.newest + ahead
+            state.known.add(via)
 
     # ---- what is sent
 
@@ -186,29 +196,43 @@ class Gains:
 
     def lacks(self, stream: Stream, now: float) -> bool:
         """Whether a neighbour is likely to lack its newest message."""
-        return self.gain(stream, now) >= LIKELY * self._streams[stream].period
+        period = self._streams[stream].period
+        return self.gain(stream, now) >= LIKELY * (min(period, KNOWN_S) if stream.topic_id == TABLE_TOPIC else period)
 
     def best(
-        self, now: float, cost: Callable[[Stream], float] = lambda _: 1.0, others: Sequence[float] = ()
+        self,
+        now: float,
+        cost: Callable[[Stream], float] = lambda _: 1.0,
+        others: Sequence[float] = (),
+        may_leave: Callable[[Stream], bool] = lambda _: True,
+        room: float = inf,
     ) -> tuple[Stream | None, float]:
         """The stream whose gain squared is largest for its cost, and its gain in s; None where nothing is gained.
 
         :param cost: of sending a stream's newest message, above 0; infinite where it is not to be considered
         :param others: gains of other messages, which count for the weight
+        :param may_leave: whether a stream's message may leave now
+        :param room: how much of the cost fits a packet: a message that takes several counts as so many for the weight
         """
         neighbours = self._neighbours(now)
         best: Stream | None = None
-        most = worth = 0.0
+        most = worth = found = found_worth = 0.0
         largest, total = max(others, default=0.0), sum(gain * gain for gain in others)
         for stream, state in self._streams.items():
             gain = self._gain(stream, state, neighbours)
-            total += gain * gain
-            if gain and gain * gain / cost(stream) > worth:
-                best, most, worth = stream, gain, gain * gain / cost(stream)
+            if not gain:
+                continue
+            costs = cost(stream)
+            total += gain * gain * (max(costs / room, 1.0) if costs < inf else 1.0)
+            by_cost = gain * gain / costs
+            if by_cost > worth:
+                most, worth = gain, by_cost
+            if by_cost > found_worth and may_leave(stream):
+                best, found, found_worth = stream, gain, by_cost
         own = len(neighbours) * (now - self._chosen_at)  # of a message made since the choice before
         self._chosen_at = now
         self._worth += SMOOTHING * (max(total / max(most, largest, own, 1e-9) ** 2, 1.0) - self._worth)
-        return best, most
+        return best, found
 
     @property
     def weight(self) -> int:
@@ -219,12 +243,15 @@ class Gains:
         """Robots that are heard."""
         return len(self._neighbours(now))
 
-    def sent(self, stream: Stream, now: float) -> None:
-        """The newest message of a stream leaves."""
+    def sent(self, stream: Stream, number: int, now: float, share: float = OWN) -> None:
+        """A message of a stream leaves.
+
+        :param share: of the way to it by which the neighbours are taken to have come
+        """
         state = self._streams[stream]
         for robot in self._neighbours(now):
             if robot != stream.origin:
-                self._count_as_heard(state, robot, state.newest, OWN)
+                self._count_as_heard(state, robot, number, share)
 
     @property
     def others(self) -> int:
@@ -250,6 +277,13 @@ class Gains:
         """A robot that is heard has started again: it has nothing of what it had."""
         for state in self._streams.values():
             state.has.pop(src_id, None)
+            state.known.discard(src_id)
+
+    def changed(self, stream: Stream) -> None:
+        """The message of a stream is another one than before: nobody has it."""
+        if (state := self._streams.get(stream)) is not None:
+            state.has.clear()
+            state.known.clear()
 
     def _state(self, stream: Stream) -> _State:
         state = self._streams.get(stream)
@@ -291,8 +325,8 @@ class Gains:
         for robot in neighbours:
             if robot != origin and not (table and origin in self._heard[robot].named):
                 before = has.get(robot)
-                if before is None:
+                if before is None or (table and before <= newest - 1 and robot not in state.known):
                     behind += UNKNOWN_S / state.period
                 elif before < newest:
-                    behind += newest - before
+                    behind += min(newest - before, KNOWN_S / state.period) if table else newest - before
         return behind * state.period

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.relay.gain import EVEN, EXPIRES_S, HEARD_S, OWN, UNKNOWN_S, Gains, Stream
+from gr_ros2.relay.gain import EVEN, EXPIRES_S, HEARD_S, KNOWN_S, OWN, UNKNOWN_S, Gains, Stream
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
+from gr_ros2.wire.v1 import TABLE_TOPIC
 
 ODOM = Stream(7, 0xCAFE, 0)
 
@@ -37,7 +38,7 @@ def test_the_gain_is_the_time_that_a_neighbour_is_behind() -> None:
     gains = hearing(2, 3)
     gains.told(3, Newest(7, 0xFE, 0, 4))
     assert gains.gain(ODOM, 1.0) == pytest.approx(0.6)
-    gains.sent(ODOM, 1.0)
+    gains.sent(ODOM, gains.has(ODOM), 1.0)
     assert gains.gain(ODOM, 1.0) == pytest.approx(0.6 * (1 - OWN))
 
 
@@ -45,7 +46,7 @@ def test_what_was_sent_is_likely_there_until_the_neighbour_tells_that_it_is_not(
     gains = hearing(2, 3)
     gains.told(3, Newest(7, 0xFE, 0, 9))
     assert gains.lacks(ODOM, 1.0)
-    gains.sent(ODOM, 1.0)
+    gains.sent(ODOM, gains.has(ODOM), 1.0)
     assert not gains.lacks(ODOM, 1.0)
     assert gains.best(1.0)[0] == ODOM
     gains.told(3, Newest(7, 0xFE, 0, 9))
@@ -67,7 +68,7 @@ def test_the_weight_grows_with_the_messages_that_wait_to_be_relayed() -> None:
 
 def test_what_a_neighbour_tells_stands_against_belief() -> None:
     gains = hearing(2, 3)
-    gains.sent(ODOM, 1.0)
+    gains.sent(ODOM, gains.has(ODOM), 1.0)
     gains.told(3, Newest(7, 0xFE, 0, 10))
     assert gains.best(1.0) == (None, 0.0)
     gains.told(3, Newest(7, 0xFE, 0, 0))
@@ -94,6 +95,39 @@ def test_an_older_message_is_not_new_and_another_start_is_another_stream() -> No
     assert gains.message(3, ODOM._replace(start=1), 0, 1.1)
     assert not gains.message(2, Stream(1, 0, 0), 5, 1.1)  # its own, sent on
     assert gains.has(ODOM) == 10
+
+
+def test_a_table_that_a_robot_lacks_goes_before_those_that_tell_that_robots_are_still_there() -> None:
+    """Where there was no room for all, they starved it for ever."""
+    gains = hearing(2, 3, 4)
+    lacked, renewed = Stream(7, 0xCAFE, TABLE_TOPIC), Stream(8, 0xCAFE, TABLE_TOPIC)
+    for number in (1, 200):
+        gains.message(2, lacked, number, 1.0)
+        gains.message(2, renewed, number, 1.0)
+        for robot in (3, 4):
+            gains.told(robot, Newest(8, 0xFE, TABLE_TOPIC, 1))
+    gains.told(3, Newest(7, 0xFE, TABLE_TOPIC, 1))
+    assert gains.gain(renewed, 1.0) == pytest.approx(2 * KNOWN_S)
+    assert gains.gain(lacked, 1.0) == pytest.approx(UNKNOWN_S + KNOWN_S)
+    gains.changed(renewed)
+    assert gains.gain(renewed, 1.0) > gains.gain(lacked, 1.0)
+    for robot in (2, 3, 4):
+        gains.neighbour(robot, 100.0)
+        gains.told(robot, Newest(7, 0xFE, TABLE_TOPIC, 199))
+    assert gains.lacks(lacked, 100.0)
+    for robot in (2, 3, 4):
+        gains.neighbour(robot, 200.0)
+    assert gains.gain(lacked, 200.0) > 2 * UNKNOWN_S, "they were away, and may have forgotten"
+
+
+def test_what_takes_several_packets_counts_for_as_many() -> None:
+    weights = []
+    for room in (100, 10):
+        gains = hearing(2, 3)
+        for now in range(100):
+            gains.best(1.0 + now / 1000, lambda _: 100.0, (), lambda _: True, room)
+        weights.append(gains.weight)
+    assert weights[0] == 1 < weights[1]
 
 
 def test_own_messages_compete_with_those_of_others() -> None:
@@ -130,7 +164,7 @@ def test_the_choice_is_something_that_is_here(packets: list[tuple[int, int, int,
         assert (best is None) == (gain == 0)
         if best is not None:
             assert gains.has(best) == newest[best]
-            gains.sent(best, now)
+            gains.sent(best, gains.has(best), now)
             assert gains.gain(best, now) < gain
 
 

@@ -32,7 +32,7 @@ from gr_ros2.link.v1.freshness import RANK, Turns, value
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.order import ALL
-from gr_ros2.link.v1.sent_topics import ON_AIR, SentTopics
+from gr_ros2.link.v1.sent_topics import ON_AIR, RELAYED_TABLES, SentTopics
 from gr_ros2.wire import QOS_BULK, QOS_DEFAULT, QOS_LATENCY
 from gr_ros2.wire.ages import AGE_STEP_S, age_code
 from gr_ros2.wire.control import WAITED_LEN, Waited
@@ -209,7 +209,11 @@ class Packing:
         return topic is None or not topic.queue
 
     def _rank(self, message: Message) -> float:
-        return RANK[message.qos] + 0.5 * (len(message.payload) > self.short)
+        return RANK[message.qos] + 0.5 * self._is_long(message)
+
+    def _is_long(self, message: Message) -> bool:
+        """Whether others go before a message. Without its table, nothing of a robot is of use."""
+        return len(message.payload) > self.short and message.topic_id != RELAYED_TABLES
 
     def _turn(self) -> int:
         """Whose turn it is; the table has none where it fills what others leave."""
@@ -272,7 +276,7 @@ class Packing:
                 lifetime.expires, lifetime.keys = message.expires, message.keys
                 lifetime.topic_id, lifetime.order = topic_id, (message.begin, message.place if not back else ALL)
                 lifetime.in_order = topic.in_order or (self._shares and topic_id == TABLE_TOPIC)
-                lifetime.long = len(message.payload) > self.short
+                lifetime.long = self._is_long(message)
                 lifetime.fresh = not (lifetime.in_order or topic.kept or topic_id > TABLE_TOPIC)
                 queue.started(message, now)
             if message.submitted < since and not topic.topic.options.max_rate:

@@ -120,6 +120,7 @@ class ReceivingSide:
                 self._outcomes,
                 lambda src_id, boot, first: self._inbox(src_id, boot, first, settings.packet_len, far=True),
                 packet_len=settings.packet_len,
+                repairs=settings.repair != "off",
                 most=settings.max_source_bytes,
                 slower=lambda: settings.slower,
             )

@@ -34,7 +34,7 @@ from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.outcomes import Outcomes
-from gr_ros2.link.v1.sent_on import SentOn, ToPass
+from gr_ros2.link.v1.sent_on import REPAIRED_S, SentOn, ToPass
 from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.relay.gain import TOLD, Gains, Stream
 from gr_ros2.relay.in_order import Kept, Name
@@ -56,11 +56,10 @@ from gr_ros2.wire.v1 import BROADCAST, CARRIED_TOPIC, TABLE_TOPIC
 
 TABLE_S = 5.0
 """s after which the table of a robot that is heard is worth sending on again: some may have come since."""
-TRIES, MOST_TABLE_S = 2, 20.0
-"""A table of several packets is worth it so many times later for each of them, and not later than so many s. Until then
-the fragments of all tries add up at those who lack it. With packets of 64 bytes, sealed, one of four topics takes 14:
-every 5 s, tables of robots that are known left no time for that of another one over a line of four; at 30 % loss none
-of 44 tries came whole."""
+LATER, MOST_TABLE_S = 2, REPAIRED_S
+"""A table of several packets is worth it so many times later for each of them, and not later than so many s. With
+packets of 64 bytes, sealed, one of four topics takes 14: every 5 s, tables of robots that are known left no time for
+that of another one over a line of four."""
 FORGET_S = 60.0
 """s after which nothing of a robot is sent on any more: its table comes every ``TABLE_S`` from who hears it."""
 _BOOT_LEN = 8
@@ -73,6 +72,7 @@ class Relaying:
     :param neighbours: the robots that are heard
     :param outcomes: takes what comes of it
     :param packet_len: bytes of a packet
+    :param repairs: whether lost packets are repaired
     :param most: bytes of messages that are kept to be sent on, of those carried here that wait, and of far tables
     :param slower: see :class:`gr_ros2.relay.gain.Gains`
     :param make_inbox: see :class:`FarRobots`
@@ -90,6 +90,7 @@ class Relaying:
         make_inbox: Callable[[int, int, int], Inbox],
         *,
         packet_len: int,
+        repairs: bool,
         most: int,
         slower: Callable[[], float],
     ) -> None:
@@ -97,7 +98,7 @@ class Relaying:
         self._neighbours, self._dropped = neighbours, outcomes.stats.dropped
         self.gains, self.routes = Gains(src_id, slower), Routes(slower)
         self.far = FarRobots(neighbours, outcomes, self.routes, make_inbox, most=most)
-        self.sent_on = SentOn(self.gains, self._dropped, most)
+        self.sent_on = SentOn(self.gains, self._dropped, most, repairs=repairs)
         self.custody: Custody
         self._telling = deque[Stream | None]()
         """What is told next: a reliable topic for all, or None for the newest message of the next of the others."""
@@ -123,7 +124,7 @@ class Relaying:
         if neighbour is not None and not neighbour.hello.digest and boot != neighbour.boot:
             boot, table, at = neighbour.boot, write_table(()), -inf  # others learn that it is there, and where
         self.far.there[src_id] = now
-        every = min(TABLE_S * max(TRIES * len(table) / self._packet_len, 1), MOST_TABLE_S) * self.gains.slower()
+        every = min(TABLE_S * max(LATER * len(table) / self._packet_len, 1), MOST_TABLE_S) * self.gains.slower()
         if table and neighbour is not None and now - at > every:
             self._table(src_id, boot, table, neighbour.inbox.newest, now)
         if now > self._swept + TABLE_S:
@@ -156,7 +157,7 @@ class Relaying:
             if (inbox := self.far.inbox(src_id, boot & 0xFFFF)) is not None:
                 self._due(inbox, now, receipts=True)
             if self._tables.get(src_id, (0, b"", 0.0))[:2] != (boot, ready.payload):
-                self._table(src_id, boot, ready.payload, number, now)
+                self._tables[src_id] = boot, ready.payload, -inf  # of all rows in a packet
             return
         if ready.payload[:1] == FRAME and ready.coded:
             return  # a chain of frames is not passed on: who lacks one of them would have no use for the others
@@ -191,10 +192,10 @@ class Relaying:
         except WireError as error:
             self._dropped[error.kind] += 1
             return
-        if withheld and not (carried or self._in_a_row(message)):  # what comes in a row may have been under repair
+        origin, start, table = message.origin, message.start, message.topic_id == TABLE_TOPIC
+        if withheld and not (carried or table or self._in_a_row(message)):  # these may have been under repair
             self._dropped["withheld"] += 1
             return
-        origin, start = message.origin, message.start
         neighbour = self._neighbours.all.get(origin)
         heard = None if neighbour is None or neighbour.gone else neighbour
         age_s, limit_s = age_of(message.age), age_of(message.limit)
@@ -213,11 +214,11 @@ class Relaying:
         if now > kept.until and not self._in_a_row(message):
             self._dropped["too_old"] += 1
             return
-        order, table = (message.number, message.place), message.topic_id == TABLE_TOPIC
+        order = message.number, message.place
         payload = message.payload[_BOOT_LEN * table :]
         of = Ready(message.topic_id, order, payload, -1, message.coded, False, message.hops, via, carried)
         of.made, of.sealed, of.limit_s = made, ready.sealed - age_s if ready.sealed < inf else inf, limit_s
-        if table and not carried and not self._starts(message, via, now, made, heard=heard is not None):
+        if table and not carried and not self._starts(message, via, now, min(made, of.sealed), heard=heard is not None):
             return
         near = heard is not None and self.gains.near(heard.heard, now)
         if heard is not None and near and message.number > heard.inbox.newest:
@@ -322,11 +323,11 @@ class Relaying:
             del self._tables[src_id]
 
     def _table(self, src_id: int, boot: int, table: bytes, number: int, now: float) -> None:
-        self._tables[src_id] = boot, table, now
         payload = boot.to_bytes(_BOOT_LEN, "big") + table
         self.sent_on.drop_other_starts(src_id, boot & 0xFFFF)
         message = Relayed(src_id, boot & 0xFFFF, number, 0, TABLE_TOPIC, 0, payload)
-        self.sent_on.take(src_id, ToPass(message, now, inf), now)
+        if self.sent_on.take(src_id, ToPass(message, now, inf), now):
+            self._tables[src_id] = boot, table, now
 
     def _starts(self, message: Relayed, via: int, now: float, made: float, *, heard: bool) -> bool:
         """Look at the table of a robot; returns whether it is that of its start, as far as this is known."""

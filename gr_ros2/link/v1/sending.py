@@ -50,6 +50,9 @@ TABLE_SHARE = 0.1
 """Part of the air that the table of topics takes at most where it follows every hello, since nobody reports. It comes
 every ``repeat_s`` in any case."""
 
+_TELLING_LEN = TOLD * NEWEST_LEN + 1
+"""Bytes in which a packet tells of messages of others, at least."""
+
 
 class SendingSide:
     """The choice of what leaves next.
@@ -137,7 +140,7 @@ class SendingSide:
             return repair
         if self._relaying is not None:
             leaves = now if slot.leave_at is None else slot.leave_at
-            self._relaying.sent_on.offer(messages.sent, now, leaves)
+            self._relaying.sent_on.offer(messages.sent, now, leaves, self._writer.room - _TELLING_LEN)
             self._relaying.custody.offer(now, leaves)
         if (sent := self._fill(due, slot)) is not None:
             return sent
@@ -159,7 +162,7 @@ class SendingSide:
         told: list[Newest] = []
         if self._relaying is not None:
             told = self._relaying.tells(now)
-            room -= max(TOLD * NEWEST_LEN, sum(map(length_of, told))) + 1  # an entry that fills it needs its length now
+            room -= max(_TELLING_LEN, sum(map(length_of, told)) + 1)  # an entry that fills it needs its length now
         number = self._window.packets.newest + 1
         parts = self._audiences is not None and self._parts()
         if parts:  # who waits for what was not sent to all is told

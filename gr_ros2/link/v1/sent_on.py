@@ -1,8 +1,8 @@
 """What is sent on of the messages of other robots.
 
 Of reliable topics for all, all messages in their order (``relay.in_order``); of all others the newest of each topic
-(``relay.gain``). Both compete with own messages by what they are worth. A table that is sent again consists of
-the same bytes as before: fragments of two tries add up. The age in it counts from the first try.
+(``relay.gain``). Both compete with own messages by what they are worth. A table is of use only whole, and may take many
+packets: these are repaired for ``REPAIRED_S``.
 
 Invariant: what is kept is bounded by ``MOST_STREAMS``, ``MOST_KEPT`` and the bytes given; of the neighbours that
 brought it, the one with most of it loses first.
@@ -16,8 +16,8 @@ from math import inf
 from typing import NamedTuple
 
 from gr_ros2.link.v1.message import Message
-from gr_ros2.link.v1.sent_topics import RELAYED_IN_ORDER, SentTopic, SentTopics
-from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.link.v1.sent_topics import RELAYED_IN_ORDER, RELAYED_TABLES, SentTopic, SentTopics
+from gr_ros2.relay.gain import OWN, Gains, Stream
 from gr_ros2.relay.in_order import InOrder, Kept, Name
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire import QOS_DEFAULT
@@ -31,8 +31,14 @@ MOST_KEPT = 4096
 """Messages of reliable topics for all that are kept to be sent on."""
 
 
+REPAIRED_S = 20.0
+"""s for which a table is repaired after it has left: another one follows then at the latest."""
 Repaired = Callable[[int, float], bool]
 """Whether something is being repaired for a robot at a time, s."""
+
+
+QUEUES = (RELAYED_TOPIC, RELAYED_TABLES, RELAYED_IN_ORDER)
+"""The queues of what is sent on; each has one message at most."""
 
 
 class ToPass(NamedTuple):
@@ -53,25 +59,28 @@ class SentOn:
     :param gains: knows who lacks what
     :param dropped: counts what is not sent on any more
     :param most: bytes of messages that are kept, of each of the two kinds
+    :param repairs: whether lost packets are repaired
     :ivar in_order: the messages of reliable topics for all
     :ivar relayed: messages sent on, by origin and topic id
     """
 
-    def __init__(self, gains: Gains, dropped: Counter[str], most: int) -> None:
+    def __init__(self, gains: Gains, dropped: Counter[str], most: int, *, repairs: bool) -> None:
         self.relayed: Counter[tuple[int, int]] = Counter()
         self.in_order = InOrder(gains, Quotas(MOST_KEPT, most))
-        self._gains, self._dropped = gains, dropped
+        self._gains, self._dropped, self._repairs = gains, dropped, repairs
         self._newest: dict[Stream, ToPass] = {}
         self._quotas: Quotas[Stream] = Quotas(MOST_STREAMS, most)
-        self._chosen: Stream | None = None
+        self._offered: dict[int, tuple[Stream, ToPass]] = {}
+        """What is in a queue of the newest messages or of tables, by its id."""
         self._next: Name | None = None
-        self._tried: dict[Stream, tuple[ToPass, Message]] = {}
-        """The tables that have left, and how."""
 
     def take(self, via: int, to_pass: ToPass, now: float) -> bool:
         """Keep a message to be sent on; returns whether it is newer than what is here."""
         message = to_pass.message
         stream = Stream(message.origin, message.start, message.topic_id)
+        before = self._newest.get(stream)
+        if stream.topic_id == TABLE_TOPIC and before is not None and before.message.payload != message.payload:
+            self._gains.changed(stream)
         if not self._gains.message(via, stream, message.number, now, to_pass.made):
             return False
         self._newest[stream] = to_pass
@@ -111,7 +120,7 @@ class SentOn:
         for topic_id in topic_ids:
             self.in_order.drop(Stream(origin, start, topic_id), lambda order: order[0] > number)
 
-    def offer(self, topics: SentTopics, now: float, leaves: float) -> None:
+    def offer(self, topics: SentTopics, now: float, leaves: float, room: int) -> None:
         """Let the messages that are worth most compete for the next packet, unless some are leaving.
 
         Their value is ``g^2 / c`` as for own messages, with g the gain per neighbour. What every neighbour is likely to
@@ -119,6 +128,7 @@ class SentOn:
 
         :param topics: with the queues of relayed messages
         :param leaves: when the packet leaves, s
+        :param room: bytes that it has for messages
         """
         for stream in [stream for stream, to_pass in self._newest.items() if now > to_pass.until]:
             self._dropped["too_old"] += self._gains.lacks(stream, now)
@@ -126,16 +136,16 @@ class SentOn:
         name, worth, gains, late = self.in_order.best(now)
         if late:
             self._dropped["too_old"] += late
-        chosen, gain = self._gains.best(now, lambda stream: self._cost(stream, now), gains)
-        queue = topics[RELAYED_TOPIC].queue
-        if not (queue and queue[0].started and now <= queue[0].expires):
-            queue.clear()
-            self._chosen = chosen
-            if chosen is not None:
-                self._queue(topics[RELAYED_TOPIC], self._newest[chosen], gain, now, leaves)
-        queue = topics[RELAYED_IN_ORDER].queue
-        if not (queue and queue[0].started and now <= queue[0].expires):
-            queue.clear()
+        free = {topic_id for topic_id in QUEUES if _is_free(topics[topic_id], now)}
+        chosen, gain = self._gains.best(
+            now, lambda stream: self._cost(stream, now), gains, lambda stream: _queue_of(stream) in free, room
+        )
+        for topic_id in free - {RELAYED_IN_ORDER}:
+            self._offered.pop(topic_id, None)
+        if chosen is not None:
+            self._offered[_queue_of(chosen)] = chosen, self._newest[chosen]
+            self._queue(topics[_queue_of(chosen)], self._newest[chosen], gain, now, leaves)
+        if RELAYED_IN_ORDER in free:
             self._next = name
             if name is not None:
                 self._queue(topics[RELAYED_IN_ORDER], self.in_order[name], worth, now, leaves)
@@ -148,35 +158,44 @@ class SentOn:
         if message.topic_id == RELAYED_IN_ORDER and self._next is not None:
             self.in_order.sent(self._next, now, repaired_for(message))
             self.relayed[self._next.stream.origin, self._next.stream.topic_id] += 1
-        elif message.topic_id == RELAYED_TOPIC and self._chosen is not None:
-            self._gains.sent(self._chosen, now)
-            if self._chosen.topic_id == TABLE_TOPIC:
-                self._tried[self._chosen] = self._newest[self._chosen], message
-            self.relayed[self._chosen.origin, self._chosen.topic_id] += 1
+        table = message.topic_id == RELAYED_TABLES
+        if table:
+            message.lifetime.expires = now + REPAIRED_S * self._gains.slower()
+        if message.topic_id in self._offered:
+            stream, to_pass = self._offered.pop(message.topic_id)
+            self._gains.sent(stream, to_pass.message.number, now, 1.0 if table and self._repairs else OWN)
+            self.relayed[stream.origin, stream.topic_id] += 1
 
     def _drop(self, stream: Stream) -> None:
         """Send nothing of a stream on."""
         self._newest.pop(stream, None)
-        self._tried.pop(stream, None)
         self._quotas.drop(stream)
         self._gains.drop(stream)
-        if stream == self._chosen:
-            self._chosen = None
+        self._offered = {topic_id: offered for topic_id, offered in self._offered.items() if offered[0] != stream}
 
     def _queue(self, topic: SentTopic, to_pass: ToPass | Kept, gain: float, now: float, leaves: float) -> None:
         message = to_pass.message
         hops = min(message.hops + 1, MOST_HOPS)
-        payload, begin = write_relayed(message._replace(hops=hops, age=age_code(leaves - to_pass.made))), 0
-        tried = self._tried.get(Stream(message.origin, message.start, message.topic_id))
-        if tried is not None and tried[0] is to_pass:
-            payload, begin = tried[1].payload, tried[1].begin
+        payload = write_relayed(message._replace(hops=hops, age=age_code(leaves - to_pass.made)))
         topic.newest = now - gain / max(self._gains.neighbours(now), 1)
-        queued = Message(
-            -1, topic.topic.topic_id, payload, QOS_DEFAULT, now, expires=to_pass.until, repeat=True, begin=begin
-        )
+        queued = Message(-1, topic.topic.topic_id, payload, QOS_DEFAULT, now, expires=to_pass.until, repeat=True)
         topic.queue.append(queued)
 
     def _cost(self, stream: Stream, now: float) -> float:
         if stream not in self._newest or not self._gains.lacks(stream, now):
             return inf
         return RELAYED_LEN + len(self._newest[stream].message.payload)
+
+
+def _queue_of(stream: Stream) -> int:
+    """The queue of the newest message of a stream."""
+    return RELAYED_TABLES if stream.topic_id == TABLE_TOPIC else RELAYED_TOPIC
+
+
+def _is_free(topic: SentTopic, now: float) -> bool:
+    """Whether another message may be put into a queue; what has not begun to leave is removed."""
+    queue = topic.queue
+    if queue and queue[0].started and now <= queue[0].expires:
+        return False
+    queue.clear()
+    return True

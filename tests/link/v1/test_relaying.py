@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from collections.abc import Iterator
 from math import inf
 from typing import Any
@@ -12,10 +13,15 @@ import pytest
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link.events import Announced, Delivered
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.link.v1.sent_on import REPAIRED_S, SentOn, ToPass
+from gr_ros2.link.v1.sent_topics import RELAYED_TABLES, SentTopics
 from gr_ros2.mac import Slots
+from gr_ros2.relay.gain import Gains
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
+from gr_ros2.wire.relayed import Relayed, read_relayed
+from gr_ros2.wire.v1 import TABLE_TOPIC
 from tests.link.v1.air import SLOT_S, Robot, registry
 from tests.link.v1.invariants import PacketsEnd
 
@@ -161,14 +167,37 @@ def test_packets_for_others_keep_their_slots_and_are_confirmed_by_that_robot_onl
     assert everybody[2].end.received.dropped["not_for_us"] > 100
 
 
-@pytest.mark.parametrize("loss", [0.0, 0.1])
-def test_tables_of_many_packets_cross_a_line(loss: float) -> None:
-    """They are of use only whole: fragments of several tries add up, and what is known leaves them time."""
+@pytest.mark.parametrize(("loss", "seed"), [(0.0, 1), (0.1, 1), (0.3, 1), (0.3, 3), (0.4, 2)])
+def test_tables_of_many_packets_cross_a_line(loss: float, seed: int) -> None:
+    """They are of use only whole: they are repaired, have slots for all their packets, and those that a robot lacks go
+    first."""
     options = {f"topic_{n}": SendOptions() for n in range(4)}
     line = Line(*(robot(src_id, "encrypt", registry(**options), packet_len=64) for src_id in (1, 2, 3, 4)), loss=loss)
+    line._rng.seed(seed)
     line.run(40)
     for one in line.robots:
         assert all(one.end.knows(other.src_id) for other in line.robots if other is not one)
+
+
+def test_a_table_that_comes_while_another_one_leaves_is_sent_on() -> None:
+    gains = Gains(2)
+    for robot_id in (1, 3):
+        gains.neighbour(robot_id, 0.0)
+    sent_on, topics = SentOn(gains, Counter(), 10_000, repairs=True), SentTopics(None, ())
+    topics.relay()
+    queue, table = topics[RELAYED_TABLES].queue, Relayed(1, 5, 10, 0, TABLE_TOPIC, 0, b"table" * 40)
+    sent_on.take(1, ToPass(table, 0.0, inf), 0.0)
+    sent_on.offer(topics, 0.0, 0.0, 100)
+    (leaving,) = queue
+    leaving.take(50)
+    later = table._replace(number=20, payload=b"later" * 40)
+    sent_on.take(1, ToPass(later, 1.0, inf), 1.0)
+    sent_on.offer(topics, 1.0, 1.0, 100)
+    assert [*queue] == [leaving]
+    sent_on.left(queue.popleft(), 1.0, lambda _: lambda _robot, _now: False)
+    assert leaving.lifetime.expires == 1.0 + REPAIRED_S
+    sent_on.offer(topics, 1.0, 1.0, 100)
+    assert read_relayed(queue[0].payload).payload == later.payload
 
 
 def test_frames_are_not_passed_on() -> None:

@@ -38,7 +38,8 @@ def says(insider: Robot, false: Relayed, now: float) -> None:
     def once(topics, *_):  # type: ignore[no-untyped-def]
         topic = topics[RELAYED_TOPIC]
         if not topic.queue:
-            passing.offer, passing._chosen = offer, None  # type: ignore[method-assign]
+            passing.offer = offer  # type: ignore[method-assign]
+            passing._offered.pop(RELAYED_TOPIC, None)
             topic.queue.append(Message(-1, RELAYED_TOPIC, write_relayed(false), 1, now, repeat=True))
 
     passing.offer = once  # type: ignore[method-assign,assignment]
