@@ -46,6 +46,7 @@ class Ready:
     :param sealed: time in s after which its last packet was sealed, where that has to be proven and it came over others
     :param limit_s: age in s at which it is of no more use
     :param after: the order of a message of its topic, between which and this one there is no other; None if unknown
+    :param came: when it began to wait for others, s
     """
 
     topic_id: int
@@ -61,6 +62,7 @@ class Ready:
     sealed: float = inf
     limit_s: float = inf
     after: tuple[int, int] | None = None
+    came: float = -inf
 
 
 def nobody(_since: float) -> bool:
@@ -171,6 +173,7 @@ class Order:
         line = self._waiting.setdefault(ready.topic_id, [])
         if not line:
             self._since[ready.topic_id] = now
+        ready.came = now
         self.held += len(ready.payload) + _COST
         line.append(ready)
 
@@ -252,13 +255,17 @@ class Order:
             if line:
                 passed = self._pass(topic_id)
                 line.sort(key=lambda ready: ready.order)
+                over = False
                 while line:
                     ready = line[0]
-                    if waits and not self._next(ready, passed) and not (quiet and self._follows(ready, now)):
-                        break
+                    if waits and not self._next(ready, passed) and not (quiet and self._follows(ready)):
+                        if not (quiet and self._waited(ready, now)):
+                            break
+                        over = True
                     due.append(line.pop(0))
                     self.reached[topic_id] = max(self.reached.get(topic_id, ready.order), ready.order)
-                    self._since[topic_id] = now
+                    if not over:  # what was missing has come, and more may; what is given up delays nothing else
+                        self._since[topic_id] = now
                     self.held -= len(ready.payload) + _COST
         return due
 
@@ -268,17 +275,23 @@ class Order:
             return ready.order[0] <= passed
         return ready.after is not None and ready.after <= self.up_to(ready.topic_id)
 
-    def _follows(self, ready: Ready, now: float) -> bool:
-        """Whether a message comes out that waits for others to bring those before it."""
+    def _follows(self, ready: Ready) -> bool:
+        """Whether all messages are here before one that others may bring."""
         here = self.up_to(ready.topic_id)
-        if ready.order <= here or (ready.after is not None and ready.after <= here):
-            return True
-        if ready.over is None or now < self._since[ready.topic_id] + self._patience_s:
+        return ready.order <= here or (ready.after is not None and ready.after <= here)
+
+    def _waited(self, ready: Ready, now: float) -> bool:
+        """Whether a message has waited for so long that nobody brings those before it any more."""
+        if ready.over is None or now < self._until(ready):
             return False
         if self._brings(self._since[ready.topic_id]):
             self._since[ready.topic_id] = now
             return False
         return True
+
+    def _until(self, ready: Ready) -> float:
+        """Until when a message waits for others to bring those before it, s."""
+        return max(self._since[ready.topic_id], ready.came) + self._patience_s
 
     def missing_since(self) -> float:
         """When the packet that its sender repairs first was found to be missing, s; inf for none."""
@@ -291,7 +304,7 @@ class Order:
         soonest = inf
         for topic_id, line in self._waiting.items():
             if line and line[0].over is not None:
-                soonest = min(soonest, max(self._since[topic_id] + self._patience_s, self.heard + self._quiet_s))
+                soonest = min(soonest, max(self._until(line[0]), self.heard + self._quiet_s))
                 if self._asked < self.heard + self._quiet_s:
                     soonest = min(soonest, self.heard + self._quiet_s)
             if line and self._gaps and not self.told:

@@ -283,6 +283,20 @@ def test_who_still_repairs_what_was_missing_has_its_time_again() -> None:
     assert since == [100.0, 160.0]
 
 
+def test_gaps_that_nobody_fills_pass_together() -> None:
+    """One after the other, each took 60 s; a message that has just come has its time all the same."""
+    decoder = RepairDecoder(60, lambda _: True, 1000)
+    order = Order(decoder, 1, 1.0, sure=10_000, fits=lambda _: True, room=60, quiet_s=3.0, patience_s=60.0)
+    for number, after in ((9, 8), (10, 9), (20, 19), (30, 29)):
+        order.wait(Ready(1, (number, 0), b"", -1, False, False, 1, 2, after=(after, 0)), 100.0)
+    assert not order.settle(110.0)
+    order.wait(Ready(1, (40, 0), b"", -1, False, False, 1, 2, after=(39, 0)), 150.0)
+    assert order.next_timeout() == 160.0
+    assert [ready.order[0] for ready in order.settle(160.0)] == [9, 10, 20, 30]
+    assert order.next_timeout() == 210.0
+    assert [ready.order[0] for ready in order.settle(210.0)] == [40]
+
+
 @pytest.mark.parametrize("quiet", [False, True])
 def test_a_message_over_others_overtakes_none_that_began_or_ends_in_a_missing_packet(quiet: bool) -> None:
     """It did not bring the packet in which it began: one before it may stand there, or go on there."""
