@@ -148,6 +148,11 @@ class Gains:
         robot = self._heard.get(src_id)
         return robot is not None and self.near(robot.at, now) and self.src_id in robot.named
 
+    def knows(self, src_id: int, stream: Stream) -> bool:
+        """Whether a robot has shown that it knows the table of another one that has a stream."""
+        table = self._streams.get(stream._replace(topic_id=TABLE_TOPIC))
+        return table is not None and src_id in table.known
+
     def heard_by(self, src_id: int) -> list[int]:
         """The robots that are heard here and that a robot says it hears."""
         robot = self._heard.get(src_id)

@@ -4,7 +4,7 @@ Every message is kept with the one of its topic before it. Each robot tells up t
 it is sent the next ones, the oldest first. One that was sent, by this robot or by another one that it hears, is sent
 again when the robot has told since that it still lacks it: at first after ``AGAIN_S``, then after twice as long with
 each time, and not while packets with a part of it are being repaired for that robot. Of a topic that is kept for late
-robots, one that has told nothing yet gets the newest.
+robots, one that has told nothing yet but knows the table gets the newest.
 
 Invariants: sans-IO, the caller passes in times; what is kept is bounded, and of the neighbours that brought it, the one
 with most of it loses first; work for a choice is bounded by ``WINDOW``, the robots that are heard and the topics.
@@ -78,6 +78,8 @@ class _Row:
     has: dict[int, Order] = field(default_factory=dict)
     told: dict[int, float] = field(default_factory=dict)
     """When each robot told last what it has, s."""
+    kept_for: dict[int, Order] = field(default_factory=dict)
+    """What robots get that came late, up to this message, one by one: they take none that was made before another."""
     served: float = -inf
     """When one of the messages was sent last, s."""
 
@@ -186,7 +188,7 @@ class InOrder:
                 apart[stream.origin] = self._gains.apart(stream.origin, now)
             wanted: dict[Order, int] = {}
             for robot in apart[stream.origin]:
-                for order, kept in self._next(row, robot, now):
+                for order, kept in self._next(stream, row, robot, now):
                     if now > kept.until:
                         late.append(Name(stream, order))
                     else:
@@ -217,13 +219,19 @@ class InOrder:
 
     # ----
 
-    def _next(self, row: _Row, robot: int, now: float) -> list[tuple[Order, Kept]]:
+    def _next(self, stream: Stream, row: _Row, robot: int, now: float) -> list[tuple[Order, Kept]]:
         """The messages that a robot lacks and that are worth sending now, and those that are of no more use."""
         has, told = row.has.get(robot), row.told.get(robot, inf)
+        if has is None and not self._gains.knows(robot, stream):
+            return []
         begin = len(row.orders) - row.late if has is None else bisect_right(row.orders, has)
         again = AGAIN_S * self._gains.slower()
         found = []
-        for n in range(max(begin, 0), min(begin + WINDOW, len(row.orders))):
+        if has is None and row.orders:
+            row.kept_for[robot] = row.orders[-1]
+        first = max(begin, 0)
+        window = 1 if has is None or has < row.kept_for.get(robot, has) else WINDOW
+        for n in range(first, min(first + window, len(row.orders))):
             kept = row.kept[n]
             at, times = kept.sent.get(robot, (-inf, 0))
             due = told > at + again / 2 and now >= at + again * 2 ** max(times - 1, 0)

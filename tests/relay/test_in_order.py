@@ -9,6 +9,7 @@ from gr_ros2.relay.in_order import AGAIN_S, InOrder, Kept, Name
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Relayed
+from gr_ros2.wire.v1 import TABLE_TOPIC
 
 GOAL = Stream(1, 7, 3)
 
@@ -79,9 +80,17 @@ def test_who_hears_the_origin_needs_nothing() -> None:
 
 
 def test_of_a_kept_topic_late_robots_get_the_newest() -> None:
-    _, kept = at_robot_2()
-    keep(kept, 1, 2, 3, late=1)
+    gains, kept = at_robot_2()
+    keep(kept, 1, 2, 3, 4, late=2)
+    table = GOAL._replace(topic_id=TABLE_TOPIC)
+    gains.message(1, table, 1, 0.0)
+    assert chosen(kept, 0.0) is None, "nobody knows the table"
+    gains.told(3, Newest(1, 7, TABLE_TOPIC, 1))
     assert chosen(kept, 0.0) == 3
+    kept.sent(Name(GOAL, (3, 0)), 0.0)
+    assert chosen(kept, 0.1) is None, "4 might come first"
+    kept.told(3, told(3, 0), 0.2)
+    assert chosen(kept, 0.2) == 4
 
 
 def test_what_is_of_no_more_use_is_skipped() -> None:

@@ -321,9 +321,12 @@ class Inbox:
         self._settle()
 
     def up_to(self, topic: AnnouncedTopic) -> tuple[int, int] | None:
-        """All messages of a topic up to this one are here; None for one that is kept, and of which none has come."""
-        if topic.latched and topic.topic_id not in self.deliveries.newest:
-            return None
+        """All messages of a topic up to this one are here; None for one that is kept, and of which none has come. Of
+        what was kept before this robot came, each follows the one before."""
+        if topic.latched:
+            newest = self.deliveries.newest.get(topic.topic_id)
+            if newest is None or newest[0] < self.first:
+                return newest
         return self.order.up_to(topic.topic_id)
 
     def overrule(self, number: int) -> bool:

@@ -302,7 +302,7 @@ class Order:
     def next_timeout(self) -> float | None:
         """Time in s at which missing packets are given up for which messages wait, or what others say counts."""
         soonest = inf
-        for topic_id, line in self._waiting.items():
+        for line in self._waiting.values():
             if line and line[0].over is not None:
                 soonest = min(soonest, max(self._until(line[0]), self.heard + self._quiet_s))
                 if self._asked < self.heard + self._quiet_s:

@@ -8,6 +8,7 @@ from math import inf
 
 import pytest
 
+from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.order import ALL, Order, Ready
 from gr_ros2.link.v1.sealing import SealMode
@@ -239,6 +240,24 @@ def test_what_was_relayed_before_its_table_came_comes_out() -> None:
         line.robots.append(robot(3, "encrypt"))
         line.run(40)
         assert line.robots[2].delivered(1).count(b"the map") == 1
+
+
+@pytest.mark.parametrize("mode", ["none", "encrypt"])
+def test_a_late_robot_over_hops_gets_the_newest_of_every_publisher_of_a_kept_topic(mode: SealMode) -> None:
+    """What came first after its table was all that it took."""
+    topics = registry(odom=SendOptions(queue="latest"), description=SendOptions())
+    line = Line(*(robot(src_id, mode, topics) for src_id in (1, 2)), loss=0.2)
+    line.run(8)
+    messages = line.robots[0].end.messages
+    messages.follow(1, PublisherQos(latched=True, depth=1, count=6, keeps=6))
+    said = [b"description %d" % publisher for publisher in range(6)]
+    for publisher, description in enumerate(said):
+        messages.submit(1, description, line.now, publisher=publisher)
+        line.run(0.3)
+    line.run(10)
+    line.robots.append(robot(3, mode, topics))
+    line.run(40)
+    assert [payload for payload in line.robots[2].delivered(1) if payload in said] == said
 
 
 def test_a_robot_that_was_away_has_its_time_to_bring_what_is_missing() -> None:
