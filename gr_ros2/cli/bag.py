@@ -96,7 +96,7 @@ class OutputBag(Closing):
             return
         elif isinstance(event, Lost):
             self._note_lost(self._run, event.src_id, event.topic_id, key=event.key)
-        elif isinstance(event, Delivered):
+        elif isinstance(event, Delivered) and not event.again:
             came = time.time() - (self._run.clock() - now)
             fillers = self._filling(self._run)
             if (event.src_id, event.topic_id) in fillers:

@@ -254,7 +254,7 @@ class Outputs:
             framed = topic.latched and shown is not event.payload
             chain, digest = (chain_of(event.payload)[0], blake2b(shown).digest()) if framed else (0, b"")
             if framed and output.kept.get(chain) == digest:
-                return event._replace(shown=shown)  # a key frame for another robot
+                return event._replace(shown=shown, again=True)
             clock = self._clock_of(event.src_id)
             payload = self._prefix.apply(topic.type_name, event.src_id, shown)
             if self._stamps is not None:

@@ -81,7 +81,7 @@ class Delivered(NamedTuple):
     them, None where there were none; ``age_s``: s for which it has been under way at least; ``shown``: the message
     that was published, where a frame was decoded for it (:mod:`gr_ros2.link.frames`), None: the payload;
     ``latency_s``: s from its stamp to its publication, None where it has no stamp, or the clock of its sender is not
-    known."""
+    known; ``again``: it came out before, and was sent once more for another robot."""
 
     src_id: int
     topic_id: int
@@ -94,6 +94,7 @@ class Delivered(NamedTuple):
     age_s: float = 0.0
     shown: bytes | None = None
     latency_s: float | None = None
+    again: bool = False
 
     @property
     def message(self) -> bytes:

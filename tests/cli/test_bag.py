@@ -56,6 +56,7 @@ def test_messages_lie_in_the_order_in_which_they_were_made(tmp_path: Path) -> No
         bag.receiver_event(Delivered(2, 0, b"frame", 0, repaired=True, age_s=9e3, shown=message(3, 50)), now + 0.2)
         bag.receiver_event(Delivered(2, 1, b"a call", 0), now)
         bag.receiver_event(Delivered(9, 0, b"nobody knows", 0), now)
+        bag.receiver_event(Delivered(2, 0, b"frame", 0, shown=message(3, 50), again=True), now + 0.3)
     found = list(read_bag(tmp_path / "new" / "bag"))
     assert [each.payload for each in found] == [message(number, 50) for number in (1, 2, 3)]
     assert {each.topic for each in found} == {"/rx_robot_2/chat"}

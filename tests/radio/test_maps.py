@@ -13,6 +13,7 @@ pytest.importorskip("zmq", reason="needs pyzmq")
 
 from gr_ros2.codecs.grid import updated
 from gr_ros2.codecs.messages import GRID, GRID_UPDATE
+from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.robot_link import RobotLink
 from tests.codecs import scenes
@@ -28,8 +29,20 @@ def box(value: int) -> bytes:
     return scenes.write(GRID_UPDATE, header=header, x=3, y=2, width=5, height=4, data=cells)
 
 
+class Maps(list[Delivered]):
+    """An observer of the maps that come."""
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None: ...
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:  # noqa: ARG002
+        if isinstance(event, Delivered):
+            self.append(event)
+
+
 @contextmanager
-def listened_to(folder: Path) -> Iterator[tuple[MemoryMiddleware, RobotLink, dict[int, list[bytes]]]]:
+def listened_to(
+    folder: Path, observer: Maps | None = None
+) -> Iterator[tuple[MemoryMiddleware, RobotLink, dict[int, list[bytes]]]]:
     """The graph and the link of robot 1, and what comes of its map at robot 2, and at robot 3, whose link is not there
     yet."""
     heard: dict[int, list[bytes]] = {2: [], 3: []}
@@ -38,7 +51,7 @@ def listened_to(folder: Path) -> Iterator[tuple[MemoryMiddleware, RobotLink, dic
         MemoryMiddleware(domain_id=domain(2)) as second,
         MemoryMiddleware(domain_id=domain(3)) as third,
         robot(1, folder, 2, 3) as one,
-        robot(2, folder, 1),
+        robot(2, folder, 1, observer=observer),
     ):
         second.subscribe("/rx_robot_1/map", GRID, LATCHED, heard[2].append)
         third.subscribe("/rx_robot_1/map", GRID, LATCHED, heard[3].append)
@@ -46,8 +59,8 @@ def listened_to(folder: Path) -> Iterator[tuple[MemoryMiddleware, RobotLink, dic
 
 
 def test_a_growing_map_crosses_as_what_changes_and_whole_to_a_late_robot(tmp_path: Path) -> None:
-    maps = list(scenes.exploring(5))
-    with listened_to(tmp_path) as (near, one, heard):
+    maps, came = list(scenes.exploring(5)), Maps()
+    with listened_to(tmp_path, came) as (near, one, heard):
         mapper = near.advertise("/robot_1/map", GRID, LATCHED)
         for number, message in enumerate(maps):
             mapper.publish(message)
@@ -58,7 +71,9 @@ def test_a_growing_map_crosses_as_what_changes_and_whole_to_a_late_robot(tmp_pat
         with robot(3, tmp_path, 1):
             wait_for(lambda: heard[3], "the late robot")
             assert heard[3] == [maps[-1]]
+        wait_for(lambda: len(came) > len(maps), "what the late robot asked for")
         assert heard[2] == maps, "what another robot asked for does not come out here"
+        assert [event.again for event in came] == [False] * len(maps) + [True] * (len(came) - len(maps))
 
 
 def test_maps_of_two_nodes_and_what_changes_of_one_reach_who_is_there_and_who_comes_late(tmp_path: Path) -> None:
