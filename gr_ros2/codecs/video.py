@@ -36,6 +36,8 @@ _ASKED = 1.12
 """Times the budget is asked for: a frame comes out at .98 of its budget in the median then, and 1.08 at 99 %."""
 _LEAST = 1000
 """bit/s."""
+_FIRSTS, _ENOUGH = 5, 0.2
+"""Times that a key frame is made at most, and the part of its budget that is enough: who joins waits for it."""
 _X264 = {
     "preset": "veryfast",
     "tune": "zerolatency",
@@ -85,6 +87,22 @@ class H264Encoder:
         picture.time_base = self._context.time_base
         self._count += 1
         return units(b"".join(bytes(packet) for packet in self._context.encode(picture)))
+
+
+def first_frame(picture: av.VideoFrame, budget: int) -> tuple[H264Encoder, bytes]:
+    """A key frame and the encoder that goes on from it. Of a few hundred bytes x264 takes some dozen for its first
+    frame, which is nearly grey, so it is asked again for as many more as are missing to half of them."""
+    asked, best = budget, None
+    for _ in range(_FIRSTS):
+        encoder = H264Encoder(picture.width, picture.height)
+        data = encoder.encode(picture, asked)
+        if best is None or len(best[1]) < len(data) <= budget:
+            best = encoder, data
+        if len(data) >= _ENOUGH * budget:
+            break
+        asked += budget // 2 - len(data)
+    assert best is not None
+    return best
 
 
 class H264Decoder:
@@ -213,16 +231,20 @@ class VideoEncoder:
         :param budget: bytes of the whole frame where it is no key frame
         """
         fixed = varint(picture.width) + varint(picture.height) + varint(len(head)) + head
-        if key or fixed != self._fixed or self._video is None:
-            self._video, self._last, self._fixed = H264Encoder(picture.width, picture.height), None, fixed
-        body = (fixed if self._last is None else b"") + varint(len(side)) + side
+        if key or fixed != self._fixed:
+            self._video = None
+        before, self._last = self._last if self._video is not None else None, None
+        body = (b"" if before is not None else fixed) + varint(len(side)) + side
         try:
-            times = KEY_TIMES if self._last is None else 1
-            data = self._video.encode(picture, max(0, times * budget - len(body) - 5))
+            if self._video is not None:
+                data = self._video.encode(picture, max(0, budget - len(body) - 5))
+            else:
+                self._fixed = fixed
+                self._video, data = first_frame(picture, max(0, KEY_TIMES * budget - len(body)))
         except (av.error.FFmpegError, ValueError) as error:
             self._video = None
             raise DamagedError(f"image: the encoder refuses it ({error})") from error
-        coded = frame(self._form, body + data, self._last)
+        coded = frame(self._form, body + data, before)
         self._last = coded.name
         return coded
 

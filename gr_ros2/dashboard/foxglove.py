@@ -213,6 +213,7 @@ class FoxgloveServer:
             type_name, channel = self._channels.get(shown.topic, ("", None))
             if type_name != shown.type_name:
                 if channel is not None:
+                    self._newest.pop(channel.id(), None)
                     channel.close()
                 text = definition(shown.type_name).text.encode()
                 schema = self._foxglove.Schema(name=shown.type_name, encoding="ros2msg", data=text)
@@ -220,6 +221,8 @@ class FoxgloveServer:
                     shown.topic, schema=schema, message_encoding="cdr", context=self._context
                 )
                 self._channels[shown.topic] = shown.type_name, channel
-            if shown.latched and len(message) + sum(map(len, self._newest.values())) <= _CACHED_BYTES:
-                self._newest[channel.id()] = message
+            if shown.latched:
+                self._newest.pop(channel.id(), None)  # what is too large to be kept leaves no older one behind
+                if len(message) + sum(map(len, self._newest.values())) <= _CACHED_BYTES:
+                    self._newest[channel.id()] = message
         channel.log(message)

@@ -337,6 +337,17 @@ def test_packets_for_ffmpeg_name_key_frames() -> None:
         topic.decoder().decode(found[1].data)
 
 
+@pytest.mark.parametrize("budget", [130, 160, 200])
+def test_a_key_frame_of_a_small_budget_is_no_grey_picture(budget: int) -> None:
+    pixels = view(0, 640, 480)
+    topic = CodedTopic(IMAGE)
+    coded = topic.encoder().encode(image(pixels, "rgb8"), budget)
+    out = read(IMAGE, topic.decoder().decode(coded.data))
+    shown = out.data.reshape(out.height, out.width, 3)
+    assert psnr(shown, pixels[2::4, 2::4]) > 18.5
+    assert len(coded.data) <= KEY_TIMES * budget
+
+
 def test_budgets_hold_when_they_change_with_each_frame() -> None:
     rng = np.random.default_rng(5)
     topic = CodedTopic(IMAGE, {"camera": {"size": "full"}})

@@ -194,6 +194,16 @@ def test_who_comes_late_sees_the_map(server: FoxgloveServer) -> None:
     assert client.seen == [("/rx_robot_2/map", message)]
 
 
+def test_a_map_that_is_too_large_to_be_kept_leaves_no_older_one_for_who_comes_late(
+    server: FoxgloveServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small, large = scenes.exploring(1, 50)[0], scenes.exploring(1, 100)[0]
+    monkeypatch.setattr("gr_ros2.dashboard.foxglove._CACHED_BYTES", len(small))
+    for message, kept in ((small, [small]), (small, [small]), (large, [])):
+        server.receiver_event(Delivered(2, 1, b"a frame", 0, shown=message), 0.0)
+        assert list(server._newest.values()) == kept
+
+
 def test_a_client_that_reads_nothing_slows_nobody_and_loses_messages_of_its_own(server: FoxgloveServer) -> None:
     """It opens a connection, subscribes and never reads again, while more comes than any buffer of its holds."""
     big = transforms("x" * 100_000)
