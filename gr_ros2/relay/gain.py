@@ -217,7 +217,7 @@ class Gains:
         :param cost: of sending a stream's newest message, above 0; infinite where it is not to be considered
         :param others: gains of other messages, which count for the weight
         :param may_leave: whether a stream's message may leave now
-        :param room: how much of the cost fits a packet: a message that takes several counts as so many for the weight
+        :param room: how much of the cost fits a packet: a table that takes several counts as so many for the weight
         """
         neighbours = self._neighbours(now)
         best: Stream | None = None
@@ -228,7 +228,8 @@ class Gains:
             if not gain:
                 continue
             costs = cost(stream)
-            total += gain * gain * (max(costs / room, 1.0) if costs < inf else 1.0)
+            packets = max(costs / room, 1.0) if stream.topic_id == TABLE_TOPIC and costs < inf else 1.0
+            total += gain * gain * packets
             by_cost = gain * gain / costs
             if by_cost > worth:
                 most, worth = gain, by_cost

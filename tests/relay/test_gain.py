@@ -120,10 +120,11 @@ def test_a_table_that_a_robot_lacks_goes_before_those_that_tell_that_robots_are_
     assert gains.gain(lacked, 200.0) > 2 * UNKNOWN_S, "they were away, and may have forgotten"
 
 
-def test_what_takes_several_packets_counts_for_as_many() -> None:
+def test_a_table_that_takes_several_packets_counts_for_as_many() -> None:
     weights = []
     for room in (100, 10):
         gains = hearing(2, 3)
+        gains.message(2, ODOM._replace(topic_id=TABLE_TOPIC), 1, 1.0)
         for now in range(100):
             gains.best(1.0 + now / 1000, lambda _: 100.0, (), lambda _: True, room)
         weights.append(gains.weight)

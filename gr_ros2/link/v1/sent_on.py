@@ -138,13 +138,17 @@ class SentOn:
             self._dropped["too_old"] += late
         free = {topic_id for topic_id in QUEUES if _is_free(topics[topic_id], now)}
         chosen, gain = self._gains.best(
-            now, lambda stream: self._cost(stream, now), gains, lambda stream: _queue_of(stream) in free, room
+            now,
+            lambda stream: self._cost(stream, now),
+            gains,
+            lambda stream: self._queue_of(stream) in free,
+            room if self._repairs else inf,
         )
         for topic_id in free - {RELAYED_IN_ORDER}:
             self._offered.pop(topic_id, None)
         if chosen is not None:
-            self._offered[_queue_of(chosen)] = chosen, self._newest[chosen]
-            self._queue(topics[_queue_of(chosen)], self._newest[chosen], gain, now, leaves)
+            self._offered[self._queue_of(chosen)] = chosen, self._newest[chosen]
+            self._queue(topics[self._queue_of(chosen)], self._newest[chosen], gain, now, leaves)
         if RELAYED_IN_ORDER in free:
             self._next = name
             if name is not None:
@@ -163,7 +167,7 @@ class SentOn:
             message.lifetime.expires = now + REPAIRED_S * self._gains.slower()
         if message.topic_id in self._offered:
             stream, to_pass = self._offered.pop(message.topic_id)
-            self._gains.sent(stream, to_pass.message.number, now, 1.0 if table and self._repairs else OWN)
+            self._gains.sent(stream, to_pass.message.number, now, 1.0 if table else OWN)
             self.relayed[stream.origin, stream.topic_id] += 1
 
     def _drop(self, stream: Stream) -> None:
@@ -181,15 +185,14 @@ class SentOn:
         queued = Message(-1, topic.topic.topic_id, payload, QOS_DEFAULT, now, expires=to_pass.until, repeat=True)
         topic.queue.append(queued)
 
+    def _queue_of(self, stream: Stream) -> int:
+        """The queue of the newest message of a stream."""
+        return RELAYED_TABLES if self._repairs and stream.topic_id == TABLE_TOPIC else RELAYED_TOPIC
+
     def _cost(self, stream: Stream, now: float) -> float:
         if stream not in self._newest or not self._gains.lacks(stream, now):
             return inf
         return RELAYED_LEN + len(self._newest[stream].message.payload)
-
-
-def _queue_of(stream: Stream) -> int:
-    """The queue of the newest message of a stream."""
-    return RELAYED_TABLES if stream.topic_id == TABLE_TOPIC else RELAYED_TOPIC
 
 
 def _is_free(topic: SentTopic, now: float) -> bool:
