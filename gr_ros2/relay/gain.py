@@ -185,7 +185,7 @@ class Gains:
         state = self._told.get((newest.origin, newest.start, newest.topic_id))
         if state is not None:
             ahead = (newest.number - state.newest + _HALF & 0xFFFF) - _HALF
-            state.has[via] = state.newest + ahead
+            state.has[via] = state.newest + min(ahead, 0)  # more may be false
             state.known.add(via)
 
     # ---- what is sent

@@ -77,6 +77,15 @@ def test_what_a_neighbour_tells_stands_against_belief() -> None:
     assert gains.gain(ODOM, 1.0) == pytest.approx(1.0)
 
 
+def test_a_number_that_is_not_here_counts_no_more_than_the_newest() -> None:
+    """It may be false, as of a table that an insider made up: the next table has to be sent all the same."""
+    gains = hearing(2, 3)
+    gains.told(3, Newest(7, 0xFE, 0, 20_000))
+    assert not gains.lacks(ODOM, 1.0)
+    gains.message(2, ODOM, 15, 1.5)
+    assert gains.lacks(ODOM, 1.5)
+
+
 def test_who_is_named_by_the_sender_is_taken_to_have_heard_it() -> None:
     gains = hearing(2, 3)
     gains.told(3, Newest(7, 0xFE, 0, 10))
