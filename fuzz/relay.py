@@ -57,7 +57,7 @@ def relay(data: bytes) -> None:
         within(MOST_LINES, lambda at=now, found=found: found.extend([s for s in [gains.best(at)[0]] if s]))
         for best in found:
             assert gains.has(best) >= 0
-            gains.sent(best, now)
+            gains.sent(best, gains.has(best), now)
         assert len(gains.tells()) <= 2
         carry(custody, data[start + 5 : start + _STEP], src_id, now)
 
