@@ -9,7 +9,9 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -104,16 +106,23 @@ class Service:
         return self.process.wait(PATIENCE_S) in self._ends_well
 
 
-def test_two_links_of_one_machine_are_found_by_root_and_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def root() -> Iterator[Path]:
+    """A root folder with a short path, since that of a socket has at most 107 characters."""
+    with TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def test_two_links_of_one_machine_are_found_by_root_and_end(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     ports = free_ports(2, socket.SOCK_DGRAM)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(root))
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    patterns = tuple(f"{tmp_path}/{pattern}".lstrip("/") for pattern in control_socket._OF_OTHERS)
+    patterns = tuple(f"{root}/{pattern}".lstrip("/") for pattern in control_socket._OF_OTHERS)
     monkeypatch.setattr(control_socket, "_OF_OTHERS", patterns)
-    (tmp_path / "etc/gr-ros2").mkdir(parents=True)
-    new_key_file(tmp_path / "etc/gr-ros2/fleet.key")
-    services = [Service(tmp_path, 1, *ports), Service(tmp_path, 2, *reversed(ports))]
+    (root / "etc/gr-ros2").mkdir(parents=True)
+    new_key_file(root / "etc/gr-ros2/fleet.key")
+    services = [Service(root, 1, *ports), Service(root, 2, *reversed(ports))]
     try:
         assert all(service.is_ready() for service in services)
         assert {status_of(service.process.pid)["name"] for service in services} == {"radio1", "radio2"}
