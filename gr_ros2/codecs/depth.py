@@ -47,6 +47,8 @@ Values = npt.NDArray[Any]
 
 UNITS = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
 """Metres of the unit of an encoding (REP 118)."""
+_NUMBERS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+"""How each encoding writes a pixel, without its byte order."""
 AUTO, EXACT = "auto", "exact"
 MODES = (AUTO, "8", "10", "12", EXACT)
 _USUAL_BITS = 10
@@ -150,7 +152,7 @@ class DepthEncoder:
         """The distances of every pixel, or of every second of both sides and so on. No mean is made of them: between a
         near and a far one there is nothing."""
         height, width = depth.metres.shape
-        bytes_each = {"16UC1": 2, "mono16": 2, "32FC1": 4}[depth.label] if self._options.type_name == IMAGE else 0
+        bytes_each = np.dtype(_NUMBERS[depth.label]).itemsize if self._options.type_name == IMAGE else 0
         each = 1 << self._size.halvings(width, height, bytes_each, budget, key)
         padded = np.pad(depth.metres, ((0, -height % each), (0, -width % each)), mode="edge")
         return padded[each // 2 :: each, each // 2 :: each]
@@ -310,8 +312,9 @@ def _head(depth: _Depth, near: float, far: float) -> bytes:
 def _read(type_name: str, image: Any) -> _Depth:
     if type_name == COMPRESSED_IMAGE:
         return _read_compressed(image)
-    kind = "f4" if image.encoding == "32FC1" else "u2"
-    rows = rows_of(image, int(kind[1]))[:, : image.width * int(kind[1])]
+    kind = _NUMBERS[image.encoding]
+    size = np.dtype(kind).itemsize
+    rows = rows_of(image, size)[:, : image.width * size]
     values = np.ascontiguousarray(rows).view((">" if image.is_bigendian else "<") + kind)
     return _Depth(Origin(image.header), _valid(values.astype(np.float32) * UNITS[image.encoding]), str(image.encoding))
 
