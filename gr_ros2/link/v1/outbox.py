@@ -31,11 +31,11 @@ from gr_ros2.link.v1.lifetime import WORTH
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.packing import ENTRY, Packing
 from gr_ros2.link.v1.peers import Peers
-from gr_ros2.link.v1.sent_topics import LONG_CARRIED, RELAYED_IN_ORDER, RELAYED_TABLES, SentTopic, SentTopics
+from gr_ros2.link.v1.sent_topics import LONG_CARRIED, RELAYED, SentTopic, SentTopics
 from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
-from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, RELAYED_TOPIC, TABLE_TOPIC
+from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, TABLE_TOPIC
 
 LARGE = 4096
 """Bytes from which on a message is coded before it is submitted. Coding 4 kB takes some .1 ms, 5 MB a fourth of a
@@ -270,7 +270,7 @@ class Outbox:
     @property
     def idle(self) -> bool:
         """Whether nothing waits."""
-        passed = {RELAYED_TOPIC, RELAYED_IN_ORDER, RELAYED_TABLES} | ({TABLE_TOPIC} if self.packing.fills else set())
+        passed = set(RELAYED) | ({TABLE_TOPIC} if self.packing.fills else set())
         return not any(topic.queue for topic_id, topic in self.sent.items() if topic_id not in passed)
 
     def reconfigure(self, settings: Settings) -> None:
@@ -340,7 +340,7 @@ class Outbox:
             topic.lifetimes.restart(message.keys)
         if topic.kept or message.topic_id == TABLE_TOPIC:
             self.kept.left(message, now, reported=reported)
-        if message.topic_id in (RELAYED_TOPIC, RELAYED_IN_ORDER, RELAYED_TABLES):
+        if message.topic_id in RELAYED:
             self.relayed_left(message, now)
         elif self.custody is not None and message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):
             self.custody.left(message, now)

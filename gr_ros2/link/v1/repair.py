@@ -158,6 +158,8 @@ class RepairWindow:
     def tell(self, number: int, now: float) -> Repair | LeftOut | None:
         """What tells peers that a packet is not repaired any more, or brings it back; None if there is nothing."""
         packets = self.packets
+        if packets.parts:
+            return self._left_out(number, now)
         packets.retire(now)
         if self._shared is None:
             self.peers.announced(range(packets.newest + 1))
@@ -165,11 +167,8 @@ class RepairWindow:
         else:
             window = self._combining.fitting(self._shared.window(now, number), number)
             if not window or number not in self._shared.spanned(window):
-                told = packets.left_out(now, number)
-                self.peers.announced(packets.told_of)
-                self._shared.tells(packets.told_of, now)
-                return told
-            window = self._of_all(now, number)
+                return self._left_out(number, now)
+            self._combines(window, now)
         spans = bool(window) and window[0].number >= number >= window[-1].number
         record = packets.records.get(number)
         if record is not None and (not spans or self.peers.replayed(number)):
@@ -211,9 +210,22 @@ class RepairWindow:
         assert self._shared is not None
         window = [record for record in self._shared.window(now, lost) if record.number >= first]
         window = self._combining.fitting(window, lost)
+        self._combines(window, now)
+        return window
+
+    def _combines(self, window: list[Sent], now: float) -> None:
+        """A combination of these packets leaves on a shared channel."""
+        assert self._shared is not None
         self.peers.announced(self._shared.spanned(window))
         self._shared.combined(window, now)
-        return window
+
+    def _left_out(self, number: int, now: float) -> LeftOut:
+        """What tells peers that they need not wait for a packet, nor for others around it."""
+        told = self.packets.left_out(now, number)
+        self.peers.announced(self.packets.told_of)
+        if self._shared is not None:
+            self._shared.tells(self.packets.told_of, now)
+        return told
 
     def complete(self, record: Sent, now: float) -> Sent | Repair | None:
         """What brings a packet to the peers for which it was sent too fast."""

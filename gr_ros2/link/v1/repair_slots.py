@@ -154,12 +154,7 @@ class RepairSlots:
 
     def _tell(self, number: int, slot: SendSlot) -> SentPacket | None:
         """Say that a packet is not repaired any more."""
-        told: Repair | LeftOut | None
-        if (packets := self._window.packets).parts:
-            told = packets.left_out(slot.now, number)
-            self._window.peers.announced(packets.told_of)
-        else:
-            told = self._window.tell(number, slot.now)
+        told = self._window.tell(number, slot.now)
         if isinstance(told, LeftOut):
             return self._writer.control([told], "repair", slot)
         if told is not None:

@@ -16,7 +16,7 @@ from math import inf
 from typing import NamedTuple
 
 from gr_ros2.link.v1.message import Message
-from gr_ros2.link.v1.sent_topics import RELAYED_IN_ORDER, RELAYED_TABLES, SentTopic, SentTopics
+from gr_ros2.link.v1.sent_topics import RELAYED, RELAYED_IN_ORDER, RELAYED_TABLES, SentTopic, SentTopics
 from gr_ros2.relay.gain import OWN, Gains, Stream
 from gr_ros2.relay.in_order import InOrder, Kept, Name
 from gr_ros2.relay.quotas import Quotas
@@ -29,16 +29,10 @@ MOST_STREAMS = 4096
 """Topics of other robots of which a message is kept to be sent on."""
 MOST_KEPT = 4096
 """Messages of reliable topics for all that are kept to be sent on."""
-
-
 REPAIRED_S = 20.0
 """s for which a table is repaired after it has left: another one follows then at the latest."""
 Repaired = Callable[[int, float], bool]
 """Whether something is being repaired for a robot at a time, s."""
-
-
-QUEUES = (RELAYED_TOPIC, RELAYED_TABLES, RELAYED_IN_ORDER)
-"""The queues of what is sent on; each has one message at most."""
 
 
 class ToPass(NamedTuple):
@@ -136,7 +130,7 @@ class SentOn:
         name, worth, gains, late = self.in_order.best(now)
         if late:
             self._dropped["too_old"] += late
-        free = {topic_id for topic_id in QUEUES if _is_free(topics[topic_id], now)}
+        free = {topic_id for topic_id in RELAYED if _is_free(topics[topic_id], now)}
         chosen, gain = self._gains.best(
             now,
             lambda stream: self._cost(stream, now),

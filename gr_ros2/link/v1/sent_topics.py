@@ -28,6 +28,8 @@ LONG_CARRIED = CARRIED_TOPIC + 1
 """The queue of carried messages that take several packets: short ones do not wait for them."""
 RELAYED_IN_ORDER, RELAYED_TABLES = LONG_CARRIED + 1, LONG_CARRIED + 2
 """The queues of messages of reliable topics of other robots, and of their tables; on the air they are of topic 241."""
+RELAYED = (RELAYED_TOPIC, RELAYED_IN_ORDER, RELAYED_TABLES)
+"""The queues of what is sent on of other robots; each has one message at most."""
 ON_AIR = {LONG_CARRIED: CARRIED_TOPIC, RELAYED_IN_ORDER: RELAYED_TOPIC, RELAYED_TABLES: RELAYED_TOPIC}
 """The topics of queues that have no topic id of their own."""
 
@@ -270,7 +272,7 @@ class SentTopics(dict[int, SentTopic]):
 
     def relay(self) -> None:
         """Send messages of other robots too, and carry some."""
-        for topic_id in (RELAYED_TOPIC, RELAYED_IN_ORDER, RELAYED_TABLES, CARRIED_TOPIC, LONG_CARRIED):
+        for topic_id in (*RELAYED, CARRIED_TOPIC, LONG_CARRIED):
             topic = Topic(topic_id, "", "")
             queue = TopicQueue[Message]("latest" if topic_id == RELAYED_TOPIC else "fifo")
             self[topic_id] = SentTopic(topic, queue, qos_class(topic.options), 1.0, latched=False)
