@@ -61,11 +61,16 @@ def fill(outage_s: float, loss: float = 0.0) -> Filled:
     queues = {"odom": SendOptions(queue="latest"), "scan": SendOptions(queue="fifo", reliability="best_effort")}
     names = Registry([Topic(n, name, "std_msgs/msg/String", how) for n, (name, how) in enumerate(queues.items())])
     notes: list[Callable[[SenderEvent], None]] = []
+
+    def tell(event: SenderEvent) -> None:
+        for note in notes:
+            note(event)
+
     sender = EndpointV1(
         names,
         Settings(1, packet_len=PACKET_LEN, packet_s=lambda: 1 / RATE),
         boot=1000,
-        observer=lambda event: [note(event) for note in notes],
+        observer=tell,
     )
     receiver = EndpointV1(None, Settings(2, packet_len=PACKET_LEN), boot=2000)
     config = BackfillConfig(topics=("odom",), for_s=2 * OUTAGE_S, memory_mb=100)

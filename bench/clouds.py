@@ -16,7 +16,7 @@ import numpy as np
 from bench.rows import Row
 from gr_ros2.codecs import CodedTopic
 from gr_ros2.codecs.messages import CLOUD, read
-from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.config import CloudOptions, SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from tests.codecs import scenes
 from tests.codecs.camera_link import ODOMETRY, PACKET_LEN, SCAN, Air, Robot
@@ -65,10 +65,10 @@ def simulate(kind: str, kbit_s: float, loss: float, seed: int) -> JudgedClouds:
 
     :param kind: fit, fixed, or none: no clouds
     """
-    options = SendOptions(cloud={"voxel": FINEST, "range": RANGE, "fit": True})
+    options = SendOptions(cloud=CloudOptions(voxel=FINEST, range=RANGE, fit=True))
     if kind == "fixed":
         edge = round(_fixed(kbit_s), 3)
-        options = SendOptions(cloud={"voxel": edge, "range": RANGE}, queue="fifo", queue_depth=1, qos="bulk")
+        options = SendOptions(cloud=CloudOptions(voxel=edge, range=RANGE), queue="fifo", queue_depth=1, qos="bulk")
     newest = SendOptions(queue="latest", codec="none")
     rows = [
         Topic(POINTS, "points", CLOUD, options),
@@ -88,7 +88,7 @@ def simulate(kind: str, kbit_s: float, loss: float, seed: int) -> JudgedClouds:
 
     def ages(events: list[tuple[float, float]]) -> scenes.Array:
         when, what = np.array([(0.0, 0.0), *events]).T
-        return (at - what[np.searchsorted(when, at, "right") - 1]) * 1e3
+        return np.asarray((at - what[np.searchsorted(when, at, "right") - 1]) * 1e3)
 
     seen, cells = [], []
     for now, message in receiver.of(1, POINTS):

@@ -306,7 +306,7 @@ def changes() -> list[Row]:
         ("a clock jumps by 1 s, after 5 s", {"jumps": [(15.0, 2, 1.0)]}),
         ("a host freezes for 1 s, after 5 s", {"frozen": [(14.0, 2, 1.0)]}),
     ):
-        ran = [swarm(fully_meshed(20), SwarmConfig(seed=seed, **config)) for seed in SEEDS]  # type: ignore[arg-type]
+        ran = [swarm(fully_meshed(20), SwarmConfig(seed=seed, **config)) for seed in SEEDS]
         rows.append(
             Row(
                 f"20 robots, {what}: receptions that collide",
@@ -401,8 +401,8 @@ def whole() -> list[Row]:
     heard = sum(robot.endpoint.received.packets for robot in run.robots)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return [
-        Row("255 whole robots: ms of a core per packet", spent / heard, "ms", "", 0, "{:.3f}", f"{heard:,} of them"),
-        Row("255 whole robots: memory", memory, "GB", "", 0, "{:.2f}"),
+        Row("255 whole robots: ms of a core per packet", spent / heard, "ms", form="{:.3f}", note=f"{heard:,} of them"),
+        Row("255 whole robots: memory", memory, "GB", form="{:.2f}"),
     ]
 
 

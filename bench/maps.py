@@ -36,10 +36,10 @@ def _maps() -> list[bytes]:
     return list(scenes.exploring(MAPS, SIZE))
 
 
-def simulate(loss: float, **options: str) -> Judged:
+def simulate(loss: float, codec: str = "auto") -> Judged:
     """One run."""
     maps = _maps()
-    topic = Topic(0, "map", GRID, SendOptions(durability="transient_local", **options))
+    topic = Topic(0, "map", GRID, SendOptions(durability="transient_local", codec=codec))
     mapper, follower = Robot(1, Registry([topic]), KBIT_S), Robot(2, None, KBIT_S)
     air = Air(mapper, follower, loss=loss)
 
@@ -74,7 +74,7 @@ def maps() -> list[Row]:
     patch = float(np.mean(patches[1:]))
     found = []
     for loss in (0.0, 0.2):
-        changes, whole = simulate(loss), simulate(loss, codec="zstd")
+        changes, whole = simulate(loss), simulate(loss, "zstd")
         note = (
             f"{patch:,.0f} B of changes in it; {changes.came} of {MAPS} came, {changes.mean_ms:,.0f} ms old; "
             f"whole: {whole.each:,.0f} B, {whole.came}, {whole.mean_ms:,.0f} ms"

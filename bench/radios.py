@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -81,6 +82,10 @@ class _Pair:
         self.heard: dict[str, list[tuple[float, bytes]]] = {"cmd_vel": [], "odom": [], "data": []}
 
 
+def _keep(kept: list[tuple[float, bytes]], payload: bytes) -> None:
+    kept.append((time.monotonic(), payload))
+
+
 @contextmanager
 def _pair(names: tuple[str, ...]) -> Iterator[_Pair]:
     with TemporaryDirectory() as folder, ExitStack() as stack:
@@ -106,12 +111,11 @@ def _pair(names: tuple[str, ...]) -> Iterator[_Pair]:
             stack.callback(graph_.close)
         for topic, kept in pair.heard.items():
             type_name = _TWIST if topic == "cmd_vel" else _BYTES
-            take = kept.append
             far.subscribe(
                 f"/rx_robot_1/{topic}",
                 type_name,
                 Qos("reliable", "volatile", 0),
-                lambda payload, take=take: take((time.monotonic(), payload)),
+                partial(_keep, kept),
             )
         for link in links:
             stack.enter_context(link)

@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import mean
 from struct import Struct
 
-from bench.rows import Row
+from bench.rows import Row, Sense
 from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.audiences import Audiences
 from gr_ros2.settings.files import find_registry
@@ -100,7 +100,7 @@ def messages() -> Iterator[Offered]:
 def for_all() -> Iterator[None]:
     """Every packet is for all, as the weakest robot needs it."""
     chosen = Audiences.of
-    Audiences.of = lambda _, __: ()  # type: ignore[method-assign]
+    Audiences.of = lambda _, __: ()  # type: ignore[assignment,method-assign]
     try:
         yield
     finally:
@@ -127,8 +127,7 @@ def _rows(what: str, found: Ages, alone: Ages, most: Mapping[int, float]) -> lis
             f"{NAMES[topic]} {1e3 * age:.0f} ms, alone {1e3 * alone[receiver][topic]:.0f}"
             for topic, age in found[receiver].items()
         )
-        sense = "≤" if receiver in most else None
-        rows.append(
-            Row(f"{what}: age at {snr_db:g} dB over alone", ratio, "", sense, most.get(receiver, 0.0), "{:.2f}", note)
-        )
+        label = f"{what}: age at {snr_db:g} dB over alone"
+        sense: Sense = "≤" if receiver in most else None
+        rows.append(Row(label, ratio, "", sense, most.get(receiver, 0.0), "{:.2f}", note))
     return rows

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,7 @@ TARGETS: list[tuple[Setting, float]] = [
 ]
 NOISE_TARGET = 2.5
 CODES = ("none", "cc", "ldpc", "polar")
-MODULATIONS = {
+MODULATIONS: Mapping[str, Sequence[dict[str, Any]]] = {
     "ofdm": [{"payload_modulation": name} for name in ("bpsk", "qpsk", "8psk", "16qam", "64qam")],
     "psk": [{"modulation": name} for name in ("bpsk", "qpsk", "8psk")],
     "gfsk": [{}],
@@ -96,7 +96,7 @@ def _other(what: str, samples: Samples, made: Callable[[], list[Any]]) -> Row:
     return Row(f"{what}: receiver over FFT", (took - idle) / fft, form="{:.1f}", note=f"{each * 1e6:.3g} µs a packet")
 
 
-def _flowgraph(samples: Samples, parts: list[Any]) -> float:
+def _flowgraph(samples: Samples, parts: Sequence[Any]) -> float:
     """Processor time of the whole process, s."""
     top = gr.top_block()
     top.connect(blocks.vector_source_c(samples), *parts)

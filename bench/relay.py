@@ -69,7 +69,8 @@ def carried() -> list[Row]:
         loss=MAP_LOSS,
     )
     line.run(12)
-    begin, first, goals = line.now, line.robots[0], []
+    begin, first = line.now, line.robots[0]
+    goals: list[bytes] = []
     whole = random.Random(1).randbytes(MAP_BYTES)
     first.end.messages.submit(2, whole, line.now)
     while whole not in line.robots[-1].delivered(1) and line.now < begin + MOST_S:

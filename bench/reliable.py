@@ -15,10 +15,12 @@ from dataclasses import dataclass, field
 from math import floor, inf
 from pathlib import Path
 from statistics import mean
+from typing import cast
 
 from bench.rows import Row
 from gr_ros2.link import Accepted, Delivered, SentPacket
 from gr_ros2.wire.control import Report, write_control
+from gr_ros2.wire.v1 import PacketV1
 from gr_ros2_lab.run.load import make_phy
 from gr_ros2_lab.run.scenario import load_scenario
 from gr_ros2_lab.run.simulate import Offered, Simulation
@@ -74,7 +76,7 @@ def talk(
         scenario = load_scenario("twenty-robots", [], **common)
         rows = scenario.load_registry()
         phy = make_phy(scenario, rows)
-        rate = scenario.phy.sample_rate * phy.airtime() * PACKETS_S
+        rate = float(scenario.phy.sample_rate) * phy.airtime() * PACKETS_S
         scenario = load_scenario("twenty-robots", [f"phy.sample_rate={rate}"], **common)
         phy = make_phy(scenario, rows)
         messages = [_offered(number, robots, seed, reliable=reliable) for number in range(robots)]
@@ -115,8 +117,9 @@ def _watched(run: Simulation, packet_len: int) -> Exchange:
                 named[own, entry.topic_id, entry.key] = entry.serial
             if T0 <= now < T1:
                 found.kinds[event.kind] += 1
-                said = sum(len(write_control(one)) for one in event.packet.body if isinstance(one, Report))
-                found.kinds["reports"] += sum(isinstance(one, Report) for one in event.packet.body)
+                reports = [one for one in cast("PacketV1", event.packet).body if isinstance(one, Report)]
+                said = sum(len(write_control(one)) for one in reports)
+                found.kinds["reports"] += len(reports)
                 spent += 1.0 if said and event.kind == "report" else said / packet_len
         elif isinstance(event, Delivered):
             serial = named[event.src_id, event.topic_id, event.key]

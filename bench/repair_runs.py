@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from bench.repair import ODOMETRY
-from bench.rows import Row
+from bench.rows import Row, Sense
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.run.runner import run_scenario
 from gr_ros2_lab.run.scenario import load_scenario
@@ -40,7 +40,7 @@ def run(settings: dict[str, Any], loss: float, burst: float, repair: str, *, bac
     if burst > 1:
         leave = 1 / burst
         channel = {"burst_loss": {"p_good_to_bad": leave * loss / (1 - loss), "p_bad_to_good": leave}}
-    reports = {"robots": [{}, {"topics": []}]} if back else {}
+    reports: dict[str, Any] = {"robots": [{}, {"topics": []}]} if back else {}
     options = {**settings, **reports, "time": "packets", "channel": channel}
     return run_scenario(load_scenario("paper-ofdm-paced", [f"repair={repair}"], **options)).result
 
@@ -48,7 +48,7 @@ def run(settings: dict[str, Any], loss: float, burst: float, repair: str, *, bac
 def _rows(source: str, settings: dict[str, Any]) -> list[Row]:
     rows: list[Row] = []
 
-    def add(name: str, value: float, unit: str, sense: Literal["≥", "≤"], target: float) -> None:
+    def add(name: str, value: float, unit: str, sense: Sense, target: float) -> None:
         form = "{:,.0f}" if unit == "ms" else "{:.4f}"
         rows.append(Row(f"run: {source} odometry, {name}", value, unit, sense, target, form))
 

@@ -14,6 +14,8 @@ from typing import Literal
 from rich import box
 from rich.table import Table
 
+Sense = Literal["≥", "≤", "="] | None
+"""Of a value to its target; None: it has none."""
 _COMPARE = {"≥": operator.ge, "≤": operator.le, "=": operator.eq}
 
 
@@ -24,7 +26,7 @@ class Row:
     what: str
     value: float
     unit: str = ""
-    sense: Literal["≥", "≤", "="] | None = None
+    sense: Sense = None
     target: float = 0.0
     form: str = "{:,.0f}"
     note: str = ""

@@ -57,7 +57,7 @@ class _Run(NamedTuple):
     def reports(self) -> float:
         """Their share of the packets."""
         sent = {name: count for name, count in self.result.packets.items() if name.startswith("air_")}
-        return sent["air_report"] / sum(sent.values())
+        return float(sent["air_report"] / sum(sent.values()))
 
 
 def slow_computer() -> list[Row]:

@@ -49,11 +49,12 @@ def _fm(sound: Wave, _band_hz: float, seed: int, cnr_db: float) -> Wave:
     return faster(narrow_fm(sound, cnr_db, seed), _PPM)
 
 
-def _ssb(sound: Wave, band_hz: float, seed: int, snr_db: float, **more: Any) -> Wave:
-    return faster(single_sideband(sound, snr_db, band_hz, seed, **more), _PPM)
+def _ssb(sound: Wave, band_hz: float, seed: int, snr_db: float) -> Wave:
+    return faster(single_sideband(sound, snr_db, band_hz, seed), _PPM)
 
 
-MODERATE = {"paths": (0.0, 0.001), "spread_hz": 0.5}
+def _moderate(sound: Wave, band_hz: float, seed: int, snr_db: float) -> Wave:
+    return faster(single_sideband(sound, snr_db, band_hz, seed, paths=(0.0, 0.001), spread_hz=0.5), _PPM)
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ BESIDE = [
     _Cell("hall", "room, RT60 .6 s, DRR -6 dB", partial(_in_room, echo_s=0.6, direct_db=-6.0), 0.9, 300),
     _Cell("voice", "narrow FM, CNR 10 dB", partial(_fm, cnr_db=10.0), 0.98, 1000),
     _Cell("voice", "SSB 50 Hz off, 10 dB", partial(_ssb, snr_db=10.0), 0.98, 1000),
-    _Cell("voice", "the same, Watterson moderate", partial(_ssb, snr_db=10.0, **MODERATE)),
+    _Cell("voice", "the same, Watterson moderate", partial(_moderate, snr_db=10.0)),
 ]
 """Where others' modems are tried, too."""
 _PACES = [(name, CLOCK_PPM) for name in ("sound", "hall", "voice", "cable")]

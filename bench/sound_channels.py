@@ -31,7 +31,7 @@ def power(sound: Wave) -> float:
 def with_noise(sound: Wave, snr_db: float, band_hz: float, seed: int) -> Wave:
     """:param band_hz: the PHY's sampled band"""
     sigma = (power(sound) / 10 ** (snr_db / 10) * CARD_RATE / 2 / band_hz) ** 0.5
-    return sound + sigma * np.random.default_rng(seed).standard_normal(len(sound))
+    return np.asarray(sound + sigma * np.random.default_rng(seed).standard_normal(len(sound)))
 
 
 def room(echo_s: float, direct_db: float, seed: int) -> Wave:
@@ -67,7 +67,7 @@ def room(echo_s: float, direct_db: float, seed: int) -> Wave:
     rest[: round(_EARLIEST * CARD_RATE)] = 0
     rest *= (direct[0] ** 2 / 10 ** (direct_db / 10) / (rest**2).sum()) ** 0.5
     rest[0] = direct[0]
-    return rest / np.sqrt((rest**2).sum())
+    return np.asarray(rest / np.sqrt((rest**2).sum()))
 
 
 def through(sound: Wave, response: Wave) -> Wave:

@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import permutations
@@ -41,7 +41,7 @@ def sound_live() -> list[Row]:
 
 
 def _cable(kind: type[SoundServer]) -> Iterator[Row]:
-    run = _run(kind, ["ab", "ba"], "cable", CABLE_HZ, CABLE_S)
+    run = _run(kind, [("a", "b"), ("b", "a")], "cable", CABLE_HZ, CABLE_S)
     what = f"{kind.__name__}, a sink each way, odometry {CABLE_HZ:g}/s"
     yield Row(f"{what}: PDR", run.pdr, "", "≥", 0.99, "{:.3f}", run.said)
     yield Row(f"{what}: mean age", run.age_s, "s", "≤", 0.6, "{:.2f}")
@@ -49,11 +49,15 @@ def _cable(kind: type[SoundServer]) -> Iterator[Row]:
 
 
 def _shared(kind: type[SoundServer], robots: int) -> Iterator[Row]:
-    run = _run(kind, ["aa"] * robots, "sound", SHARED_HZ, SHARED_S)
+    run = _run(kind, [("a", "a")] * robots, "sound", SHARED_HZ, SHARED_S)
     what = f"{kind.__name__}, one sink for {robots} robots"
     yield Row(f"{what}: PDR", run.pdr, "", "≥", 0.98, "{:.3f}", run.said)
     yield Row(f"{what}: first message", run.first_s, "s", "≤", 15, "{:.0f}")
     yield Row(f"{what}: of a core", run.cores, "", "≤", 0.2, "{:.2f}")
+
+
+Sinks = Sequence[tuple[str, str]]
+"""For each robot the sink it plays to and the one it hears."""
 
 
 @dataclass
@@ -80,13 +84,14 @@ class _Run:
         return f"{len(self.came)} of {len(self.sent) * (self.robots - 1)}; {self.age_s:.2f} s old"
 
 
-def _run(kind: type[SoundServer], sinks: Sequence[str], preset: str, rate_hz: float, seconds: float) -> _Run:
-    """:param sinks: for each robot the sink it plays to and the one it hears"""
+def _run(
+    kind: type[SoundServer], sinks: Sequence[tuple[str, str]], preset: str, rate_hz: float, seconds: float
+) -> _Run:
     count = len(sinks)
     run = _Run(count)
     numbers = range(1, count + 1)
     fleet = Fleet(SimSettings(robots=count, odom_rate=10.0))
-    messages = {number: [] for number in numbers}
+    messages: dict[int, list[bytes]] = {number: [] for number in numbers}
     for sent in fleet.messages(seconds, topics={f"/robot_{number}/odom" for number in numbers}):
         messages[int(sent.topic.split("/")[1].rsplit("_", 1)[1])].append(sent.payload)
     with TemporaryDirectory() as folder, ExitStack() as stack:
@@ -125,7 +130,7 @@ def _run(kind: type[SoundServer], sinks: Sequence[str], preset: str, rate_hz: fl
     return run
 
 
-def _say(run: _Run, publishers: dict[int, Publisher], messages: dict[int, list[bytes]], place: int) -> None:
+def _say(run: _Run, publishers: Mapping[int, Publisher], messages: dict[int, list[bytes]], place: int) -> None:
     for number, publisher in publishers.items():
         data = messages[number][place % len(messages[number])]
         run.sent[number, data] = time.monotonic()
@@ -133,7 +138,7 @@ def _say(run: _Run, publishers: dict[int, Publisher], messages: dict[int, list[b
 
 
 @contextmanager
-def _links(server: SoundServer, folder: Path, sinks: Sequence[str], preset: str, run: _Run) -> Iterator[None]:
+def _links(server: SoundServer, folder: Path, sinks: Sinks, preset: str, run: _Run) -> Iterator[None]:
     """The robots' links, and their processor time into ``run``."""
     processes, begin = [], time.monotonic()
     for number, (plays, hears) in enumerate(sinks, 1):

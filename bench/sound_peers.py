@@ -73,7 +73,7 @@ class _Program(Peer):
             subprocess.run(command, stdin=words.open(), check=True, capture_output=True)
             rate, samples = wavfile.read(out)
         assert rate == CARD_RATE
-        return samples / np.abs(samples).max()
+        return np.asarray(samples / np.abs(samples).max())
 
     def heard(self, sound: Wave) -> str:
         with TemporaryDirectory() as folder:
@@ -92,5 +92,5 @@ def peers() -> Iterator[Peer]:
             sends = ("minimodem", "--tx", baud, "-R", str(CARD_RATE), "-f", "{sound}")
             yield _Program(f"minimodem {baud}", sends, ("minimodem", "--rx", baud, "-q", "-f", "{sound}"), "\n{}\n")
     if which("gen_packets") and which("atest"):
-        sends = ("gen_packets", "-r", str(CARD_RATE), "-o", "{sound}", "{text}")
-        yield _Program("direwolf 1200", sends, ("atest", "{sound}"), "N0CALL>N0CALL:{}\n")
+        makes = ("gen_packets", "-r", str(CARD_RATE), "-o", "{sound}", "{text}")
+        yield _Program("direwolf 1200", makes, ("atest", "{sound}"), "N0CALL>N0CALL:{}\n")

@@ -71,7 +71,7 @@ class HearingGraph(Surroundings):
     :param hears: for every robot those that hear it, as a function of time: the same object as long as nothing changes
     """
 
-    moves, passes = True, False
+    moves, passes = "who hears whom", False
 
     def __init__(self, hears: Callable[[float], Sequence[set[int]]] | Sequence[set[int]], config: SwarmConfig) -> None:
         self._hears = hears if callable(hears) else lambda _: hears

@@ -10,6 +10,7 @@ from fuzz.loop import main, work
 from gr_ros2.core.errors import WireError
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, ReceiverEvent
+from gr_ros2.link.key import Key
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.settings.registry import Registry
@@ -49,6 +50,7 @@ def endpoint(data: bytes) -> None:
         end.next_timeout()
         for event in events:
             if isinstance(event, Delivered):
+                assert isinstance(event.key, Key)
                 name, order = (event.src_id, event.topic_id, event.key.boot), (event.key.number, event.key.place)
                 assert order > latest.get(name, (-1, -1))
                 latest[name] = order

@@ -11,6 +11,7 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 from functools import cache, partial
+from typing import cast
 
 from fuzz.insider import STARTS, Robot, Script
 from fuzz.loop import main, work
@@ -27,7 +28,7 @@ from gr_ros2.link.message_codec import FRAME
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.sealing import Keys, SealMode
-from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.config import CloudOptions, SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import v1
 from gr_ros2.wire.control import Ask, Control, Report
@@ -127,7 +128,7 @@ class Victim:
         rows = [
             Topic(CAMERA, "camera/image", IMAGE),
             Topic(MAP, "map", GRID, SendOptions(durability="transient_local")),
-            Topic(POINTS, "points", CLOUD, SendOptions(cloud={"voxel": 0.1, "fit": True})),
+            Topic(POINTS, "points", CLOUD, SendOptions(cloud=CloudOptions(voxel=0.1, fit=True))),
         ]
         topics, known = Registry(rows), message_codec()
         settings = Settings(
@@ -169,7 +170,8 @@ class Victim:
         for _ in range(2):
             self.end.pace.credit()
             sent = self.end.next_packet(now)
-            if sent is not None and sent.packet.repair is not None and sent.packet.repair.clear:
+            repair = None if sent is None else cast("v1.PacketV1", sent.packet).repair
+            if sent is not None and repair is not None and repair.clear:
                 self.echo = sent.data[-4:]
 
     def _take(self, events: Sequence[ReceiverEvent], now: float) -> None:

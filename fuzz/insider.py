@@ -10,11 +10,12 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from fuzz.loop import main, work
 from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Delivered, ReceiverEvent, SentPacket
+from gr_ros2.link.key import Key
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.gf256 import combine
@@ -289,7 +290,8 @@ def insider(data: bytes) -> None:
         assert lines < MOST_LINES, f"{lines} lines"
         for packet in sent:
             assert len(packet.data) <= PACKET_LEN
-            if packet.packet.repair is not None and packet.packet.repair.clear:
+            repair = cast("v1.PacketV1", packet.packet).repair
+            if repair is not None and repair.clear:
                 echo = packet.data[-4:]
         check(end, events, latest)
 
@@ -314,6 +316,7 @@ def check(
     """Nothing is delivered after a later message of its topic, and memory is bounded."""
     for event in events:
         if isinstance(event, Delivered):
+            assert isinstance(event.key, Key)
             name, order = (event.src_id, event.topic_id, event.key.boot), (event.key.number, event.key.place)
             assert order > latest.get(name, (-1, -1)), f"{event} after {latest[name]}"
             latest[name] = order

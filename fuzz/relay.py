@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from functools import partial
 
-from fuzz.loop import main, within
+from fuzz.loop import main, within, work
 from gr_ros2.core.errors import WireError
 from gr_ros2.link.v1.custody import MOST_HELD, Custody
 from gr_ros2.link.v1.repair import RepairWindow
@@ -53,9 +53,8 @@ def relay(data: bytes) -> None:
         gains.neighbour(src_id, now, names, 2)
         within(MOST_LINES, partial(gains.message, src_id, stream, message.number, now))
         within(MOST_LINES, partial(gains.told, src_id, told))
-        found: list[Stream] = []
-        within(MOST_LINES, lambda at=now, found=found: found.extend([s for s in [gains.best(at)[0]] if s]))
-        for best in found:
+        _, (best, _) = work(partial(gains.best, now), MOST_LINES)
+        if best is not None:
             assert gains.has(best) >= 0
             gains.sent(best, gains.has(best), now)
         assert len(gains.tells()) <= 2
