@@ -37,7 +37,8 @@ class ClockWatch:
     :param heard: returns the robots that are heard now, each with its ``clock``
     :param ask: asks a robot
     :param set_wall: told the clock of the wall minus ``now``, s, at each look
-    :param wall: s since 1970
+    :param wall: s since 1970; None where the clock of the link is not this computer's (a simulation in lock step), so
+        that nobody is asked and nothing is said of clocks
     :ivar given: samples that chrony has taken
     """
 
@@ -49,7 +50,7 @@ class ClockWatch:
         heard: Callable[[float], Sequence[Mapping[str, Any]]],
         ask: Callable[[int], object],
         set_wall: Callable[[float], None],
-        wall: Callable[[], float] = time.time,
+        wall: Callable[[], float] | None = time.time,
     ) -> None:
         every = config.every_s
         self.every_s = (CHRONY_S if config.chrony else MINE_S if mine else 0.0) if every == AUTO else every
@@ -69,6 +70,8 @@ class ClockWatch:
 
         :param now: s, monotonic
         """
+        if self._wall is None:
+            return
         wall_s = self._wall() - now
         if self._wall_s is not None and abs(wall_s - self._wall_s) >= SET_S:
             self._set[None] = now, wall_s - self._wall_s
@@ -77,7 +80,7 @@ class ClockWatch:
         for peer in self._heard(now):
             robot, clock = peer["robot"], peer["clock"]
             if clock is not None:
-                self._take(robot, clock, now)
+                self._take(robot, clock, now, wall_s + now)
             itself = not peer["hops"] and not peer["silent"]
             if self.every_s and itself and now >= self._asked.get(robot, -inf) + self.every_s:
                 self._asked[robot] = now
@@ -97,12 +100,12 @@ class ClockWatch:
             self._socket.close()
             self._socket = None
 
-    def _take(self, robot: int, clock: Mapping[str, Any], now: float) -> None:
+    def _take(self, robot: int, clock: Mapping[str, Any], now: float, wall: float) -> None:
         if clock["jumps"] != self._jumps.get(robot, 0):
             self._jumps[robot], self._set[robot] = clock["jumps"], (now, clock["jumped_s"])
         if robot == self._config.robot and clock["answers"] != self._answers:
             self._answers = clock["answers"]
-            self._give(self._wall() - clock["newest_age_s"], clock["newest_s"])
+            self._give(wall - clock["newest_age_s"], clock["newest_s"])
 
     def _give(self, at: float, ahead_s: float) -> None:
         """Give chrony a sample, if it is there.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -60,12 +59,15 @@ def about(config: LinkConfig, phys: Sequence[Phy]) -> dict[str, Any]:
 
 
 def introduce(
-    live: LiveEnd[OpenEndpoint], told: Mapping[str, Any], snr_db: Callable[[], float | None], now: float
+    live: LiveEnd[OpenEndpoint], told: Mapping[str, Any], snr_db: Callable[[], float | None], wall_s: float
 ) -> None:
-    """From now on, tell those who ask what this end is, what time it has, and how well it receives."""
+    """From now on, tell those who ask what this end is, what time it has, and how well it receives.
+
+    :param wall_s: see :func:`set_wall`; 0 = unknown
+    """
     questions = live.endpoint.questions
     questions.introduce(**told)
-    questions.snr_db, questions.wall_s = snr_db, time.time() - now
+    questions.snr_db, questions.wall_s = snr_db, wall_s
 
 
 def peers(live: LiveEnd[OpenEndpoint], now: float) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
@@ -133,10 +134,12 @@ class RobotLink(Flowgraph):
             self._connect_radio(number)
         if all(radio.phy.has_airtime for radio in radios):  # without, nothing sets a pace
             self.source.use_credit()
+        # A clock that a medium process tells stands still now and then, so it does not say how far others are ahead.
+        wall = time.time if self._clock is time.monotonic else None
         told = about(config, [radio.phy for radio in radios])
         asked_by: Mapping[int, float] = {}
         if hasattr(self.end.endpoint, "questions"):  # the paper's robots ask nothing
-            introduce(self.end, told, lambda: self.radio.snr_db, self._clock())
+            introduce(self.end, told, lambda: self.radio.snr_db, 0.0 if wall is None else wall() - self._clock())
             asked_by = self.end.endpoint.questions.asked_by
         self._clocks = ClockWatch(
             config.clock,
@@ -144,6 +147,7 @@ class RobotLink(Flowgraph):
             heard=partial(peers, self.end),
             ask=self.ping,
             set_wall=partial(set_wall, self.end),
+            wall=wall,
         )
         self._stack.callback(self._clocks.close)
         self.findings = LinkFindings(

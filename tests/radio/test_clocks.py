@@ -74,6 +74,18 @@ def test_a_clock_that_was_set_is_said_for_a_while() -> None:
     assert robots.walls == [1e9, 1e9 + 7.5, 1e9 + 7.5], "the endpoint is told"
 
 
+def test_a_link_whose_clock_is_simulated_says_nothing_of_clocks() -> None:
+    def fails(*_: object) -> float:
+        raise AssertionError
+
+    watch = ClockWatch(
+        build(ClockConfig, {"every_s": 1}), mine=False, heard=fails, ask=fails, set_wall=fails, wall=None
+    )
+    watch.look(0.0)
+    watch.look(12.0)
+    assert watch.lines(12.0) == []
+
+
 def test_chrony_gets_each_answer_once_and_may_start_later(tmp_path: Path) -> None:
     path = tmp_path / "chrony.sock"
     robots = Robots(chrony=str(path), robot=2)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from math import nan
 from pathlib import Path
@@ -181,6 +182,31 @@ def process(tmp_path: Path) -> Iterator[MediumProcess]:
     over.set()
     running.join()
     made.close()
+
+
+def test_a_medium_that_stands_still_sets_no_clock(process: MediumProcess, tmp_path: Path) -> None:
+    with (
+        Robot(1, front_end(tmp_path, 1), hears=(2,)) as one,
+        Robot(2, front_end(tmp_path, 2), hears=(1,)) as two,
+    ):
+        wait_for(lambda: two.say(1) and bool(one.heard), "robot 1 to hear")
+
+        def answers(count: int) -> bool:
+            one.link.check()
+            two.link.check()
+            return bool(one.link.ping(2)["answered"] >= count)
+
+        wait_for(lambda: answers(1), "an answer")
+        clock, still, before = one.link.front_end.clock, threading.Event(), process._take
+        vars(process).update(_take=lambda _: still.wait())
+        stopped_s = time.monotonic() - clock()
+        wait_for(lambda: time.monotonic() - clock() > stopped_s + 0.5, "half a second in which nothing goes on")
+        vars(process).update(_take=before)
+        still.set()
+        wait_for(lambda: answers(3), "further answers")
+        for robot, other in ((one, 2), (two, 1)):
+            assert robot.link.stats()["clocks"]["set"] == []
+            assert robot.link.ping(other)["clock_s"] is None, "nothing tells how long the medium stood still"
 
 
 def test_nobody_waits_for_a_robot_that_sends_and_never_answers_the_time(
