@@ -30,6 +30,7 @@ from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.control_socket import sockets
 from gr_ros2.cli.status import NO_LINK, STATUS, Stats, ask_link, in_seconds, json_option, peer_state
 from gr_ros2.core.errors import RunError, shortened
+from gr_ros2.core.watch import Watch
 from gr_ros2.gr.health import LinkHealth
 from gr_ros2.settings.config import DiagnosticsConfig, build
 from gr_ros2.wire import BROADCAST
@@ -46,7 +47,7 @@ class Watched:
     """A program with a control socket, which is asked again and again until ``gone`` is set or it is closed."""
 
     def __init__(self, pid: int) -> None:
-        self._pid, self._answered_at = pid, time.monotonic()
+        self._pid, self._answered_at, self._silence = pid, time.monotonic(), Watch(2 * _EVERY_S)
         self._health: LinkHealth | None = None
         self._row: dict[str, Any] | None = None
         """What it has said; None while it is not known to be a link."""
@@ -63,7 +64,7 @@ class Watched:
 
     def row(self) -> dict[str, Any] | None:
         """Its row of the table; None while nothing is known, and for a run."""
-        silent_s = time.monotonic() - self._answered_at
+        silent_s = self._silent_s()
         late = silent_s > _LATE_S
         if self._row is None and (self._refuses or not late):
             return None
@@ -74,7 +75,12 @@ class Watched:
     @property
     def settled(self) -> bool:
         """Whether waiting longer brings no more than the next look."""
-        return self._looks > 1 or self._refuses or time.monotonic() - self._answered_at > _LATE_S
+        return self._looks > 1 or self._refuses or self._silent_s() > _LATE_S
+
+    def _silent_s(self) -> float:
+        """s since its last answer, as far as this program has run itself."""
+        now = time.monotonic()
+        return self._silence.age(now - self._answered_at, now)
 
     def _watch(self) -> None:
         while not self.gone.is_set():

@@ -12,7 +12,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gr_ros2.core.errors import ConfigError, RadioError
-from gr_ros2.core.watch import wait_until
+from gr_ros2.core.watch import Watch, wait_until
 from gr_ros2.radio.audio_bursts import CARD_RATE, LATE_S
 from gr_ros2.radio.audio_card import Microphone, PortAudioError, Speaker, devices, look_again
 from gr_ros2.radio.burst_device import BurstDeviceOptions, BurstFrontEnd
@@ -99,7 +99,7 @@ class AudioFrontEnd(BurstFrontEnd):
     def _open(self) -> None:
         self._check_asked()
         self._keyer: Keyer | None = None
-        self._muted = self._too_loud = False
+        self._silence, self._muted, self._too_loud = Watch(), False, False
         self._blocks = 0, 0
         self._counted: dict[str, int] = {}
         with self._one_line():
@@ -166,7 +166,7 @@ class AudioFrontEnd(BurstFrontEnd):
 
     def _check_heard(self, now: float) -> None:
         """Say once what is wrong with what is heard, and once that it is over."""
-        muted = self._receiving.silent_s(now) > _MUTED_S
+        muted = self._silence.age(self._receiving.silent_s(now), now) > _MUTED_S
         if muted != self._muted:
             self._muted = muted
             _log.warning(

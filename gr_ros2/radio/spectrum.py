@@ -10,12 +10,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from math import inf
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gr_ros2.core.errors import ConfigError, RadioError
+from gr_ros2.core.watch import Watch
 from gr_ros2.phy import Phy
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.occupancy import Occupancy, decibels, in_parts
@@ -94,7 +96,7 @@ class Listening:
         try:
             self._ended.wait(_SETTLE_S if sending else 0.0)
             heard = {one.name: Occupancy() for one in radios}
-            self._hear(radios, heard, time.monotonic() + for_s)
+            self._hear(radios, heard, for_s)
             told = [_told(one, heard[one.name], for_s) for one in radios]
             self._told = {"state": "done", "for_s": for_s, "radios": told}
         except RadioError as error:
@@ -104,9 +106,10 @@ class Listening:
                 for one in sending:
                     one.radio.transmit(on=True)
 
-    def _hear(self, radios: Sequence[OneRadio], heard: Mapping[str, Occupancy], end: float) -> None:
+    def _hear(self, radios: Sequence[OneRadio], heard: Mapping[str, Occupancy], for_s: float) -> None:
         before: dict[str, NDArray[np.complex64]] = {}
-        while time.monotonic() < end and not self._ended.wait(_LOOK_S):
+        listened = Watch()
+        while listened.age(inf, time.monotonic()) < for_s and not self._ended.wait(_LOOK_S):
             for one in radios:
                 samples = one.radio.samples()
                 if samples is None or np.array_equal(samples, before.get(one.name, samples[:0]), equal_nan=True):

@@ -19,7 +19,7 @@ import pytest
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
-from gr_ros2.cli import control_socket
+from gr_ros2.cli import control_socket, top
 from gr_ros2.cli.console import console
 from gr_ros2.cli.control_socket import ControlSocket, folder, sockets
 from gr_ros2.cli.dashboard import audience
@@ -139,6 +139,30 @@ def test_a_run_is_no_link_and_an_answer_of_another_release_is_named(
                 assert "\n" not in row["warnings"][0]
             assert links.look() == []
     wait_for(lambda: not any(one.name.startswith("gr-ros2-top") for one in threading.enumerate()), "its threads to end")
+
+
+def test_a_table_that_was_frozen_itself_accuses_no_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It looks first, before the thread that asks, which stood still with it."""
+    asked, hangs, frozen_s = [0], threading.Event(), [0.0]
+
+    def ask(*_: object) -> None:
+        asked[0] += 1
+        if asked[0] > 1:
+            hangs.wait()
+        raise ValueError
+
+    monkeypatch.setattr(top, "ask_link", ask)
+    monkeypatch.setattr(top, "_EVERY_S", 0.01)
+    monkeypatch.setattr(top.time, "monotonic", lambda real=top.time.monotonic: real() + frozen_s[0])
+    watched = top.Watched(1)
+    wait_for(lambda: asked[0] > 1 and watched.row(), "an answer")
+    frozen_s[0] = 12.0
+    row = watched.row()
+    assert row is not None
+    assert row["answers"]
+    monkeypatch.undo()
+    watched.gone.set()
+    hangs.set()
 
 
 def test_words_of_another_program_are_no_markup() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -154,6 +155,20 @@ def test_silence_of_zeros_is_named_once_and_so_is_its_end(
             alone.link.transmit(on=True)
             says_until(alone, 1, lambda: "comes in again" in caplog.text)
         assert caplog.text.count("digital silence") == 1
+
+
+@pytest.mark.real_time
+@pytest.mark.usefixtures("server")
+def test_a_link_that_was_frozen_accuses_no_microphone(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    at(monkeypatch, "a", "a")
+    monkeypatch.setattr(AudioFrontEnd, "loops_back", True)
+    with Robot(1, dict(SOUND), hears=(1,), repair="off", phy=PHY) as alone:
+        says_until(alone, 1, lambda: alone.heard)
+        alone.link.check()
+        alone.link.front_end.check(time.monotonic() + 12.0)
+        assert "digital silence" not in caplog.text
 
 
 @pytest.mark.real_time

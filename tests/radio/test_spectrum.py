@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.radio import spectrum
 from gr_ros2.radio.occupancy import PARTS, Occupancy
 from gr_ros2.radio.spectrum import Listening
 from tests.radio.robots import Robot
@@ -135,6 +138,19 @@ def test_a_link_is_silent_while_it_listens_and_sends_again(tmp_path: Path) -> No
         wait_for(lambda: one.link.radio.transmits, "the end of the silence")
         before = one.link.stats()["packets"]["out"]
         wait_for(lambda: one.link.stats()["packets"]["out"] > before, "another packet")
+
+
+def test_a_link_that_was_frozen_while_it_listened_listens_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looks, monotonic = [0], time.monotonic
+
+    def after_a_freeze() -> float:
+        looks[0] += threading.current_thread().name == "gr-ros2-spectrum"
+        return monotonic() + 12.0 * (looks[0] > 1)
+
+    with robot(tmp_path / "in", noise(400, np.random.default_rng(7))) as one:
+        monkeypatch.setattr(spectrum.time, "monotonic", after_a_freeze)
+        assert measured(one)["state"] == "done"
+        monkeypatch.undo()
 
 
 def test_who_has_switched_sending_meanwhile_is_obeyed(tmp_path: Path) -> None:
