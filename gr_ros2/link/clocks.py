@@ -24,6 +24,7 @@ class ClockOffset(NamedTuple):
     :param jumped_s: by how much at last, s
     :param answers: how many have told it
     :param newest_s: what the newest of them alone tells, s
+    :param newest_error_s: s by which that may be wrong
     :param newest_age_s: s since that came
     """
 
@@ -33,6 +34,7 @@ class ClockOffset(NamedTuple):
     jumped_s: float
     answers: int
     newest_s: float
+    newest_error_s: float
     newest_age_s: float
 
     @property
@@ -89,5 +91,5 @@ class OtherClock:
         if best is None or newest is None:
             return None
         error_s = best.error_at(now, DRIFT)
-        age_s = max(now - newest.at, 0.0)
-        return ClockOffset(best.ahead_s, error_s, self._jumps, self._jumped_s, self._answers, newest.ahead_s, age_s)
+        told = newest.ahead_s, newest.error_s, max(now - newest.at, 0.0)
+        return ClockOffset(best.ahead_s, error_s, self._jumps, self._jumped_s, self._answers, *told)

@@ -1,7 +1,8 @@
 """Watches the clocks of the robots that a link hears, says what was set, and gives one to chrony.
 
 Invariants: each robot that is heard itself is asked once in ``every_s``. Each answer is one sample for chrony, of the
-offset that this answer tells alone, at the time at which it came, so that chrony itself sees how they scatter.
+offset that this answer tells alone, at the time at which it came, so that chrony itself sees how they scatter. One that
+tells nothing beside those before it is none: an end was frozen, or the air full, while it was under way.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ MINE_S, CHRONY_S = 10.0, 1.0
 """s between two questions where none are set: for stamps, and for chrony."""
 SET_S = 0.1
 """s by which this computer's clock has moved at least that is said."""
+WIDE = 10.0
+"""Bounds of an answer, beside the best ones known, at which it tells nothing."""
 SAID_S = 60.0
 """s for which it is said that a clock was set."""
 SAMPLE = struct.Struct("@lldiiii")
@@ -105,7 +108,8 @@ class ClockWatch:
             self._jumps[robot], self._set[robot] = clock["jumps"], (now, clock["jumped_s"])
         if robot == self._config.robot and clock["answers"] != self._answers:
             self._answers = clock["answers"]
-            self._give(wall - clock["newest_age_s"], clock["newest_s"])
+            if clock["newest_error_s"] <= WIDE * clock["error_s"]:
+                self._give(wall - clock["newest_age_s"], clock["newest_s"])
 
     def _give(self, at: float, ahead_s: float) -> None:
         """Give chrony a sample, if it is there.

@@ -88,7 +88,7 @@ def test_what_fills_a_gap_stands_where_it_was_made_and_once(tmp_path: Path) -> N
     now, wall = time.monotonic(), time.time()
     made = [round((wall - ago) * 1e6) for ago in (30, 20, 10)]
     with opened(tmp_path / "bag") as bag:
-        bag._run.clocks = lambda: {2: ClockOffset(5.0, 0.001, 0, 0.0, 1, 5.0, 0.0)}  # type: ignore[union-attr]
+        bag._run.clocks = lambda: {2: ClockOffset(5.0, 0.001, 0, 0.0, 1, 5.0, 0.001, 0.0)}  # type: ignore[union-attr]
         bag.receiver_event(Delivered(2, 0, message(3, 50), 0, Key(7, 40, 1), age_s=1.0), now)
         oldest, old = Later(0, 0, made[0], message(1, 50)), Later(0, 1, made[1], message(2, 50), (30, 0))
         came = Later(0, 2, made[2], message(3, 50), (40, 1))

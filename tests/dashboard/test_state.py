@@ -210,7 +210,7 @@ def test_what_comes_of_a_sender_that_is_not_observed_has_an_age() -> None:
 
 
 def test_where_the_clock_of_a_sender_is_known_its_messages_have_a_latency() -> None:
-    state, clock = make(), ClockOffset(3600.5, 0.002, 0, 0.0, 1, 3600.5, 0.0)
+    state, clock = make(), ClockOffset(3600.5, 0.002, 0, 0.0, 1, 3600.5, 0.002, 0.0)
     state.receiver_event(Delivered(9, 3, at(1, 2), 0, "key", hops=1, over=4, age_s=0.1, latency_s=0.75), 1.0)
     snapshot = state.tick(2.0, clocks={9: clock})
     [topic], [robot] = [topic for topic in snapshot.topics if topic.src_id == 9], snapshot.heard

@@ -60,7 +60,7 @@ def test_an_old_answer_counts_less() -> None:
     assert late is not None
     assert late.error_s == pytest.approx(0.001 + 3600 * DRIFT)
     clock.answered(1.05, 0.1, 3600.0)
-    assert clock.at(3602.0) == pytest.approx((1.05, 0.05 + 2 * DRIFT, 0, 0.0, 2, 1.05, 2.0))
+    assert clock.at(3602.0) == pytest.approx((1.05, 0.05 + 2 * DRIFT, 0, 0.0, 2, 1.05, 0.05, 2.0))
 
 
 def test_a_clock_that_is_adjusted_was_not_set() -> None:

@@ -21,7 +21,7 @@ class Robots:
 
     def __init__(self, *, mine: bool = False, **settings: Any) -> None:
         self.asked: list[tuple[int, float]] = []
-        self.now, self.set_by_s, self.jumps = 0.0, 0.0, 0
+        self.now, self.set_by_s, self.jumps, self.error_s = 0.0, 0.0, 0, 0.02
         self.heard: list[dict[str, Any]] = []
         self.walls: list[float] = []
         self.watch = ClockWatch(
@@ -36,7 +36,7 @@ class Robots:
     def look(self, now: float, *robots: int, hops: int = 0) -> None:
         """All that was asked has been answered 0.125 s ago."""
         self.now = now
-        clock = ClockOffset(0.2, 0.01, self.jumps, -3.0, len(self.asked), 0.25, 0.125)._asdict()
+        clock = ClockOffset(0.2, 0.01, self.jumps, -3.0, len(self.asked), 0.25, self.error_s, 0.125)._asdict()
         told = clock if self.asked else None
         self.heard = [{"robot": robot, "clock": told, "hops": hops, "silent": False} for robot in robots]
         self.watch.look(now)
@@ -101,8 +101,13 @@ def test_chrony_gets_each_answer_once_and_may_start_later(tmp_path: Path) -> Non
         chrony.setblocking(False)
         with pytest.raises(BlockingIOError):
             chrony.recv(SAMPLE.size)
+        robots.error_s = 6.0
+        robots.look(2.25, 2, 3)
+        with pytest.raises(BlockingIOError):  # the other robot was frozen before it answered
+            chrony.recv(SAMPLE.size)
+        robots.error_s = 0.02
     path.unlink()
-    for now in (3.0, 3.5):
+    for now in (3.25, 3.75):
         robots.look(now, 2)
     assert robots.watch.given == 1
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as again:
