@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 
 from gr_ros2.link.endpoint import Endpoint
 from gr_ros2.link.events import SenderEvent
+from gr_ros2.phy.threads import wait_until_s
 
 _E_co = TypeVar("_E_co", bound=Endpoint, covariant=True)
 SHORTEST_WAIT_S = 2e-4
@@ -63,7 +64,7 @@ class LiveEnd(Generic[_E_co]):
         if not self._foreseen:
             at = self.endpoint.next_departure()
         self.sleeps_until = inf if at is None else at
-        self.work.wait(None if at is None else max(SHORTEST_WAIT_S, at - now))
+        self.work.wait(wait_until_s(at, now, SHORTEST_WAIT_S))
         self.looked = clock()  # before it counts as awake: `stalled_s` takes no lock
         self.sleeps_until = -inf
 

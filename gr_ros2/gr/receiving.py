@@ -35,6 +35,7 @@ from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.phy.pdus import packets_of, take_messages
+from gr_ros2.phy.threads import wait_until_s
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.settings.robot import RobotConfig
 
@@ -284,6 +285,6 @@ class ReceivingBlock(HalfBlock):
                     if outputs.opening:
                         at = min(self.clock() + CHECK_S, inf if at is None else at)
                     self._timer_idle = at is None
-                    outputs.due.wait(None if at is None else max(_SHORTEST_WAIT_S, at - self.clock()))
+                    outputs.due.wait(wait_until_s(at, self.clock(), _SHORTEST_WAIT_S))
                     self._timer_idle = False
             self._settle(events)

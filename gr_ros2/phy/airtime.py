@@ -18,7 +18,7 @@ from gr_ros2.link.airtime_limit import AirtimeLimit
 from gr_ros2.link.events import AirPacket
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy.pdus import CreditPort, PduPort, packets_of, take_messages, with_begin
-from gr_ros2.phy.threads import WaitingBlock
+from gr_ros2.phy.threads import WaitingBlock, wait_until_s
 
 
 class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
@@ -186,6 +186,6 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         if not pdus and not credits:
             at = self._clock.next_timeout(now)
             self._looks_at = inf if at is None else max(at, now)
-            self._changed.wait(None if at is None else max(0.0, at - now))
+            self._changed.wait(wait_until_s(at, now))
             self._looks_at = self._now()
         return pdus, credits

@@ -29,6 +29,9 @@ slow_computer``). In the demo ages are the same with both, and with Python's def
 _MAX_MESSAGES = "GR_CONF_DEFAULT_MAX_MESSAGES"
 """Environment variable of GNU Radio's setting ``max_messages``, read when a flowgraph starts."""
 
+_LONGEST_WAIT_S = 3600.0
+"""s after which a thread looks again at what is due later: with 300 years, which a rate may ask for, Python fails."""
+
 _LOOK_S = 0.1
 """s between two checks: a thread that waits without a time limit may miss a signal."""
 
@@ -36,6 +39,11 @@ _START_ATTEMPTS = 20
 """GNU Radio maps each buffer twice in a row, and gives up when another thread maps memory at that place in between."""
 
 _log = logging.getLogger(__name__)
+
+
+def wait_until_s(at: float | None, now: float, least_s: float = 0.0) -> float | None:
+    """The time to wait for what is due at ``at``, s, as a condition takes it; None where nothing is due."""
+    return None if at is None else min(max(least_s, at - now), _LONGEST_WAIT_S)
 
 
 def shorten_switch_interval() -> None:

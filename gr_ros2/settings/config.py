@@ -51,7 +51,7 @@ PacketLen = Annotated[int, Field(ge=MIN_PACKET_LEN, le=MAX_PACKET_LEN)]
 RobotId = Annotated[int, Field(ge=0, le=BROADCAST - 1)]
 DomainId = Annotated[int, Field(ge=0, le=232)]
 SampleRate = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=2**31 - 1)]
 """Of what DDS and GNU Radio take as a signed number of 32 bits."""
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]

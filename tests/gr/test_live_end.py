@@ -39,3 +39,23 @@ def test_a_thread_that_has_slept_for_long_is_never_taken_for_stalled() -> None:
     assert len(said) >= 3
     assert max(said) == 0
     assert end.stalled_s(23.0) == 11.0
+
+
+def test_it_sleeps_however_much_later_the_next_packet_is_due() -> None:
+    class Slow:
+        urgent = True
+
+        def next_departure(self, **_: bool) -> float:
+            return 1e300
+
+    end = LiveEnd(lambda _: Slow())  # type: ignore[arg-type, return-value]
+
+    def wake() -> None:
+        with end.lock:
+            end.wake()
+
+    with end.lock:
+        other = threading.Thread(target=wake)
+        other.start()
+        end.sleep(lambda: 0.0)
+    other.join()

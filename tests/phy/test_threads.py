@@ -11,7 +11,7 @@ import pytest
 from gnuradio import gr, pdu
 
 from gr_ros2.phy.ofdm import OfdmPhy
-from gr_ros2.phy.threads import lift_message_limit
+from gr_ros2.phy.threads import lift_message_limit, wait_until_s
 from tests.waiting import PATIENCE_S, wait_for
 
 OVER_GNU_RADIOS_LIMIT = 8192 + 2500  # of which 1024 find room behind the port
@@ -29,6 +29,14 @@ class KeptAliveSink(gr.sync_block):  # type: ignore[misc]
         self.go.wait(PATIENCE_S)
         self.taken += len(input_items[0])
         return len(input_items[0])
+
+
+def test_what_is_due_in_a_thousand_years_can_be_waited_for() -> None:
+    assert wait_until_s(None, 5.0) is None
+    assert wait_until_s(7.0, 5.0) == 2.0
+    assert wait_until_s(4.0, 5.0, least_s=0.1) == 0.1
+    for at in (3e10, 1e300, float("inf")):
+        assert 0 < (wait_until_s(at, 5.0) or 0) <= threading.TIMEOUT_MAX
 
 
 def test_a_port_without_a_handler_keeps_all_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:

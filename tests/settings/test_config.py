@@ -80,6 +80,7 @@ def test_an_unknown_key_further_down_is_named_with_its_path() -> None:
         (PaperConfig, "min_fragment", 0),
         (PaperConfig, "flush_timeout_s", -0.1),
         (PaperConfig, "flush_timeout_s", float("nan")),
+        (RobotConfig, "repeat_s", 1e300),
         (RobotConfig, "packet_rate", float("inf")),
         (RobotConfig, "queue_depth", -1),
         (GraphConfig, "depth", -1),
