@@ -59,3 +59,4 @@ def test_it_sleeps_however_much_later_the_next_packet_is_due() -> None:
         other.start()
         end.sleep(lambda: 0.0)
     other.join()
+    assert end.looked == 0.0

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from math import nan
 from pathlib import Path
@@ -197,12 +196,16 @@ def test_a_medium_that_stands_still_sets_no_clock(process: MediumProcess, tmp_pa
             return bool(one.link.ping(2)["answered"] >= count)
 
         wait_for(lambda: answers(1), "an answer")
-        clock, still, before = one.link.front_end.clock, threading.Event(), process._take
-        vars(process).update(_take=lambda _: still.wait())
-        stopped_s = time.monotonic() - clock()
-        wait_for(lambda: time.monotonic() - clock() > stopped_s + 0.5, "half a second in which nothing goes on")
+        goes_on, looks, before = threading.Event(), [0], process._take
+
+        def stands_still(_: float) -> None:
+            while not goes_on.wait(0.01):
+                looks[0] += 1
+
+        vars(process).update(_take=stands_still)
+        wait_for(lambda: looks[0] > 50, "half a second in which nothing goes on")
         vars(process).update(_take=before)
-        still.set()
+        goes_on.set()
         wait_for(lambda: answers(3), "further answers")
         for robot, other in ((one, 2), (two, 1)):
             assert robot.link.stats()["clocks"]["set"] == []
