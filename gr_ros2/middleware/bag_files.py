@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rosbags.interfaces import (
     Connection,
@@ -47,6 +47,7 @@ from gr_ros2.middleware.ros_graph import check_topic
 from gr_ros2.middleware.type_definitions import same_type
 from gr_ros2.settings.registry import normalize_type
 
+_T = TypeVar("_T")
 _CDR = "cdr"
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 _METADATA = "metadata.yaml"
@@ -258,19 +259,21 @@ class _Bag:
         expected = [
             Connection(
                 number,
-                topic["name"],
-                topic["type"],
+                _said(topic, "name", str),
+                _said(topic, "type", str),
                 _NO_DEFINITION,
-                topic.get("type_description_hash", ""),
-                row["message_count"],
-                ConnectionExtRosbag2(topic["serialization_format"], _profiles(topic.get("offered_qos_profiles"))),
+                _said({"type_description_hash": "", **topic}, "type_description_hash", str),
+                _said(row, "message_count", int),
+                ConnectionExtRosbag2(
+                    _said(topic, "serialization_format", str), _profiles(topic.get("offered_qos_profiles"))
+                ),
                 self,
             )
             for number, row in enumerate(information["topics_with_message_count"])
             for topic in [row["topic_metadata"]]
         ]
         names = [PurePath(name).name for name in information["relative_file_paths"]]
-        self.expected, self.message_count = expected, information["message_count"]
+        self.expected, self.message_count = expected, _said(information, "message_count", int)
         return names
 
     def _open(self, path: Path) -> McapStorage | SqliteStorage:
@@ -306,6 +309,17 @@ def is_bag(path: Path) -> bool:
     if path.is_dir():
         return (path / _METADATA).is_file() or bool(_files(path))
     return path.suffix in (".mcap", ".db3", ".zstd", ".bag")
+
+
+def _said(row: Mapping[str, Any], key: str, kind: type[_T]) -> _T:
+    """What metadata.yaml says.
+
+    :raises BagError: it is of another kind
+    """
+    value = row[key]
+    if not isinstance(value, kind):
+        raise BagError(f"{key} = {value!r}")
+    return value
 
 
 def _profiles(said: Any) -> list[Profile]:

@@ -2,7 +2,8 @@
 
 Invariants: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags
 alone writes the first one into both. A message that is missing in the index is read too, and so are all complete
-records of a file that was never closed. A schema in a language that ROS does not use is ignored, and so is the profile.
+records of a file that was never closed. A schema in a language that ROS does not use is ignored, whatever its bytes,
+and so is the profile.
 """
 
 from __future__ import annotations
@@ -12,16 +13,17 @@ import struct
 from collections.abc import Collection, Generator
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from rosbags.interfaces import Connection
+from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.storage_mcap import (
     ChunkInfo,
     McapReader,
     McapWriter,
     Schema,
-    read_string,
+    read_bytes,
     write_channel,
     write_string,
 )
@@ -39,6 +41,14 @@ _DIGEST = "topic_type_hash"
 """Name of the RIHS01 hash of a topic's type, as rosbag2 writes it since Iron."""
 _PUBLISH_TIME_AT = 1 + 8 + 2 + 4 + 8
 """Bytes of a message record before its publish_time: opcode, length, channel, sequence, log_time."""
+
+
+def read_string(bio: BinaryIO) -> str:
+    """A text. What is not of UTF-8 in it is replaced: the schemas of other topics, as of protobuf, may be binary."""
+    return read_bytes(bio).decode(errors="replace")
+
+
+storage_mcap.read_string = read_string
 
 
 class _Schemas(dict[int, Schema]):

@@ -60,13 +60,13 @@ class SqliteStorage(Sqlite3Reader):
         if not {"messages", "topics"} <= tables:
             raise BagError(f"bag {self.path}: is no ROS 2 bag: it has no tables messages and topics")
         columns = {row[1] for row in _rows(database, "PRAGMA table_info(topics)")}
-        qos, digest = (name if name in columns else "''" for name in ("offered_qos_profiles", "type_description_hash"))
+        names = ("name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
+        texts_of = ", ".join(f"CAST({name} AS BLOB)" if name in columns else "x''" for name in names)
         texts = (
             "SELECT topic_type, encoding, encoded_message_definition, type_description_hash FROM message_definitions"
         )
         definitions = _rows(database, texts) if "message_definitions" in tables else []
         counts = dict(_rows(database, "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
-        topics = f"SELECT id, name, type, serialization_format, {qos}, {digest} FROM topics ORDER BY id"
         self.connections = [
             Connection(
                 number,
@@ -78,9 +78,15 @@ class SqliteStorage(Sqlite3Reader):
                 ConnectionExtRosbag2(serialization, parse_qos(profiles)),
                 self,
             )
-            for number, name, type_name, serialization, profiles, type_hash in _rows(database, topics)
+            for number, *said in _rows(database, f"SELECT id, {texts_of} FROM topics ORDER BY id")
+            for name, type_name, serialization, profiles, type_hash in [map(_text, said)]
         ]
         self.metadata = self.metadata._replace(message_count=sum(counts.values()))
+
+
+def _text(data: bytes | None) -> str:
+    """A text of a topic, as far as it is one, so that another one's decides nothing; '' where there is none."""
+    return (data or b"").decode(errors="replace")
 
 
 def _definition(rows: list[tuple[Any, ...]], type_name: str, type_hash: str) -> MessageDefinition:

@@ -265,7 +265,7 @@ def _sized(data: bytes) -> bytes:
 
 
 def _text(text: str) -> bytes:
-    return _sized(text.encode())
+    return _sized(text.encode(errors="surrogateescape"))
 
 
 def _schema(place: int, topic: Foreign) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,55 @@ def test_metadata_that_cannot_be_used_is_a_remark(tmp_path: Path, text: str) -> 
     (path / "metadata.yaml").write_text(text)
     assert counts(path) == {"/a": 10}
     assert len(bag_contents(path).remarks) == 1 and "metadata.yaml cannot be used" in bag_contents(path).remarks[0]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("message_count", "ten"), ("name", None), ("type", 5), ("serialization_format", []), ("type_description_hash", 7)],
+)
+def test_what_metadata_says_of_one_topic_decides_over_no_file(tmp_path: Path, key: str, value: object) -> None:
+    topics = [Foreign("/a"), Foreign("/b")]
+    path = make_folder(tmp_path / "in", [make_mcap(tmp_path / "a.mcap", topics)], topics)
+    metadata = yaml.safe_load((path / "metadata.yaml").read_text())
+    row = metadata["rosbag2_bagfile_information"]["topics_with_message_count"][1]
+    (row if key in row else row["topic_metadata"])[key] = value
+    (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    assert counts(path) == {"/a": 10, "/b": 10}
+    assert bag_contents(path).remarks == [
+        f"{path}: metadata.yaml cannot be used ({key} = {value!r}): all files of the folder count"
+    ]
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_schema_of_bytes_beside_others_hinders_nothing(tmp_path: Path, killed: bool) -> None:
+    binary = bytes(range(256)).decode(errors="surrogateescape")
+    topics = [
+        Foreign("/a"),
+        Foreign("/p", type_name="foo.Bar", encoding="protobuf", text=binary, serialization="protobuf"),
+        Foreign("/q", qos=binary),
+    ]
+    path = unclosed(tmp_path / "in.mcap", topics) if killed else make_mcap(tmp_path / "in.mcap", topics)
+    assert counts(path) == {"/a": 10, "/q": 10}
+    contents = bag_contents(path)
+    assert contents.left_out == {"/p": "it is serialized as 'protobuf', and a link carries 'cdr'"}
+    assert f"{path}: the QoS of /q cannot be read: reliable, volatile and 10 are taken instead" in contents.differences
+
+
+@pytest.mark.parametrize(
+    "row", [(None, "std_msgs/msg/String", "cdr"), ("/b", None, "cdr"), ("/b", 5, None), (b"\xff", b"\xfe", b"\xff")]
+)
+def test_a_topic_of_an_sqlite_file_that_is_none_is_left_out(tmp_path: Path, row: tuple[object, ...]) -> None:
+    path = make_sqlite(tmp_path / "a.db3", [Foreign("/a"), Foreign("/b")])
+    with closing(sqlite3.connect(path)) as database:
+        texts = [f"CAST(x'{value.hex()}' AS TEXT)" if isinstance(value, bytes) else "?" for value in row]
+        values = [value for value in row if not isinstance(value, bytes)]
+        database.execute(
+            f"UPDATE topics SET name = {texts[0]}, type = {texts[1]}, serialization_format = {texts[2]} WHERE id = 2",
+            values,
+        )
+        database.commit()
+    assert counts(path) == {"/a": 10}
+    assert len(bag_contents(path).left_out) == 1
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "foreign"])
