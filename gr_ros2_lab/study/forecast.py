@@ -24,6 +24,7 @@ import numpy as np
 
 from gr_ros2.codecs.frames import coded_topic
 from gr_ros2.core.errors import ConfigError, RunError
+from gr_ros2.core.names import first
 from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.airtime_limit import sustained
@@ -278,7 +279,10 @@ class Planner:
         self.phy = make_phy(self.scenario, self.registry)
         self._messages = [list(messages) for messages in offered_by(self.scenario, self.registry)]
         if not any(self._messages):
-            raise ConfigError(f"source = {scenario.source!r}: has nothing on the registered topics; set other topics")
+            asked = ", ".join(first(topic.name for topic in self.registry))
+            raise ConfigError(
+                f"source = {scenario.source!r}: has no message of {asked}; set other topics, or record them again"
+            )
         self._rows: dict[str, str] = {}
         self._weights: dict[str, float] = {}
         self._framed: set[int] = set()
