@@ -19,6 +19,7 @@ from rich.console import Console
 from gr_ros2.cli.control_socket import ControlSocket, receive, request, running_programs
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import BackendMissingError, ConfigError, RunError
+from gr_ros2.dashboard.addresses import ANY, exposed, in_url
 from gr_ros2.settings.config import STRICT, build
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from gr_ros2.observe.observers import LateObservers
 
 ADDRESS, PORT = "127.0.0.1", 5006
-LOCAL = (ADDRESS, "localhost", "::1")
 _ASK_S = 0.5
 _ANSWER_S, _ANSWER_BYTES = 2.0, 4096
 _log = logging.getLogger(__name__)
@@ -65,13 +65,13 @@ def foxglove_server(where: str | None, console: Console) -> Iterator[list[Foxglo
 
     address, port = parse_place(where, "foxglove")
     with FoxgloveServer(address, port) as server:
-        console.print(f"Foxglove: ws://{address}:{server.port}", soft_wrap=True)
-        if address not in LOCAL:
+        url = f"ws://{in_url(address)}:{server.port}"
+        console.print(f"Foxglove: {url}", soft_wrap=True)
+        if exposed(address):
             _log.warning(
-                "ws://%s:%d: everybody on the network can see all messages and call services of other robots; leave "
-                "the address out to serve this machine only",
-                address,
-                server.port,
+                "%s: everybody on the network can see all messages and call services of other robots; leave the "
+                "address out to serve this machine only",
+                url,
             )
         yield [server]
 
@@ -203,7 +203,8 @@ def parse_place(text: str, what: str = "dashboard") -> tuple[str, int]:
     address, _, port = text.strip().rpartition(":")
     if not port.isascii() or not port.isdigit() or int(port) > 65535 or (":" in address and address[0] != "["):
         raise ConfigError(f"{what} = {text!r}: write [ADDRESS:]PORT, such as {PORT} or 0.0.0.0:{PORT}")
-    return address.strip("[]") or ADDRESS, int(port)
+    host = address.strip("[]") or ADDRESS
+    return ANY[0] if host in ("*", "0") else host, int(port)
 
 
 def _answers(address: str, port: int) -> bool:

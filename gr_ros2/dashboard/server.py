@@ -8,15 +8,12 @@ it. Before it closes, it shows every viewer the last picture. It leaves no threa
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import secrets
 import socket
-import struct
 import threading
 import uuid
 from concurrent.futures import Future
 from contextlib import suppress
-from ipaddress import ip_address
 from typing import Any
 
 from bokeh.application import Application
@@ -30,6 +27,7 @@ from tornado.web import RequestHandler
 
 from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.dashboard.addresses import ANY, exposed, in_url, own_addresses
 from gr_ros2.dashboard.admission import SETTINGS, Admission, BoundedServer, keep
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.monitor import TICK_S, RunMonitor
@@ -41,9 +39,6 @@ _LAST_PICTURE_S = 2.0
 _POLL_S = 0.02
 _UNUSED_MS = 5000
 """ms that a closed page is kept, in case its viewer comes back."""
-_ANY = ("0.0.0.0", "::")
-_SIOCGIFADDR = 0x8915
-"""Asks Linux for the address of an interface (netdevice(7))."""
 
 
 class Dashboard(Closing, RunMonitor):
@@ -66,15 +61,12 @@ class Dashboard(Closing, RunMonitor):
     @property
     def url(self) -> str:
         """Address of the page. Where every interface serves it, one under which others reach it, if there is one."""
-        return f"http://{_in_url(_own_addresses()[0] if self.address in _ANY else self.address)}:{self.port}/"
+        return f"http://{in_url(self.address)}:{self.port}/"
 
     @property
     def exposed(self) -> bool:
         """Whether others than this machine can open the page."""
-        try:
-            return not ip_address(self.address).is_loopback
-        except ValueError:
-            return self.address != "localhost"
+        return exposed(self.address)
 
     @property
     def viewers(self) -> int:
@@ -153,12 +145,12 @@ class Dashboard(Closing, RunMonitor):
     def _origins(self) -> list[str]:
         """Host names, with the port, under which the page may be opened."""
         hosts = {self.address, "localhost"} if self.address in ("127.0.0.1", "::1") else {self.address}
-        if self.address in _ANY:
+        if self.address in ANY:
             name = socket.gethostname()
-            hosts = {self.address, "localhost", name, socket.getfqdn(), *_own_addresses()}
+            hosts = {self.address, "localhost", name, socket.getfqdn(), *own_addresses()}
             with suppress(OSError):  # the host cannot resolve its own name
                 hosts.update(socket.gethostbyname_ex(name)[2])
-        return [f"{_in_url(host)}:{self.port}" for host in sorted(hosts)]
+        return [f"{in_url(host)}:{self.port}" for host in sorted(hosts)]
 
     def _open(self, document: Document) -> None:
         """Make the page of a new viewer."""
@@ -187,21 +179,6 @@ class Dashboard(Closing, RunMonitor):
         while any(page.behind for page in self._pages) and loop.time() < deadline:
             await asyncio.sleep(_POLL_S)
         loop.stop()
-
-
-def _own_addresses() -> list[str]:
-    """The IPv4 addresses of this machine, those of a network first."""
-    found = {"127.0.0.1"}
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        for _, name in socket.if_nameindex():
-            with suppress(OSError):  # an interface without an address
-                request = struct.pack("256s", name.encode())
-                found.add(socket.inet_ntoa(fcntl.ioctl(asked, _SIOCGIFADDR, request)[20:24]))
-    return sorted(found, key=lambda address: (address.startswith("127."), address))
-
-
-def _in_url(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
 
 
 class _Alive(RequestHandler):  # type: ignore[misc]

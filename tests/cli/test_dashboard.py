@@ -24,6 +24,8 @@ from tests.waiting import PATIENCE_S
         ("5006", ("127.0.0.1", 5006)),
         ("0", ("127.0.0.1", 0)),
         ("0.0.0.0:80", ("0.0.0.0", 80)),
+        ("*:80", ("0.0.0.0", 80)),
+        ("0:80", ("0.0.0.0", 80)),
         ("[::1]:5006", ("::1", 5006)),
         (" robot.local:65535 ", ("robot.local", 65535)),
     ],
@@ -124,13 +126,13 @@ def test_beside_what_was_started_without(
 def test_who_serves_it_to_the_network_is_warned_and_told_the_real_address(tmp_path: Path) -> None:
     pytest.importorskip("bokeh", reason="needs bokeh: pip install 'gr-ros2[dashboard]'")
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    from gr_ros2.dashboard.server import _own_addresses
+    from gr_ros2.dashboard.addresses import own_addresses
 
     command = [sys.executable, "-m", "gr_ros2.cli", "run", "paper-direct", "--no-report", "--duration", "1", *MEMORY]
     out = str(tmp_path / "out")
     done = subprocess.run([*command, "--dashboard=0.0.0.0:0", "--out", out], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert f"live at http://{_own_addresses()[0]}:" in done.stdout
+    assert f"live at http://{own_addresses()[0]}:" in done.stdout
     (line,) = done.stderr.splitlines()
     assert "everybody on the network can open this page" in line
     quiet = subprocess.run([*command, "--dashboard=0", "--out", f"{out}2"], capture_output=True, text=True)

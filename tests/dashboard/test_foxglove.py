@@ -8,6 +8,7 @@ import socket
 import struct
 import sys
 from collections.abc import Callable
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,12 +18,15 @@ import pytest
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk")
 
+from rich.console import Console
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import websocket_connect
 
+from gr_ros2.cli.dashboard import foxglove_server
 from gr_ros2.codecs import CodedTopic
 from gr_ros2.codecs.messages import GRID, IMAGE, VIDEO, read
 from gr_ros2.core.errors import BackendMissingError, ConfigError
+from gr_ros2.dashboard.addresses import own_addresses
 from gr_ros2.dashboard.foxglove import BACKLOG, FoxgloveServer
 from gr_ros2.link.events import Accepted, Announced, Delivered
 from gr_ros2.middleware import Qos
@@ -301,6 +305,13 @@ def test_without_the_sdk_one_line_says_what_to_install(monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(BackendMissingError, match=r"--foxglove needs foxglove-sdk: pip install 'gr-ros2\[foxglove\]'"):
         FoxgloveServer("127.0.0.1", 0)
+
+
+def test_who_serves_the_network_is_told_the_address_that_others_use(caplog: pytest.LogCaptureFixture) -> None:
+    said = StringIO()
+    with foxglove_server("0.0.0.0:0", Console(file=said, width=200)) as (served,):
+        assert said.getvalue() == f"Foxglove: ws://{own_addresses()[0]}:{served.port}\n"
+        assert "everybody on the network" in caplog.text
 
 
 def test_a_port_that_is_taken_is_named(server: FoxgloveServer) -> None:

@@ -16,7 +16,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from bokeh.document import Document
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.dashboard import server
+from gr_ros2.dashboard.addresses import own_addresses
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.server import Dashboard
 from gr_ros2.dashboard.state import DashboardState
@@ -65,7 +65,7 @@ def test_a_taken_port_is_named() -> None:
 
 def test_every_interface_only_where_asked() -> None:
     with Dashboard("0.0.0.0", port=0) as dashboard:
-        here, *_ = server._own_addresses()
+        here, *_ = own_addresses()
         assert dashboard.url == f"http://{here}:{dashboard.port}/"
         assert get(dashboard.url)
         assert f"{here}:{dashboard.port}" in dashboard._origins()
@@ -75,7 +75,7 @@ def test_every_interface_only_where_asked() -> None:
 def test_the_addresses_of_this_machine_are_those_that_linux_names() -> None:
     told = subprocess.run(["ip", "-4", "-o", "addr"], capture_output=True, text=True, check=True).stdout
     named = set(re.findall(r"inet ([0-9.]+)", told))
-    found = server._own_addresses()
+    found = own_addresses()
     assert set(found) <= named
     assert found[0].startswith("127.") == all(address.startswith("127.") for address in named)
 

@@ -140,9 +140,9 @@ def test_recordings_as_others_leave_them(tmp_path: Path, capsys: pytest.CaptureF
         assert run(["plan", str(tmp_path / name)]) == BAD_INPUT
         assert f"gr-ros2: bag {tmp_path / name}: {says}" in capsys.readouterr().err
     with Writer(tmp_path / "silent", version=8, storage_plugin=StoragePlugin.MCAP) as silent:
-        silent.add_connection("/a", "std_msgs/msg/Int32", msgdef="int32 data", rihs01="")
+        silent.add_connection("/a", "std_msgs/msg/Int32", msgdef="int32 data", rihs01="RIHS01_" + "0" * 64)
     assert run(["plan", str(tmp_path / "silent")]) == BAD_INPUT
-    assert "has no message of a; set other topics, or record them again" in capsys.readouterr().err
+    assert "has no message of /a; set other topics, or record them again" in capsys.readouterr().err
     (tmp_path / "killed").mkdir()
     packed = tmp_path / "killed" / "in.mcap.zstd"
     packed.write_bytes(zstd.compress(unclosed(tmp_path / "in.mcap", [Foreign("/a")]).read_bytes()))
