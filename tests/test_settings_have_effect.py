@@ -445,6 +445,7 @@ effects(
         "radio/test_two_radios.py::test_each_radio_has_a_name_a_phy_a_front_end_and_airtime_of_its_own"
     ),
     airtime=Elsewhere("radio/test_two_radios.py::test_each_radio_has_a_name_a_phy_a_front_end_and_airtime_of_its_own"),
+    packet_len=Elsewhere("radio/test_bound_topics.py::test_a_radio_has_longer_packets_for_what_goes_over_it_alone"),
 )
 effects(
     "Link",

@@ -57,7 +57,18 @@ def radio_words(stats: Stats) -> list[str]:
             f"radio {name} ({radio['phy']['name']}, {radio['phy']['airtime_s'] * 1e3:.3g} ms a packet): {state}; "
             f"{radio['sent']} packets and {radio['copied']} copies sent; heard: {heard or 'nobody'}"
         )
+        if (bound := radio.get("bound")) and bound["topics"]:
+            lines.append(f"radio {name} alone: {bound_words(radio)}")
     return lines
+
+
+def bound_words(radio: Mapping[str, Any]) -> str:
+    """What goes over one of several radios alone, and whether it has a way."""
+    bound = radio["bound"]
+    words = f"{', '.join(bound['topics'])}; {bound['packets']} packets sent, {bound['waiting']} messages wait"
+    if not radio["present"]:
+        return f"{words}, until the device is back"
+    return words if bound["heard"] else f"{words}; nobody is heard there, so nothing says that they arrive"
 
 
 def _heading(stats: Stats) -> str:

@@ -120,8 +120,9 @@ class FoundTopics:
     def unmatched(self) -> list[str]:
         """Names, on the ROS graph, of the topics without a publisher; the patterns, if no name is known yet."""
         subscribed, choice = self._subscriptions.subscribed, self.choice
-        unseen = [name for name in choice.named if name not in subscribed and name not in self.offered]
-        if choice.open and not subscribed and not unseen:
+        named = [name for name, word in choice.named.items() if self._takes(word)]
+        unseen = [name for name in named if name not in subscribed and name not in self.offered]
+        if any(map(self._takes, choice.patterns)) and not subscribed and not unseen:
             return [choice.everything]
         return unseen + self._subscriptions.unmatched()
 
@@ -179,10 +180,17 @@ class FoundTopics:
             row_name = self.choice.row_name(info.topic)
             if row_name is None or info.topic in self.left_out or self._subscriptions.returns([info.topic]):
                 continue
+            if not self._takes(row_name):
+                continue
             try:
                 self._subscriptions.add(row_name, info)
             except GrRos2Error as error:
                 self._leave_out(info.topic, f"topic {info.topic} is not sent", error)
+
+    def _takes(self, row_name: str) -> bool:
+        """Whether a topic is sent here, and not over one radio alone."""
+        subscriptions = self._subscriptions
+        return subscriptions.takes(options_of(row_name, subscriptions.options, DEFAULT_OPTIONS))
 
     def _offer_services(self, rows: Sequence[ServiceRow], uncallable: frozenset[str]) -> None:
         for row in rows:

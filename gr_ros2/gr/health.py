@@ -273,6 +273,10 @@ class LinkHealth:
                     status.problems.append(f"robot {robot} is hardly heard over it")
             status.values |= {name: str(radio[name]) for name in ("sent", "copied", "skipped", "came", "copies")}
             status.values["carries"] = str(radio["carries"])
+            if bound := radio.get("bound"):
+                status.values["alone"] = ", ".join(bound["topics"])
+                status.values["alone, messages that wait"] = str(bound["waiting"])
+                status.values["alone, robots heard"] = ", ".join(map(str, bound["heard"]))
             found.append(status)
         return found
 

@@ -13,7 +13,7 @@ from gr_ros2.link.bond import Bond
 from gr_ros2.phy.pdus import PduPort, port_of
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire import QOS_LATENCY
+from gr_ros2.wire import BOUND, QOS_LATENCY
 
 
 class RadioPorts:
@@ -30,8 +30,12 @@ class RadioPorts:
         self, block: Any, radios: int, bond: Bond | None, lock: threading.Lock, registry: Callable[[], Registry]
     ) -> None:
         self._ports = [PduPort(block, port_of("pdus", radio)) for radio in range(radios)]
+        self._sending = [threading.Lock() for _ in self._ports]
+        """Two threads send over a radio that another endpoint has alone; what is behind the port knows one."""
         self._bond, self._lock, self._registry = bond, lock, registry
         self._pdus = PduMaker()
+        self.left: Callable[[int, int], None] = lambda _radio, _packets: None
+        """Called with a radio and how many packets have left over it, without the lock."""
 
     def find_readers(self) -> bool:
         """Find what reads the ports; returns whether something reads each of them."""
@@ -44,24 +48,32 @@ class RadioPorts:
         :param adaptive: whether each says its MCS
         """
         if self._bond is None:
-            self._send_over(self._ports[0], packets, adaptive)
+            self._send_over(0, packets, adaptive)
+            self.left(0, len(packets))
             return
         shares: list[list[SentPacket]] = [[] for _ in self._ports]
         with self._lock:
             for sent in packets:
                 for radio in self._bond.leave(everywhere=self._everywhere(sent)):
                     shares[radio].append(sent)
-        for port, share in zip(self._ports, shares, strict=True):
-            self._send_over(port, share, adaptive)
+        for radio, share in enumerate(shares):
+            self._send_over(radio, share, adaptive)
+            self.left(radio, len(share))
 
-    def _send_over(self, port: PduPort, packets: list[SentPacket], adaptive: bool) -> None:
+    def send_bound(self, radio: int, packets: list[SentPacket], *, adaptive: bool) -> None:
+        """Send packets of the endpoint that has one radio alone. Called without a lock."""
+        self._send_over(radio, [sent._replace(data=BOUND + sent.data) for sent in packets], adaptive)
+
+    def _send_over(self, radio: int, packets: list[SentPacket], adaptive: bool) -> None:
+        port = self._ports[radio]
         on_air = [AirPacket(sent.data, None, sent.leave_at, sent.mcs if adaptive else None) for sent in packets]
-        if port.direct:
-            port.send(on_air)
-        else:
-            wall = time.time()
-            for sent, packet in zip(packets, on_air, strict=True):
-                port.send_pdu(self._pdus.pdu(sent.packet, packet, wall))
+        with self._sending[radio]:
+            if port.direct:
+                port.send(on_air)
+            else:
+                wall = time.time()
+                for sent, packet in zip(packets, on_air, strict=True):
+                    port.send_pdu(self._pdus.pdu(sent.packet, packet, wall))
 
     def _everywhere(self, sent: SentPacket) -> bool:
         """Whether a packet leaves over all radios."""

@@ -59,6 +59,13 @@ class Services(Protocol):
         """Take over the topics and services that a robot announces now."""
 
 
+class Apart(Protocol):
+    """The endpoints that have one radio alone, see :mod:`gr_ros2.gr.bound`."""
+
+    def take(self, radio: int, packets: Sequence[AirPacket]) -> list[AirPacket]:
+        """Take what is for them of the packets that have come over a radio; returns the others."""
+
+
 class ReceivingBlock(HalfBlock):
     """Reassembles packets into messages and publishes them on a ROS graph.
 
@@ -89,6 +96,8 @@ class ReceivingBlock(HalfBlock):
         super().__init__("ros2_sink", config, end, graph, observer=observer, clock=clock, bond=bond)
         self.registry = registry
         self._calls: Services | None = None
+        self.apart: Apart | None = None
+        """What takes packets that are not for the endpoint of this block."""
         self._timer_idle = False
         self._failures = Failures(self._log, self._lock)
         self._types: TypeSearch | None = None
@@ -202,7 +211,8 @@ class ReceivingBlock(HalfBlock):
     def take(self, packets: Sequence[AirPacket], radio: int = 0) -> None:
         """Packets have come from a radio."""
         try:
-            self._take([piece for packet in packets for piece in self._cut(packet)], radio)
+            own = packets if self.apart is None else self.apart.take(radio, packets)
+            self._take([piece for packet in own for piece in self._cut(packet)], radio)
         except Exception as error:  # noqa: BLE001 - an exception would end the block's thread and all reception
             self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
         self.handled += len(packets)

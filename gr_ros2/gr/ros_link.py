@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -19,75 +19,28 @@ from gnuradio import gr
 from gr_ros2.core.errors import ConfigError, GrRos2Error
 from gr_ros2.core.names import link_node
 from gr_ros2.gr.backfill import LiveBackfill
+from gr_ros2.gr.bound import BoundEnds, OwnWay, bound_to_none
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.factory import Start, make_endpoint, start_of
-from gr_ros2.gr.found_topics import FoundTopics
+from gr_ros2.gr.link_sending import LinkSendingBlock
 from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.radio_ports import RadioPorts
 from gr_ros2.gr.receiving import ReceivingBlock
 from gr_ros2.gr.sending import SendingBlock
-from gr_ros2.gr.subscriptions import OpenSubscriptions
 from gr_ros2.gr.throughput import LiveThroughput
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.air import Air
 from gr_ros2.link.airtime import LEAD_S
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.bond import Bond
-from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.mac import GUARD_S, access_of
 from gr_ros2.middleware import Middleware, joined
 from gr_ros2.phy.pdus import port_of
-from gr_ros2.settings.config import airtime_from, replaced
+from gr_ros2.settings.config import airtime_from
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import MAX_TOPICS, Registry, check_outputs
 from gr_ros2.settings.robot import ONE_RADIO, RobotConfig, robot_from
-
-
-class LinkSendingBlock(SendingBlock):
-    """Sends topics that need not be known when it is made.
-
-    :ivar found: what it looks for
-    """
-
-    _subscribes = OpenSubscriptions
-    subscriptions: OpenSubscriptions
-    _end: OpenEndpoint
-
-    def __init__(self, config: RobotConfig, registry: Registry, *arguments: Any, **options: Any) -> None:
-        super().__init__(config, registry, *arguments, **options)
-        self.found = FoundTopics(config, self.middleware, self.subscriptions, self._log)
-
-    def unmatched(self) -> list[str]:
-        return self.found.unmatched()
-
-    def start(self) -> bool:
-        super().start()
-        self.found.start()
-        return True
-
-    def stop(self) -> bool:
-        self.found.stop()
-        return super().stop()
-
-    def close(self) -> None:
-        if hasattr(self, "found"):
-            self.found.stop()
-        super().close()
-
-    @property
-    def live_options(self) -> Sequence[str]:
-        """Options of a topic that may change while it runs."""
-        return self._end.live_options
-
-    def set_topics(self, topics: Any) -> None:
-        """Use other options of single topics, of which ``live_options`` may change. A message is for the robot that
-        ``to`` named when the ROS graph handed it over."""
-        with self._lock:
-            config = replaced(self.config, topics=topics)
-            self.subscriptions.change(config.options)
-            self.config = config
-            self.live.wake()
-            self._space.notify_all()
 
 
 class LinkBlock(gr.hier_block2):  # type: ignore[misc]
@@ -100,6 +53,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     :ivar wishes: topics asked for from afar; None likewise
     :ivar throughput: measurements of what the link carries; None likewise
     :ivar backfill: what crosses later; None where nothing does
+    :ivar bound: what goes over one radio alone; None where nothing can
     """
 
     source: SendingBlock
@@ -109,6 +63,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     wishes: LiveWishes | None = None
     throughput: LiveThroughput | None = None
     backfill: LiveBackfill | None = None
+    bound: BoundEnds | None = None
 
     def __init__(self, config: RobotConfig, radios: int = 1) -> None:
         super().__init__("ros2_link", gr.io_signature(0, 0, 0), gr.io_signature(0, 0, 0))
@@ -129,6 +84,7 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
         for part in (
+            self.bound,
             self.backfill,
             self.throughput,
             self.wishes,
@@ -151,6 +107,7 @@ class RosLink(LinkBlock):
     :param observer, clock, backpressure: see :class:`SendingBlock`
     :param registry: the topics that the robots know beforehand; None: as the settings say
     :param bond: its radios, where there are several
+    :param ways: those of its radios over which topics may go alone, by their numbers
     :raises ConfigError: for settings that contradict each other
     """
 
@@ -169,6 +126,7 @@ class RosLink(LinkBlock):
         backpressure: bool = False,
         registry: Registry | None = None,
         bond: Bond | None = None,
+        ways: Mapping[int, OwnWay] | None = None,
     ) -> None:
         super().__init__(config, 1 if bond is None else len(bond.carries))
         known = registry
@@ -196,8 +154,14 @@ class RosLink(LinkBlock):
         graph, self._leave = joined(self, middleware, config.graph, link_node(config.robot_id))
         published = heard.with_options(config.publish.topics, announced=True)
         try:
-            self.source = LinkSendingBlock(config, topics, sending, graph, backpressure=backpressure, **common)
+            self.source = LinkSendingBlock(
+                config, topics, sending, graph, backpressure=backpressure, takes=bound_to_none, **common
+            )
             self.sink = ReceivingBlock(config, published, self.end, graph, **common)
+            if ways and isinstance(self.source.ports, RadioPorts):
+                parts = {"known": heard, "graph": graph, "main": self.source, "ports": self.source.ports}
+                self.bound = self.source.sharing = self.sink.apart = BoundEnds(config, ways, clock=clock, **parts)
+                self.source.ports.left = self.bound.left
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
                 self.wishes = LiveWishes(config, self.end, self.calls, self.source.found, graph, clock=clock)

@@ -21,7 +21,7 @@ from gr_ros2.gr.half import HalfBlock
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.radio_ports import RadioPorts
 from gr_ros2.gr.readable import describe
-from gr_ros2.gr.subscriptions import Subscriptions
+from gr_ros2.gr.subscriptions import Subscriptions, Takes, everything
 from gr_ros2.link import Ended, Refused, SenderEvent, SentPacket
 from gr_ros2.link.bond import Bond
 from gr_ros2.link.endpoint import Endpoint
@@ -46,6 +46,29 @@ class Keeper(Protocol):
         """An event of the sending half, with the lock of the endpoint held; must be fast."""
 
 
+class Ports(Protocol):
+    """Where packets leave."""
+
+    def find_readers(self) -> bool:
+        """As :meth:`RadioPorts.find_readers`."""
+
+    def send(self, packets: list[SentPacket], *, adaptive: bool) -> None:
+        """As :meth:`RadioPorts.send`."""
+
+
+class Sharing(Protocol):
+    """The endpoints that share the radios with the one of this block, see :mod:`gr_ros2.gr.bound`."""
+
+    def start(self) -> None:
+        """The block runs."""
+
+    def stop(self) -> None:
+        """It stops."""
+
+    def granted(self, radio: int, packets: int, since: float | None) -> int:
+        """A radio takes so many further packets; returns how many more this block may send."""
+
+
 class SendingBlock(HalfBlock):
     """Subscribes to topics of a ROS graph and emits their messages as packets.
 
@@ -63,6 +86,8 @@ class SendingBlock(HalfBlock):
     :param observer: called with every SenderEvent, in order, while the block's lock is held. It must not call the
         block. An observer that raises is not called again
     :param backpressure: holds the middleware back instead of dropping when a queue is full (bags)
+    :param ports: where packets leave; None: over its own message ports
+    :param takes: which topics it sends, by their options
     """
 
     _subscribes: type[Subscriptions] = Subscriptions
@@ -78,6 +103,8 @@ class SendingBlock(HalfBlock):
         clock: Callable[[], float] = time.monotonic,
         backpressure: bool = False,
         bond: Bond | None = None,
+        ports: Ports | None = None,
+        takes: Takes = everything,
     ) -> None:
         super().__init__(
             f"ros2_source {config.robot_id}", config, end, graph, observer=observer, clock=clock, bond=bond
@@ -95,7 +122,12 @@ class SendingBlock(HalfBlock):
         self._said: set[tuple[int, str]] = set()
         self.keeper: Keeper | None = None
         """Keeps messages for later, where something does."""
-        self._ports = RadioPorts(self, self.radios, bond, self._lock, lambda: self.subscriptions.registry)
+        self.sharing: Sharing | None = None
+        """What else sends over its radios."""
+        if ports is None:
+            ports = RadioPorts(self, self.radios, bond, self._lock, lambda: self.subscriptions.registry)
+        self.ports = ports
+        """Where packets leave."""
         take_messages(self, "credit", "_credit", self.radios, called="grant")
         self._backpressure = backpressure
         self.subscriptions = self._subscribes(
@@ -107,6 +139,7 @@ class SendingBlock(HalfBlock):
             counters=self._counters,
             log=self._log,
             backpressure=backpressure,
+            takes=takes,
         )
         """What it sends."""
         self._space = self.subscriptions.space
@@ -157,7 +190,7 @@ class SendingBlock(HalfBlock):
             self._end.pace.use_credit()
 
     def start(self) -> bool:
-        self._unread = not self._ports.find_readers()
+        self._unread = not self.ports.find_readers()
         if self._unread:
             self._log.error("ros2_source %d: nothing reads message port `pdus`; connect it", self.src_id)
         self.live.looked = self.clock()
@@ -232,11 +265,36 @@ class SendingBlock(HalfBlock):
         packets = max(0, packets)
         if self._backpressure and since != inf:
             since = None  # whoever waits for room in a queue wants nothing dropped
+        if self.sharing is not None:
+            packets = self.sharing.granted(radio, packets, since)
         with self._lock:
             if self._bond is not None:
                 packets = self._bond.ask(radio, packets)
             self._end.pace.credit(packets, since)
             self.live.wake(credited=True)
+
+    def wants(self, radio: int) -> bool:
+        """Whether there is something to send over a radio."""
+        with self._lock:
+            at = self._end.next_departure(credited=True)
+            waiting = at is not None and at <= self.clock()
+            return waiting if self._bond is None else self._bond.wants(radio, waiting=waiting)
+
+    def unused(self, radio: int) -> int:
+        """How many credits of a radio nobody has used."""
+        with self._lock:
+            return (self._end.pace.credits or 0) if self._bond is None else self._bond.unused(radio)
+
+    def used(self, radio: int, left: int) -> None:
+        """Another endpoint has used a credit of a radio.
+
+        :param left: how many there are now
+        """
+        with self._lock:
+            if self._bond is None:
+                self._end.pace.left_with(left)
+            else:
+                self._bond.spend(radio)
 
     def _pump(self) -> None:
         while self._running:
@@ -270,7 +328,7 @@ class SendingBlock(HalfBlock):
         if self.config.debug:
             for sent in packets:
                 self._log.debug("tx %s", describe(sent, self.subscriptions.registry))
-        self._ports.send(packets, adaptive=bool(self._end.mcs_table))
+        self.ports.send(packets, adaptive=bool(self._end.mcs_table))
         self.emitted += len(packets)
         if self._unread:
             with self._lock:

@@ -15,6 +15,15 @@ def account_of(state: str, robot_id: int, radio: int = 0) -> Path:
     return state_file(state, robot_id).with_suffix(f".{radio + 1}.airtime" if radio else ".airtime")
 
 
+def bound_state_file(state: str, robot_id: int, radio: int) -> Path:
+    """The file that counts the starts of the endpoint that has one radio alone, beside that of its robot.
+
+    :param state: state file of the robot, '' = the usual one
+    :param radio: which of its radios, from 0 on
+    """
+    return state_file(state, robot_id).with_suffix(f".{radio + 1}.bound.json")
+
+
 def state_file(state: str, robot_id: int) -> Path:
     """The file that counts a robot's starts.
 

@@ -30,6 +30,13 @@ from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import DEFAULT_OPTIONS, NewTopic, Registry, Topic, normalize_type, options_of
 from gr_ros2.settings.robot import RobotConfig
 
+Takes = Callable[[SendOptions], bool]
+
+
+def everything(_options: SendOptions) -> bool:
+    """Every topic."""
+    return True
+
 
 class Subscriptions:
     """The topics that a robot sends, and the services that it offers.
@@ -40,6 +47,7 @@ class Subscriptions:
     :param clock: s, monotonic
     :param backpressure: holds the middleware back while a queue is full
     :param counters: counts ``held_back_at_close``, and what static transforms count
+    :param takes: which topics it sends, by their options
     :ivar registry: all topics so far
     :ivar frames: the topics that are sent as frames; None in a version, or with a setting, without them
     :ivar options: the options of single topics, by name
@@ -60,8 +68,9 @@ class Subscriptions:
         counters: Counter[str],
         log: logging.Logger,
         backpressure: bool = False,
+        takes: Takes = everything,
     ) -> None:
-        self._given = registry
+        self._given, self.takes = registry, takes
         self.options: Mapping[str, SendOptions] = config.options
         self.registry = registry = registry.with_options(self.options)
         self.space = threading.Condition(live.lock)
@@ -78,7 +87,9 @@ class Subscriptions:
         self._moved: dict[int, Topic] = {}
         """As what messages leave now, by the topic ids that were subscribed, where options have changed."""
         chosen = registry.chosen(config.words) if registry else []
-        self.subscribed = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_topic}
+        self.subscribed = {
+            topic.on_graph(config.namespace): topic for topic in chosen if topic.is_topic and takes(topic.options)
+        }
         self.services = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_service}
 
     def open(self) -> None:

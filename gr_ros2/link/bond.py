@@ -55,6 +55,8 @@ class Bond:
         """Packets for which each has asked while it stands by."""
         self._owed = [0 for _ in every]
         """Packets that took the place of one for which each had asked, and which still waits: the next is none more."""
+        self._lacked = [False for _ in every]
+        """Whether each had no room for the last copy that it was to carry."""
         self._extra = [0 for _ in every]
         """Packets for which each has not asked, since it asked last."""
         self._asked: deque[int] = deque()
@@ -101,7 +103,23 @@ class Bond:
                 radios.append(radio)
             else:
                 self.skipped[radio] += 1
+                self._lacked[radio] = True
         return radios
+
+    def unused(self, radio: int) -> int:
+        """For how many packets a radio has asked that have not come."""
+        return self._held[radio] + max(self._promised(radio), 0)
+
+    def wants(self, radio: int, *, waiting: bool) -> bool:
+        """Whether there is something to send over a radio.
+
+        :param waiting: whether the endpoint has a packet for those that carry
+        """
+        return self._lacked[radio] or (waiting and self.carries[radio])
+
+    def spend(self, radio: int) -> None:
+        """A packet leaves over a radio that is not of this endpoint."""
+        self._spend(radio)
 
     def arrive(self, radio: int, data: bytes) -> bool:
         """A packet comes over a radio. False for a copy of one that came over another: the endpoint does not see it.
@@ -197,6 +215,7 @@ class Bond:
 
     def _spend(self, radio: int) -> None:
         """A radio takes a packet that is not the next one for which it has asked."""
+        self._lacked[radio] = False
         if self._held[radio]:
             self._held[radio] -= 1
         elif self._promised(radio) > 0:

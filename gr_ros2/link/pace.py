@@ -79,6 +79,15 @@ class Pace:
         return self._since if self._since > self.slot else self.slot
 
     @property
+    def credits(self) -> int | None:
+        """For how many packets there are credits; None where none are needed."""
+        return None if self._unpaced else self._credits
+
+    def left_with(self, packets: int) -> None:
+        """There are credits for so many packets now, since another endpoint has used some of those that both had."""
+        self._credits = packets
+
+    @property
     def credited(self) -> bool:
         """Whether there is a credit for a packet."""
         return bool(self._credits)

@@ -19,11 +19,13 @@ from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.permission import check_band
 from gr_ros2.settings.airtime import Airtime, AirtimeConfig
 from gr_ros2.settings.config import (
+    BOUND_TO_NONE,
     STRICT,
     AirConfig,
     ChannelConfig,
     ClockConfig,
     DiagnosticsConfig,
+    PacketLen,
     PhyConfig,
     Text,
     build,
@@ -32,7 +34,7 @@ from gr_ros2.settings.effect import ActsWhere
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.files import read_settings
 from gr_ros2.settings.robot import ONE_RADIO, RobotConfig
-from gr_ros2.wire import FORMATS
+from gr_ros2.wire import BOUND, FORMATS
 
 _MOST_RADIOS = 4
 """Radios of one robot: more than anybody has carried."""
@@ -48,6 +50,8 @@ class RadioConfig:
     """its physical layer; auto = the link's"""
     front_end: dict[str, Any]
     """``name`` of its front end, and that front end's settings"""
+    packet_len: Annotated[PacketLen | Auto, Field(title="Packet length of what goes over it alone (bytes)")] = AUTO
+    """bytes of the longest packet of topics whose ``via`` names it, the same at all robots; auto = the link's"""
     airtime: Airtime | Auto = AUTO
     """how much it may send, with an account of its own: settings, or the name of a band; auto = as the link says"""
 
@@ -56,12 +60,14 @@ class OwnRadio(NamedTuple):
     """A radio with all that it has of the link.
 
     :param called: what status and log call it
+    :param packet_len: bytes of the longest packet of topics that go over it alone
     """
 
     called: str
     phy: PhyConfig
     front_end: Mapping[str, Any]
     airtime: AirtimeConfig
+    packet_len: int
 
     @property
     def front_end_name(self) -> str:
@@ -74,12 +80,19 @@ class OwnRadio(NamedTuple):
         return {key: value for key, value in self.front_end.items() if key != "name"}
 
     def made_phy(self, packet_len: int) -> Phy:
-        """Its PHY, for packets of so many bytes.
+        """Its PHY, for packets of so many bytes of the link, and for its own.
 
         :raises ConfigError: for a wrong setting
         """
         rate = self.phy.sample_rate
-        return configured(self.phy, packet_len, 0.0 if rate == AUTO else rate)
+        longest = max(packet_len, self.packet_len)
+        phy = configured(self.phy, longest, 0.0 if rate == AUTO else rate)
+        if packet_len != self.packet_len and not phy.any_length:
+            raise ConfigError(
+                f"radio {self.called}: packet_len = {self.packet_len}, where that of the link is {packet_len}, and phy "
+                f"{self.phy.name} sends packets of one length; leave it out, or set lengths: any in the phy's options"
+            )
+        return phy
 
     def check(self, where: str) -> None:
         """:raises ValueError: for what no radio can be"""
@@ -162,6 +175,7 @@ class LinkConfig(AirConfig, RobotConfig):
         self.airtime.check_seal(encrypts=bool(self.key) and self.seal == "encrypt")
         if self.packet_len < (least := FORMATS[1].min_packet_len):
             raise ValueError(f"packet_len = {self.packet_len}: a link needs at least {least}")
+        self._check_bound(least)
         return self
 
     def _several(self) -> None:
@@ -171,6 +185,24 @@ class LinkConfig(AirConfig, RobotConfig):
             raise ValueError(f"radios: {len(names)} of 2 to {_MOST_RADIOS}; one alone is front_end")
         if len(set(names)) < len(names):
             raise ValueError(f"radios: two are called {max(names, key=names.count)!r}; give each a name of its own")
+        if words := sorted(BOUND_TO_NONE.intersection(names)):
+            raise ValueError(f"radios: one is called {words[0]!r}, which means another thing in via; call it otherwise")
+
+    def _check_bound(self, least: int) -> None:
+        """:raises ValueError: for topics that cannot go over one radio alone"""
+        lengths = {own.called: own.packet_len for own in self.own_radios}
+        for part, chosen in (("topics", self.topics), ("offer", self.offer)):
+            for word, options in chosen.items():
+                if (via := options.via) in BOUND_TO_NONE:
+                    continue
+                if part == "offer":
+                    raise ValueError(f"offer.{word}.via = {via!r}: only what is sent anyway can have one radio alone")
+                if via not in lengths:
+                    raise ValueError(f"topics.{word}.via = {via!r}: best, all, or one of {', '.join(lengths)}")
+                if lengths[via] < least + len(BOUND):
+                    raise ValueError(
+                        f"packet_len = {lengths[via]} of radio {via}: topics bound to it need {least + len(BOUND)}"
+                    )
 
     @property
     def remark(self) -> str:
@@ -189,6 +221,7 @@ class LinkConfig(AirConfig, RobotConfig):
                 self.phy if radio.phy == AUTO else radio.phy,
                 radio.front_end,
                 self.airtime if radio.airtime == AUTO else radio.airtime,
+                self.packet_len if radio.packet_len == AUTO else radio.packet_len,
             )
             for radio in radios
         )

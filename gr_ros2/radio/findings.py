@@ -44,8 +44,13 @@ def about(config: LinkConfig, phys: Sequence[Phy]) -> dict[str, Any]:
     :param phys: that of each radio
     """
     options = [
-        {"name": phy.name, "options": repr(phy.options), "rate": phy.sample_rate if phy.has_samples else 0}
-        for phy in phys
+        {
+            "name": phy.name,
+            "options": repr(phy.options),
+            "rate": phy.sample_rate if phy.has_samples else 0,
+            **({} if own.packet_len == config.packet_len else {"packet_len": own.packet_len}),
+        }
+        for phy, own in zip(phys, config.own_radios, strict=True)
     ]
     digest = zlib.crc32(json.dumps(options if phys[1:] else options[0], sort_keys=True).encode())
     key = int.from_bytes(hashlib.sha256(read_key_file(config.key)[0]).digest()[:4], "big") if config.key else 0

@@ -11,8 +11,8 @@ from functools import partial
 from typing import Any
 
 from gr_ros2.core.errors import ConfigError, shortened
+from gr_ros2.gr.link_sending import LinkSendingBlock
 from gr_ros2.gr.receiving import ReceivingBlock
-from gr_ros2.gr.ros_link import LinkSendingBlock
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import options_of
 
@@ -53,16 +53,16 @@ class LiveSettings:
             self._setters[name](value)
             return shortened(f"{name} = {value}")
         topic, option = place
-        sent = self._source.subscriptions.subscribed
+        sent = {name: topic for each in self._source.together for name, topic in each.subscriptions.subscribed.items()}
         topic = sent[topic].name if topic in sent else topic  # as status writes it
         given = self._source.config.topics
         known = next((other for other in given if other.lstrip("/") == topic.lstrip("/")), topic)
         before = options_of(topic, self._source.config.options, SendOptions())
         changed = {**{each.name: getattr(before, each.name) for each in fields(SendOptions)}, option: value}
         self._source.set_topics({**given, known: changed})
-        if topic.lstrip("/") in {one.name.lstrip("/") for one in self._source.subscriptions.subscribed.values()}:
+        if topic.lstrip("/") in {one.name.lstrip("/") for one in sent.values()}:
             return shortened(f"{name} = {value}")
-        names = ", ".join(sorted(self._source.subscriptions.subscribed))
+        names = ", ".join(sorted(sent))
         others = f"sent are {names}" if names else "nothing is sent yet"
         return shortened(f"{name} = {value}; no topic {topic} is sent now, it waits for one; {others}")
 

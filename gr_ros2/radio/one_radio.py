@@ -22,6 +22,9 @@ from gr_ros2.radio.limits import open_limit
 from gr_ros2.radio.permission import permitted
 from gr_ros2.radio.radio import Radio
 
+_SENT = ("packets", "entries", "payload_bytes", "repeats")
+_CAME = ("packets", "repeats", "repaired", "publish_failed")
+"""Counters of the two halves of a link that are sums over its endpoints."""
 _RETRY_S = 1.0
 """s between two attempts to open a device that has vanished."""
 
@@ -207,6 +210,38 @@ def together(bond: Bond, radios: Sequence[OneRadio], each: Sequence[Mapping[str,
         },
         "radios": own,
     }
+
+
+def join_bound(
+    halves: dict[str, dict[str, Any]], radios: Mapping[str, Any], names: Sequence[str], bound: Mapping[int, Any]
+) -> None:
+    """Count what goes over one radio alone too: its packets and its topics, and of each of several radios what is bound
+    to it.
+
+    :param halves: the statistics of both halves of the link
+    :param names: of the radios
+    :param bound: what the endpoints that have one radio alone say, by its number
+    """
+    for number, stats in bound.items():
+        source, sink = halves["source"], halves["sink"]
+        source["air"] = dict(Counter(source["air"]) + Counter(stats["source"]["air"]))
+        for half, counters in (("source", _SENT), ("sink", _CAME)):
+            for name in counters:
+                halves[half][name] += stats[half][name]
+        source["topics"] = {**source["topics"], **stats["source"]["topics"]}
+        source["unmatched"] = [*source["unmatched"], *stats["source"]["unmatched"]]
+        sink["topics"] = {**sink["topics"], **stats["sink"]["topics"]}
+        sink["rejected"] = dict(Counter(sink["rejected"]) + Counter(stats["sink"]["rejected"]))
+        sink["dropped"] = dict(Counter(sink["dropped"]) + Counter(stats["sink"]["dropped"]))
+        if "radios" in radios:
+            topics = stats["source"]["topics"]
+            radios["radios"][names[number]]["bound"] = {
+                "topics": sorted(topics),
+                "waiting": sum(topic["queued"] for topic in topics.values()),
+                "heard": stats["heard"],
+                "packets": stats["source"]["packets"],
+                "repairs": stats["source"]["air"].get("repair", 0),
+            }
 
 
 def _sum(parts: Sequence[Mapping[str, Any]], name: str) -> Any:

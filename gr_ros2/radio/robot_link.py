@@ -37,7 +37,7 @@ from gr_ros2.radio.findings import about, introduce, peers, ping, set_wall
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.link_findings import LinkFindings
 from gr_ros2.radio.mismatch import Mismatch
-from gr_ros2.radio.one_radio import OneRadio, together
+from gr_ros2.radio.one_radio import OneRadio, join_bound, together
 from gr_ros2.radio.radio import Radio
 from gr_ros2.radio.ros_side import RosSide
 from gr_ros2.radio.spectrum import Listening
@@ -114,7 +114,7 @@ class RobotLink(Flowgraph):
         config, radios = self.config, self.radios
         self._clock = self.front_end.clock
         if len(radios) > 1:
-            self.bond = Bond([radio.front_end.airtime() for radio in radios])
+            self.bond = Bond([radio.front_end.airtime(config.packet_len) for radio in radios])
             if any(radio.phy.mcs_table for radio in radios):
                 raise ConfigError("radios: with several, each has one rate; set rate: fixed in the options of its phy")
         self._ros = RosSide(
@@ -248,6 +248,8 @@ class RobotLink(Flowgraph):
             if asks := self.bond.asks():
                 self.end.endpoint.pace.credit(asks)
                 self.end.wake()
+        if anew and self._ros.link.bound is not None:
+            self._ros.link.bound.opened_again(number)
 
     def transmit(self, *, on: bool) -> None:
         """Switch sending off, at once for all packets that have not reached the device, or on again.
@@ -261,7 +263,10 @@ class RobotLink(Flowgraph):
 
     def _at_rest(self) -> int | None:
         """As :meth:`Radio.at_rest`; None also while a packet is composed or has to be."""
-        if self.source.composed != self.radio.gate.arrived or self.source.due(self._clock()):
+        composed = self.source.composed
+        if self._ros.link.bound is not None:
+            composed += sum(end.source.composed for end in self._ros.link.bound)
+        if composed != self.radio.gate.arrived or self.source.due(self._clock()):
             return None
         return self.radio.at_rest()
 
@@ -311,7 +316,9 @@ class RobotLink(Flowgraph):
             return
         now = self._clock()
         self._clocks.look(now)
-        _check_goes_on(self.config.name, "sending thread", self._watch, self.source.stalled_s(now), now)
+        sources = [self.source, *(end.source for end in self._ros.link.bound or () if end.sends)]
+        stalled_s = max(source.stalled_s(now) for source in sources)
+        _check_goes_on(self.config.name, "sending thread", self._watch, stalled_s, now)
         for one in self.radios:
             if one.retry_at < inf or one.gone:
                 continue
@@ -392,11 +399,13 @@ class RobotLink(Flowgraph):
         if self.bond is not None:
             with self.end.lock:  # packets change it
                 radios = together(self.bond, self.radios, each)
+        halves = {"source": self.source.stats(), "sink": self.sink.stats()}
+        if self._ros.link.bound is not None:
+            join_bound(halves, radios, [one.name for one in self.radios], self._ros.link.bound.stats())
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
-            "source": self.source.stats(),
-            "sink": self.sink.stats(),
+            **halves,
             "peers": peers(self.end, self._clock()),
             "calls": {} if self.calls is None else self.calls.stats(),
             "backfill": {} if self._ros.link.backfill is None else self._ros.link.backfill.stats(),

@@ -12,7 +12,8 @@ from dataclasses import replace
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.names import link_node
-from gr_ros2.gr.ros_link import LinkBlock
+from gr_ros2.gr.bound import OwnWay, names_of
+from gr_ros2.gr.ros_link import LinkBlock, RosLink
 from gr_ros2.link.access import Access
 from gr_ros2.link.air import Air
 from gr_ros2.link.airtime import LEAD_S
@@ -54,7 +55,7 @@ class RosSide:
     ) -> None:
         sends = any(radio.sends for radio in radios)
         front_ends = [radio.front_end for radio in radios]
-        front_end = min(front_ends, key=lambda each: each.airtime())
+        front_end = min(front_ends, key=lambda each: each.airtime(config.packet_len))
         loops_back = any(each.loops_back for each in front_ends)
         self._medium, self._front_end = config.medium, front_end
         self.node_name = link_node(config.robot_id)
@@ -66,6 +67,8 @@ class RosSide:
                 f"medium = {config.medium!r}: front_end {front_end.name} reaches no other robot; leave it out, or set "
                 "another front_end"
             )
+        if loops_back and (names := names_of(config)):
+            raise ConfigError(f"via = {min(names)!r}: front_end {front_end.name} reaches no other robot; leave it out")
         self.slots: Slots | None = None
         self.graph = middleware or stack.enter_context(join(config.graph, self.node_name))
         air = Air(
@@ -73,7 +76,7 @@ class RosSide:
             half_duplex=self.shares or all(getattr(each.options, "half_duplex", False) for each in front_ends),
             any_length=all(radio.phy.any_length for radio in radios),
             mcs_table=radios[0].phy.mcs_table,
-            airtime_s=front_end.airtime(),
+            airtime_s=front_end.airtime(config.packet_len),
             airtime_share=max(sustained(radio.own.airtime.rule) for radio in radios),
             access=self._access if sends else lambda _: None,
             relay=config.relay == "gain",
@@ -86,6 +89,7 @@ class RosSide:
             observer=observer,
             clock=clock,
             **({} if bond is None else {"bond": bond}),
+            **({} if self.shares or loops_back or block is not RosLink else {"ways": _ways(config, radios)}),
         )
         stack.callback(self.link.close)
 
@@ -96,3 +100,23 @@ class RosSide:
         access = make(src_id)
         self.slots = access if isinstance(access, Slots) else None
         return access
+
+
+def _ways(config: LinkConfig, radios: Sequence[OneRadio]) -> dict[int, OwnWay]:
+    """What an endpoint that has one radio alone has to know of it, by its number."""
+    return {
+        number: OwnWay(
+            name=radio.name,
+            packet_len=radio.own.packet_len,
+            sends=radio.sends,
+            air=Air(
+                hears=radio.sends and config.receives,
+                half_duplex=getattr(radio.front_end.options, "half_duplex", False),
+                any_length=radio.phy.any_length,
+                mcs_table=radio.phy.mcs_table,
+                airtime_s=radio.front_end.airtime() if radio.phy.has_airtime else 0.0,
+                airtime_share=sustained(radio.own.airtime.rule),
+            ),
+        )
+        for number, radio in enumerate(radios)
+    }

@@ -14,7 +14,7 @@ from gr_ros2.core.names import INFRASTRUCTURE, link_node
 from gr_ros2.middleware import TopicInfo
 
 if TYPE_CHECKING:
-    from gr_ros2.gr.ros_link import LinkSendingBlock
+    from gr_ros2.gr.link_sending import LinkSendingBlock
 
 _FIRST_S, _EVERY_S = 3.0, 10.0
 """s after which the graph has told most of what is on it, and s from one look at it to the next."""
@@ -107,8 +107,9 @@ class Waiting:
 
         :raises MiddlewareError: when the graph cannot be asked
         """
-        missing = self._source.found.unmatched()
-        types = {name: topic.type_name for name, topic in self._source.subscriptions.subscribed.items()}
+        together = self._source.together
+        missing = [name for source in together for name in source.found.unmatched()]
+        types = {name: topic.type_name for each in together for name, topic in each.subscriptions.subscribed.items()}
         self._had |= types.keys() - set(missing)
         line = waiting_line(missing, types, self._others(), left=self._had) if missing else self._sent()
         if line == self._last:
@@ -125,7 +126,8 @@ class Waiting:
         """That every topic has a publisher; with the topics and services, where the user did not name them."""
         if not self._source.found.choice.open:
             return ALL_THERE
-        topics = [name for name, topic in self._source.subscriptions.subscribed.items() if not topic.action]
+        subscribed = [pair for source in self._source.together for pair in source.subscriptions.subscribed.items()]
+        topics = [name for name, topic in subscribed if not topic.action]
         found = self._source.found.offered
         offered = f"; services and actions: {_listed(sorted(found))}" if found else ""
         return f"{ALL_THERE}: {_listed(topics)}{offered}"

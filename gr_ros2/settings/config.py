@@ -75,6 +75,10 @@ DEFAULT_MIDDLEWARE = "dds"
 """Of everything that joins a ROS graph; a name of ``gr_ros2.middleware.MIDDLEWARE``."""
 
 
+BOUND_TO_NONE = frozenset((AUTO, "best", "all"))
+"""Values of ``via`` that are no name of a radio."""
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Seeded:
     """What draws random numbers."""
@@ -224,9 +228,9 @@ class SendOptions:
     are never kept"""
     to: RobotId | Auto = AUTO
     """robot for which it is; auto = all"""
-    via: Literal["best", "all"] | Auto = AUTO
-    """of several radios: all = over each, best = over the fastest that is heard; auto = all for class latency, else
-    best"""
+    via: str = AUTO
+    """of several radios: all = over each, best = over the fastest that is heard, a name = that one alone; auto = all
+    for class latency, else best"""
     codec: str = AUTO
     """auto, none, fields or zstd, where ``compression`` is on (docs/explanation/compression.md)"""
     quantize: str = ""

@@ -63,10 +63,11 @@ class TopicChoice:
         wanted = [_ALL if word == AUTO else word for word in wanted]
         self.named = {self._absolute(word): word for word in wanted if not is_wild(word)}
         """Topics that are named exactly: the word by its absolute name on the graph."""
-        self._patterns = [word for word in wanted if is_wild(word)]
-        self.open = bool(self._patterns)
+        self.patterns = [word for word in wanted if is_wild(word)]
+        """The words that may choose topics which are not named exactly."""
+        self.open = bool(self.patterns)
         """Whether topics may be chosen that are not named exactly."""
-        self.everything = ", ".join(map(self._absolute, self._patterns))
+        self.everything = ", ".join(map(self._absolute, self.patterns))
         """What these topics are, for a person: ``/robot_1/*``."""
 
     def __bool__(self) -> bool:
@@ -87,7 +88,7 @@ class TopicChoice:
         hidden = hidden or name in INFRASTRUCTURE or name.startswith(OWN_NODES)
         if hidden or "/_" in name:  # ROS hides what begins with _
             return None
-        for pattern in self._patterns:
+        for pattern in self.patterns:
             if fnmatchcase(name, self._absolute(pattern)):
                 return name if pattern.startswith("/") else name.removeprefix(self._namespace)
         return None

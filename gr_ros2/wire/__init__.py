@@ -35,9 +35,10 @@ from gr_ros2.wire.format import (
 )
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v0 import V0
-from gr_ros2.wire.v1 import V1, is_sealed
+from gr_ros2.wire.v1 import BOUND, V1, is_sealed
 
 __all__ = [
+    "BOUND",
     "BROADCAST",
     "FORMATS",
     "QOS_BULK",

@@ -56,6 +56,9 @@ SPAN = 30_000
 MAX_WINDOW = 127
 """Most numbers that a repair spans."""
 
+BOUND = b"\x20"
+"""Stands before each packet of an endpoint that sends over one radio of a robot alone. No packet begins with it."""
+
 MAX_TOPICS = 240
 TABLE_TOPIC = 240
 """Topic id of the table of topics (``table``), which is sent like any other message."""
@@ -193,6 +196,7 @@ def crc(data: bytes, session: int) -> bytes:
 
 def is_sealed(data: bytes) -> bool:
     """Whether a packet's header says that a key seals it."""
+    data = data.removeprefix(BOUND)
     return len(data) > HEADER_LEN and data[0] >> 4 & 7 == VERSION and data[0] & _SEALED != 0
 
 

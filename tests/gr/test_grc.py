@@ -24,8 +24,9 @@ from gnuradio.grc.core.schema_checker import BLOCK_SCHEME, Validator
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.gr import RosLink
+from gr_ros2.gr.link_sending import LinkSendingBlock
 from gr_ros2.gr.receiving import ReceivingBlock
-from gr_ros2.gr.ros_link import LinkSendingBlock, make_link
+from gr_ros2.gr.ros_link import make_link
 from gr_ros2.grc.path import example, grc_path
 from gr_ros2.middleware import MIDDLEWARE, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware

@@ -22,11 +22,15 @@ _AUDIO = 1024
 
 
 class SerialCable:
-    """Two serial lines whose bytes cross; ``ends`` are their devices. It can be pulled out and plugged in again."""
+    """Two serial lines whose bytes cross; ``ends`` are their devices. It can be pulled out and plugged in again.
+
+    :ivar loses: share of what crosses at once that does not come
+    """
 
     def __init__(self, folder: Path) -> None:
         self.ends = [folder / "tty-a", folder / "tty-b"]
         self.carried = 0
+        self.loses, self._rng = 0.0, random.Random(1)
         self.plug()
 
     def plug(self) -> None:
@@ -54,6 +58,8 @@ class SerialCable:
             for ready in select.select(self._masters, [], [], 0.02)[0]:
                 data = os.read(ready, _CHUNK)
                 self.carried += len(data)
+                if self._rng.random() < self.loses:
+                    continue
                 os.write(second if ready == first else first, data)
 
     def __enter__(self) -> SerialCable:

@@ -89,7 +89,7 @@ class Robot:
 
     def taken(self) -> int:
         """Messages that the link has taken."""
-        return int(self.link.source.stats()["topics"][f"/robot_{self.link.source.src_id}/chat"]["submitted"])
+        return int(self.link.stats()["source"]["topics"][f"/robot_{self.link.source.src_id}/chat"]["submitted"])
 
     def __enter__(self) -> Robot:
         self.link.start()

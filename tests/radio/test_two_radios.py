@@ -12,57 +12,9 @@ import pytest
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
-from tests.radio.cables import SerialCable
-from tests.radio.robots import Robot, config
+from tests.radio.robots import config
+from tests.radio.team import FAST, SLOW, Team, modem
 from tests.waiting import wait_for
-
-FAST, SLOW = 200_000, 4_800
-"""Bit/s of a modem."""
-
-
-def modem(bit_rate: float) -> dict[str, Any]:
-    return {"name": "modem", "options": {"bit_rate": bit_rate}}
-
-
-class Team:
-    """Two robots with a cable for each radio.
-
-    :param rates: bit/s of each radio
-    """
-
-    def __init__(self, folder: Path, rates: tuple[int, int], closing: ExitStack, **values: Any) -> None:
-        names = ("left", "right")
-        self.cables = []
-        for name in names:
-            (folder / name).mkdir()
-            self.cables.append(closing.enter_context(SerialCable(folder / name)))
-        self.robots = []
-        for number in (1, 2):
-            radios = [
-                {
-                    "name": name,
-                    "phy": modem(rate),
-                    "front_end": {"name": "serial", "device": str(cable.ends[number - 1]), "baud": 230400},
-                }
-                for name, rate, cable in zip(names, rates, self.cables, strict=True)
-            ]
-            state = str(folder / f"robot_{number}.json")
-            robot = Robot(number, {"name": "sim"}, (3 - number,), radios=radios, state=state, **values)
-            self.robots.append(closing.enter_context(robot))
-        for robot in self.robots:
-            wait_for(lambda: robot.link.stats()["peers"], "the other robot to be heard")  # noqa: B023 - called at once
-
-    def radio(self, number: int, name: str) -> dict[str, Any]:
-        """What robot ``number`` says of a radio."""
-        radio: dict[str, Any] = self.robots[number - 1].link.stats()["radios"][name]
-        return radio
-
-    def talk(self, first: int, count: int = 20) -> None:
-        """Robot 1 says so many messages, all of which robot 2 hears in order."""
-        before = len(self.robots[1].heard)
-        said = self.robots[0].say(*range(first, first + count))
-        wait_for(lambda: len(self.robots[1].heard) >= before + count, "all messages")
-        assert self.robots[1].heard[before:] == said
 
 
 @pytest.fixture

@@ -29,6 +29,7 @@ NOT_A_REPAIR = 255
 
 _SUBKEY_LEN = 16
 _SALT = b"gr-ros2 version 1"
+_BOUND = b"bound to one radio"
 _HOP = HEADER_LEN + 1
 _nonce = Struct(">IQB")
 _info = Struct(">BQ")
@@ -156,6 +157,14 @@ class Keys:
             raise ConfigError(f"seal = {mode!r} with {len(keys)} keys; {remedy}")
         self.mode = mode
         self._keys = tuple(keys)
+
+    def bound(self) -> Keys:
+        """Those of the endpoints that send over one radio alone: what these have sealed opens nowhere else, also
+        without the byte before it."""
+        from cryptography.hazmat.primitives.hashes import SHA256
+        from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+        return Keys([HKDF(SHA256(), KEY_LEN, _SALT, _BOUND).derive(key) for key in self._keys], self.mode)
 
     @property
     def sealed(self) -> bool:

@@ -59,6 +59,17 @@ def test_another_start_number_repair_id_source_or_key_is_refused(mode: SealMode)
             trailer.open(clear, rest, number, repair_id)
 
 
+def test_what_goes_over_one_radio_alone_opens_nowhere_else() -> None:
+    keys = Keys((bytes(32), bytes(range(32))), "encrypt")
+    clear = write_header(Header(0, True, 1, 5))
+    for closing, opening in ((keys, keys.bound()), (keys.bound(), keys)):
+        data = closing.own(1, 2).close(clear, b"body", 5, NOT_A_REPAIR)
+        for trailer in opening.candidates(1, 2, encrypt=True):
+            with pytest.raises(WireError):
+                trailer.open(data[: len(clear)], data[len(clear) :], 5, NOT_A_REPAIR)
+        assert closing.candidates(1, 2, encrypt=True)[0].open(clear, data[len(clear) :], 5, NOT_A_REPAIR) == b"body"
+
+
 def test_a_relay_may_change_the_hop_count_and_nothing_else() -> None:
     ours, theirs = trailers("encrypt")
     clear = write_header(Header(0, True, 3, 5, dst_id=9, hop=3))
