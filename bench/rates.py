@@ -1,12 +1,13 @@
 """Receivers at different SNRs: how old the newest messages are at each, over how old they are where it is alone.
 
 Odometry at 35 Hz in packets of its own and a scan at 5 Hz in eight packets are more than the air carries as the far
-receiver hears them, with the packets that it loses. An age is the mean over time, over both topics, and over runs that
-lose other packets.
+receiver hears them, with the packets that it loses; fewer packets end the bench. An age is the mean over time, over
+both topics, and over runs that lose other packets.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from heapq import merge
@@ -15,7 +16,7 @@ from statistics import mean
 from struct import Struct
 
 from bench.rows import Row, Sense
-from gr_ros2.link.events import Delivered
+from gr_ros2.link.events import Delivered, SentPacket
 from gr_ros2.link.v1.audiences import Audiences
 from gr_ros2.settings.files import find_registry
 from gr_ros2_lab.run.load import make_phy
@@ -28,6 +29,9 @@ SCAN, ODOM = 0, 1
 """Topic ids of the registry."""
 NAMES = {SCAN: "scan", ODOM: "odom"}
 LENGTHS, HZ = {SCAN: 1500, ODOM: 100}, {SCAN: 5.0, ODOM: 35.0}
+PACKETS = {SCAN: 8, ODOM: 1}
+"""Packets in which a message leaves at least; slots take a part of their room."""
+COMPRESSION = False
 SAMPLE_RATE, SLOTS_RATE = 1.5e5, 1e6
 """In slots every packet takes the time of the longest one with the most robust MCS."""
 WARM_UP_S, SECONDS = 5.0, 65.0
@@ -59,7 +63,7 @@ def _ages(snrs_db: Mapping[int, float], sample_rate: float, medium: str, seed: i
             "duplex": "half" if medium == "slots" else "full",
             "robots": [{}, *[{"robot": receiver, "topics": []} for receiver in snrs_db]],
             "topics": {name: {"queue": "latest"} for name in NAMES.values()},
-            "compression": False,
+            "compression": COMPRESSION,
             "phy": {"name": "ofdm", "sample_rate": sample_rate, "options": {"rate": "adaptive"}},
             "paths": [{"from": 1, "to": receiver, "snr_db": snr_db} for receiver, snr_db in snrs_db.items()],
             "duration_s": SECONDS,
@@ -70,11 +74,17 @@ def _ages(snrs_db: Mapping[int, float], sample_rate: float, medium: str, seed: i
     newest = {(receiver, topic): 0.0 for receiver in snrs_db for topic in HZ}
     area, last = dict.fromkeys(newest, 0.0), dict.fromkeys(newest, WARM_UP_S)
 
+    packets: dict[int, dict[int, set[int]]] = {topic: defaultdict(set) for topic in HZ}
+
     def until(now: float, at: tuple[int, int]) -> None:
         area[at] += ((now - newest[at]) ** 2 - (last[at] - newest[at]) ** 2) / 2
         last[at] = now
 
     for now, robot, event in run.events():
+        if isinstance(event, SentPacket):
+            for entry in event.entries:
+                if entry.topic_id in HZ:
+                    packets[entry.topic_id][entry.serial].add(event.number)
         if isinstance(event, Delivered) and event.topic_id in HZ and now < SECONDS:
             at = robot.src_id, event.topic_id
             if now > WARM_UP_S:
@@ -82,6 +92,9 @@ def _ages(snrs_db: Mapping[int, float], sample_rate: float, medium: str, seed: i
             (newest[at],) = _stamp.unpack_from(event.payload)
     for at in newest:
         until(SECONDS, at)
+    each = {topic: max(map(len, found.values())) for topic, found in packets.items()}
+    if any(each[topic] < least for topic, least in PACKETS.items()):
+        raise SystemExit(f"bench rates: messages leave in {each} packets by topic, not in {PACKETS} or more")
     return {receiver: {topic: area[receiver, topic] / (SECONDS - WARM_UP_S) for topic in HZ} for receiver in snrs_db}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench import gate, port
+from bench import gate, port, rates
 from bench.rows import Row
 
 
@@ -19,6 +19,15 @@ def test_a_row_whose_packets_were_compressed_away_ends_the_bench(monkeypatch: py
     monkeypatch.setattr(port, "AS_IT_IS", {})
     with pytest.raises(SystemExit, match="100 messages of 15 packets arrived in"):
         port.blocks_rate(port.ODOMETRY_BYTES, 15)
+
+
+def test_ages_beside_messages_that_were_compressed_away_end_the_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rates, "SECONDS", 6.0)
+    monkeypatch.setattr(rates, "SEEDS", [0])
+    assert rates.ages({rates.NEAR: 30.0}, rates.SAMPLE_RATE)[rates.NEAR][rates.ODOM] > 0
+    monkeypatch.setattr(rates, "COMPRESSION", True)
+    with pytest.raises(SystemExit, match="messages leave in"):
+        rates.ages({rates.NEAR: 30.0}, rates.SAMPLE_RATE)
 
 
 def test_the_gate_misses_what_has_become_twice_as_bad(monkeypatch: pytest.MonkeyPatch) -> None:
