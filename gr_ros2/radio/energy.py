@@ -24,6 +24,9 @@ not fall silent for ever."""
 _SILENCE = 2 * STANDS_OUT
 """Samples that are all zero are silence, so many times below the weakest power that came. Twice as much would still
 be a signal; noise that begins after zeros, as a driver may give at its start, counts as one for ``DOUBLES_S`` only."""
+_WEAKEST = 1e-8
+"""Power over the greatest one below which nothing is a signal: the edges of a burst beside zeros. After such an edge,
+noise counted as a signal for minutes."""
 
 
 class EnergyCounter(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
@@ -45,6 +48,7 @@ class EnergyCounter(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
         self._blanked_in = blanked_in
         self._noise = self._weakest = inf
         """Power of the noise, and the least power of a chunk that is not zero; infinite while it is not known."""
+        self._strongest = 0.0
         self._silent = False
         """Whether zeros came before anything else."""
         self._above = False
@@ -65,13 +69,13 @@ class EnergyCounter(KeepsThreadState, gr.sync_block):  # type: ignore[misc]
             for low, high in self._blanked_in(first, first + whole):
                 heard[max(low - first, 0) // _CHUNK : (high - first - 1) // _CHUNK + 1] = False
         power = power[heard]
-        before, known = self._noise, self._weakest < inf
+        known = self._weakest < inf
         self._weakest = min(self._weakest, power[power > 0].min(initial=inf))
-        silence = self._weakest / _SILENCE
-        if self._silent and not known:
-            before = silence
+        self._strongest = max(self._strongest, power.max(initial=0.0))
+        silence = max(self._weakest, _WEAKEST * self._strongest) / _SILENCE
+        before = silence if self._silent and not known else max(self._noise, silence)
         self._silent |= not power.all()
-        power = np.where(power > 0, power, silence)
+        power = np.maximum(power, silence)
         steps = self._rise ** np.arange(1, len(power) + 1)
         # The lowest power so far, each one grown since: noise[n] = min(power[k] * rise^(n - k), k <= n).
         noise = steps * np.minimum.accumulate(np.minimum(power / steps, before))

@@ -46,9 +46,10 @@ def test_what_was_blanked_is_no_noise() -> None:
 
 
 def listened(samples: NDArray[np.complex64], sample_rate: float = 1e6) -> EnergyCounter:
+    """A counter that has taken them a few at a time."""
     graph, counter = gr.top_block(), EnergyCounter(sample_rate)
     graph.connect(blocks.vector_source_c(samples), counter)
-    graph.run()
+    graph.run(512)
     return counter
 
 
@@ -67,6 +68,18 @@ def test_noise_that_begins_after_zeros_is_noise_after_a_while() -> None:
     samples = np.concatenate([np.zeros(20_000, np.complex64), noise(200_000, 1e-6)])
     assert listened(samples[:30_000], 2e4).is_above()
     assert not listened(samples, 2e4).is_above()
+
+
+def test_noise_that_begins_after_bursts_with_soft_edges_is_noise_after_a_while() -> None:
+    """As behind a squelch, or where a computer takes the noise out of its microphone."""
+    edge = 10 ** np.linspace(-8, 0, 2000)
+    burst = 0.3 * np.concatenate([edge, np.ones(10_000), edge[::-1]])
+    samples = np.concatenate([np.zeros(20_000), burst, np.zeros(20_000)]).astype(np.complex64)
+    assert listened(samples[:30_000], 2e4).is_above()
+    assert not listened(samples, 2e4).is_above()
+    opened = np.concatenate([samples, noise(600_000, 1e-8)])
+    assert listened(opened[:80_000], 2e4).is_above()
+    assert not listened(opened, 2e4).is_above()
 
 
 def test_silence_and_samples_that_are_no_numbers_do_no_harm() -> None:
