@@ -141,7 +141,7 @@ class Gains:
 
     def near(self, at: float, now: float) -> bool:
         """Whether a robot that was heard at a time counts as a neighbour."""
-        return now - at < HEARD_S * self.slower()
+        return now - at < self._near_s
 
     def hears(self, src_id: int, now: float) -> bool:
         """Whether a robot is heard and says that it hears this one."""
@@ -320,7 +320,12 @@ class Gains:
             state.has[robot] = before + share * (number - before)
 
     def _neighbours(self, now: float) -> list[int]:
-        return [src_id for src_id, robot in self._heard.items() if self.near(robot.at, now)]
+        near_s = self._near_s
+        return [src_id for src_id, robot in self._heard.items() if now - robot.at < near_s]
+
+    @property
+    def _near_s(self) -> float:
+        return HEARD_S * self.slower()
 
     def _gain(self, stream: Stream, state: _State, neighbours: Iterable[int]) -> float:
         newest, origin, has = state.newest, stream.origin, state.has

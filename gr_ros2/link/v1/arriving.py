@@ -284,6 +284,8 @@ class ArrivingMessages:
 
     def expire(self, now: float) -> None:
         """Give up incomplete messages that nothing came of for long."""
+        if self.reassembly.next_timeout() is None:
+            return
         for partial in self.reassembly.expired(now, self._incomplete_s, self._repaired_until_here):
             self._lose(partial, Fate.EXPIRED)
 

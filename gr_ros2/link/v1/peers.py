@@ -6,7 +6,7 @@ Invariant: what is told about a packet that was never sent changes nothing.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf, ldexp
@@ -121,14 +121,14 @@ class Peer:
         """Probability that a packet is lost if its report does not come: it or the report was lost."""
         return 1 / (2 - self.loss) if self.reports_soon else max(self.loss, 0.5)
 
-    def overdue(self) -> Callable[[float], float]:
-        """From a packet's departure to the time from which on its report is overdue, all in s.
+    def overdue(self) -> tuple[float, float, float]:
+        """When the report about a packet is overdue: so long after the packet left, and, for one that left after a
+        time, not before another time; all in s.
 
         A peer that loses nothing reports the first packet after a rest at once, and keeps the report about those that
         follow back. What had arrived before a report left is in that report.
         """
-        patience, told, calm = self.patience, self.heard - self.delay, self.heard + _LATER * self.calm
-        return lambda left_at: left_at + patience if left_at <= told else max(left_at + patience, calm)
+        return self.patience, self.heard - self.delay, self.heard + _LATER * self.calm
 
 
 class Peers:

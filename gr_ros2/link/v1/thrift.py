@@ -48,18 +48,21 @@ class Thrift:
             return len(window) * loss > len(under_way) * (1 - loss) + _ENOUGH
         for peer in peers:
             expected = 0.0 if peer.reports_soon else peer.loss
-            overdue, doubt = peer.overdue(), peer.doubt
+            (patience, told, calm), doubt = peer.overdue(), peer.doubt
+            bit, lost, calm_is_over = peer.bit, peer.lost, now >= calm
+            since = now - peer.under_way(now)
+            coming = sum([at > since for at in under_way]) * (1 - peer.loss) + _ENOUGH
             need = 0.0
             for record in window:
-                if not record.confirmed & peer.bit:
-                    if record.number in peer.lost:
+                if not record.confirmed & bit:
+                    if record.number in lost:
                         need += 1
+                    elif now >= record.at + patience and (calm_is_over or record.at <= told):
+                        need += doubt
                     else:
-                        need += doubt if now >= overdue(record.at) else expected
-            since = now - peer.under_way(now)
-            coming = sum([at > since for at in under_way])
-            if need > coming * (1 - peer.loss) + _ENOUGH:
-                return True
+                        need += expected
+                    if need > coming:
+                        return True
         return False
 
     def next_doubt(self, since: float) -> float:
@@ -71,7 +74,11 @@ class Thrift:
         for record in reversed(self._packets.records.values()):
             if record.number <= self._packets.newest - MAX_WINDOW:
                 break
-            for bit, overdue in waits:
-                if not record.confirmed & bit and since < (doubt := overdue(record.at)) < soonest:
-                    soonest = doubt
+            for bit, (patience, told, calm) in waits:
+                if not record.confirmed & bit:
+                    doubt = record.at + patience
+                    if doubt < calm and record.at > told:
+                        doubt = calm
+                    if since < doubt < soonest:
+                        soonest = doubt
         return soonest
