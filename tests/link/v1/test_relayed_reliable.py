@@ -12,6 +12,7 @@ from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.order import ALL, Order, Ready
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.link.v1.sent_on import REPAIRED_S
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_relaying import Line, robot
@@ -68,7 +69,7 @@ def rest(line: Line, seconds: float, goals: list[bytes]) -> None:
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.2, 0.3])
 def test_a_relayed_message_neither_overtakes_nor_delays_what_repair_brings(loss: float, mode: SealMode) -> None:
     everybody = cell(mode, loss)
-    goals = talk(everybody, 150)
+    goals = talk(everybody, 100)
     everybody.run(6)
     assert whole(everybody, goals)
 
@@ -207,7 +208,10 @@ def test_long_messages_cross_a_line_in_one_try(loss: float, mode: SealMode) -> N
     for goal in goals:
         line.robots[0].end.messages.submit(1, goal, line.now)
         line.run(2)
-    line.run(60)
+    end = line.now + 60
+    while line.now < end and not came(line.robots[1], 1) == came(line.robots[2], 1) == goals:
+        line.run(1)
+    line.run(REPAIRED_S)
     assert came(line.robots[1], 1) == came(line.robots[2], 1) == goals
     assert relayed[1, 1] - before <= len(goals) + 1
 
