@@ -14,6 +14,8 @@ from gr_ros2.cli.ending import INTERRUPTED, on_signals
 def main() -> None:
     """Entry point of the program; always ends in SystemExit."""
     on_signals(_leave)
+    # No plug-in of pydantic is of use here, and to look for one takes a thirtieth of the start of a link.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     from gr_ros2.cli.main import run
 
     try:
