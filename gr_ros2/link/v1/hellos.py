@@ -4,13 +4,15 @@ Hellos are sent at the start, several in the first second because any of them ma
 changes; at once to answer a robot that is heard for the first time; and otherwise every one or two seconds, about
 50 bytes/s, every two where nothing is lost, or less and less often while nobody is heard. While messages wait, hellos
 are delayed: by half a second, or by two seconds if receivers report. On a slow channel all of it takes longer
-(``Settings.slower``).
+(``Settings.slower``). Regular hellos come early by a random part of their period, never late (RFC 5148): in a channel
+that is bad in just their rhythm none would ever pass.
 
 Invariant: a hello names a kept message only after the receivers had time to get it when it was first sent.
 """
 
 from __future__ import annotations
 
+import random
 from collections import deque
 from collections.abc import Sequence
 from math import inf
@@ -39,7 +41,7 @@ _T = TypeVar("_T")
 STARTING_S = (0.0, 0.1, 0.25, 0.5, 1.0)
 """Times in s after the start at which hellos are sent."""
 HELLO_BYTES_S = 50.0
-"""Bytes/s that hellos take, as far as the interval stays between ``OFTEN_S`` and ``SELDOM_S``."""
+"""Bytes/s that hellos take that are not early, as far as the interval stays between ``OFTEN_S`` and ``SELDOM_S``."""
 OFTEN_S = 1.0
 """s between two hellos at least, once they are regular."""
 SELDOM_S = 2.0
@@ -47,6 +49,8 @@ SELDOM_S = 2.0
 LONE_S = 10.0
 """Most s between two hellos of a robot that hears nobody and says nothing: the time doubles with each hello, as in
 Trickle (RFC 6206). A robot that starts is met at once, by its own hellos."""
+EARLY = 0.25
+"""Part of the time to the next hello by which it comes early at most; RFC 5148 advises no more."""
 EAGER_S = 0.1
 """s between hellos while another robot has not proven yet that it heard this start: until then its messages are not
 delivered."""
@@ -80,9 +84,10 @@ class Hellos:
         self._settings = settings
         self._messages, self._window, self._neighbours = messages, window, neighbours
         self._boot = boot
+        self._rng = random.Random(f"hellos {boot} {settings.src_id}")
         self._capabilities = settings.hears * (CAN_HEAR | READS_LEFT_OUT) | encrypts * ENCRYPTS
         self._pause = self._period
-        """s to the next hello."""
+        """s to the next hello at most."""
         self._starting: deque[float] = deque()
         self._apart: list[Control] = []
         """What did not fit into the last hello and goes into a packet of its own."""
@@ -125,6 +130,10 @@ class Hellos:
     def hurry(self, now: float) -> None:
         """Send the next hello at once."""
         self.due = min(self.due, now)
+
+    def early(self, pause_s: float) -> float:
+        """A time in s, shorter by a random part: for what nobody may hear if it comes in an exact rhythm."""
+        return pause_s * (1 - EARLY * self._rng.random())
 
     def urgent(self, now: float, *, idle: bool, latency: bool, heard: bool) -> bool:
         """Whether a hello goes before messages.
@@ -221,7 +230,7 @@ class Hellos:
         slow = self._settings.shares and self._settings.slower > 1
         while slow and self._starting and self._starting[0] <= now:
             self._starting.popleft()  # messages went first for so long that this hello stands for several
-        due = self._starting.popleft() if self._starting else now + self._pause
+        due = self._starting.popleft() if self._starting else now + self.early(self._pause)
         if not wants or not self._eager:
             return due
         self._eager -= 1

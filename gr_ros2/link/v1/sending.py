@@ -317,7 +317,7 @@ class SendingSide:
         self._messages.expire(slot.now, self._pace.sure_interval(slot.now))
         if slot.now < self._beacon_at:
             return None
-        self._beacon_at = slot.now + self.settings.beacon_s
+        self._beacon_at = slot.now + self.hellos.early(self.settings.beacon_s)
         return self._hello(slot)
 
     def _start(self, now: float) -> None:
@@ -330,7 +330,7 @@ class SendingSide:
 
     def _plan_repeat(self, now: float) -> None:
         every = self.settings.repeat_s * self._repeats
-        self._repeat_at = now + every if every else inf
+        self._repeat_at = now + self.hellos.early(every) if every else inf
 
     def _repeat(self, now: float) -> None:
         """Repeat the kept messages, if no robot reports that it has them."""
