@@ -16,6 +16,7 @@ from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.packing import Packing
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sent_packets import Sent
+from gr_ros2.link.v1.shared import in_a_row
 from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 from gr_ros2.wire.control import LeftOut
 
@@ -26,8 +27,8 @@ _POLL_S, _CALM_POLL_S = 0.02, 0.1
 
 
 MOST_AHEAD = 16
-"""Repairs in a row that go before new messages; each new packet allows one more. Without it, new messages had to wait
-for 40 s after an outage of 300 s at 10 Hz, and those that their queue had no room for were lost."""
+"""Repairs in a row that go before new messages; each new packet allows ``in_a_row`` more. Without it, new messages had
+to wait for 40 s after an outage of 300 s at 10 Hz, and those that their queue had no room for were lost."""
 YIELDS = 8
 """Times that a repair for which later messages wait lets messages of class latency go first. Where these still wait
 then, every second packet may be such a repair: with fewer, repairs could not keep up with 30 % of the packets lost, and
@@ -88,7 +89,8 @@ class RepairSlots:
             return None
         waiting = packing.next_timeout(now) <= now
         if waiting:
-            self._ahead = min(self._ahead + newest - self._number, MOST_AHEAD)
+            more = (newest - self._number) * in_a_row(self._window.peers.loss)
+            self._ahead = min(self._ahead + more, MOST_AHEAD)
             self._number = newest
             if not self._ahead:
                 return None

@@ -9,6 +9,8 @@ from gr_ros2.link.events import Delivered
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Air, Robot, registry
+from tests.link.v1.test_relayed_reliable import Cell
+from tests.link.v1.test_relaying import robot as relaying_robot
 
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
@@ -85,3 +87,26 @@ def test_nothing_waits_for_long_on_a_full_link_where_topics_of_all_kinds_lose_pa
 
 def _delivered(robot: Robot) -> list[Delivered]:
     return [event for event in robot.events if isinstance(event, Delivered)]
+
+
+@pytest.mark.parametrize(("robots", "full", "loss"), [(2, 1, 0.6), (2, 2, 0.3), (4, 4, 0.55)])
+def test_a_full_link_brings_in_order_what_it_took(robots: int, full: int, loss: float) -> None:
+    """Receivers lacked ever more, and the order stood still as long as something new waited: with one repair for each
+    new packet where more than half is lost, and where full packets have no room for reports."""
+    topics = registry(few=SendOptions(queue="latest", reliability="best_effort"), many=SendOptions())
+    if robots == 2:
+        many = [Robot(1, topics), Robot(2, topics)]
+        channel: Air | Cell = Air(*many, loss=loss)
+    else:
+        many = [relaying_robot(src_id, topics=topics, relay=False) for src_id in range(1, robots + 1)]
+        channel = Cell(*many, loss=loss)
+    channel.run(10)
+    said = 0
+    while channel.now < 50:
+        for one in many[:full]:
+            while one.end.messages.queued()[1] < 10:
+                said += 1
+                one.end.messages.submit(1, b"%45d" % said, channel.now)
+        channel.run(0.1)
+    came = sum(len(payload) == 45 for one in many for payload in one.delivered())
+    assert came >= 0.8 * (robots - 1) * said
