@@ -44,8 +44,8 @@ class Outlet(Protocol):
     ) -> Message | None:
         """Put a frame into the queue of its topic; None if it is too large."""
 
-    def tabulate(self) -> None:
-        """Announce the topics anew."""
+    def becomes_coded(self, topic_id: int) -> None:
+        """Announce that frames of a topic follow."""
 
 
 class SentFrames:
@@ -83,7 +83,7 @@ class SentFrames:
         self.sent.setdefault(topic_id, deque())
         self._used.leave_out(topic_id)
         self._ages.setdefault(topic_id, 0.0)
-        self._outlet.tabulate()
+        self._outlet.becomes_coded(topic_id)
 
     def end(self, topic_id: int) -> None:
         """No frame of a topic follows, and those that have left are of no more use."""

@@ -295,13 +295,17 @@ class Outbox:
         if self._tabulate():
             self._owner.topics_changed()
 
+    def becomes_coded(self, topic_id: int) -> None:
+        """Announce that frames of a topic follow. Its first turn does not wait until one is coded."""
+        self.packing.turns.join(topic_id)
+        self.tabulate()
+
     def submit_frame(
         self, topic: SentTopic, frame: bytes, came: float, now: float, *, key: bool, chain: int
     ) -> Message | None:
         """Queue a frame of a coded topic; None where it is too large."""
         topic_id = topic.topic.topic_id
         self._owner.submitted(topic_id, now)
-        self.packing.turns.join(topic_id)
         serial, before = self._kept_frames.get((topic_id, chain), (-1, b""))
         again = topic.kept and frame == before
         if again:

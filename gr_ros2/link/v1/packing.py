@@ -216,8 +216,10 @@ class Packing:
         return len(message.payload) > self.short and message.topic_id != RELAYED_TABLES
 
     def _turn(self) -> int:
-        """Whose turn it is; the table has none where it fills what others leave."""
-        return self.turns.holder(self._open.keys() - {TABLE_TOPIC} if self.fills else self._open)
+        """Whose turn it is; the table has none where it fills what others leave, nor where it goes first anyway."""
+        table = self._open.get(TABLE_TOPIC)
+        without = table is not None and (self.fills or table[0].qos == QOS_LATENCY)
+        return self.turns.holder(self._open.keys() - {TABLE_TOPIC} if without else self._open)
 
     def _heap(self) -> list[tuple[float, float, int, int]]:
         """Topics that may send, the most urgent and most valuable first."""
