@@ -240,6 +240,8 @@ class Inbox:
         if told.settled:
             self.order.repaired_from(number - MAP + 1)
         self._settle()
+        if self.order.held:
+            self.reports.unreported += 1  # its sender goes on to what is waited for now
 
     def handle_timeout(self, now: float) -> None:
         """Go on without packets that have been waited for long enough."""
