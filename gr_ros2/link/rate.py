@@ -106,7 +106,9 @@ class _Peer:
         return gap
 
     def snr_db(self, now: float) -> float:
-        """The SNR to count on."""
+        """The SNR to count on; -inf before the first report."""
+        if self.heard == -inf:
+            return -inf
         return self.reported_db - self.correction_db - self.change_db_s * max(now - self.heard, 0.0)
 
     def silent(self, now: float) -> bool:

@@ -79,6 +79,14 @@ def test_packets_that_were_not_for_a_robot_say_nothing_of_it() -> None:
     assert rate.chosen(400 * REPORT_S)[7] < 2, "of the others it loses nearly all"
 
 
+def test_a_robot_that_has_not_reported_is_expected_to_lose_all() -> None:
+    """And not NaN, which the loss that repairs count on became then."""
+    rate = RateController(MCS_TABLE)
+    assert rate.lost(1, 0, 5.0) == pytest.approx(1.0)
+    rate.meet(1)
+    assert rate.lost(1, 0, 5.0) == pytest.approx(1.0)
+
+
 def test_a_packet_for_everybody_serves_the_weakest() -> None:
     rate = RateController(MCS_TABLE)
     for robot in (1, 2):
