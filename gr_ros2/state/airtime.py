@@ -73,7 +73,10 @@ class AirtimeFile:
             self.spent = self._read()
         except (FileNotFoundError, NotADirectoryError):
             pass  # ``save`` makes it, or says what is wrong
-        except OSError as error:
+        except BaseException as error:
+            self.close()
+            if not isinstance(error, OSError):
+                raise
             raise ConfigError(
                 f"{self._path}: cannot be opened ({error.strerror}), so what was sent would be forgotten; let this "
                 "user write it (sudo chown), or run the link as its owner"

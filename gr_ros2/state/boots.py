@@ -128,7 +128,7 @@ class BootFile:
             return 0, {"sealed": {}, "open": {}}
         except OSError as error:
             raise ConfigError(f"{self._path}: cannot be read ({error.strerror})") from error
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise ConfigError(f"{self._path}: no state file of a link ({error}); restore it, or change keys") from error
 
     def _write(self) -> None:

@@ -223,9 +223,14 @@ def _read(path: Path, setting: dict[str, Any]) -> CollisionTable | None:
             return None
         snrs_db = tuple(values["snrs_db"])
         delivered = np.array(values["delivered"], float).reshape(len(snrs_db), len(SIRS_DB), len(OFFSETS))
-        return CollisionTable(setting, snrs_db, values["sent"], delivered, tuple(values["edges"]))
+        sent, (begin, end) = values["sent"], values["edges"]
+        counts = np.array([*delivered.flat, begin * sent, end * sent])
+        rising = len(snrs_db) > 1 and np.isfinite(snrs_db).all() and (np.diff(snrs_db) > 0).all()
+        if not (sent > 0 and rising and ((counts >= 0) & (counts <= sent)).all()):
+            raise ValueError("counts or shares that are none")
+        return CollisionTable(setting, snrs_db, sent, delivered, (begin, end))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
         _log.warning("%s: no table of collisions (%s); measuring again", path, error)
         return None

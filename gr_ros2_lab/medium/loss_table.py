@@ -296,10 +296,14 @@ def _read(path: Path, table: LossTable) -> None:
         values = json.loads(path.read_text(encoding="utf-8"))
         if (path.parent == BUILTIN_DIR or values["program"] == program()) and values["setting"] == table.setting:
             points = {row[0]: Point(*row[1:]) for row in values["points"]}
+            for snr_db, point in points.items():
+                sure = snr_db is None or math.isfinite(snr_db)
+                if not (sure and 0 <= point.delivered <= point.sent > 0 <= point.lost_in):
+                    raise ValueError(f"{point} at {snr_db} dB")
             table.points.update(points)
     except FileNotFoundError:
         return
-    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as error:
         _log.warning("%s: no table of losses (%s); measuring again", path, error)
 
 

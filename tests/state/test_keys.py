@@ -144,7 +144,11 @@ def test_a_key_by_mistake_is_not_repeated(capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", '{"open": {}}', '{"boot": 1, "open": {"a": 2}}', '{"boot": 4294967295, "open": {}}']
+    "text",
+    [
+        *["", "[]", '{"open": {}}', '{"boot": 1, "open": {"a": 2}}', '{"boot": 4294967295, "open": {}}'],
+        *['{"boot": Infinity}', '{"boot": 1, "open": {"3": [5, 1e999]}}', pytest.param("[" * 100_000, id="deep")],
+    ],
 )
 def test_a_damaged_state_file_is_an_error_and_no_new_start(tmp_path: Path, text: str) -> None:
     path = tmp_path / "state"

@@ -152,7 +152,14 @@ def test_a_damaged_table_is_measured_again(small: Path) -> None:
     first = collision_table(of, ChannelConfig())
     assert first is not None
     (file,) = small.glob("*.json")
-    for content in ("{", '{"delivered": [[1]]}'):
+    values = json.loads(file.read_text())
+    for content in (
+        "{",
+        '{"delivered": [[1]]}',
+        json.dumps({**values, "sent": 0}),
+        json.dumps({**values, "edges": [0.5, float("nan")]}),
+        json.dumps({**values, "snrs_db": values["snrs_db"][::-1]}),
+    ):
         file.write_text(content)
         again = collision_table(of, ChannelConfig())
         assert again is not None

@@ -13,7 +13,16 @@ from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2_lab.medium import loss_table
-from gr_ros2_lab.medium.loss_table import LossTable, Point, measure, neighbours, packet_losses, setting_of, table_for
+from gr_ros2_lab.medium.loss_table import (
+    LossTable,
+    Point,
+    measure,
+    neighbours,
+    packet_losses,
+    program,
+    setting_of,
+    table_for,
+)
 
 PACKETS = 200
 
@@ -62,6 +71,17 @@ def test_a_damaged_table_is_measured_again(cache: Path, content: str, caplog: py
     (cache / table.name).write_text(content)
     assert table_for(phy(), ChannelConfig(), {None}, packets=10).points[None].delivered == 10
     assert any("no table of losses" in record.message for record in caplog.records)
+
+
+@pytest.mark.parametrize(
+    "row", [[None, "x", 0, 0], [None, 0, 0, 0], [None, 10, 20, 0], ["x", 10, 10, 0], [None, 10, 10, []]]
+)
+def test_a_count_that_is_none_is_measured_again(cache: Path, row: list[object]) -> None:
+    table = LossTable(setting_of(phy(), ChannelConfig()))
+    cache.mkdir(parents=True)
+    values = {"program": program(), "setting": table.setting, "points": [row]}
+    (cache / table.name).write_text(json.dumps(values))
+    assert table_for(phy(), ChannelConfig(), {None}, packets=10).points == {None: Point(10, 10, 0)}
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
