@@ -34,7 +34,11 @@ class Graph:
         return future.result()
 
     def set(self, name: str, value: Any) -> tuple[bool, str]:
-        kinds = {int: ("integer_value", ParameterType.PARAMETER_INTEGER), float: ("double_value", 3)}
+        kinds = {
+            int: ("integer_value", ParameterType.PARAMETER_INTEGER),
+            float: ("double_value", ParameterType.PARAMETER_DOUBLE),
+            str: ("string_value", ParameterType.PARAMETER_STRING),
+        }
         field, number = kinds[type(value)]
         parameter = Parameter(name=name, value=ParameterValue(type=number, **{field: value}))
         (result,) = self.ask(SetParameters, "set_parameters", SetParameters.Request(parameters=[parameter])).results

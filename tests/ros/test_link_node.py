@@ -18,6 +18,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import DescribeParameters, GetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header, String
 
 from tests.domains import free_domains
@@ -68,7 +69,8 @@ def test_a_link_as_a_node(config: Path, graph: Graph, ending: signal.Signals) ->
         assert graph.set("repeat_s", 0) == (True, "")
         assert graph.set("topics.header.to", 7) == (True, "")
         assert graph.set("topics.header.to", "auto") == (True, "")
-        assert "queue_depth = -1" in graph.set("queue_depth", -1)[1]
+        refused, why = graph.set("queue_depth", -1)  # by rclpy, from the described range
+        assert not refused and "queue_depth" in why and "-1" in why
         assert not graph.set("hold_s", 5.0)[0]
         assert "cannot change while the link runs" in graph.set("graph.nothing", 7)[1]
         assert not graph.set("packet_len", 64)[0]
@@ -128,8 +130,9 @@ def test_what_the_library_logs_is_in_the_log_of_ros(config: Path, graph: Graph) 
     """A warning of the middleware, and a packet where `debug` is on."""
     (config.parent / "topics.csv").write_text("header,std_msgs/Header\nother,std_msgs/Header\n")
     said: dict[int, str] = {}
+    past = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # said before the link is discovered
     graph.node.create_subscription(
-        Log, "/rosout", lambda line: said.update({line.level: said.get(line.level, "") + line.msg}), 10
+        Log, "/rosout", lambda line: said.update({line.level: said.get(line.level, "") + line.msg}), past
     )
     graph.node.create_publisher(String, "/robot_1/other", 10)
     publisher = graph.node.create_publisher(Header, "/robot_1/header", 10)
