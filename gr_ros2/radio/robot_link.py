@@ -280,8 +280,9 @@ class RobotLink(Flowgraph):
 
         :raises PhyError: when GNU Radio refuses the flowgraph
         """
+        began = self._clock()  # packets leave before a busy computer comes back here
         super().start(max_noutput_items)
-        self._started = self._clock()
+        self._started = began
         if self.config.remark:
             _log.info("link %s: %s", self.config.name, self.config.remark)
         for one in self.radios:
