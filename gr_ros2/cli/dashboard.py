@@ -17,6 +17,7 @@ from pydantic.dataclasses import dataclass
 from rich.console import Console
 
 from gr_ros2.cli.control_socket import ControlSocket, receive, request, running_programs
+from gr_ros2.cli.params import Number
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import BackendMissingError, ConfigError, RunError
 from gr_ros2.dashboard.addresses import ANY, exposed, in_url
@@ -161,7 +162,7 @@ def _make(address: str, port: int) -> Dashboard:
 @click.command()
 @click.argument("place", default=str(PORT), metavar="[[ADDRESS:]PORT]")
 @click.option("--pid", type=int, help="Process to look at, where several run.")
-@click.option("--wait", type=click.FloatRange(0), default=0.0, help="Seconds to wait for a run to begin.")
+@click.option("--wait", type=Number(0), default=0.0, help="Seconds to wait for a run to begin.")
 @click.option("--browser/--no-browser", default=True, help="Open it, or only say where it is.")
 def dashboard(place: str, pid: int | None, wait: float, browser: bool) -> None:
     """Open the live page of a run or a link that goes on in another terminal.

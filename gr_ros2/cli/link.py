@@ -24,7 +24,7 @@ from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option, foxglove_option, foxglove_server
 from gr_ros2.cli.ending import FAILED
-from gr_ros2.cli.params import BackendName, set_option
+from gr_ros2.cli.params import BackendName, Number, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.ping import check
 from gr_ros2.cli.spectrum import LONGEST_S
@@ -62,15 +62,15 @@ def _flag(name: str, **how: Any) -> Callable[[Any], Any]:
 @_flag("listen", metavar="ADDRESS")
 @_flag("peer", metavar="ADDRESS", multiple=True)
 @_flag("device", metavar="ARGS")
-@_flag("frequency", type=float, metavar="HZ")
-@_flag("frequency-rx", type=float, metavar="HZ")
+@_flag("frequency", type=Number(), metavar="HZ")
+@_flag("frequency-rx", type=Number(), metavar="HZ")
 @click.option("--registry", metavar="CSV", help="Without CONFIG: a file of topics to send; default: --topics auto.")
 @click.option(
     "--topics", metavar="NAMES", help="Without CONFIG: topics to send, 'auto', 'auto, -camera/*', 'odom map'."
 )
 @click.option("--middleware", type=BackendName(MIDDLEWARE), help=f"Joins the ROS graph; default: {DEFAULT_MIDDLEWARE}.")
 @click.option("--save", type=click.Path(dir_okay=False, path_type=Path), help="Without CONFIG: write it for next time.")
-@click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
+@click.option("--duration", type=Number(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
 @click.option("--transmit/--listen-only", default=None, help="A radio may send here, or only receives.")
 @click.option("--open", "is_open", is_flag=True, help="A radio may send without a key, for anybody to read and forge.")
 @click.option(

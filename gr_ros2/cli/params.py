@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from math import isfinite
 from types import MappingProxyType
 from typing import Any, get_type_hints
 
@@ -12,6 +13,9 @@ from click.shell_completion import CompletionItem
 
 from gr_ros2.core.backends import BackendTable
 from gr_ros2.settings.fields import AUTO
+
+MOST_S = 1e9
+"""s that a program can wait at most."""
 
 
 class Completed(click.ParamType):
@@ -28,6 +32,21 @@ class Completed(click.ParamType):
         incomplete: str,
     ) -> list[CompletionItem]:
         return [item for item in self.candidates() if item.value.startswith(incomplete)]
+
+
+class Number(click.FloatRange):
+    """A finite number in a range: to click alone, NaN is in every one."""
+
+    name = "float"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number: float = super().convert(value, param, ctx)
+        if not isfinite(number):
+            self.fail(f"{value!r} is no finite number", param, ctx)
+        return number
+
+    def _describe_range(self) -> str:
+        return "" if self.min is self.max is None else super()._describe_range()
 
 
 class OrAuto(click.ParamType):

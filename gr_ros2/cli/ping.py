@@ -16,7 +16,7 @@ from rich.live import Live
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.ending import FAILED
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import MOST_S, Number, set_option
 from gr_ros2.cli.status import PING, ask_link, find_link, json_option, pid_option
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.radio.config import LinkConfig, load_link
@@ -71,7 +71,7 @@ def opened(settings: LinkConfig, *, instrumented: bool = False) -> Iterator[Robo
 @click.argument("config", type=click.Path(path_type=Path), required=False)
 @click.option("--count", type=click.IntRange(1), help="Questions to ask; default until Ctrl-C, with --json 10.")
 @click.option(
-    "--interval", type=click.FloatRange(0.1), default=1.0, show_default=True, help="Seconds from one to the next."
+    "--interval", type=Number(0.1, MOST_S), default=1.0, show_default=True, help="Seconds from one to the next."
 )
 @pid_option
 @json_option

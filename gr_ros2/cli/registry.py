@@ -17,7 +17,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from gr_ros2.cli.params import Completed, OrAuto
+from gr_ros2.cli.params import Completed, Number, OrAuto
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.names import INFRASTRUCTURE, checked_namespace, first, topic_fault
 from gr_ros2.middleware import MIDDLEWARE, Qos, TopicInfo, join_graph
@@ -106,7 +106,7 @@ def shared_graph(whose: str) -> Callable[[Any], Any]:
 @_namespace
 @_topics
 @shared_graph(f"Whose graph: {', '.join(_SHARED)}.")
-@click.option("--wait", default=3.0, show_default=True, type=click.FloatRange(0, 600), help="Seconds to look around.")
+@click.option("--wait", default=3.0, show_default=True, type=Number(0, 600), help="Seconds to look around.")
 @click.option("--services", is_flag=True, help="Services and actions too, for links of version 1.")
 @_out
 def from_graph(

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.ending import FAILED
+from gr_ros2.cli.params import Number
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import RadioError
 from gr_ros2.phy import PHY
@@ -37,7 +38,7 @@ def sound() -> None:
 @sound.command("check")
 @click.option("--device", default=AUTO, metavar="NAME", help="Device that plays; default: the system's choice.")
 @click.option("--device-rx", default=AUTO, metavar="NAME", help="Device that records; default: as --device.")
-@click.option("--level", default=0.2, type=click.FloatRange(0, 1, min_open=True), help="Of what is played, 1 = full.")
+@click.option("--level", default=0.2, type=Number(0, 1, min_open=True), help="Of what is played, 1 = full.")
 @click.option("--listen-only", is_flag=True, help="Play nothing: list the devices and show the level.")
 def check(*, device: str, device_rx: str, level: float, listen_only: bool) -> int:
     """List the devices, show the level of the microphone, play a tone that rises, and say what came of it."""

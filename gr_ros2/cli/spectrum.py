@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import Number, set_option
 from gr_ros2.cli.ping import opened
 from gr_ros2.cli.status import LISTEN, ask_link, find_link, json_option, pid_option
 from gr_ros2.core.backends import uninterrupted
@@ -39,7 +39,7 @@ Told = Mapping[str, Any]
 @click.option(
     "--for",
     "for_s",
-    type=click.FloatRange(0, LONGEST_S, min_open=True),
+    type=Number(0, LONGEST_S, min_open=True),
     default=2.0,
     show_default=True,
     help="Seconds to listen.",

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.ending import FAILED
+from gr_ros2.cli.params import Number
 from gr_ros2.cli.status import OFFERS, WANT, ask_link, find_link, json_option, pid_option
 from gr_ros2.core.errors import RunError
 from gr_ros2.wire import BROADCAST
@@ -95,7 +96,7 @@ def offer_table(robot: int, rows: list[Mapping[str, Any]]) -> Table | str:
 @click.command()
 @robot_argument
 @click.argument("topic")
-@click.option("--rate", type=click.FloatRange(0), default=0.0, help="Messages/s at most; default: as many as come.")
+@click.option("--rate", type=Number(0), default=0.0, help="Messages/s at most; default: as many as come.")
 @click.option("--for", "for_s", type=Duration(), default="60s", show_default=True, help="How long, such as 60s or 2h.")
 @click.option("--give-up", is_flag=True, help="Want it no more.")
 @pid_option

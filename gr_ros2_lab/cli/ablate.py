@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import Number, set_option
 from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, written_line
 from gr_ros2_lab.report.compare import write_comparison
 from gr_ros2_lab.report.table import as_table
@@ -20,7 +20,7 @@ from gr_ros2_lab.study.ablation import Variant, run_variants, worth_grid
 @click.argument("scenario", type=SCENARIO)
 @click.option("--out", type=OUT_FOLDER, help="Folder for results; default results/ablate-NAME-TIME.")
 @click.option("--seed", type=int, help="Seed of robots, channel and sender.")
-@click.option("--duration", type=float, help="Seconds of each run during which messages are sent.")
+@click.option("--duration", type=Number(), help="Seconds of each run during which messages are sent.")
 @set_option(Scenario)
 def ablate(
     scenario: str, out: Path | None, seed: int | None, duration: float | None, overrides: tuple[str, ...]

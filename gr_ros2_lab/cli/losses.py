@@ -10,7 +10,7 @@ from rich import box
 from rich.table import Table
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import Number, set_option
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO
 from gr_ros2_lab.medium.loss_table import PACKETS, STEP_DB, table_for
@@ -20,8 +20,8 @@ from gr_ros2_lab.run.scenario import Scenario, load_scenario
 
 @click.command()
 @click.argument("scenario", type=SCENARIO)
-@click.option("--from", "low", type=float, default=0.0, show_default=True, help="Lowest SNR, dB.")
-@click.option("--to", "high", type=float, default=20.0, show_default=True, help="Highest SNR, dB.")
+@click.option("--from", "low", type=Number(), default=0.0, show_default=True, help="Lowest SNR, dB.")
+@click.option("--to", "high", type=Number(), default=20.0, show_default=True, help="Highest SNR, dB.")
 @click.option("--packets", type=click.IntRange(min=1), default=PACKETS, show_default=True, help="Sent at each SNR.")
 @click.option("--out", type=OUT_FOLDER, help="Folder to keep the table in; default the cache.")
 @set_option(Scenario)

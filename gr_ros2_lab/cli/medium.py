@@ -7,13 +7,13 @@ from pathlib import Path
 
 import click
 
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import Number, set_option
 from gr_ros2_lab.medium.process import MediumConfig, MediumProcess, load_medium
 
 
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path))
-@click.option("--duration", type=click.FloatRange(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
+@click.option("--duration", type=Number(min=0, min_open=True), help="Seconds to run; default until Ctrl-C.")
 @set_option(MediumConfig)
 def medium(config: Path, duration: float | None, overrides: tuple[str, ...]) -> int:
     """Let the links of several processes or machines share one simulated channel, with collisions, gains and noise.

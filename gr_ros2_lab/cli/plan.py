@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import Number, set_option
 from gr_ros2.link.fates import ARRIVED, Fate
 from gr_ros2.middleware.bag_files import is_bag
 from gr_ros2_lab.cli.params import SCENARIO
@@ -36,7 +36,7 @@ _HEADINGS = ("offered [1/s]", "message [B]", "on air [B]", "load", "rate [1/s]",
 @click.option("--bag", type=click.Path(exists=True, path_type=Path), help="With LINK: send this recording.")
 @click.option("--graph", is_flag=True, help="With LINK or alone: what is published on the ROS graph now.")
 @click.option("--seed", type=int, help="Seed of robots and sender.")
-@click.option("--duration", type=click.FloatRange(0), help="Seconds of traffic; default: of a bag all, of the graph 5.")
+@click.option("--duration", type=Number(0), help="Seconds of traffic; default: of a bag all, of the graph 5.")
 @set_option(Scenario)
 @click.option("--no-advice", is_flag=True, help="Only the forecast.")
 def plan(

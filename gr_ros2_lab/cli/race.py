@@ -9,7 +9,7 @@ import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import OrAuto
+from gr_ros2.cli.params import Number, OrAuto
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.cli.params import OUT_FOLDER
 from gr_ros2_lab.report.table import as_table
@@ -31,7 +31,7 @@ _TEAM = {"packet_len": 96, "loss": (0.05,), "load": (2.0, 4.0)}
 @click.option("--peers", metavar="NAME,...", help="Who races; default all.")
 @click.option("--source", help="sim, a simulated robot's odometry at 35 Hz, or bag:PATH.")
 @click.option("--topic", "bag_topic", help="Of the bag, where it has several.")
-@click.option("--duration", "duration_s", type=float, help="Seconds of the recording; default 15.")
+@click.option("--duration", "duration_s", type=Number(), help="Seconds of the recording; default 15.")
 @click.option("--packet-len", type=int, help="Bytes of gr-ros2's longest packets; default 64, of a team 96.")
 @click.option("--seed", type=int, help="Of robot, losses and sender.")
 def race(

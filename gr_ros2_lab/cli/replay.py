@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import Number, set_option
 from gr_ros2.core.names import first
 from gr_ros2_lab.cli.params import SCENARIO
 from gr_ros2_lab.report.explain import air_lines
@@ -22,7 +22,7 @@ from gr_ros2_lab.run.scenario import Scenario, load_scenario
 @click.option("--scenario", "name", type=SCENARIO, required=True, help="Whose link: a built-in name or a YAML file.")
 @click.option("--topics", help="Names with commas between; the registry is then made of the recording.")
 @click.option("--seed", type=int, help="Seed of channel and sender.")
-@click.option("--duration", type=float, default=0.0, help="Seconds of the recording; default 0 = all of it.")
+@click.option("--duration", type=Number(), default=0.0, help="Seconds of the recording; default 0 = all of it.")
 @set_option(Scenario)
 def replay(
     recording: Path,

@@ -18,7 +18,7 @@ from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
-from gr_ros2.cli.params import set_option
+from gr_ros2.cli.params import Number, set_option
 from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.codecs import CODECS
 from gr_ros2.core.backends import uninterrupted
@@ -60,7 +60,7 @@ _options = [
     click.option("--out", type=OUT_FOLDER, help="Folder for results; default results/NAME-TIME."),
     click.option("--seed", type=int, help="Seed of robots, channel and sender."),
     click.option("--repetitions", type=click.IntRange(1), help="Runs, with seeds SEED, SEED + 1, ..."),
-    click.option("--duration", type=float, help="Seconds during which messages are sent; 0 = to the end of a bag."),
+    click.option("--duration", type=Number(), help="Seconds during which messages are sent; 0 = to the end of a bag."),
     click.option("--details", is_flag=True, help="The tables and sentences of the report, here too."),
     click.option("--no-report", is_flag=True, help="No report; `gr-ros2 report FOLDER` makes it later."),
     pictures_option,

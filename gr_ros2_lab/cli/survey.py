@@ -14,6 +14,7 @@ import numpy as np
 
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.params import Number
 from gr_ros2.cli.registry import shared_graph
 from gr_ros2.cli.status import find_link, pid_option, status_of
 from gr_ros2.core.errors import ConfigError
@@ -73,8 +74,8 @@ class NumberPair(click.ParamType):
 @click.option("--frame", default="base_link", show_default=True, help="Of this robot, in transforms.")
 @click.option("--origin", type=NumberPair(), help="Latitude,longitude of x = y = 0, for GeoJSON; x is to the east.")
 @click.option("--map", "grid", metavar="TOPIC", default="/map", show_default=True, help="Map below the figure.")
-@click.option("--every", type=click.FloatRange(0.1, 60), default=0.5, show_default=True, help="Seconds of one row.")
-@click.option("--duration", type=click.FloatRange(0, min_open=True), help="Seconds; default until Ctrl-C.")
+@click.option("--every", type=Number(0.1, 60), default=0.5, show_default=True, help="Seconds of one row.")
+@click.option("--duration", type=Number(0, min_open=True), help="Seconds; default until Ctrl-C.")
 @shared_graph("Of the robot's graph.")
 @pid_option
 def survey(

@@ -30,6 +30,22 @@ def test_every_command_has_help(table: command.Commands) -> None:
         assert found.get_help(click.Context(found))
 
 
+def test_no_number_of_a_command_is_nan() -> None:
+    asked = 0
+    for table in (command.COMMANDS, command.PACKET_COMMANDS, command.REGISTRY_COMMANDS):
+        group = command.LazyGroup(table, "group", "")
+        for name in group.list_commands(click.Context(group)):
+            found = group.get_command(click.Context(group), name)
+            assert found is not None
+            numbers = [one for one in found.params if isinstance(one.type, type(click.FLOAT))]
+            asked += len(numbers)
+            for one in numbers:
+                for text in ("nan", "inf"):
+                    with pytest.raises(click.BadParameter):
+                        one.type.convert(text, one, None)
+    assert asked > 15
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.run(["--version"]) == 0
     assert __version__ in capsys.readouterr().out
