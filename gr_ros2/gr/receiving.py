@@ -10,8 +10,9 @@ delivered only after it was published. Everything else is counted by name.
 from __future__ import annotations
 
 import logging
+import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import Any, Protocol
@@ -106,6 +107,10 @@ class ReceivingBlock(HalfBlock):
         """When a packet of each robot was taken last, s."""
         self._packets: Counter[int] = Counter()
         """Packets of each robot that were taken."""
+        self._events: deque[ReceiverEvent] = deque()
+        """What has happened and is not handled yet, in order."""
+        self._settling = threading.RLock()
+        """Held by the one thread that handles them: those of several radios and of timeouts bring some."""
         self.handled = 0
         """Number of PDUs that this block has finished with, whatever the result."""
         take_messages(self, "pdus", "_handle", self.radios, called="take")
@@ -243,31 +248,38 @@ class ReceivingBlock(HalfBlock):
             if self._end.answers:
                 self.live.look()
                 self.live.wake()
-        self._settle(events)
+            self._events += events
+        self._settle()
 
-    def _settle(self, events: Iterable[ReceiverEvent]) -> None:
-        """Handle each event, then call the observer."""
-        debug, calls = self.config.debug, self._calls
-        for event in events:
-            try:
-                if debug and isinstance(event, Received | Rejected):
-                    self._log.debug("rx %s", describe(event, self.registry))
-                if isinstance(event, Received):
-                    self._heard[event.packet.src_id] = self.clock()
-                    self._packets[event.packet.src_id] += 1
-                elif isinstance(event, Announced):
-                    topics = self.outputs.take(event)
-                    if calls is not None:
-                        calls.learn(event.src_id, topics)
-                elif isinstance(event, Rejected):
-                    self._warn(event)
-                taken = calls is not None and calls.takes(event)
-                if isinstance(event, Delivered) and not taken:
-                    self.outputs.deliver(event)
-                else:
-                    self._tell(event)
-            except Exception as error:  # noqa: BLE001 - an exception would lose the next events and the thread
-                self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
+    def _settle(self) -> None:
+        """Handle all events, in the order in which the endpoint has told them, whichever thread it told."""
+        with self._settling:
+            while self._events:
+                event = self._events.popleft()
+                try:
+                    self._handle_event(event)
+                except Exception as error:  # noqa: BLE001 - an exception would lose the next events and the thread
+                    self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
+
+    def _handle_event(self, event: ReceiverEvent) -> None:
+        """Handle an event, then call the observer."""
+        calls = self._calls
+        if self.config.debug and isinstance(event, Received | Rejected):
+            self._log.debug("rx %s", describe(event, self.registry))
+        if isinstance(event, Received):
+            self._heard[event.packet.src_id] = self.clock()
+            self._packets[event.packet.src_id] += 1
+        elif isinstance(event, Announced):
+            topics = self.outputs.take(event)
+            if calls is not None:
+                calls.learn(event.src_id, topics)
+        elif isinstance(event, Rejected):
+            self._warn(event)
+        taken = calls is not None and calls.takes(event)
+        if isinstance(event, Delivered) and not taken:
+            self.outputs.deliver(event)
+        else:
+            self._tell(event)
 
     def _tell(self, event: ReceiverEvent) -> None:
         if self._observer is not None:
@@ -297,4 +309,5 @@ class ReceivingBlock(HalfBlock):
                     self._timer_idle = at is None
                     outputs.due.wait(wait_until_s(at, self.clock(), _SHORTEST_WAIT_S))
                     self._timer_idle = False
-            self._settle(events)
+                self._events += events
+            self._settle()

@@ -96,7 +96,8 @@ class LinkedRobot:
 
     def _settle(self, events: list[ReceiverEvent]) -> None:
         if events:
-            self.link.sink._settle(events)
+            self.link.sink._events += events
+            self.link.sink._settle()
             self.settle()
 
     def settle(self) -> None:

@@ -313,7 +313,7 @@ def test_two_robots_on_one_graph_of_a_real_dds(monkeypatch: pytest.MonkeyPatch) 
             for robot in (1, 2):
                 messages = (0, odometry), (2, transforms("imu")), (2, transforms("laser")), (1, transforms("wheel"))
                 for data in packets(robot, *messages):
-                    sink._settle(sink._end.receive(AirPacket(data), 0.0))
+                    sink.take([AirPacket(data)])
             wait_for(lambda: len(moving) == 2 and odometries)
             assert tree(moving[1]) == {"robot_2/wheel": ("robot_2/base", 0.0)}
             assert STORE.deserialize_cdr(odometries[0], "nav_msgs/msg/Odometry").child_frame_id == "robot_1/odom"

@@ -17,7 +17,7 @@ from gnuradio import gr
 
 from gr_ros2.core.errors import ConfigError, MiddlewareError
 from gr_ros2.gr.latency import LatencySummary, LatencyWindow
-from gr_ros2.link import Delivered, Lost, Received
+from gr_ros2.link import AirPacket, Delivered, Lost, Received
 from gr_ros2.middleware import Publisher, Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.paper import RosSink
@@ -95,6 +95,31 @@ def test_messages_come_out_unaltered_and_in_order(rig: Rig) -> None:
     wait_for(lambda: len(rig.heard) == len(sent))
     assert rig.heard == sent
     wait_for(lambda: sink.stats()["topics"]["/rx_robot_1/odom"]["delivered"] == len(sent), "the count")
+
+
+def test_messages_that_two_threads_bring_come_out_in_the_order_of_their_packets(rig: Rig) -> None:
+    held = threading.Event()
+    published: list[bytes] = []
+    with MemoryMiddleware(domain_id=DOMAIN) as middleware:
+        advertise = middleware.advertise
+
+        def slow(topic: str, type_name: str, qos: Qos) -> Publisher:
+            publisher = advertise(topic, type_name, qos)
+            publisher.publish = lambda payload: (payload == sent[0] and held.wait(), published.append(payload))[1]
+            return publisher
+
+        middleware.advertise = slow
+        sent = [stamped(number)[:40] for number in (1, 2)]
+        sink, takers = rig.make(middleware=middleware), []
+        for count, data in enumerate(packets(*((0, payload) for payload in sent)), 1):
+            takers.append(threading.Thread(target=sink.take, args=([AirPacket(data)],)))
+            takers[-1].start()
+            wait_for(lambda: sink.stats()["packets"] == count, "the packet to be taken")  # noqa: B023 - called at once
+        held.set()
+        for taker in takers:
+            taker.join()
+        rig.sink.close()
+    assert published == sent
 
 
 def test_each_sender_has_its_topics(rig: Rig) -> None:
