@@ -303,7 +303,7 @@ def _live(running: RobotLink) -> LiveRun:
         fates=None,
         airtime=running.phy.airtime if running.phy.has_airtime else None,
         received_as=running.sink.outputs.heard.name_of,
-        announced=running.sink.outputs.heard.announced,
+        announced=running.announced,
         alarms=running.findings.alarms,
         clocks=running.clocks,
         wishes=running.wishes if running.calls is not None else None,
@@ -315,7 +315,7 @@ def _live(running: RobotLink) -> LiveRun:
 
 def _key_frame(running: RobotLink, src_id: int, topic_id: int) -> None:
     """Ask for a key frame of a topic of this robot, or of another one."""
-    live = running.sink.live
+    live, topic_id = running.end_of(topic_id)
     with live.lock:
         frames = live.endpoint.frames
         if frames is not None and src_id == running.source.src_id:

@@ -10,6 +10,9 @@ is sealed with keys of its own.
 *Who has one.* A radio that some topic of this robot names, from the start on; another one from the first such packet on
 that comes over it, so that a robot takes what others have bound. That one sends nothing before it has heard a robot.
 
+*Observers* are told what comes out. So that topic ids of several endpoints are not mixed up, those of a radio's own are
+greater by ``APART`` times the number of the radio, counted from 1.
+
 *Airtime.* The credits of the radio are for both endpoints, see :mod:`gr_ros2.link.shared_credits`.
 """
 
@@ -17,7 +20,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,13 +34,17 @@ from gr_ros2.gr.starts import bound_state_file
 from gr_ros2.link import AirPacket, SentPacket
 from gr_ros2.link.air import Air
 from gr_ros2.link.endpoint import OpenEndpoint
+from gr_ros2.link.events import Announced, Delivered, Lost, ReceiverEvent, SenderEvent
+from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.shared_credits import ALL, ALONE, SharedCredits
 from gr_ros2.middleware import Middleware
 from gr_ros2.settings.config import BOUND_TO_NONE, SendOptions
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.settings.robot import BackfillConfig, RobotConfig
 from gr_ros2.wire import BOUND
 
+APART = 256
+"""Between the topic ids of two endpoints of a robot, as observers see them."""
 _log = logging.getLogger(__name__)
 
 
@@ -62,6 +69,28 @@ def bound_to_none(options: SendOptions) -> bool:
     return options.via in BOUND_TO_NONE
 
 
+class _Told:
+    """Tells an observer what comes out over one radio alone.
+
+    :param apart: by how much topic ids are greater there
+    """
+
+    def __init__(self, observer: LinkObserver, apart: int) -> None:
+        self._observer, self._apart = observer, apart
+
+    def sender_event(self, src_id: int, event: SenderEvent) -> None:
+        """Of what leaves, topic ids are not known there."""
+
+    def receiver_event(self, event: ReceiverEvent, now: float) -> None:
+        """Messages that come out, or do not, and what they are."""
+        apart = self._apart
+        if isinstance(event, Delivered | Lost):
+            self._observer.receiver_event(event._replace(topic_id=event.topic_id + apart), now)
+        elif isinstance(event, Announced):
+            topics = tuple(row._replace(topic_id=row.topic_id + apart) for row in event.topics)
+            self._observer.receiver_event(event._replace(topics=topics), now)
+
+
 class BoundEnd:
     """The endpoint of what goes over one radio alone.
 
@@ -71,6 +100,7 @@ class BoundEnd:
     :param graph: the robot's participant on its ROS graph, which the caller closes
     :param main: what sends over all radios
     :param ports: of that block
+    :param observer: is told what comes out
     :param clock: s, monotonic
     :raises GrRos2Error: when it cannot be made
     :ivar named: whether a topic of this robot is bound to the radio
@@ -87,6 +117,7 @@ class BoundEnd:
         graph: Middleware,
         main: LinkSendingBlock,
         ports: RadioPorts,
+        observer: LinkObserver | None,
         clock: Callable[[], float],
     ) -> None:
         self.way, self._radio, self._main, self._ports, self._clock = way, radio, main, ports, clock
@@ -117,13 +148,24 @@ class BoundEnd:
                 own, topics, self.end, graph, clock=clock, ports=self, takes=lambda options: options.via == way.name
             )
             published = known.with_options(config.publish.topics, announced=True)
-            self.sink = ReceivingBlock(own, published, self.end, graph, clock=clock)
+            told = None if observer is None else _Told(observer, self.apart)
+            self.sink = ReceivingBlock(own, published, self.end, graph, observer=told, clock=clock)
         except GrRos2Error:
             self.close()
             raise
         if self._paced:
             self.source.use_credit()
             self.source.grant(self._credits.of(ALONE), None)
+
+    @property
+    def apart(self) -> int:
+        """By how much its topic ids are greater for observers."""
+        return APART * (self._radio + 1)
+
+    def announced(self) -> list[tuple[int, str, Topic]]:
+        """What others announce over this radio alone, as observers see it."""
+        rows = self.sink.outputs.heard.announced()
+        return [(src_id, name, replace(topic, topic_id=topic.topic_id + self.apart)) for src_id, name, topic in rows]
 
     def start(self) -> None:
         """Take packets, and send them where something is to be sent."""
@@ -249,7 +291,7 @@ class BoundEnds:
             self.close()
             raise
 
-    def __iter__(self) -> Any:
+    def __iter__(self) -> Iterator[BoundEnd]:
         return iter(self._ends.values())
 
     def start(self) -> None:
@@ -305,6 +347,10 @@ class BoundEnds:
         """Use other options of single topics from now on."""
         for source in self.sources:
             source.set_topics(topics)
+
+    def end_of(self, topic_id: int) -> BoundEnd | None:
+        """The endpoint of a topic, by its id as observers see it; None for what has no radio alone."""
+        return self._ends.get(topic_id // APART - 1)
 
     def stats(self) -> dict[int, dict[str, Any]]:
         """What each counts, by the number of its radio."""

@@ -159,7 +159,13 @@ class RosLink(LinkBlock):
             )
             self.sink = ReceivingBlock(config, published, self.end, graph, **common)
             if ways and isinstance(self.source.ports, RadioPorts):
-                parts = {"known": heard, "graph": graph, "main": self.source, "ports": self.source.ports}
+                parts = {
+                    "known": heard,
+                    "graph": graph,
+                    "main": self.source,
+                    "ports": self.source.ports,
+                    "observer": observer,
+                }
                 self.bound = self.source.sharing = self.sink.apart = BoundEnds(config, ways, clock=clock, **parts)
                 self.source.ports.left = self.bound.left
             if calls:

@@ -19,6 +19,7 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.watch import Watch
+from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
 from gr_ros2.gr.throughput import LiveThroughput
 from gr_ros2.gr.wishes import LiveWishes
@@ -43,7 +44,7 @@ from gr_ros2.radio.ros_side import RosSide
 from gr_ros2.radio.spectrum import Listening
 from gr_ros2.radio.switch import TransmitSwitch
 from gr_ros2.radio.wish_service import WishService
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.registry import Registry, Topic
 
 _STOP_S = 10.0
 """s that a flowgraph may take to stop when its device has vanished."""
@@ -269,6 +270,18 @@ class RobotLink(Flowgraph):
         if composed != self.radio.gate.arrived or self.source.due(self._clock()):
             return None
         return self.radio.at_rest()
+
+    def announced(self) -> list[tuple[int, str, Topic]]:
+        """Source id, absolute name here and meaning of each topic that another robot has announced, with topic ids as
+        observers see them."""
+        bound = self._ros.link.bound or ()
+        return [*self.sink.outputs.heard.announced(), *(row for end in bound for row in end.announced())]
+
+    def end_of(self, topic_id: int) -> tuple[LiveEnd[Any], int]:
+        """The endpoint of a topic, by its id as observers see it, and its id there."""
+        bound = self._ros.link.bound
+        end = None if bound is None else bound.end_of(topic_id)
+        return (self.sink.live, topic_id) if end is None else (end.end, topic_id - end.apart)
 
     @property
     def registry(self) -> Registry:

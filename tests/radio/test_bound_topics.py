@@ -10,9 +10,12 @@ from typing import Any
 
 import pytest
 
+from gr_ros2.cli.bag import OutputBag
+from gr_ros2.cli.link import _live
 from gr_ros2.cli.status import radio_words
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import AirPacket
+from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.live_settings import LiveSettings
@@ -78,6 +81,28 @@ def test_another_topic_does_not_wait_for_it(tmp_path: Path, closing: ExitStack) 
     assert heard == told
     assert len(team.robots[1].heard) < len(said), "the slow radio still carries what was said before"
     wait_for(lambda: team.robots[1].heard == said, "all of it")
+
+
+def test_a_bag_has_what_came_over_one_radio_alone_and_over_all(tmp_path: Path, closing: ExitStack) -> None:
+    registry = tmp_path / "topics.csv"
+    registry.write_text(f"news,{CUSTOM}\nchat,{CUSTOM}\n")
+    bag = OutputBag(tmp_path / "bag")
+    values = {"topics": {"news": {}, **CHAT}, "registry": str(registry)}
+    team = Team(tmp_path, (FAST, FAST), closing, second={"observer": bag, "registry": ""}, **values)
+    bag.run_started(_live(team.robots[1].link))
+    graph = MemoryMiddleware(domain_id=domain(1))
+    closing.callback(graph.close)
+    news = graph.advertise("/robot_1/news", CUSTOM, QOS)
+    wait_for(news.matched, "the link to take news")
+    news.publish(told := message(50, 200))
+    said = team.robots[0].say(1, 2, 3)
+    sink = team.robots[1].link
+    wait_for(lambda: sum(t["delivered"] for t in sink.stats()["sink"]["topics"].values()) == 4, "all messages")
+    sink.stop()
+    bag.close()
+    found = [(each.topic, each.payload) for each in read_bag(tmp_path / "bag")]
+    assert sorted(found) == sorted([("/rx_robot_1/news", told), *(("/rx_robot_1/chat", each) for each in said)])
+    assert bag.incomplete() == []
 
 
 @pytest.mark.parametrize("sealed", [False, True])
