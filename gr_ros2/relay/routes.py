@@ -10,6 +10,7 @@ Invariants: sans-IO, the caller passes in times; memory is bounded by the ids.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 
 STALE_S = 15.0
 """s for which a distance counts: tables are relayed every 5 s at least, and two may be lost."""
@@ -59,13 +60,14 @@ class Routes:
         self._doubted.pop((robot, via), None)
 
     def over(self, robot: int, now: float, usable: Callable[[int], bool]) -> int | None:
-        """The robot to which a message for ``robot`` is to be handed; None if no way is known.
+        """The robot to which a message for ``robot`` is to be handed; None if no way is known. Of those over which
+        messages did not arrive, the one of which this was noticed first has its turn.
 
         :param usable: whether a robot may be taken
         """
         since = now - self.stale_s
         open_ways = [
-            (now < self._doubted.get((robot, via), now), hops, via)
+            (until if now < (until := self._doubted.get((robot, via), -inf)) else -inf, hops, via)
             for via, (hops, at) in self._ways.get(robot, {}).items()
             if since <= at and usable(via)
         ]

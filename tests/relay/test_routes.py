@@ -63,3 +63,17 @@ def test_a_distance_counts_for_longer_where_robots_send_seldom() -> None:
     routes.note(9, 2, 1, 0.0)
     assert routes.over(9, 4 * STALE_S, anybody) == 2
     assert routes.over(9, 4 * STALE_S + 0.1, anybody) is None
+
+
+def test_of_those_over_which_nothing_arrived_each_has_its_turn() -> None:
+    """One of two takes all and hands nothing on; the other had started again."""
+    routes = Routes()
+    for now in (0.0, 10.0):
+        routes.note(9, 2, 1, now)
+        routes.note(9, 3, 1, now)
+    routes.doubt(9, 3, 11.0)
+    assert routes.over(9, 12.0, anybody) == 2
+    routes.doubt(9, 2, 12.0)
+    assert routes.over(9, 13.0, anybody) == 3
+    routes.doubt(9, 3, 13.0)
+    assert routes.over(9, 14.0, anybody) == 2
