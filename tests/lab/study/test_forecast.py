@@ -272,10 +272,10 @@ def test_slots_are_proposed_where_packets_overlap() -> None:
 
 @pytest.mark.slow
 def test_slots_deliver_what_overlap_loses() -> None:
-    plan = planner("two-robots-half-duplex", duration=15.0)
+    plan = planner("two-robots-half-duplex", "repair='off'", duration=15.0)
     (slots,) = (advice for advice in plan.advice() if advice.setting == "medium=slots")
     lost, with_slots = (min(effect.pdr[after] for effect in slots.effects) for after in (False, True))
-    assert lost < 0.9 < with_slots
+    assert lost < 0.98 < with_slots
 
 
 def test_cuts_are_the_same_for_every_robot() -> None:
