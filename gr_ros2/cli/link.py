@@ -157,9 +157,9 @@ def link(
         for number, on in ((signal.SIGUSR1, False), (signal.SIGUSR2, True)):
             signal.signal(number, lambda *_, on=on: _switch(running, on))
         try:
+            run_observers.run_started(_live(running))  # first: they pass over what comes before it
             running.start()
             answers |= _answers(running)
-            run_observers.run_started(_live(running))
             _show(console, running, duration)
         except KeyboardInterrupt:
             pass  # the normal end of a link

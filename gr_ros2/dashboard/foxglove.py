@@ -13,6 +13,7 @@ subscribes to a latched topic gets its newest message.
 from __future__ import annotations
 
 import threading
+import time
 from contextlib import suppress
 from importlib import import_module
 from math import inf
@@ -36,6 +37,10 @@ VIDEO_NAME = "video"
 """Of the topic beside one of pictures that has H.264 as it crossed the link."""
 _CACHED_BYTES = 1 << 26
 """Bytes of latched messages that are kept for clients that subscribe later."""
+_SEQUENCE = b"\0\0\1\x67"
+"""Begins what a decoder of H.264 needs first; every key frame has it."""
+_AGAIN_S = 2.0
+"""s after which a key frame that has not come is asked for again: what asks for it may be lost on the air."""
 _LOOK_S = 0.5
 """s between two looks at which services other robots have."""
 
@@ -69,6 +74,8 @@ class FoxgloveServer:
         self._told: dict[tuple[int, int], _Shown] = {}
         self._sent: dict[tuple[int, int], _Shown] = {}
         self._videos: dict[tuple[int, int], _Shown] = {}
+        self._wanted: dict[tuple[int, int], float] = {}
+        """When a key frame of video that has not come was asked for, s, monotonic."""
         self._frames = FrameReceiver()
         self._services: dict[str, str] = {}
         """Types of the services that are offered, by name."""
@@ -146,7 +153,13 @@ class FoxgloveServer:
         shown = self._videos.get(key)
         if shown is not None:
             with suppress(CodecError):
-                self._show(shown, self._frames.decode(key, shown.topic, frame, now))
+                message = self._frames.decode(key, shown.topic, frame, now)
+                self._show(shown, message)
+                if (asked := self._wanted.get(key)) is not None:
+                    if _SEQUENCE in message:
+                        self._wanted.pop(key, None)
+                    elif time.monotonic() - asked > _AGAIN_S:
+                        self._ask_key(key, shown)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """Show a message that came out, and of pictures that came as video that, too."""
@@ -202,8 +215,15 @@ class FoxgloveServer:
         if message is not None and found is not None:
             found[1].log(message)
         for key, shown in list(self._videos.items()):
-            if shown.topic == channel.topic and self._run is not None:
-                self._run.wants_key(*key)
+            if shown.topic == channel.topic:
+                self._ask_key(key, shown)
+
+    def _ask_key(self, key: tuple[int, int], shown: _Shown) -> None:
+        """Ask for a key frame: the frames of now are of no use to who has not seen those before."""
+        if self._run is not None:
+            if shown.type_name == VIDEO:
+                self._wanted[key] = time.monotonic()
+            self._run.wants_key(*key)
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:
         """A client has had enough: the server stops by itself."""

@@ -94,6 +94,29 @@ def test_the_middleware_is_that_of_both_directions(tmp_path: Path, capsys: pytes
     assert settings.graph.middleware == "memory"
 
 
+def test_those_who_look_on_know_the_link_before_it_hears_anything(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They pass over what comes before they know it: topics of a robot that has told them would never be shown."""
+    pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
+    from gr_ros2.observe.observers import RunObservers
+    from gr_ros2.radio.robot_link import RobotLink
+
+    known: list[bool] = []
+    started, began = RunObservers.run_started, RobotLink.start
+
+    def run_started(self: RunObservers, live: Any) -> None:
+        known.append(True)
+        started(self, live)
+
+    def start(self: RobotLink) -> None:
+        assert known
+        began(self)
+
+    monkeypatch.setattr(RunObservers, "run_started", run_started)
+    monkeypatch.setattr(RobotLink, "start", start)
+    line = ("link", "--robot", "1", "--radio", "sim", "--middleware", "memory")
+    assert run([*line, "--duration", "0.1"]) == 0
+
+
 @pytest.mark.slow
 def test_two_robots_in_one_line_each(tmp_path: Path) -> None:
     """No file: a message crosses, each says what it waits for, and what is saved starts the same link again."""

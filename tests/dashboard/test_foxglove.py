@@ -247,8 +247,9 @@ def test_a_live_link_is_seen_by_both_names(tmp_path: Path) -> None:
         MemoryMiddleware(domain_id=domain(2)) as far,
     ):
         observers = RunObservers([server], threaded=True)
-        with robot(1, tmp_path, 2), robot(2, tmp_path, 1, observer=observers) as two:
-            observers.run_started(_live(two.link))
+        two = robot(2, tmp_path, 1, observer=observers)
+        observers.run_started(_live(two.link))
+        with robot(1, tmp_path, 2), two:
             publishers = [near.advertise("/robot_1/tf", TF, QOS), far.advertise("/robot_2/tf", TF, QOS)]
             client = Client(server.port)
 
@@ -282,8 +283,9 @@ def test_a_service_of_another_robot_is_called_and_is_gone_with_its_server(tmp_pa
         lamps = far.serve("/robot_2/lamp", "std_srvs/srv/SetBool", answer)
         other = far.serve("/robot_2/own", "own_package/srv/Own", lambda *_: None)
         observers = RunObservers([server], threaded=True)
-        with robot(1, tmp_path, 2, observer=observers) as one, robot(2, tmp_path, 1):
-            observers.run_started(_live(one.link))
+        one = robot(1, tmp_path, 2, observer=observers)
+        observers.run_started(_live(one.link))
+        with one, robot(2, tmp_path, 1):
             client = Client(server.port)
             try:
                 client.watch(lambda: len(client.services) == 2)

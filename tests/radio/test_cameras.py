@@ -12,9 +12,12 @@ from typing import Any
 import pytest
 
 pytest.importorskip("zmq", reason="needs pyzmq")
+from gr_ros2.cli.link import _live
 from gr_ros2.codecs.messages import CAMERA_INFO, IMAGE, read
+from gr_ros2.link.v1.frames import SentFrames
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.observe.observers import RunObservers
 from gr_ros2.radio.live_settings import LiveSettings
 from gr_ros2.radio.robot_link import RobotLink
 from tests.codecs import scenes
@@ -56,14 +59,16 @@ class Camera:
 
 
 @contextmanager
-def link(number: int, tmp_path: Path, observer: Any = None, **values: Any) -> Iterator[RobotLink]:
+def link(number: int, tmp_path: Path, observers: RunObservers | None = None, **values: Any) -> Iterator[RobotLink]:
     """A robot's end over a link of 250 kBd, as long as it runs."""
     own, other = (f"ipc://{tmp_path}/{end}" for end in (number, 3 - number))
     phy = {"name": "psk", "sample_rate": 500e3, "options": {"lengths": "any"}}
     front_end = {"name": "zmq", "bind": own, "connect": [other]}
     found = {"registry": "", "packet_len": 220, "phy": phy, **values}
-    made = RobotLink(config(number, front_end, **found), observer=observer)
+    made = RobotLink(config(number, front_end, **found), observer=observers)
     try:
+        if observers is not None:
+            observers.run_started(_live(made))
         made.start()
         yield made
     finally:
@@ -127,17 +132,27 @@ def test_a_camera_is_turned_off_and_on_while_it_is_seen(tmp_path: Path, watcher:
 
 
 @pytest.mark.real_time
-def test_an_operator_who_comes_late_sees_the_video_of_a_live_link(tmp_path: Path) -> None:
+@pytest.mark.parametrize("missed", [0, 1])
+def test_an_operator_who_comes_late_sees_the_video_of_a_live_link(
+    tmp_path: Path, missed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where what asks for a key frame is lost."""
     pytest.importorskip("foxglove", reason="needs foxglove-sdk")
-    from gr_ros2.cli.link import _live
     from gr_ros2.dashboard.foxglove import FoxgloveServer
-    from gr_ros2.observe.observers import RunObservers
     from tests.dashboard.test_foxglove import Client
 
+    asked: list[int] = []
+    ask = SentFrames.lost
+
+    def lost(self: SentFrames, src_id: int, topic_id: int) -> None:
+        asked.append(topic_id)
+        if len(asked) > missed:
+            ask(self, src_id, topic_id)
+
+    monkeypatch.setattr(SentFrames, "lost", lost)
     with FoxgloveServer("127.0.0.1", 0) as server, Camera(1, 80):
         observers = RunObservers([server], threaded=True)
-        with link(1, tmp_path), link(2, tmp_path, observer=observers, topics=[]) as two:
-            observers.run_started(_live(two))
+        with link(1, tmp_path), link(2, tmp_path, observers, topics=[]):
             name = f"{SEEN}/video"
             wait_for(lambda: name in server._channels, "its channel")
             client = Client(server.port)
