@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import NamedTuple
 
-from gr_ros2.relay.gain import FIRST_PERIOD_S, Gains, Stream
+from gr_ros2.relay.gain import EXPIRES_S, FIRST_PERIOD_S, Gains, Stream
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Relayed
@@ -74,10 +74,14 @@ class _Row:
     late: int = 0
     orders: list[Order] = field(default_factory=list)
     """Ascending."""
+    newest: Order = (-1, 0)
+    """Of the message that came last; it may be kept no more."""
     kept: list[Kept] = field(default_factory=list)
     has: dict[int, Order] = field(default_factory=dict)
     told: dict[int, float] = field(default_factory=dict)
     """When each robot told last what it has, s."""
+    beyond: dict[int, tuple[Order, float]] = field(default_factory=dict)
+    """By robot: what it has told that has not come here, and since when, s."""
     kept_for: dict[int, Order] = field(default_factory=dict)
     """What robots get that came late, up to this message, one by one: they take none that was made before another."""
     served: float = -inf
@@ -118,7 +122,7 @@ class InOrder:
             self._drop(stream, row.orders[bisect_left(row.orders, order) :])
         else:
             row = self._rows[stream] = self._named[stream.origin, stream.start & 0xFF, stream.topic_id] = _Row()
-        row.late = late
+        row.late, row.newest = late, order
         row.orders.append(order)
         row.kept.append(kept)
         lost = self._quotas.put(Name(stream, order), via, len(message.payload) + _COST)
@@ -150,9 +154,22 @@ class InOrder:
         row = self._named.get((newest.origin, newest.start, newest.topic_id))
         if row is not None and newest.place is not None:
             before = row.has.get(robot, (-1, 0))
-            row.has[robot], row.told[robot] = (newest.number, newest.place), now
+            row.has[robot], row.told[robot] = self._believed(row, robot, (newest.number, newest.place), now), now
             for kept in row.kept[bisect_right(row.orders, before) : bisect_right(row.orders, row.has[robot])]:
                 kept.sent.pop(robot, None)
+
+    @staticmethod
+    def _believed(row: _Row, robot: int, order: Order, now: float) -> Order:
+        """Up to where a robot that tells an order has all. What has not come here for ``EXPIRES_S`` may be false: who
+        was told it takes true messages again by then, and is sent what comes here."""
+        if order <= row.newest:
+            row.beyond.pop(robot, None)
+            return order
+        first, since = row.beyond.get(robot, (order, now))
+        if first <= row.newest:
+            first, since = order, now
+        row.beyond[robot] = first, since
+        return order if now <= since + EXPIRES_S else row.newest
 
     def heard(self, via: int, name: Name, now: float) -> None:
         """A robot has sent a message on: those that it hears should have it, too."""
@@ -168,6 +185,7 @@ class InOrder:
         for row in self._rows.values():
             row.has.pop(robot, None)
             row.told.pop(robot, None)
+            row.beyond.pop(robot, None)
             for kept in row.kept:
                 kept.sent.pop(robot, None)
 

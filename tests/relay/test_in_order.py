@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import inf
 
-from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.relay.gain import EXPIRES_S, Gains, Stream
 from gr_ros2.relay.in_order import AGAIN_S, InOrder, Kept, Name
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire.control import Newest
@@ -69,6 +69,30 @@ def test_what_another_robot_has_sent_on_counts_as_sent() -> None:
     kept.told(3, told(0), 0.0)
     kept.heard(4, Name(GOAL, (1, 0)), 0.1)
     assert chosen(kept, 0.2) is None
+
+
+def test_who_was_told_a_number_too_high_gets_what_comes_once_it_has_expired() -> None:
+    gains, kept = at_robot_2()
+    keep(kept, 1, 2)
+    for second in range(int(EXPIRES_S) + 3):
+        gains.neighbour(3, second, [2, 4], 2)
+        kept.told(3, told(30_000), second)
+        assert chosen(kept, second + 0.5) is None
+    keep(kept, 3)
+    assert chosen(kept, second + 0.5) == 3
+
+
+def test_who_has_more_than_is_here_gets_none_of_it_when_it_comes() -> None:
+    gains, kept = at_robot_2()
+    keep(kept, 1)
+    for second in range(2 * int(EXPIRES_S)):
+        gains.neighbour(3, second, [2, 4], 2)
+        kept.told(3, told(second + 10), second)
+        if second % 10 == 9:
+            keep(kept, second)
+        assert chosen(kept, second + 0.5) is None
+    kept.told(3, told(second - 1), second)
+    assert chosen(kept, second + 0.5) == second
 
 
 def test_who_hears_the_origin_needs_nothing() -> None:
