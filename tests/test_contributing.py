@@ -154,7 +154,9 @@ def test_a_setting_is_one_field(tmp_path: Path) -> None:
         "True",
     ]
     page = (tmp_path / "docs" / "reference" / "parameters.md").read_text(encoding="utf-8")
-    assert page.count("| `warm_up_s` | `0`, ≥\N{NO-BREAK SPACE}0 | s after the start in which nothing is sent |") == 1
+    bounds = "0..1 000 000 000".replace(" ", "\N{NARROW NO-BREAK SPACE}")
+    assert page.count(f"| `warm_up_s` | `0`, {bounds} | s after the start in which nothing is sent |") == 1
     block = (tmp_path / "gr_ros2" / "grc" / "ros2_link.block.yml").read_text(encoding="utf-8")
-    for part in ("label: Warm up (s)", "${ 0 <= warm_up_s }", "warm_up_s=${warm_up_s}", "Warm up: s after the start"):
+    asserted, said = "${ 0 <= warm_up_s <= 1000000000.0 }", "Warm up: s after the start"
+    for part in ("label: Warm up (s)", asserted, "warm_up_s=${warm_up_s}", said):
         assert part in block

@@ -235,7 +235,10 @@ def test_a_planned_packet_length_fits_messages_stamped_by_the_wall_clock() -> No
 
 @pytest.mark.parametrize(
     ("overrides", "says"),
-    [(["phy.name=direct"], "takes no airtime"), (["sim.robots=1", "robots.0.robot=/robot_7"], "has nothing on")],
+    [
+        (["phy.name=direct"], "takes no airtime"),
+        (["sim.robots=1", "robots.0.robot=/robot_7"], "has no message of odom"),
+    ],
 )
 def test_what_cannot_be_planned(overrides: list[str], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
@@ -263,10 +266,10 @@ def test_robots_on_one_channel_are_forecast_together(name: str, duration: float,
 
 
 def test_slots_are_proposed_where_packets_overlap() -> None:
-    plan = planner("two-robots-half-duplex", duration=5.0)
+    plan = planner("two-robots-half-duplex", duration=10.0)
     (slots,) = (advice for advice in plan.advice() if advice.setting == "medium=slots")
     assert slots.harmless
-    followed = planner("two-robots-half-duplex", slots.setting, duration=5.0).forecast()
+    followed = planner("two-robots-half-duplex", slots.setting, duration=10.0).forecast()
     assert followed.used == pytest.approx(slots.forecast.used)
 
 
