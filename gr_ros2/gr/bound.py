@@ -197,7 +197,7 @@ class BoundEnd:
     def granted(self, packets: int, since: float | None) -> int:
         """The radio takes so many further packets; returns how many of them the endpoint with all radios may send."""
         wanted_by = {ALL} if self._main.wants(self._radio) else set()
-        if self._wants():
+        if self.sends and self.source.wants(self._radio):
             wanted_by.add(ALONE)
         with self._lock:
             more = self._credits.grant(packets, wanted_by=wanted_by)
@@ -255,15 +255,7 @@ class BoundEnd:
 
     def _follow(self) -> None:
         """Tell the endpoint how many credits it has."""
-        with self.end.lock:
-            self.end.endpoint.pace.left_with(self._credits.of(ALONE))
-
-    def _wants(self) -> bool:
-        if not self.sends:
-            return False
-        with self.end.lock:
-            at = self.end.endpoint.next_departure(credited=True)
-        return at is not None and at <= self._clock()
+        self.source.used(self._radio, self._credits.of(ALONE))
 
 
 class BoundEnds:
