@@ -27,7 +27,11 @@ def own_addresses() -> list[str]:
 
 def in_url(address: str) -> str:
     """An address as a URL has it. Where every interface serves, one under which others reach it, if there is one."""
-    host = own_addresses()[0] if address in ANY else address
+    return bracketed(own_addresses()[0] if address in ANY else address)
+
+
+def bracketed(host: str) -> str:
+    """A host as a URL has it (RFC 3986, section 3.2.2)."""
     return f"[{host}]" if ":" in host else host
 
 

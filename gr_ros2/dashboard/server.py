@@ -27,7 +27,7 @@ from tornado.web import RequestHandler
 
 from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.dashboard.addresses import ANY, exposed, in_url, own_addresses
+from gr_ros2.dashboard.addresses import ANY, bracketed, exposed, in_url, own_addresses
 from gr_ros2.dashboard.admission import SETTINGS, Admission, BoundedServer, keep
 from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.monitor import TICK_S, RunMonitor
@@ -150,7 +150,7 @@ class Dashboard(Closing, RunMonitor):
             hosts = {self.address, "localhost", name, socket.getfqdn(), *own_addresses()}
             with suppress(OSError):  # the host cannot resolve its own name
                 hosts.update(socket.gethostbyname_ex(name)[2])
-        return [f"{in_url(host)}:{self.port}" for host in sorted(hosts)]
+        return [f"{bracketed(host)}:{self.port}" for host in sorted(hosts)]
 
     def _open(self, document: Document) -> None:
         """Make the page of a new viewer."""
