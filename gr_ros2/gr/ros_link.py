@@ -159,14 +159,17 @@ class RosLink(LinkBlock):
             )
             self.sink = ReceivingBlock(config, published, self.end, graph, **common)
             if ways and isinstance(self.source.ports, RadioPorts):
-                parts = {
-                    "known": heard,
-                    "graph": graph,
-                    "main": self.source,
-                    "ports": self.source.ports,
-                    "observer": observer,
-                }
-                self.bound = self.source.sharing = self.sink.apart = BoundEnds(config, ways, clock=clock, **parts)
+                self.bound = BoundEnds(
+                    config,
+                    ways,
+                    known=heard,
+                    graph=graph,
+                    main=self.source,
+                    ports=self.source.ports,
+                    observer=observer,
+                    clock=clock,
+                )
+                self.source.sharing = self.sink.apart = self.bound
                 self.source.ports.left = self.bound.left
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)

@@ -117,10 +117,6 @@ class Bond:
         """
         return self._lacked[radio] or (waiting and self.carries[radio])
 
-    def spend(self, radio: int) -> None:
-        """A packet leaves over a radio that is not of this endpoint."""
-        self._spend(radio)
-
     def arrive(self, radio: int, data: bytes) -> bool:
         """A packet comes over a radio. False for a copy of one that came over another: the endpoint does not see it.
 
@@ -206,15 +202,15 @@ class Bond:
                 self._held[first] += 1
         carriers = [radio for radio, carries in enumerate(self.carries) if carries]
         chosen = min(carriers, key=lambda radio: (-self._held[radio] - self._promised(radio), self._extra[radio]))
-        self._spend(chosen)
+        self.spend(chosen)
         return chosen
 
     def _promised(self, radio: int) -> int:
         """For how many packets a radio has asked that have not come, beside those that are held."""
         return self._asked.count(radio) - self._owed[radio]
 
-    def _spend(self, radio: int) -> None:
-        """A radio takes a packet that is not the next one for which it has asked."""
+    def spend(self, radio: int) -> None:
+        """A radio takes a packet that is not the next one for which it asked: a copy, or one of another endpoint."""
         self._lacked[radio] = False
         if self._held[radio]:
             self._held[radio] -= 1
@@ -229,5 +225,5 @@ class Bond:
         room = waits or (self.carries[radio] and self._extra[radio] < OUTSTANDING)
         if self._airtimes[radio] and not room:  # without airtime, it never asks
             return False
-        self._spend(radio)
+        self.spend(radio)
         return True
