@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
@@ -14,7 +14,7 @@ from gr_ros2.link.reader import Dissection, Reader
 from gr_ros2.settings.config import MAX_PACKET_LEN, MIN_PACKET_LEN
 from gr_ros2.settings.registry import Registry
 from gr_ros2.state.keys import read_key_file
-from gr_ros2.wire import BROADCAST, QOS_NAMES, Entry, Packet, decode, format_of
+from gr_ros2.wire import BOUND, BROADCAST, QOS_NAMES, Entry, Packet, decode, format_of
 
 _SHOWN = 16
 """Most payload bytes of an entry that are printed."""
@@ -52,17 +52,14 @@ def decode_packets(
     packets = list(_packets(inputs or ("-",), packet_len))
     if not packets:
         raise ConfigError("nothing to decode: the input is empty")
-    # A sender without fixed lengths fills few packets. The longest packet gives the packet length of the link.
-    longest = packet_len or max((len(data) for data, _ in packets if _is_version_1(data)), default=0)
-    reader = Reader(longest, keys)
-    for data, _ in packets:
-        if _is_version_1(data):
-            reader.learn(data)
+    readers = {mark: _reader([data for data, _ in packets], mark, packet_len, keys) for mark in (b"", BOUND)}
     rejected = 0
     for number, (data, expected) in enumerate(packets, start=1):
         try:
             if _is_version_1(data):
-                lines = _looked_at(reader.read(data), data, reader, registry)
+                mark = data[:1] if data.startswith(BOUND) else b""
+                look = readers[mark].read(data.removeprefix(mark))
+                lines = _looked_at(look, data, readers[mark], registry)
             else:
                 lines = _lines(decode(data, expected), expected, registry)
             print(f"packet {number}: " + "\n".join(lines))
@@ -74,8 +71,19 @@ def decode_packets(
         context.exit(1)
 
 
+def _reader(packets: Sequence[bytes], mark: bytes, packet_len: int | None, keys: Sequence[bytes]) -> Reader:
+    """What reads those of some packets of version 1 that have a mark before them, or none."""
+    mine = [data.removeprefix(mark) for data in packets if _is_version_1(data) and data.startswith(BOUND) == bool(mark)]
+    # A sender without fixed lengths fills few packets. The longest packet gives the packet length of the link.
+    longest = packet_len - len(mark) if packet_len else max(map(len, mine), default=0)
+    reader = Reader(longest, keys, bound=bool(mark))
+    for data in mine:
+        reader.learn(data)
+    return reader
+
+
 def _is_version_1(data: bytes) -> bool:
-    return data[:1].hex().startswith(("1", "9"))  # 9: with a block for medium access
+    return data.removeprefix(BOUND)[:1].hex().startswith(("1", "9"))  # 9: with a block for medium access
 
 
 def _packets(inputs: tuple[str, ...], packet_len: int | None) -> Iterator[tuple[bytes, int]]:
@@ -129,6 +137,7 @@ def _looked_at(look: Dissection, data: bytes, reader: Reader, registry: Registry
         content = f"{len(look.combined)} bytes combined: {_preview(look.combined)}"
     else:
         content = f"{len(look.entries)} entries"
+    kind = f"bound to one radio, {kind}" if data.startswith(BOUND) else kind
     yield f"{len(data)} bytes, version 1, {kind}, src {header.src_id}, {to}, {what}, {content}, {look.check}"
     if look.access is not None:
         yield f"  medium access: {look.access.describe()}"

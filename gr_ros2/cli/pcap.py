@@ -21,7 +21,7 @@ import click
 
 from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import ConfigError, RunError
-from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
+from gr_ros2.link.events import BoundPacket, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 
 if TYPE_CHECKING:
     from gr_ros2.observe.observers import LiveRun
@@ -84,12 +84,12 @@ class PacketCapture(Closing):
 
         :raises RunError: when this write fails, or an earlier one has failed
         """
-        if isinstance(event, SentPacket):
+        if isinstance(event, SentPacket | BoundPacket):
             self._write(_SENT, event.data, event.now)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """Write a packet that arrived, accepted or rejected. Errors are the same as in :meth:`sender_event`."""
-        if isinstance(event, Received | Rejected):
+        if isinstance(event, Received | Rejected | BoundPacket):
             self._write(_RECEIVED, event.data, now)
 
     def close(self) -> None:

@@ -34,7 +34,7 @@ from gr_ros2.gr.starts import bound_state_file
 from gr_ros2.link import AirPacket, SentPacket
 from gr_ros2.link.air import Air
 from gr_ros2.link.endpoint import OpenEndpoint
-from gr_ros2.link.events import Announced, Delivered, Lost, ReceiverEvent, SenderEvent
+from gr_ros2.link.events import Announced, BoundPacket, Delivered, Lost, Received, ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.shared_credits import ALL, ALONE, SharedCredits
 from gr_ros2.middleware import Middleware
@@ -70,7 +70,7 @@ def bound_to_none(options: SendOptions) -> bool:
 
 
 class _Told:
-    """Tells an observer what comes out over one radio alone.
+    """Tells an observer what comes out over one radio alone, and the packets.
 
     :param apart: by how much topic ids are greater there
     """
@@ -79,12 +79,16 @@ class _Told:
         self._observer, self._apart = observer, apart
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """Of what leaves, topic ids are not known there."""
+        """Packets that leave; topic ids of what is sent are not known there."""
+        if isinstance(event, SentPacket):
+            self._observer.sender_event(src_id, BoundPacket(BOUND + event.data, event.now))
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """Messages that come out, or do not, and what they are."""
+        """Packets; messages that come out, or do not, and what they are."""
         apart = self._apart
-        if isinstance(event, Delivered | Lost):
+        if isinstance(event, Received | Rejected):
+            self._observer.receiver_event(BoundPacket(BOUND + event.data, now), now)
+        elif isinstance(event, Delivered | Lost):
             self._observer.receiver_event(event._replace(topic_id=event.topic_id + apart), now)
         elif isinstance(event, Announced):
             topics = tuple(row._replace(topic_id=row.topic_id + apart) for row in event.topics)
@@ -144,11 +148,18 @@ class BoundEnd:
             self.end: LiveEnd[OpenEndpoint] = LiveEnd(
                 lambda events: make_endpoint(own, topics, air=way.air, start=self._start, observer=events)
             )
+            told = None if observer is None else _Told(observer, self.apart)
             self.source = LinkSendingBlock(
-                own, topics, self.end, graph, clock=clock, ports=self, takes=lambda options: options.via == way.name
+                own,
+                topics,
+                self.end,
+                graph,
+                observer=told,
+                clock=clock,
+                ports=self,
+                takes=lambda options: options.via == way.name,
             )
             published = known.with_options(config.publish.topics, announced=True)
-            told = None if observer is None else _Told(observer, self.apart)
             self.sink = ReceivingBlock(own, published, self.end, graph, observer=told, clock=clock)
         except GrRos2Error:
             self.close()

@@ -47,6 +47,16 @@ class AirPacket(NamedTuple):
     snr_db: float | None = None
 
 
+class BoundPacket(NamedTuple):
+    """A packet of an endpoint that has one radio of its robot alone left or came: its bytes on the air, and when, s.
+
+    Other observers than a capture know packets by their numbers, which are those of the endpoint with all radios.
+    """
+
+    data: bytes
+    now: float
+
+
 class Received(NamedTuple):
     """A packet arrived: its bytes, their meaning, and the fields of its name. Events that it causes follow it.
 
@@ -143,7 +153,7 @@ class Announced(NamedTuple):
     topics: tuple[AnnouncedTopic, ...]
 
 
-ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced
+ReceiverEvent = Received | Rejected | Delivered | Lost | Met | Gone | Announced | BoundPacket
 
 
 class Accepted(NamedTuple):
@@ -244,4 +254,4 @@ class SentPacket(NamedTuple):
         return PacketId(self.src_id, self.boot, self.number, self.repair_id)
 
 
-SenderEvent = Accepted | Refused | Missed | Ended | SentPacket
+SenderEvent = Accepted | Refused | Missed | Ended | SentPacket | BoundPacket

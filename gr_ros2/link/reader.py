@@ -108,12 +108,14 @@ class Reader:
 
     :param packet_len: bytes of the longest packet on the link
     :param keys: 32 bytes each; empty if no sealed packet is to be opened
+    :param bound: whether the packets are those of endpoints that have one radio alone, without the byte before them
     :raises ConfigError: a key of another length
     """
 
-    def __init__(self, packet_len: int, keys: Sequence[bytes] = ()) -> None:
+    def __init__(self, packet_len: int, keys: Sequence[bytes] = (), *, bound: bool = False) -> None:
         self._packet_len = max(packet_len, MIN_PACKET_LEN)
-        self._keys = Keys(keys, "encrypt") if keys else None
+        fleet = Keys(keys, "encrypt") if keys else None
+        self._keys = fleet.bound() if bound and fleet is not None else fleet
         self._starts: dict[int, list[_AnnouncedStart]] = {}
         self._current: dict[int, int] = {}
         """The boot number of each robot that is heard now, by its id."""

@@ -16,7 +16,7 @@ from gr_ros2.core.backlog import Backlog
 from gr_ros2.core.errors import RunError
 from gr_ros2.core.guard import Guard
 from gr_ros2.link.clocks import ClockOffset
-from gr_ros2.link.events import Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
+from gr_ros2.link.events import BoundPacket, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.link.observe import LinkObserver, Observers, name_of
 from gr_ros2.observe.result import RunResult
@@ -310,4 +310,4 @@ def _size(event: SenderEvent | ReceiverEvent) -> int:
     """Bytes of the packet or message that an event holds. A packet counts twice: as bytes and as payloads."""
     if isinstance(event, SentPacket | Received):
         return 2 * len(event.data)
-    return len(event.data) if isinstance(event, Rejected) else len(getattr(event, "payload", b""))
+    return len(event.data) if isinstance(event, Rejected | BoundPacket) else len(getattr(event, "payload", b""))

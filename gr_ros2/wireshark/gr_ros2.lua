@@ -18,9 +18,12 @@ local PLACES = { [0] = "whole message", [1] = "first fragment", [2] = "middle fr
 local CONTROLS = { [0xF6] = "left out", [0xF7] = "waited", [0xF8] = "hello", [0xF9] = "ask", [0xFA] = "report", [0xFB] = "heard", [0xFC] = "ping", [0xFD] = "about",
     [0xFE] = "newest" }
 local BROADCAST, MOST_BLOCK = 255, 12
+-- The byte before a packet that is bound to one radio, whose robot has starts, numbers and topics of its own there.
+local BOUND, APART = 0x20, 256
 local CRC_LEN, HEADER_LEN, ENTRY_HEADER_LEN = 2, 5, 5
 
 local f = {
+    bound = ProtoField.uint8("gr_ros2.bound", "Bound to one radio", base.HEX),
     version = ProtoField.uint8("gr_ros2.version", "Version", base.DEC, nil, 0x70),
     qos = ProtoField.uint8("gr_ros2.qos", "QoS", base.DEC, QOS, 0x0C),
     compressed = ProtoField.bool("gr_ros2.compressed", "Compressed (C)", 8, nil, 0x02),
@@ -196,11 +199,11 @@ function proto.prefs_changed()
 end
 
 -- What was heard so far of the senders of version 1, filled as the packets are read for the first time.
-local starts, frames, tables, announced, longest = {}, {}, {}, {}, 0
+local starts, frames, tables, announced, longest = {}, {}, {}, {}, {}
 
 function proto.init()
     read_registry(proto.prefs.registry)
-    starts, frames, tables, announced, longest = {}, {}, {}, {}, 0
+    starts, frames, tables, announced, longest = {}, {}, {}, {}, {}
 end
 
 -- CRC-16, polynomial 0x1021, init 0, not reflected, no final xor.
@@ -823,7 +826,8 @@ local function dissect_block(buffer, tree, at, limit)
     return at + size
 end
 
-local function dissect_v1(buffer, pinfo, tree)
+-- A packet of version 1; `apart` is what a robot's number is greater by among those whose starts and topics are known.
+local function dissect_v1(buffer, pinfo, tree, apart)
     local first = buffer(0, 1):uint()
     local sealed, addressed = math.floor(first / 8) % 2 == 1, math.floor(first / 4) % 2 == 1
     local header, trailer = addressed and 6 or 4, sealed and 8 or 4
@@ -847,9 +851,9 @@ local function dissect_v1(buffer, pinfo, tree)
     local first_time = not frame
     frame = frame or {}
     frames[pinfo.number] = frame
-    longest = math.max(longest, buffer:len())
+    longest[apart] = math.max(longest[apart] or 0, buffer:len())
     local packet = {
-        src = buffer(1, 1):uint(), low = buffer(2, 2):uint(), sealed = sealed, frame = frame, first_time = first_time,
+        src = buffer(1, 1):uint() + apart, low = buffer(2, 2):uint(), sealed = sealed, frame = frame, first_time = first_time,
     }
     local repair, shares = first % 4 == 3, first > 127
     local at, window, clear = header, nil, false
@@ -896,7 +900,7 @@ local function dissect_v1(buffer, pinfo, tree)
         tree:add(f.combined, buffer(at, limit - at))
         summary = { string.format("of %d..%d", packet.number - window + 1, packet.number) }
     elseif at < limit then
-        local packet_len = math.max(proto.prefs.packet_len, longest)
+        local packet_len = math.max(proto.prefs.packet_len - (apart > 0 and 1 or 0), longest[apart])
         local room = packet_len - header - 2 - trailer - (shares and MOST_BLOCK or 0)
         -- Without the preference: where all packets are as long as this one, the longest body ends 2 bytes before the trailer; where a sender
         -- sends only what is needed, it ends with the longest packet's.
@@ -906,18 +910,22 @@ local function dissect_v1(buffer, pinfo, tree)
         packet.short, packet.filled = limit - at < room, at + room
         summary = dissect_body(buffer, tree, packet, at, limit)
     end
-    pinfo.cols.src = "robot " .. packet.src
+    pinfo.cols.src = "robot " .. buffer(1, 1):uint()
     pinfo.cols.dst = addressed and "robot " .. buffer(4, 1):uint() or "broadcast"
     pinfo.cols.info = string.format(
-        "%s %d%s  %s", KINDS[kind], packet.number, intact and "" or " CRC mismatch", table.concat(summary, " "))
+        "%s%s %d%s  %s", apart > 0 and "bound " or "", KINDS[kind], packet.number, intact and "" or " CRC mismatch", table.concat(summary, " "))
     return buffer:len()
 end
 
 function proto.dissector(buffer, pinfo, root)
     pinfo.cols.protocol = "gr-ros2"
     local tree = root:add(proto, buffer())
+    if buffer:len() > 1 and buffer(0, 1):uint() == BOUND then
+        tree:add(f.bound, buffer(0, 1))
+        return 1 + dissect_v1(buffer(1):tvb(), pinfo, tree, APART)
+    end
     if buffer:len() > 0 and buffer(0, 1):bitfield(1, 3) == 1 then
-        return dissect_v1(buffer, pinfo, tree)
+        return dissect_v1(buffer, pinfo, tree, 0)
     end
     return dissect_v0(buffer, pinfo, tree)
 end

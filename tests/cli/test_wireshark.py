@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from gr_ros2.cli.main import run
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.core.errors import ConfigError, WireError
-from gr_ros2.link.events import PacketId, Received, SentPacket
+from gr_ros2.link.events import BoundPacket, PacketId, Received, SentPacket
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.registry import Registry
+from gr_ros2.wire import BOUND
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.relayed import read_relayed
 from gr_ros2.wire.v0 import V0, PacketV0, with_crc
@@ -300,6 +302,21 @@ def test_a_conversation_is_read_with_the_topics_that_it_announces(mode: SealMode
     else:
         assert 0 < hidden < len(packets)
         assert not named
+
+
+@needs_tshark
+def test_what_is_bound_to_one_radio_has_starts_numbers_and_topics_of_its_own(tmp_path: Path) -> None:
+    packets, bound = talk("none"), [BOUND + data for data in talk("none", restart=True)]
+    path = tmp_path / "bound.pcapng"
+    with PacketCapture(path, clock=lambda: 0.0) as writing:
+        for number, (data, own) in enumerate(zip_longest(packets, bound)):
+            for event in filter(None, (data and Received(data, NOTHING, *NOBODY), own and BoundPacket(own, 0.0))):
+                writing.receiver_event(event, number / 75)
+    assert not tshark(path, "-Y", "_ws.expert")
+    assert tshark(path, "-V").count("(correct)") == len(packets) + len(bound)
+    assert tshark(path, "-Y", "gr_ros2.bound == 0x20").count("\n") == len(bound)
+    assert tshark(path, "-Y", 'gr_ros2.topic == "scan" and !gr_ros2.bound').count("\n") == 10
+    assert tshark(path, "-Y", 'gr_ros2.topic == "scan" and gr_ros2.bound').count("\n") == 10
 
 
 def test_the_documentation_lists_the_fields_of_version_1() -> None:

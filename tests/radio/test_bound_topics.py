@@ -12,6 +12,8 @@ import pytest
 
 from gr_ros2.cli.bag import OutputBag
 from gr_ros2.cli.link import _live
+from gr_ros2.cli.main import run
+from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.status import radio_words
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import AirPacket
@@ -115,6 +117,28 @@ def test_a_bag_has_what_came_over_one_radio_alone_and_over_all(tmp_path: Path, c
     found = [(each.topic, each.payload) for each in read_bag(tmp_path / "bag")]
     assert sorted(found) == sorted([("/rx_robot_1/news", told), *(("/rx_robot_1/chat", each) for each in said)])
     assert bag.incomplete() == []
+
+
+@pytest.mark.parametrize("sealed", [False, True])
+def test_a_capture_has_what_went_over_one_radio_alone(
+    tmp_path: Path, closing: ExitStack, sealed: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys = key(tmp_path) if sealed else {}
+    paths = [tmp_path / f"{number}.pcapng" for number in (1, 2)]
+    first, second = (closing.enter_context(PacketCapture(path)) for path in paths)
+    team = Team(tmp_path, (FAST, FAST), closing, second={"observer": second}, topics=CHAT, observer=first, **keys)
+    team.talk(0, 3)
+    for robot in team.robots:
+        robot.link.stop()
+    for path in paths:
+        options = ["--key", str(tmp_path / "key")] if sealed else []
+        assert run(["packet", "decode", str(path), "--packet-len", "64", *options]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert not [line for line in lines if "not opened" in line or "not checked" in line]
+        bound = [line for line in lines if "bound to one radio, source" in line]
+        assert {line.partition("src ")[2][0] for line in bound} == {"1", "2"}
+        assert len([line for line in lines if ": topic 0" in line]) > 2
+        assert [line for line in lines if "version 1, control" in line], "what leaves over both"
 
 
 @pytest.mark.parametrize("sealed", [False, True])
