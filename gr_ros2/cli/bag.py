@@ -27,7 +27,7 @@ from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import BagError, GrRos2Error, WireError
 from gr_ros2.core.files import make_folder
 from gr_ros2.core.names import link_node
-from gr_ros2.link.events import Announced, Delivered, Lost, ReceiverEvent, SenderEvent
+from gr_ros2.link.events import APART, Announced, Delivered, Lost, ReceiverEvent, SenderEvent
 from gr_ros2.link.key import Key
 from gr_ros2.middleware.base import Qos
 from gr_ros2.radio.lost_messages import LOST_TYPE, lost_definition, lost_event
@@ -141,10 +141,11 @@ class OutputBag(Closing):
             self._count(f"not_recorded:robot {event.src_id}", str(error))
             return
         boot = event.key.boot if isinstance(event.key, Key) else 0
+        apart = event.topic_id // APART * APART
         clock = run.clocks().get(event.src_id)
         for each in found:
             if isinstance(each, Missing):
-                self._note_lost(run, event.src_id, each.topic_id, each.count)
+                self._note_lost(run, event.src_id, each.topic_id + apart, each.count)
                 continue
             known = self._is_known((event.src_id, boot, each.serial))
             if each.began is not None:
@@ -153,7 +154,7 @@ class OutputBag(Closing):
                 known = self._is_known(name) or known
             if not known:
                 made = each.made_us * 1e-6 - (0.0 if clock is None else clock.ahead_s)
-                self._write(run, (event.src_id, each.topic_id), made, came, each.payload)
+                self._write(run, (event.src_id, each.topic_id + apart), made, came, each.payload)
 
     def _is_known(self, name: _Name) -> bool:
         """Whether a message of this name is in the bag; from now on it is."""

@@ -307,7 +307,7 @@ def _live(running: RobotLink) -> LiveRun:
         alarms=running.findings.alarms,
         clocks=running.clocks,
         wishes=running.wishes if running.calls is not None else None,
-        calls=running.calls,
+        calls=running if running.calls is not None else None,
         wants_key=partial(_key_frame, running),
         hears_always=running.phy.has_samples and running.front_end.hears_always,
     )

@@ -13,6 +13,9 @@ that comes over it, so that a robot takes what others have bound. That one sends
 *Observers* are told what comes out. So that topic ids of several endpoints are not mixed up, those of a radio's own are
 greater by ``APART`` times the number of the radio, counted from 1.
 
+*Services* that are bound are announced and called there, and what fills gaps (:mod:`gr_ros2.gr.backfill`) crosses
+there. What is offered and bound is asked for over all radios, and sent over its own.
+
 *Airtime.* The credits of the radio are for both endpoints, see :mod:`gr_ros2.link.shared_credits`.
 """
 
@@ -25,6 +28,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from gr_ros2.core.errors import GrRos2Error
+from gr_ros2.gr.backfill import LiveBackfill
+from gr_ros2.gr.calls import LiveCalls, has_room_for_calls
 from gr_ros2.gr.factory import make_endpoint, start_of
 from gr_ros2.gr.link_sending import LinkSendingBlock
 from gr_ros2.gr.live_end import LiveEnd
@@ -34,17 +39,25 @@ from gr_ros2.gr.starts import bound_state_file
 from gr_ros2.link import AirPacket, SentPacket
 from gr_ros2.link.air import Air
 from gr_ros2.link.endpoint import OpenEndpoint
-from gr_ros2.link.events import Announced, BoundPacket, Delivered, Lost, Received, ReceiverEvent, Rejected, SenderEvent
+from gr_ros2.link.events import (
+    APART,
+    Announced,
+    BoundPacket,
+    Delivered,
+    Lost,
+    Received,
+    ReceiverEvent,
+    Rejected,
+    SenderEvent,
+)
 from gr_ros2.link.observe import LinkObserver
 from gr_ros2.link.shared_credits import ALL, ALONE, SharedCredits
 from gr_ros2.middleware import Middleware
 from gr_ros2.settings.config import BOUND_TO_NONE, SendOptions
 from gr_ros2.settings.registry import Registry, Topic
-from gr_ros2.settings.robot import BackfillConfig, RobotConfig
+from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.wire import BOUND
 
-APART = 256
-"""Between the topic ids of two endpoints of a robot, as observers see them."""
 _log = logging.getLogger(__name__)
 
 
@@ -109,7 +122,12 @@ class BoundEnd:
     :raises GrRos2Error: when it cannot be made
     :ivar named: whether a topic of this robot is bound to the radio
     :ivar sends: whether it sends now
+    :ivar calls: its services; None where it goes one way, or topics leave no room for calls
+    :ivar backfill: what crosses later; None where nothing does
     """
+
+    calls: LiveCalls | None = None
+    backfill: LiveBackfill | None = None
 
     def __init__(
         self,
@@ -130,12 +148,11 @@ class BoundEnd:
             config,
             topics=config.topics if self.named else {},
             offer={},
-            services=False,
-            backfill=BackfillConfig(),
             packet_len=way.packet_len - len(BOUND),
             state=str(bound_state_file(config.state, config.robot_id, radio)),
         )
         topics = known if own.sends else Registry.empty()
+        calls = way.air.hears and has_room_for_calls(topics)
         self._lock = threading.Lock()
         """Guards the credits, and whether it sends. While it is held, that of an endpoint may be taken, not the other
         way round."""
@@ -146,7 +163,7 @@ class BoundEnd:
         self._start = counted if counted.keys is None else replace(counted, keys=counted.keys.bound())
         try:
             self.end: LiveEnd[OpenEndpoint] = LiveEnd(
-                lambda events: make_endpoint(own, topics, air=way.air, start=self._start, observer=events)
+                lambda events: make_endpoint(own, topics, air=way.air, start=self._start, observer=events, calls=calls)
             )
             told = None if observer is None else _Told(observer, self.apart)
             self.source = LinkSendingBlock(
@@ -161,6 +178,10 @@ class BoundEnd:
             )
             published = known.with_options(config.publish.topics, announced=True)
             self.sink = ReceivingBlock(own, published, self.end, graph, observer=told, clock=clock)
+            if calls:
+                self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
+                if self.named and config.backfill.topics:
+                    self.backfill = LiveBackfill(config, self.end, self.source, share=way.air.airtime_share)
         except GrRos2Error:
             self.close()
             raise
@@ -194,7 +215,7 @@ class BoundEnd:
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
-        for part in (getattr(self, "source", None), getattr(self, "sink", None)):
+        for part in (self.backfill, self.calls, getattr(self, "source", None), getattr(self, "sink", None)):
             if part is not None:
                 part.close()
         self._start.close()
@@ -215,12 +236,14 @@ class BoundEnd:
             self.source.grant(more[ALONE], since)
         return more[ALL]
 
-    def others_left(self, packets: int) -> None:
-        """The endpoint with all radios has sent so many packets over this one."""
+    def others_left(self, packets: Sequence[SentPacket]) -> None:
+        """The endpoint with all radios has sent packets over this one."""
+        with self.end.lock:
+            self.end.endpoint.used_air.others_left(packets, self._clock())
         if not self._paced:
             return
         with self._lock:
-            for _ in range(packets):
+            for _ in packets:
                 self._credits.left(ALL)
             self._follow()
 
@@ -251,7 +274,13 @@ class BoundEnd:
         now = self._clock()
         with self.end.lock:
             heard = [peer.robot for peer in self.end.endpoint.peers(now) if not peer.silent]
-        return {"source": self.source.stats(), "sink": self.sink.stats(), "heard": heard}
+        return {
+            "source": self.source.stats(),
+            "sink": self.sink.stats(),
+            "heard": heard,
+            "calls": {} if self.calls is None else self.calls.stats(),
+            "backfill": {} if self.backfill is None else self.backfill.stats(),
+        }
 
     def _begin(self) -> None:
         """Send, if there is a reason."""
@@ -330,8 +359,8 @@ class BoundEnds:
         end = self._ends.get(radio)
         return packets if end is None else end.granted(packets, since)
 
-    def left(self, radio: int, packets: int) -> None:
-        """The endpoint with all radios has sent so many packets over one."""
+    def left(self, radio: int, packets: Sequence[SentPacket]) -> None:
+        """The endpoint with all radios has sent packets over one."""
         end = self._ends.get(radio)
         if end is not None and packets:
             end.others_left(packets)
@@ -345,6 +374,15 @@ class BoundEnds:
     def sources(self) -> list[LinkSendingBlock]:
         """What sends topics of this robot."""
         return [end.source for end in self._ends.values() if end.named]
+
+    def source_of(self, via: str) -> LinkSendingBlock | None:
+        """What sends over a radio alone, by its name."""
+        return next((end.source for end in self._ends.values() if end.named and end.way.name == via), None)
+
+    @property
+    def calls(self) -> list[LiveCalls]:
+        """The services of each."""
+        return [end.calls for end in self._ends.values() if end.calls is not None]
 
     def set_topics(self, topics: Any) -> None:
         """Use other options of single topics from now on."""
@@ -381,5 +419,5 @@ class BoundEnds:
 
 
 def names_of(config: RobotConfig) -> set[str]:
-    """The radios that topics of a robot name."""
-    return {options.via for options in config.options.values()} - BOUND_TO_NONE
+    """The radios that topics of a robot name, and what it offers."""
+    return {options.via for options in (*config.options.values(), *config.offer.values())} - BOUND_TO_NONE

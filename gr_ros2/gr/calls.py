@@ -35,7 +35,7 @@ from gr_ros2.link.events import Gone, Met
 from gr_ros2.middleware import Middleware
 from gr_ros2.middleware.services import ServiceClient, ServiceGraph, ServiceServer
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import CALLS_TYPE, FILLER_TYPE, INTERNAL_TYPES, Topic
+from gr_ros2.settings.registry import CALLS_TYPE, FILLER_TYPE, INTERNAL_TYPES, MAX_TOPICS, Registry, Topic
 
 DEADLINE_S = 30.0
 """s that a call waits for its reply, unless ``deadline_s`` of its service says otherwise."""
@@ -365,6 +365,11 @@ class LiveCalls:
             first = self._counters[counter] == 1
         if first:
             _log.warning("calls: %s (counted as %s)", error, counter)
+
+
+def has_room_for_calls(topics: Registry) -> bool:
+    """Whether these topics leave one for requests and replies, or were made to."""
+    return len(topics) < MAX_TOPICS or bool(topics.services)
 
 
 def _deadline(topic: Topic) -> float:

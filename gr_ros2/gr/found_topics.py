@@ -126,10 +126,11 @@ class FoundTopics:
             return [choice.everything]
         return unseen + self._subscriptions.unmatched()
 
-    def begin(self, offered: OpenTopic, rate: float) -> None:
+    def begin(self, offered: OpenTopic, rate: float, options: Mapping[str, SendOptions]) -> None:
         """Send something that is offered, or send it with another rate.
 
         :param rate: messages/s at most; 0 = as they come
+        :param options: of what is offered
         :raises GrRos2Error: when it cannot be sent
         """
         with self._changing:
@@ -138,7 +139,7 @@ class FoundTopics:
             if offered.info is None:
                 for row in offered.rows:
                     if not self._is_offered(row):
-                        self._add_services(offered.name, row, self._config.offer)
+                        self._add_services(offered.name, row, options)
             elif sent is not None and sent.type_name == normalize_type(offered.type_name):
                 subscriptions.use(name, offered.at(rate))
             else:
@@ -188,7 +189,7 @@ class FoundTopics:
                 self._leave_out(info.topic, f"topic {info.topic} is not sent", error)
 
     def _takes(self, row_name: str) -> bool:
-        """Whether a topic is sent here, and not over one radio alone."""
+        """Whether a topic or service is sent here, and not by another endpoint of the robot."""
         subscriptions = self._subscriptions
         return subscriptions.takes(options_of(row_name, subscriptions.options, DEFAULT_OPTIONS))
 
@@ -196,6 +197,8 @@ class FoundTopics:
         for row in rows:
             row_name = self.choice.row_name(row.name, hidden=row.of_node)
             if row_name is None or self._is_offered(row) or f"{row.name} {row.kind}" in self.left_out:
+                continue
+            if not self._takes(row_name):
                 continue
             if not uncallable.isdisjoint(parts(row.name, row.kind)):
                 if not self.not_offered:
@@ -225,7 +228,8 @@ class FoundTopics:
                 self._is_offered(row) and row.name not in sent
             )
             if name and not anyway and row.name not in {info.topic for info in infos}:
-                before = found.get(name.lstrip("/"), OpenTopic(name, row.name))
+                options = options_of(name, self._config.offer, DEFAULT_OPTIONS)
+                before = found.get(name.lstrip("/"), OpenTopic(name, row.name, options=options))
                 found[name.lstrip("/")] = replace(before, rows=(*before.rows, row))
         return found
 

@@ -61,6 +61,17 @@ class LinkSendingBlock(SendingBlock):
             self.found.stop()
         super().close()
 
+    def measure_air(self) -> None:
+        """Count from now on how much of the air is used."""
+        with self._lock:
+            self._end.used_air.on = True
+
+    def air_for(self, size: float) -> tuple[float, float]:
+        """Bytes of the air that a message of so many bytes takes, and bytes/s that are free."""
+        with self._lock:
+            air = self._end.used_air
+            return air.cost(size), air.free(self.clock())
+
     @property
     def live_options(self) -> Sequence[str]:
         """Options of a topic that may change while it runs."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from gr_ros2.gr.pmts import PduMaker
@@ -34,8 +34,8 @@ class RadioPorts:
         """Two threads send over a radio that another endpoint has alone; what is behind the port knows one."""
         self._bond, self._lock, self._registry = bond, lock, registry
         self._pdus = PduMaker()
-        self.left: Callable[[int, int], None] = lambda _radio, _packets: None
-        """Called with a radio and how many packets have left over it, without the lock."""
+        self.left: Callable[[int, Sequence[SentPacket]], None] = lambda _radio, _packets: None
+        """Called with a radio and the packets that have left over it, without the lock."""
 
     def find_readers(self) -> bool:
         """Find what reads the ports; returns whether something reads each of them."""
@@ -49,7 +49,7 @@ class RadioPorts:
         """
         if self._bond is None:
             self._send_over(0, packets, adaptive)
-            self.left(0, len(packets))
+            self.left(0, packets)
             return
         shares: list[list[SentPacket]] = [[] for _ in self._ports]
         with self._lock:
@@ -58,7 +58,7 @@ class RadioPorts:
                     shares[radio].append(sent)
         for radio, share in enumerate(shares):
             self._send_over(radio, share, adaptive)
-            self.left(radio, len(share))
+            self.left(radio, share)
 
     def send_bound(self, radio: int, packets: list[SentPacket], *, adaptive: bool) -> None:
         """Send packets of the endpoint that has one radio alone. Called without a lock."""

@@ -20,7 +20,7 @@ from gr_ros2.core.errors import ConfigError, GrRos2Error
 from gr_ros2.core.names import link_node
 from gr_ros2.gr.backfill import LiveBackfill
 from gr_ros2.gr.bound import BoundEnds, OwnWay, bound_to_none
-from gr_ros2.gr.calls import LiveCalls
+from gr_ros2.gr.calls import LiveCalls, has_room_for_calls
 from gr_ros2.gr.factory import Start, make_endpoint, start_of
 from gr_ros2.gr.link_sending import LinkSendingBlock
 from gr_ros2.gr.live_end import LiveEnd
@@ -39,7 +39,7 @@ from gr_ros2.middleware import Middleware, joined
 from gr_ros2.phy.pdus import port_of
 from gr_ros2.settings.config import airtime_from
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import MAX_TOPICS, Registry, check_outputs
+from gr_ros2.settings.registry import Registry, check_outputs
 from gr_ros2.settings.robot import ONE_RADIO, RobotConfig, robot_from
 
 
@@ -133,7 +133,7 @@ class RosLink(LinkBlock):
         if known is None:
             known = Registry.from_csv(config.registry) if config.registry else Registry.empty()
         topics = known if config.sends else Registry.empty()
-        calls = config.direction == "both" and not loops_back and (len(topics) < MAX_TOPICS or bool(topics.services))
+        calls = config.direction == "both" and not loops_back and has_room_for_calls(topics)
         if config.offer and not calls:
             raise ConfigError(
                 "offer: nobody can ask over this link, which has no room or no way for calls; leave it out"
@@ -173,7 +173,14 @@ class RosLink(LinkBlock):
                 self.source.ports.left = self.bound.left
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
-                self.wishes = LiveWishes(config, self.end, self.calls, self.source.found, graph, clock=clock)
+                self.wishes = LiveWishes(
+                    config,
+                    self.calls,
+                    self.source,
+                    graph,
+                    clock=clock,
+                    alone=None if self.bound is None else self.bound.source_of,
+                )
                 self.throughput = LiveThroughput(
                     config, self.end, self.calls, self.sink, share=air.airtime_share, clock=clock
                 )

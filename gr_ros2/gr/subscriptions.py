@@ -90,7 +90,9 @@ class Subscriptions:
         self.subscribed = {
             topic.on_graph(config.namespace): topic for topic in chosen if topic.is_topic and takes(topic.options)
         }
-        self.services = {topic.on_graph(config.namespace): topic for topic in chosen if topic.is_service}
+        self.services = {
+            topic.on_graph(config.namespace): topic for topic in chosen if topic.is_service and takes(topic.options)
+        }
 
     def open(self) -> None:
         """Subscribe to all topics.

@@ -39,12 +39,12 @@ from gr_ros2.calls.wishes import PATIENCE_S, HeldWishes, OwnWish, OwnWishes
 from gr_ros2.core.errors import ConfigError, GrRos2Error, WireError
 from gr_ros2.core.names import topic_fault
 from gr_ros2.gr.calls import LiveCalls
-from gr_ros2.gr.found_topics import FoundTopics
-from gr_ros2.gr.live_end import LiveEnd
+from gr_ros2.gr.link_sending import LinkSendingBlock
 from gr_ros2.gr.offers import Measurements, OpenTopic
-from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.middleware import Middleware
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.fields import AUTO
+from gr_ros2.settings.registry import DEFAULT_OPTIONS
 from gr_ros2.settings.robot import RobotConfig
 
 LOOK_S = 1.0
@@ -80,21 +80,23 @@ class _List:
 class LiveWishes:
     """The wishes of both directions of one robot's link.
 
-    :param end: its endpoint
-    :param found: what may be asked for, which sends it
+    :param source: sends what is asked for, and knows what may be
+    :param alone: what sends over one radio alone, by the name of the radio
     """
 
     def __init__(
         self,
         config: RobotConfig,
-        end: LiveEnd[OpenEndpoint],
         calls: LiveCalls,
-        found: FoundTopics,
+        source: LinkSendingBlock,
         graph: Middleware,
         *,
         clock: Callable[[], float],
+        alone: Callable[[str], LinkSendingBlock | None] | None = None,
     ) -> None:
-        self._config, self._end, self._calls, self._found, self._clock = config, end, calls, found, clock
+        self._config, self._calls, self._source, self._clock = config, calls, source, clock
+        self._alone = alone or (lambda _via: None)
+        self._found = source.found
         self._closed = threading.Event()
         self._measurements = Measurements(graph, clock, self._closed, coded=config.compression)
         self._due = threading.Condition()
@@ -111,7 +113,8 @@ class LiveWishes:
         self._look_at = inf
         self._thread: threading.Thread | None = None
         if config.offer:
-            end.endpoint.used_air.on = True
+            for options in (DEFAULT_OPTIONS, *config.offer.values()):
+                self._sender(options).measure_air()
             if not config.key:
                 _log.warning(
                     "what offer names can be asked for by whoever can send on this link, as it has no key; set key"
@@ -325,9 +328,7 @@ class LiveWishes:
         if offered.info is None or offered.fits:
             return WishAnswer(WishOutcome.SENT, rate)
         measured = self._measurements.measure([offered])[offered.name]
-        now, air = self._clock(), self._end.endpoint.used_air
-        with self._end.lock:
-            each, free = air.cost(measured.size), air.free(now)
+        each, free = self._sender(offered.options).air_for(measured.size)
         comes = measured.rate
 
         def takes(most: float) -> float:
@@ -345,18 +346,23 @@ class LiveWishes:
         with self._due:
             wanted = self._held.wanted(self._clock())
         for name in [name for name in self._sent if name not in wanted]:
-            self._found.end(self._sent.pop(name)[0])
+            ended, _ = self._sent.pop(name)
+            self._sender(ended.options).found.end(ended)
         for name, rate in wanted.items():
             offered, (sent, sent_at) = self._found.offers.get(name), self._sent.get(name, (None, inf))
             if offered is None or (sent is not None and sent.type_name == offered.type_name and sent_at == rate):
                 continue
             try:
-                self._found.begin(offered, rate)
+                self._sender(offered.options).found.begin(offered, rate, self._config.offer)
                 self._sent[name] = offered, rate
             except GrRos2Error as error:
                 self._counters["failed"] += 1
                 if self._counters["failed"] == 1:
                     _log.warning("%s is asked for and not sent: %s", name, error)
+
+    def _sender(self, options: SendOptions) -> LinkSendingBlock:
+        """What sends a topic with these options."""
+        return self._alone(options.via) or self._source
 
     # ---- the thread
 

@@ -292,6 +292,9 @@ class AirMeter(Protocol):
     def cost(self, size: float) -> float:
         """bytes that a message of so many bytes takes."""
 
+    def others_left(self, packets: Sequence[SentPacket], now: float) -> None:
+        """Packets of another endpoint have left over the same radio."""
+
     def leave_out(self, topic_id: int) -> None:
         """A topic is made to fit what others leave: what it uses does not count as used."""
 

@@ -47,6 +47,11 @@ class AirPacket(NamedTuple):
     snr_db: float | None = None
 
 
+APART = 256
+"""Between the topic ids of two endpoints of a robot, as observers see them: the one that has all radios and those that
+have one alone."""
+
+
 class BoundPacket(NamedTuple):
     """A packet of an endpoint that has one radio of its robot alone left or came: its bytes on the air, and when, s.
 

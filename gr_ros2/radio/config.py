@@ -195,10 +195,8 @@ class LinkConfig(AirConfig, RobotConfig):
             for word, options in chosen.items():
                 if (via := options.via) in BOUND_TO_NONE:
                     continue
-                if part == "offer":
-                    raise ValueError(f"offer.{word}.via = {via!r}: only what is sent anyway can have one radio alone")
                 if via not in lengths:
-                    raise ValueError(f"topics.{word}.via = {via!r}: best, all, or one of {', '.join(lengths)}")
+                    raise ValueError(f"{part}.{word}.via = {via!r}: best, all, or one of {', '.join(lengths)}")
                 if lengths[via] < least + len(BOUND):
                     raise ValueError(
                         f"packet_len = {lengths[via]} of radio {via}: topics bound to it need {least + len(BOUND)}"

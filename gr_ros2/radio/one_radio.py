@@ -215,15 +215,17 @@ def together(bond: Bond, radios: Sequence[OneRadio], each: Sequence[Mapping[str,
 def join_bound(
     halves: dict[str, dict[str, Any]], radios: Mapping[str, Any], names: Sequence[str], bound: Mapping[int, Any]
 ) -> None:
-    """Count what goes over one radio alone too: its packets and its topics, and of each of several radios what is bound
-    to it.
+    """Count what goes over one radio alone too: its packets, topics and services, and of each of several radios what is
+    bound to it.
 
-    :param halves: the statistics of both halves of the link
+    :param halves: the statistics of both halves of the link, its ``calls`` and ``backfill``
     :param names: of the radios
     :param bound: what the endpoints that have one radio alone say, by its number
     """
     for number, stats in bound.items():
         source, sink = halves["source"], halves["sink"]
+        for part in ("calls", "backfill"):
+            halves[part] = _added(halves[part], stats[part])
         source["air"] = dict(Counter(source["air"]) + Counter(stats["source"]["air"]))
         for half, counters in (("source", _SENT), ("sink", _CAME)):
             for name in counters:
@@ -246,6 +248,18 @@ def join_bound(
 
 def _sum(parts: Sequence[Mapping[str, Any]], name: str) -> Any:
     return sum(part[name] for part in parts)
+
+
+def _added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Counters, lists of names and counters by name, of two parts together; either may be empty."""
+    found = {**other, **one}
+    for name in one.keys() & other.keys():
+        both = one[name], other[name]
+        if isinstance(both[0], Mapping):
+            found[name] = dict(Counter(both[0]) + Counter(both[1]))
+        else:
+            found[name] = sorted(both[0] + both[1]) if isinstance(both[0], list) else both[0] + both[1]
+    return found
 
 
 def _merged(parts: Sequence[Mapping[str, Any]], name: str) -> dict[str, int]:

@@ -19,6 +19,7 @@ from typing import Any
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.watch import Watch
+from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
 from gr_ros2.gr.throughput import LiveThroughput
@@ -283,6 +284,24 @@ class RobotLink(Flowgraph):
         end = None if bound is None else bound.end_of(topic_id)
         return (self.sink.live, topic_id) if end is None else (end.end, topic_id - end.apart)
 
+    def reached(self) -> dict[str, str]:
+        """As :meth:`LiveCalls.reached`, over any of its radios."""
+        return {name: kind for calls in self._all_calls for name, kind in calls.reached().items()}
+
+    def call(self, name: str, payload: bytes) -> bytes:
+        """As :meth:`LiveCalls.call`.
+
+        :raises MiddlewareError: there is no such service, or no reply has come in time
+        """
+        calls = [*self._all_calls]
+        return next((each for each in calls if name in each.reached()), calls[0]).call(name, payload)
+
+    @property
+    def _all_calls(self) -> list[LiveCalls]:
+        """The services that cross over all radios, and over one alone."""
+        bound = [] if self._ros.link.bound is None else self._ros.link.bound.calls
+        return bound if self.calls is None else [self.calls, *bound]
+
     @property
     def registry(self) -> Registry:
         """The topics that are sent; it grows if they are looked for on the ROS graph."""
@@ -413,7 +432,12 @@ class RobotLink(Flowgraph):
         if self.bond is not None:
             with self.end.lock:  # packets change it
                 radios = together(self.bond, self.radios, each)
-        halves = {"source": self.source.stats(), "sink": self.sink.stats()}
+        halves = {
+            "source": self.source.stats(),
+            "sink": self.sink.stats(),
+            "calls": {} if self.calls is None else self.calls.stats(),
+            "backfill": {} if self._ros.link.backfill is None else self._ros.link.backfill.stats(),
+        }
         if self._ros.link.bound is not None:
             join_bound(halves, radios, [one.name for one in self.radios], self._ros.link.bound.stats())
         return {
@@ -421,8 +445,6 @@ class RobotLink(Flowgraph):
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
             **halves,
             "peers": peers(self.end, self._clock()),
-            "calls": {} if self.calls is None else self.calls.stats(),
-            "backfill": {} if self._ros.link.backfill is None else self._ros.link.backfill.stats(),
             "wishes": {} if self._ros.link.wishes is None else self._ros.link.wishes.stats(),
             **radios,
             "clocks": {"set": self._clocks.lines(self._clock()), "given_to_chrony": self._clocks.given},

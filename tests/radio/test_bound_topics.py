@@ -259,7 +259,7 @@ def test_an_option_of_such_a_topic_changes_while_the_link_runs(tmp_path: Path, c
     ("change", "problem"),
     [
         ({"topics": {"odom": {"via": "c"}}}, "topics.odom.via = 'c': best, all, or one of a, b"),
-        ({"offer": {"odom": {"via": "a"}}}, "offer.odom.via = 'a': only what is sent anyway"),
+        ({"offer": {"odom": {"via": "c"}}}, "offer.odom.via = 'c': best, all, or one of a, b"),
         ({"radios": [{"name": n, "front_end": {"name": "sim"}} for n in ("a", "all")]}, "one is called 'all'"),
         (
             {"topics": {"odom": {"via": "a"}}, "packet_len": 40},

@@ -6,7 +6,7 @@ Invariant: nothing is counted, and nothing costs time, before somebody asks for 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import ceil, inf
 
 from gr_ros2.link.events import SentPacket
@@ -54,7 +54,9 @@ class UsedAir:
                 used = self._room * used // self._packet_len - fitted
             else:
                 used = sum(len(part.payload) + ENTRY for part in parts) - fitted
-        needed = 0 if sent.kind == "repair" else used
+        self._count(used, 0 if sent.kind == "repair" else used, now)
+
+    def _count(self, used: int, needed: int, now: float) -> None:
         self._window.append((now, used, needed))
         self._sum += used
         self._needed += needed
@@ -63,6 +65,12 @@ class UsedAir:
             _, used, needed = self._window.popleft()
             self._sum -= used
             self._needed -= needed
+
+    def others_left(self, packets: Sequence[SentPacket], now: float) -> None:
+        """Packets of another endpoint have left over the same radio."""
+        for sent in packets if self.on else ():
+            used = self._room * len(sent.data) // self._packet_len if self._packet_len else self._room
+            self._count(used, used, now)
 
     def capacity(self, now: float) -> float:
         """bytes/s that fit on the air; infinite where its rate is not known."""
