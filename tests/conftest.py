@@ -107,6 +107,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
+def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
+    """Long values are named by their length: every worker tells the names of all tests, once megabytes of pixels."""
+    return f"{argname}_of_{len(val)}" if isinstance(val, (bytes, str)) and len(val) > 99 else None
+
+
 @pytest.hookimpl(hookwrapper=True)
 def pytest_collection() -> Iterator[None]:
     """Modules and tests live to the end, so the garbage collector need not look at them: a third of the time here.

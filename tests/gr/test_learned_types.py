@@ -102,6 +102,7 @@ def test_a_custom_type_is_coded_and_prefixed_by_what_its_nodes_say(how: str, sta
         return payload == message(number, frame="robot_1/base")
 
     wait_for(prefixed, "the sink to learn the type")
+    wait_for(lambda: link.sink.stats()["topics"][RECEIVED]["latency_s"], "its age to be measured, after it came out")
     topic = link.sink.stats()["topics"][RECEIVED]
     assert topic["latency_s"]["measured"] and not topic["lost"]
     assert not link.sink.stats()["rejected"]

@@ -14,6 +14,7 @@ from gr_ros2.wire.ages import age_of
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 from tests.link.v1.test_ages import MODES, absent
 from tests.link.v1.test_relaying import Line, robot
+from tests.pairs import pairs
 
 WITHIN_S = 4.0
 SCAN = SendOptions(queue="deadline", deadline_s=WITHIN_S)
@@ -100,9 +101,7 @@ def test_what_repair_brings_counts_from_the_packet_before_it(mode: SealMode, aft
     assert (b"scan" * 8 in receiver.delivered()) == (after_s < WITHIN_S)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("away_s", LATE_S)
-@pytest.mark.parametrize("latched", [False, True])
+@pairs(away_s=LATE_S, mode=MODES, latched=[False, True])
 def test_a_relay_hands_nothing_on_that_is_over(mode: SealMode, away_s: float, latched: bool) -> None:
     """Robot 3 is away when robot 1 says it, and comes when robot 1 is off; kept for a late robot or not."""
     scan = SendOptions(queue="deadline", deadline_s=WITHIN_S, durability="transient_local" if latched else "auto")

@@ -17,6 +17,7 @@ from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 from tests.link.v1.test_relayed_reliable import Cell
+from tests.pairs import pairs
 
 JOY, TEXT = 0, 1
 LATENCY = SendOptions(qos="latency", queue="fifo")
@@ -62,10 +63,7 @@ def air(medium: str, *robots: Robot, loss: float = 0.0) -> Air | Cell:
     return cell
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("medium", MEDIA)
-@pytest.mark.parametrize("size", [8, 40, 200])
-@pytest.mark.parametrize("loss", [0.1, 0.3])
+@pairs(size=[8, 40, 200], loss=[0.1, 0.3], medium=MEDIA, mode=MODES)
 def test_what_was_lost_is_repaired(loss: float, size: int, medium: str, mode: SealMode) -> None:
     one, others = busy(1, medium, mode), [plain(src_id, medium, mode) for src_id in (2, 3)]
     one.size = size

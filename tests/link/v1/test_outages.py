@@ -8,6 +8,7 @@ import pytest
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Air, Robot, registry
+from tests.pairs import pairs
 
 MODES: tuple[SealMode, ...] = ("none", "encrypt")
 EVERY_S = 0.05
@@ -62,26 +63,24 @@ def two(mode: SealMode, *, both: bool, **settings: object) -> tuple[Robot, Robot
     return one, Robot(2, TOPICS if both else None, mode=mode, packet_len=220, any_length=True, **settings)
 
 
-LATER = [
-    pytest.param({}, 0.0, id="both at once"),
-    pytest.param({(1, 2)}, 3.0, id="to the other 3 s later"),
-    pytest.param({(2, 1)}, 3.0, id="back 3 s later"),
-    pytest.param({(2, 1)}, 15.0, id="back 15 s later"),
-]
+LATER: dict[str, tuple[set[tuple[int, int]], float]] = {
+    "both at once": (set(), 0.0),
+    "to the other 3 s later": ({(1, 2)}, 3.0),
+    "back 3 s later": ({(2, 1)}, 3.0),
+    "back 15 s later": ({(2, 1)}, 15.0),
+}
+"""Which way is back last after an outage, and by how many s."""
 
 
-@pytest.mark.parametrize(("both", "mode"), [(False, "none"), (True, "encrypt")], ids=["one sends", "both send"])
-@pytest.mark.parametrize("seconds", [5.0, 12.0, 30.0])
-@pytest.mark.parametrize(("later", "wait"), LATER)
-def test_every_reliable_message_arrives_after_an_outage(
-    both: bool, mode: SealMode, seconds: float, later: set[tuple[int, int]], wait: float
-) -> None:
-    one, other = two(mode, both=both)
+@pairs("relaying", relaying=[False, True], both=[False, True], seconds=[5.0, 12.0, 30.0], later=list(LATER))
+def test_every_reliable_message_arrives_after_an_outage(both: bool, seconds: float, later: str) -> None:
+    one, other = two("encrypt" if both else "none", both=both)
+    one_way, wait = LATER[later]
     talk = Talk(one, other, loss=0.1)
     talk.run(5)
     talk.part((1, 2), (2, 1))
     talk.run(seconds)
-    talk.part(*later)
+    talk.part(*one_way)
     talk.run(wait)
     talk.part()
     talk.run(3)
@@ -93,9 +92,7 @@ def test_every_reliable_message_arrives_after_an_outage(
             assert talk.got(receiver, sender.src_id, topic) == said
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("restarts", [1, 2])
-@pytest.mark.parametrize("early", [False, True], ids=["both ways", "back later"])
+@pairs("relaying", relaying=[False, True], early=[False, True], restarts=[1, 2], mode=MODES)
 def test_a_reliable_topic_goes_on_after_a_restart_in_an_outage(mode: SealMode, restarts: int, early: bool) -> None:
     one, other = two(mode, both=True)
     talk = Talk(one, other, loss=0.1)
