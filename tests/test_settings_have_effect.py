@@ -715,6 +715,7 @@ def sources_in(file: str) -> dict[str, str]:
     }
 
 
+@pytest.mark.xdist_group("effects")  # they share what happens without a setting
 @pytest.mark.parametrize("row", [row for row in EFFECTS if row not in ELSEWHERE], ids=": ".join)
 def test_a_setting_has_an_effect(row: Row) -> None:
     entry = EFFECTS[row]
