@@ -19,7 +19,7 @@ import av
 import numpy as np
 
 from bench.rows import Row
-from gr_ros2.codecs import video
+from gr_ros2.codecs import h264, video
 from gr_ros2.codecs.messages import IMAGE, read
 from gr_ros2.settings.config import SendOptions, vars_of
 from tests.codecs import scenes
@@ -114,7 +114,7 @@ class Fixed(Scheme):
         made.options = {"preset": "veryfast", "tune": "zerolatency"} | dict.fromkeys(
             ("maxrate", "bufsize"), str(self.rate)
         )
-        self.writer, self.reader = made, video._reader("h264", 1 << 22)
+        self.writer, self.reader = made, h264.reader("h264", 1 << 22)
         self.broken, self.last = False, -1
 
     def message(self, number: int) -> bytes:

@@ -66,7 +66,7 @@ CONFINED = {
     "rcl_interfaces": ("gr_ros2/ros/",),
     "distributed": ("gr_ros2_lab/study/sweep/cluster.py",),
     "zenoh": ("gr_ros2/middleware/zenoh.py", "gr_ros2_lab/race/"),
-    "av": ("gr_ros2/codecs/video.py", "gr_ros2/codecs/camera.py"),
+    "av": ("gr_ros2/codecs/h264.py", "gr_ros2/codecs/video.py", "gr_ros2/codecs/camera.py"),
 }
 BLOCKED = (*CONFINED, "cyclonedds")
 WITHOUT_BACKENDS = (

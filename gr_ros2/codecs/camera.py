@@ -19,6 +19,7 @@ from av.video.reformatter import VideoReformatter
 
 from gr_ros2.codecs import video
 from gr_ros2.codecs.base import MAX_SIZE, Coded
+from gr_ros2.codecs.h264 import Pixels
 from gr_ros2.codecs.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -35,7 +36,7 @@ from gr_ros2.codecs.messages import (
     write,
 )
 from gr_ros2.codecs.sizes import AUTO, FULL, MAX_PIXELS, FittingSize, blocks, halved
-from gr_ros2.codecs.video import Pixels, VideoDecoder, VideoEncoder
+from gr_ros2.codecs.video import VideoDecoder, VideoEncoder
 from gr_ros2.compression.zstd_frames import read_varint
 from gr_ros2.core.errors import ConfigError, DamagedError, OtherKindError, UnfitError
 from gr_ros2.wire import varint

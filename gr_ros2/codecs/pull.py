@@ -122,7 +122,7 @@ class FramePull:
     def __init__(self, *, period_s: float = 0.0, coding_s: float = 0.008) -> None:
         self.period_s, self._coding_s = period_s, coding_s
         self._newest: bytes | None = None
-        self._came = self._taken = self._keyed = -inf
+        self._came = self._taken = self._keyed = self._due = -inf
         self._period = 0.0
         self._coding = False
         self._key = True
@@ -141,8 +141,7 @@ class FramePull:
 
     def waits(self, now: float, _asks: int = 0, _reports: bool = True) -> bool:
         """Whether a message waits that may be coded now, if the air and the receivers allow it."""
-        opens = self._taken + self.period_s - self._period / 2
-        return self._newest is not None and not self._coding and now >= opens
+        return self._newest is not None and not self._coding and now >= self._due - self._period / 2
 
     def pull(self, now: float, progress: FrameState, share: float = 1.0) -> Pull | None:
         """The message to be coded now, None if there is none yet. ``done`` has to follow.
@@ -169,6 +168,8 @@ class FramePull:
             self._key, self._keyed = False, now
         request = Pull(self._newest, self._came, budget, key)
         self._newest, self._coding, self._taken = None, True, now
+        late = now - self._due
+        self._due = self.period_s + (self._due if late < self.period_s / 2 else now)  # in the mean no more often
         return request
 
     def done(self, failed: Pull | None = None) -> None:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gr_ros2.codecs import CODECS, CodedTopic, video
+from gr_ros2.codecs import CODECS, CodedTopic, h264, video
 from gr_ros2.codecs.base import KEY_TIMES
 from gr_ros2.codecs.camera import ENCODINGS, scaled_camera_info
 from gr_ros2.codecs.messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, PACKET, VIDEO, read, write
@@ -298,11 +298,11 @@ def test_what_claims_to_be_large_is_refused_before_it_is_decoded() -> None:
     decoder = CodedTopic(IMAGE).decoder(1 << 20)
     with pytest.raises(DamagedError, match="65534 × 65534 pixels, at most"):
         decoder.decode(claims(65534, 65534, bytes(20)))
-    large = video.H264Encoder(2048, 2048).encode(video.from_luma(np.zeros((2048, 2048), np.uint8)), 9000)
+    large = h264.H264Encoder(2048, 2048).encode(video.from_luma(np.zeros((2048, 2048), np.uint8)), 9000)
     with pytest.raises(DamagedError):
         decoder.decode(claims(64, 64, large))
     with pytest.raises(DamagedError):
-        video.H264Decoder(2048, 1024).decode(large)
+        h264.H264Decoder(2048, 1024).decode(large)
 
 
 def test_compressed_video_is_what_ffmpeg_decodes_without_a_warning(tmp_path: Path) -> None:
@@ -346,6 +346,24 @@ def test_a_key_frame_of_a_small_budget_is_no_grey_picture(budget: int) -> None:
     shown = out.data.reshape(out.height, out.width, 3)
     assert psnr(shown, pixels[2::4, 2::4]) > 18.5
     assert len(coded.data) <= KEY_TIMES * budget
+
+
+@pytest.mark.parametrize("budget", [100, 160, 200, 330])
+def test_a_budget_between_two_kilobits_is_used_and_held(budget: int) -> None:
+    """x264's buffer is a whole number of kilobits."""
+    encoder = CodedTopic(IMAGE, {"camera": {"size": "full"}}).encoder()
+    frames = [encoder.encode(image(view(n, WIDTH, HEIGHT), "rgb8", n), budget) for n in range(60)]
+    shares = [len(frame.data) / budget for frame in frames[1:]]
+    assert np.median(shares) >= 0.8
+    assert np.percentile(shares, 99) <= 1.15
+    assert 0.65 <= len(frames[0].data) / budget / KEY_TIMES <= 1
+
+
+def test_a_budget_that_grows_is_used_at_once() -> None:
+    encoder = CodedTopic(IMAGE, {"camera": {"size": "full"}}).encoder()
+    budgets = [200 + 50 * (n % 2) for n in range(60)]
+    frames = [encoder.encode(image(view(n, WIDTH, HEIGHT), "rgb8", n), budget) for n, budget in enumerate(budgets)]
+    assert np.median([len(frame.data) for frame in frames[1::2]]) >= 0.75 * 250
 
 
 def test_budgets_hold_when_they_change_with_each_frame() -> None:

@@ -112,6 +112,17 @@ def test_a_longest_rate_leaves_messages_out() -> None:
     assert taken[-1][1] == pytest.approx(PART * RATE * 0.2, abs=1)
 
 
+def test_a_longest_rate_holds_where_the_air_is_free_between_two_messages() -> None:
+    pull, taken = FramePull(period_s=0.2), 0
+    for step in range(3000):
+        if step % 67 == 0:
+            pull.offer(b"message", step / 1000)
+        if step % 13 == 0 and pull.pull(step / 1000, FREE):
+            taken += 1
+            pull.done()
+    assert 14 <= taken <= 16
+
+
 def test_none_is_begun_while_all_robots_have_lacked_one_for_long_and_are_silent() -> None:
     pull, now = running()
     assert pull.pull(now, FREE._replace(lacked=PATIENCE_S + 0.01, behind=1.0, silent=True)) is None
