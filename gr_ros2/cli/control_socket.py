@@ -19,11 +19,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from gr_ros2.core.errors import GrRos2Error, RunError, shortened
+from gr_ros2.core.watch import LOOK_S, Watch
 
 _LINE = 4096
 """Most bytes of a request."""
@@ -228,20 +230,23 @@ def parse(line: bytes) -> Mapping[str, Any]:
     return found
 
 
-def receive(connection: socket.socket, most: int, deadline: float, end: bytes = b"") -> bytes:
+def receive(connection: socket.socket, most: int, timeout_s: float, end: bytes = b"") -> bytes:
     """Receive data until the other side closes, ``end`` has arrived, or there are ``most`` bytes.
 
     :param most: most bytes to receive
-    :param deadline: time at which to stop, s, monotonic
+    :param timeout_s: s of this process's own time after which to stop
     :raises TimeoutError: when the time is over
     """
-    data = b""
+    data, watch = b"", Watch()
     while len(data) < most and not (end and end in data):
-        left = deadline - time.monotonic()
+        left = timeout_s - watch.age(inf, time.monotonic())
         if left <= 0:
             raise TimeoutError("timed out")
-        connection.settimeout(left)
-        more = connection.recv(most - len(data))
+        connection.settimeout(min(left, LOOK_S))
+        try:
+            more = connection.recv(most - len(data))
+        except TimeoutError:
+            continue
         if not more:
             break
         data += more
@@ -249,7 +254,6 @@ def receive(connection: socket.socket, most: int, deadline: float, end: bytes = 
 
 
 def _ask(path: Path, query: Mapping[str, Any]) -> Mapping[str, Any]:
-    deadline = time.monotonic() + _WAIT_S
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.settimeout(_WAIT_S)
         try:
@@ -259,4 +263,4 @@ def _ask(path: Path, query: Mapping[str, Any]) -> Mapping[str, Any]:
                 path.unlink(missing_ok=True)
             raise
         client.sendall(json.dumps(query).encode() + b"\n")
-        return parse(receive(client, _ANSWER, deadline, b"\n"))
+        return parse(receive(client, _ANSWER, _WAIT_S, b"\n"))

@@ -20,6 +20,7 @@ from gr_ros2.cli.control_socket import ControlSocket, receive, request, running_
 from gr_ros2.cli.params import Number
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import BackendMissingError, ConfigError, RunError
+from gr_ros2.core.watch import wait_until
 from gr_ros2.dashboard.addresses import ANY, exposed, in_url
 from gr_ros2.settings.config import STRICT, build
 
@@ -170,13 +171,18 @@ def dashboard(place: str, pid: int | None, wait: float, browser: bool) -> None:
     One that was not started with --dashboard is asked to serve its page at PLACE now.
     """
     address, port = parse_place(place)
-    deadline = time.monotonic() + wait
-    while (url := _find(address, port, pid)) is None:
-        if time.monotonic() >= deadline:
-            raise RunError(
-                f"{address}:{port}: no dashboard there, and no run or link of yours goes on; start one, or --wait"
-            )
-        time.sleep(_ASK_S)
+    found: list[str] = []
+
+    def find() -> bool:
+        url = _find(address, port, pid)
+        found.extend([] if url is None else [url])
+        return url is not None
+
+    if not wait_until(find, wait, lambda _: time.sleep(_ASK_S)):
+        raise RunError(
+            f"{address}:{port}: no dashboard there, and no run or link of yours goes on; start one, or --wait"
+        )
+    (url,) = found
     click.echo(url)
     if browser:
         webbrowser.open(url)
@@ -210,10 +216,9 @@ def parse_place(text: str, what: str = "dashboard") -> tuple[str, int]:
 
 def _answers(address: str, port: int) -> bool:
     """Whether a dashboard answers there. Any other server is read for two seconds and a few thousand bytes at most."""
-    deadline = time.monotonic() + _ANSWER_S
     try:
         with socket.create_connection((address, port), _ANSWER_S) as connection:
             connection.sendall(b"GET /alive HTTP/1.0\r\n\r\n")
-            return b'"instance"' in receive(connection, _ANSWER_BYTES, deadline, b'"instance"')
+            return b'"instance"' in receive(connection, _ANSWER_BYTES, _ANSWER_S, b'"instance"')
     except (OSError, ValueError, OverflowError):
         return False

@@ -19,6 +19,7 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import MOST_S, Number, set_option
 from gr_ros2.cli.status import PING, ask_link, find_link, json_option, pid_option
 from gr_ros2.core.backends import uninterrupted
+from gr_ros2.core.watch import wait_until
 from gr_ros2.radio.config import LinkConfig, load_link
 from gr_ros2.settings.config import ClockConfig, DiagnosticsConfig
 from gr_ros2.wire import BROADCAST
@@ -158,13 +159,15 @@ def check(settings: LinkConfig, duration: float | None, against: Path | None = N
             f"packet_len {own['packet_len']}, phy settings {own['phy']:08x}, key {key}",
             soft_wrap=True,
         )
-        end = time.monotonic() + (CHECK_S if duration is None else duration)
         told: dict[int, Mapping[str, Any]] = {}
-        while time.monotonic() < end and not _answered(told):
-            time.sleep(_CHECK_EVERY_S)
+
+        def answered() -> bool:
             link.check()
             for peer in link.stats()["peers"]:
                 told[peer["robot"]] = link.ping(peer["robot"])
+            return _answered(told)
+
+        wait_until(answered, CHECK_S if duration is None else duration, lambda _: time.sleep(_CHECK_EVERY_S))
         stats = link.stats()
     if not told:
         console.print("no other end is heard:")

@@ -18,6 +18,7 @@ from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import Number
 from gr_ros2.cli.status import OFFERS, WANT, ask_link, find_link, json_option, pid_option
 from gr_ros2.core.errors import RunError
+from gr_ros2.core.watch import wait_until
 from gr_ros2.wire import BROADCAST
 
 _PATIENCE_S = 30.0
@@ -44,9 +45,14 @@ class Duration(click.ParamType):
 
 def _until(look: Callable[[], Mapping[str, Any]], done: Callable[[Mapping[str, Any]], bool]) -> Mapping[str, Any]:
     """What is told when it is done, or when the time is over."""
-    deadline = time.monotonic() + _PATIENCE_S
-    while not done(told := look()) and time.monotonic() < deadline:
-        time.sleep(_LOOK_S)
+    told: Mapping[str, Any] = {}
+
+    def over() -> bool:
+        nonlocal told
+        told = look()
+        return done(told)
+
+    wait_until(over, _PATIENCE_S, lambda _: time.sleep(_LOOK_S))
     return told
 
 

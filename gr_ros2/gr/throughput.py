@@ -50,6 +50,8 @@ PATIENCE_S = 30.0
 """s for which answers of the other robot are waited for."""
 _STEP_S, _LOOK_S, _REPORT_S = 0.005, 0.2, 1.0
 """s between two looks at what waits, two at the ages of topics, and two questions for what has arrived there."""
+_STILL_S = 2.0
+"""s from one look to the next after which this process has stood still, and nothing can be said of the link."""
 _REST_S = 3.0
 """s for which messages may still arrive at the robot that asks."""
 _HEAD = 64
@@ -293,9 +295,12 @@ class LiveThroughput:
 
     def _measure(self, run: _Run) -> None:
         look_at = report_at = -inf
-        dropped = False
+        looked, dropped = self._clock(), False
         while not self._closed.wait(_STEP_S if run.sends_at < inf else _LOOK_S / 4):
-            now = self._clock()
+            before, looked = looked, self._clock()
+            now = looked
+            if run.asks and not run.refused and now > before + _STILL_S:
+                run.refused = f"this link stood still for {now - before:.0f} s itself meanwhile; measure again"
             if run.refused:
                 break
             if run.sends_at == inf:

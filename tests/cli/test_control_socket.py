@@ -12,10 +12,12 @@ import threading
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from gr_ros2.cli import control_socket
 from gr_ros2.cli.control_socket import ControlSocket, folder, request, running_programs
 from gr_ros2.core.errors import ConfigError, RunError
 from tests.waiting import PATIENCE_S, wait_for
@@ -175,3 +177,24 @@ def test_an_answer_that_never_ends_is_not_waited_for(monkeypatch: pytest.MonkeyP
             request(1, {"x": 1})
         left.set()
         thread.join()
+
+
+def test_an_answer_that_came_while_this_program_was_frozen_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock has gone on for a minute when it looks again."""
+    clock = iter([0.0, 0.0, 60.0, *[60.0] * 10])
+    monkeypatch.setattr(control_socket, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    here, there = socket.socketpair()
+    with here, there:
+        there.sendall(b"half ")
+        assert control_socket.receive(here, 5, 5.0) == b"half "
+        there.sendall(b"an answer\n")
+        assert control_socket.receive(here, 100, 5.0, b"\n") == b"an answer\n"
+
+
+def test_who_says_nothing_is_not_waited_for_any_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 1.0, 2.0])
+    monkeypatch.setattr(control_socket, "LOOK_S", 0.001)
+    monkeypatch.setattr(control_socket, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    here, there = socket.socketpair()
+    with here, there, pytest.raises(TimeoutError):
+        control_socket.receive(here, 100, 2.0, b"\n")
