@@ -2,8 +2,8 @@
 
 Invariants: what rosbag2 calls the receive and the send timestamp are MCAP's ``log_time`` and ``publish_time``; rosbags
 alone writes the first one into both. A message that is missing in the index is read too, and so are all complete
-records of a file that was never closed. A schema in a language that ROS does not use is ignored, whatever its bytes,
-and so is the profile.
+records of a file that was never closed, those at the beginning of a chunk that is cut off included. A schema in a
+language that ROS does not use is ignored, whatever its bytes, and so is the profile.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Collection, Generator
-from io import BytesIO
+from io import SEEK_CUR, SEEK_SET, BufferedReader, BytesIO, RawIOBase
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.errors import ReaderError
@@ -34,7 +35,9 @@ _FOOTER = b"\x02" + (20).to_bytes(8, "little")
 _END_LEN = len(_FOOTER) + 20 + len(_MAGIC)
 _RECORD_LEN = 1 + 8
 """Bytes of a record before its content: opcode, length."""
-_CHUNK = 0x06
+_MESSAGE, _CHUNK = 0x05, 0x06
+_PIECE, _SECTOR = 4096, 512
+"""Bytes of a damaged chunk that are decompressed at a time, and that a disk stores together."""
 _STAMPS = 1 << 64
 """Number of stamps."""
 _DIGEST = "topic_type_hash"
@@ -76,15 +79,16 @@ class McapStorage(McapReader):
         self.bio.seek(max(size - _END_LEN, 0))
         end = self.bio.read()
         closed = end.startswith(_FOOTER) and end.endswith(_MAGIC)
-        self.data_start, self.data_end = len(_MAGIC), size - _END_LEN if closed else size
+        self.data_start, self.data_end = len(_MAGIC), size - _END_LEN if closed else self._stored(size)
         summary = int.from_bytes(end[len(_FOOTER) :][:8], "little") if closed else 0
         if summary:
             self.data_end = summary
             self.read_index()
         if not all(chunk.message_index_offsets for chunk in self.chunks) or not self.statistics:
-            self._find_chunks()
+            cut = self._find_chunks(closed=closed)
             if not closed:
-                self.broken = f"has no end, as after a crash: {size - self.data_end} bytes of it cannot be read"
+                self.broken = "has no end, as after a crash: "
+                self.broken += cut or f"{size - self.data_end} bytes of it cannot be read"
         if not self.statistics or not self.schemas:
             self.meta_scan()
         if self.broken and not self.connections:
@@ -101,15 +105,31 @@ class McapStorage(McapReader):
             if not chunk.message_index_offsets:
                 chunk.channel_count.update(dict.fromkeys(self.channels, 1))
 
-    def _find_chunks(self) -> None:
-        """List the chunks, and find where the last complete record ends."""
+    def _stored(self, size: int) -> int:
+        """Up to where a file without an end has been written: behind what a computer had stored when it went off, there
+        may be zeros."""
         assert self.bio is not None
+        end = size
+        while end > 0:
+            self.bio.seek(max(end - _PIECE, 0))
+            piece = self.bio.read(min(end, _PIECE)).rstrip(b"\0")
+            end = max(end - _PIECE, 0) + len(piece)
+            if piece:
+                break
+        return min(-(-end // _SECTOR) * _SECTOR, size)
+
+    def _find_chunks(self, *, closed: bool) -> str:
+        """List the chunks, and find where the last complete record ends; returns what is said of a last chunk of which
+        only a part is here."""
+        assert self.bio is not None
+        cut = -1
         self.chunks.clear()
         at = self.data_start
         while at + _RECORD_LEN <= self.data_end:
             self.bio.seek(at)
             kind, length = struct.unpack("<BQ", self.bio.read(_RECORD_LEN))
             if not kind or at + _RECORD_LEN + length > self.data_end:
+                cut = at if kind == _CHUNK and not closed else cut
                 break
             if kind == _CHUNK:
                 first, last, size, _ = struct.unpack("<QQQI", self.bio.read(28))
@@ -119,7 +139,34 @@ class McapStorage(McapReader):
                     ChunkInfo(first, last, at, _RECORD_LEN + length, {}, 0, compression, packed, size, {})
                 )
             at += _RECORD_LEN + length
-        self.data_end = at
+        end, self.data_end = self.data_end, at
+        return "" if cut < 0 else self._mend(cut, end)
+
+    def _mend(self, at: int, end: int) -> str:
+        """Put a chunk of what can be read of a damaged one in its place; returns what is said of it, '' where nothing
+        can be read.
+
+        :param at: where it begins
+        :param end: of the file
+        """
+        assert self.bio is not None
+        self.bio.seek(at + _RECORD_LEN)
+        content = BytesIO(self.bio.read(end - at - _RECORD_LEN))
+        try:
+            first, last, size, _ = struct.unpack("<QQQI", content.read(28))
+            compression = read_string(content)
+            (packed,) = struct.unpack("<Q", content.read(8))
+        except (struct.error, ReaderError):
+            return ""
+        raw, messages = _complete(_decompressed(compression, content.read(min(packed, end))))
+        if not messages:
+            return ""
+        head = struct.pack("<QQQI", first, last, len(raw), 0) + bytes(4) + struct.pack("<Q", len(raw))
+        record = struct.pack("<BQ", _CHUNK, len(head) + len(raw)) + head + raw
+        self.bio = BufferedReader(_Spliced(self.bio, at, record))
+        self.chunks.append(ChunkInfo(first, last, at, len(record), {}, 0, "", len(raw), len(raw), {}))
+        self.data_end = at + len(record)
+        return f"{messages} messages of its last chunk are read ({len(raw)} of {size} bytes)"
 
     def messages(
         self,
@@ -138,6 +185,66 @@ class McapStorage(McapReader):
         for connection, stamp, payload in found:
             # rosbag2 writes its signed stamps as unsigned numbers.
             yield connection, stamp - _STAMPS if stamp >= _STAMPS >> 1 else stamp, payload
+
+
+class _Spliced(RawIOBase):
+    """A file up to a place, and then other bytes."""
+
+    def __init__(self, file: BinaryIO, end: int, then: bytes) -> None:
+        self._file, self._end, self._then, self._at = file, end, then, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = SEEK_SET) -> int:
+        base = {SEEK_SET: 0, SEEK_CUR: self._at}.get(whence, self._end + len(self._then))
+        self._at = base + offset
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        if self._at < self._end:
+            self._file.seek(self._at)
+            data = self._file.read(min(len(buffer), self._end - self._at))
+        else:
+            data = self._then[self._at - self._end :][: len(buffer)]
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def _decompressed(compression: str, data: bytes) -> bytes:
+    """What can be decompressed of data that end too early, or are damaged from some place on."""
+    if not compression:
+        return data
+    kinds = {"lz4": LZ4FrameDecompressor, "zstd": storage_mcap.zstd.ZstdDecompressor}  # type: ignore[attr-defined]
+    if compression not in kinds:
+        return b""
+    reader, raw = kinds[compression](), bytearray()
+    try:
+        for at in range(0, len(data), _PIECE):
+            raw += reader.decompress(data[at : at + _PIECE])
+    except Exception:  # noqa: BLE001 - each library has errors of its own
+        return bytes(raw)
+    return bytes(raw)
+
+
+def _complete(raw: bytes) -> tuple[bytes, int]:
+    """The complete records at the beginning of a chunk, and how many messages are among them."""
+    at = messages = 0
+    while at + _RECORD_LEN <= len(raw):
+        kind, length = struct.unpack_from("<BQ", raw, at)
+        if not kind or at + _RECORD_LEN + length > len(raw):
+            break
+        messages += kind == _MESSAGE
+        at += _RECORD_LEN + length
+    return raw[:at], messages
 
 
 def _digest(settings: bytes) -> str:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import struct
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from random import Random
 from typing import Any
 
+import lz4.frame  # type: ignore[import-untyped]
 import yaml
+from rosbags.rosbag2.storage_mcap import zstd  # type: ignore[attr-defined]
 
 STEP_NS = 20_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -18,7 +22,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True)
 class Foreign:
-    """One topic of a bag: ``count`` String messages that tell topic and number, unless ``payloads`` are given."""
+    """One topic of a bag: ``count`` String messages that tell topic and number, and ``random`` bytes in hex."""
 
     name: str
     type_name: str = "std_msgs/msg/String"
@@ -29,11 +33,13 @@ class Foreign:
     serialization: str = "cdr"
     digest: str = ""
     start: int = 0
+    random: int = 0
 
     @property
     def payloads(self) -> list[bytes]:
         return [
-            string(f"{self.name} {self.type_name} {number}") for number in range(self.start, self.start + self.count)
+            string(f"{self.name} {self.type_name} {number}{Random(number).randbytes(self.random).hex()}")
+            for number in range(self.start, self.start + self.count)
         ]
 
 
@@ -203,6 +209,24 @@ def unclosed(
         file += _record(0x06, chunk) if chunked else record
     path.write_bytes(file + tail)
     return path
+
+
+def chunks_of(path: Path, topic: Foreign, compression: str, per_chunk: int) -> list[int]:
+    """A file that was never closed, of chunks with so many messages each; where each chunk begins, and where the file
+    ends."""
+    pack = {"": bytes, "lz4": lz4.frame.compress, "zstd": zstd.compress}[compression]
+    file = bytearray(b"\x89MCAP0\r\n") + _record(0x01, _text("ros2") + _text("by hand"))
+    file += _schema(1, topic) + _channel(1, topic, False)
+    begins, rows = [], in_order([topic])
+    for n in range(0, len(rows), per_chunk):
+        begins.append(len(file))
+        part = rows[n : n + per_chunk]
+        raw = b"".join(_record(0x05, struct.pack("<HIQQ", p, 0, at, at) + payload) for p, at, payload in part)
+        packed = pack(raw)
+        head = struct.pack("<QQQI", part[0][1], part[-1][1], len(raw), zlib.crc32(raw))
+        file += _record(0x06, head + _text(compression) + struct.pack("<Q", len(packed)) + packed)
+    path.write_bytes(file)
+    return [*begins, len(file)]
 
 
 def make_folder(

@@ -159,9 +159,9 @@ def test_truncated_is_one_line_naming_the_path(tmp_path: Path, storage: Storage,
         except BagError as error:
             assert str(damaged) in str(error) and "\n" not in str(error)
         else:
-            # SQLite from 3.46 on reads a file that lacks the unused end of its last page, and the messages of an MCAP
-            # file, here of one chunk, come before its index.
-            assert keep >= 0.9 and got == intact
+            # SQLite from 3.46 on reads a file that lacks the unused end of its last page; of an MCAP file, here of one
+            # chunk, what is there of it is read.
+            assert got == (intact[: len(got)] if storage == "mcap" else intact) and (keep < 0.9 or len(got) > 1500)
             assert storage == "sqlite3" or bag_files.bag_contents(damaged).remarks
 
 

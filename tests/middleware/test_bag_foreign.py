@@ -23,6 +23,7 @@ from tests.middleware import foreign_bags
 from tests.middleware.foreign_bags import (
     Foreign,
     broken_off,
+    chunks_of,
     crashed,
     listing,
     make_folder,
@@ -192,6 +193,30 @@ def test_a_recorder_that_was_killed(tmp_path: Path, chunked: bool, folder: bool,
     assert [one.stamp_ns for one in read] == sorted(one.stamp_ns for one in read)
     (said,) = bag_contents(path).remarks
     assert said.endswith(f"in_0.mcap has no end, as after a crash: {len(tail)} bytes of it cannot be read")
+
+
+@pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
+@pytest.mark.parametrize("zeros", [0, 5000, 900_000])
+def test_of_a_chunk_that_is_cut_off_all_is_read_that_can_be(tmp_path: Path, compression: str, zeros: int) -> None:
+    """lz4 and zstd give out blocks of 64 and 128 kB. A computer that goes off may leave zeros."""
+    topic = Foreign("/a", count=1500, random=250)
+    path, payloads = tmp_path / "in.mcap", topic.payloads
+    begins = chunks_of(path, topic, compression, 1000)
+    whole = path.read_bytes()
+    for place in (1000, *(begins[1] * n // 8 for n in range(1, 8)), *range(begins[1], begins[2], 33_333)):
+        cut = place // 512 * 512 if zeros else place  # what a disk stores together
+        path.write_bytes(whole[:cut] + bytes(zeros))
+        begun = max(begin for begin in begins if begin <= cut)
+        before, length = begins.index(begun) * 1000, (begins[begins.index(begun) + 1] - begun)
+        least = before + int((cut - begun) / length * min(1000, 1500 - before) - (512 if compression else 2))
+        if least <= 0:
+            continue
+        read = [one.payload for one in read_bag(path)]
+        assert len(read) >= least
+        assert read == payloads[: len(read)]
+        if len(read) > before:
+            (said,) = bag_contents(path).remarks
+            assert f"{len(read) - before} messages of its last chunk are read (" in said
 
 
 def test_a_recorder_that_was_killed_before_it_wrote_a_message(tmp_path: Path) -> None:
