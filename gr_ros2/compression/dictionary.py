@@ -17,12 +17,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from gr_ros2.compression.floats import CLASSES, KnownNumbers
 from gr_ros2.compression.prepared import Model
 from gr_ros2.compression.static_values import Words
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, shortened
 
 FORMAT = 1
 SHIPPED = (1, 2)
@@ -102,12 +103,24 @@ class Dictionary:
 def shipped(number: int = GENERAL) -> Dictionary:
     """A shipped set by its number.
 
-    :raises ConfigError: when there is none of that number
+    :raises ConfigError: when there is none of that number, or its file is damaged
     """
     if number not in SHIPPED:
         raise ConfigError(f"no shipped dictionaries of number {number}; there are {', '.join(map(str, SHIPPED))}")
-    text = files("gr_ros2.compression").joinpath(f"dictionaries/shipped-{number}.json").read_text(encoding="utf-8")
-    return _parse(json.loads(text), number)
+    folder = Path(str(files("gr_ros2.compression")))
+    return read_dictionary(folder / "dictionaries" / f"shipped-{number}.json", number)
+
+
+def read_dictionary(file: Path, number: int) -> Dictionary:
+    """Read one from its file.
+
+    :raises ConfigError: when the file is missing, damaged or of another format; names it
+    """
+    try:
+        return _parse(json.loads(file.read_text(encoding="utf-8")), number)
+    except (OSError, LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        why = shortened(f"{type(error).__name__}: {error}")
+        raise ConfigError(f"{file}: no dictionary, or damaged ({why}); install gr-ros2 again") from error
 
 
 def _parse(data: Any, number: int) -> Dictionary:

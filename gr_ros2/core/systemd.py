@@ -15,4 +15,5 @@ def notify(state: str) -> None:
     path = f"\0{address[1:]}" if address.startswith("@") else address
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, suppress(OSError):  # it may be restarting
         sender.setblocking(False)
-        sender.sendto(state.encode(), path)
+        # Names of files may be no UTF-8, and a line of its own would be another state.
+        sender.sendto(" ".join(state.splitlines()).encode(errors="replace"), path)

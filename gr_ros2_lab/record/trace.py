@@ -76,6 +76,8 @@ SCHEMAS = {
         }
     ),
 }
+_MAY_LACK = {MESSAGES: {"t_sent", "t_delivered", "hops"}, PACKETS: {"t_received"}, PATHS: {"x", "y"}}
+"""The columns in which a row may have no value."""
 
 
 @dataclass(slots=True)
@@ -314,6 +316,8 @@ def read_trace(directory: Path) -> Trace:
                 raise ConfigError(
                     f"{path}: no table of a run (column {column.name!r} is {found or 'missing'}, not {column.type})"
                 )
+            if column.name not in _MAY_LACK[name] and table.column(column.name).null_count:
+                raise ConfigError(f"{path}: no table of a run (column {column.name!r} has rows without a value)")
         try:
             ends.add(float((table.schema.metadata or {})[_T_END]))
         except (KeyError, ValueError) as error:

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from gr_ros2.compression import shipped
-from gr_ros2.compression.dictionary import SHIPPED
+from gr_ros2.compression import dictionary, shipped
+from gr_ros2.compression.dictionary import SHIPPED, read_dictionary
 from gr_ros2.core.errors import ConfigError
 from tests.compression.support import Writer, codec_for, learn, simulated
 
@@ -34,6 +34,35 @@ def test_coded_messages_keep_their_meaning(vector: dict[str, str]) -> None:
     assert codec.decode(0, bytes.fromhex(vector["coded"])).hex() == vector["decoded"]
     if vector["coded"][1] not in "13":  # another zstd may find another encoding
         assert codec.encode(0, bytes.fromhex(vector["payload"])).hex() == vector["coded"]
+
+
+def test_a_damaged_file_is_one_line_that_names_it(tmp_path: Path) -> None:
+    file = tmp_path / "shipped-1.json"
+    text = (Path(dictionary.__file__).parent / "dictionaries" / file.name).read_bytes()
+    rng, refused = random.Random(1), 0
+    wrong = [
+        b"",
+        b"[]",
+        b"{}",
+        b"null",
+        b'{"format": 2}',
+        b"[" * 100_000,
+        text.replace(b'"words": [', b'"words": [5, ['),
+    ]
+    wrong += [text[: rng.randrange(len(text))] for _ in range(5)]
+    wrong += [text[:at] + rng.randbytes(20) + text[at + 20 :] for at in (rng.randrange(len(text)) for _ in range(30))]
+    for data in wrong:
+        file.write_bytes(data)
+        try:
+            read_dictionary(file, 1)
+        except ConfigError as error:
+            refused += 1
+            assert str(error).startswith(f"{file}: no dictionary, or damaged (")
+            assert "\n" not in str(error)
+    assert refused > 30
+    file.unlink()
+    with pytest.raises(ConfigError, match="No such file"):
+        read_dictionary(file, 1)
 
 
 def test_the_common_packages_are_covered() -> None:

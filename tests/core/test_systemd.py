@@ -26,3 +26,12 @@ def test_nobody_listens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.delenv("NOTIFY_SOCKET")
     notify("READY=1")
     assert not list(tmp_path.iterdir())
+
+
+def test_any_text_is_one_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors name files, whose names may be anything."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        notify("STATUS=/tmp/\udcff: no such file\nREADY=1")
+        assert systemd.recv(100) == b"STATUS=/tmp/?: no such file READY=1"

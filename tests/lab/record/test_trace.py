@@ -10,6 +10,7 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pa_parquet
 import pytest
 
@@ -126,6 +127,18 @@ def test_tables_of_something_else_are_refused(tmp_path: Path) -> None:
     table = pa_parquet.read_table(tmp_path / "messages.parquet")
     pa_parquet.write_table(table.replace_schema_metadata({}), tmp_path / "messages.parquet")
     with pytest.raises(ConfigError, match=r"messages\.parquet: no table of a run .it does not say when"):
+        read_trace(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "column"), [("packets", "total"), ("messages", "fate")])
+def test_rows_without_what_each_has_are_refused(tmp_path: Path, name: str, column: str) -> None:
+    make_run(tmp_path)
+    path = tmp_path / f"{name}.parquet"
+    table = pa_parquet.read_table(path)
+    place = table.column_names.index(column)
+    empty = pa.nulls(table.num_rows, table.schema.field(column).type)
+    pa_parquet.write_table(table.set_column(place, table.schema.field(column), empty), path)
+    with pytest.raises(ConfigError, match=rf"{name}\.parquet: no table of a run \(column '{column}' has rows without"):
         read_trace(tmp_path)
 
 
