@@ -28,14 +28,14 @@ PIECE = 8192
 REPEATS = 15
 Setting = tuple[str, dict[str, Any], int]
 TARGETS: list[tuple[Setting, float]] = [
-    (("ofdm", {}, 64), 10),
-    (("ofdm", {}, 1500), 8),
-    (("ofdm", {"payload_modulation": "64qam"}, 1500), 12),
-    (("psk", {}, 64), 12),
-    (("gfsk", {}, 64), 10),
-    (("lora", {}, 64), 8),
+    (("ofdm", {}, 64), 6.5),
+    (("ofdm", {}, 1500), 4),
+    (("ofdm", {"payload_modulation": "64qam"}, 1500), 9.5),
+    (("psk", {}, 64), 6.5),
+    (("gfsk", {}, 64), 5.5),
+    (("lora", {}, 64), 6.5),
 ]
-NOISE_TARGET = 2.5
+NOISE_TARGET = 1.8
 CODES = ("none", "cc", "ldpc", "polar")
 MODULATIONS: Mapping[str, Sequence[dict[str, Any]]] = {
     "ofdm": [{"payload_modulation": name} for name in ("bpsk", "qpsk", "8psk", "16qam", "64qam")],

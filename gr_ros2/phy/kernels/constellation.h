@@ -49,6 +49,15 @@ struct Received {
     }
 };
 
+// The likeliest points, their parts apart, and how likely each is.
+struct Nearest {
+    std::vector<float> most, real, imag;
+
+    void resize(int count) {
+        for (auto* one : {&most, &real, &imag}) one->resize(count);
+    }
+};
+
 class Constellation {
    public:
     // `marks`: per point, one per bit in the order they are sent.
@@ -123,17 +132,43 @@ class Constellation {
         }
     }
 
-    int nearest(Sample received) const {
-        int best = 0;
-        float most = likelihood(received, 0);
-        for (int k = 1; k < count(); k++) {
-            const float likely = likelihood(received, k);
-            if (likely > most) {
-                most = likely;
-                best = k;
+    // Of each received point the likeliest one of the constellation.
+    void nearest(const Sample* received, int used, Nearest& found) const {
+        found.resize(used);
+        float *__restrict most = found.most.data(), *__restrict real = found.real.data(),
+              *__restrict imag = found.imag.data();
+        std::fill_n(most, used, -INFINITY);
+        std::fill_n(real, used, points_[0].real());
+        std::fill_n(imag, used, points_[0].imag());
+        for (const Sample point : points_) {
+            const float twice[2] = {2 * point.real(), 2 * point.imag()}, power = square(point);
+            for (int i = 0; i < used; i++) {
+                const float likely = received[i].real() * twice[0] + received[i].imag() * twice[1] - power;
+                const bool better = likely > most[i];
+                most[i] = better ? likely : most[i];
+                real[i] = better ? point.real() : real[i];
+                imag[i] = better ? point.imag() : imag[i];
             }
         }
-        return best;
+    }
+
+    // Soft bits of received points that are equally sharp.
+    void soft(const Sample* received, int used, float sharpness, Nearest& work, float* out) const {
+        work.resize(used);
+        float *__restrict one = work.real.data(), *__restrict zero = work.imag.data();
+        for (int bit = 0; bit < bits_; bit++) {
+            std::fill_n(one, used, kLowest);
+            std::fill_n(zero, used, kLowest);
+            for (int k = 0; k < count(); k++) {
+                const float twice[2] = {2 * points_[k].real(), 2 * points_[k].imag()}, power = square(points_[k]);
+                float* __restrict most = marks_[k * bits_ + bit] ? one : zero;
+                for (int i = 0; i < used; i++) {
+                    const float likely = received[i].real() * twice[0] + received[i].imag() * twice[1] - power;
+                    most[i] = std::max(most[i], likely * sharpness);
+                }
+            }
+            for (int i = 0; i < used; i++) out[static_cast<size_t>(i) * bits_ + bit] = one[i] - zero[i];
+        }
     }
 
     // Soft bits of one received point, from the likelihood of each point of the constellation.
@@ -193,7 +228,7 @@ class Constellation {
         }
         const float *received = seen.parts[axis].data(), *sharpness = seen.sharpness.data();
         float* found[each];
-        for (int bit = 0; bit < each; bit++) found[bit] = seen.bits[bit].data();
+        for (int bit = 0; bit < each; bit++) found[bit] = bits_ == 1 ? out : seen.bits[bit].data();
         for (int i = 0; i < used; i++) {
             float likely[Side];
             for (int k = 0; k < Side; k++) likely[k] = (received[i] * twice[k] - squares[k]) * sharpness[i];
@@ -206,6 +241,7 @@ class Constellation {
                 found[bit][i] = one - zero;
             }
         }
+        if (bits_ == 1) return;
         const int lowest = axes_ == 2 && axis == 0 ? each : 0;
         for (int bit = 0; bit < each; bit++) {
             for (int i = 0; i < used; i++) out[static_cast<size_t>(i) * bits_ + lowest + bit] = found[bit][i];

@@ -41,8 +41,13 @@ inline Sample unit(double angle) { return Sample(turn(angle)); }
 // exp(i (start + step k)) for k = 0, 1, ...: by four recurrences, which do not wait for each other.
 class Rotation {
    public:
-    Rotation(double start, double step) : four_(turn(4 * step)) {
-        for (int k = 0; k < 4; k++) next_[k] = turn(start + k * step);
+    Rotation(double start, double step) {
+        const Turn one = turn(step), two = mul(one, one);
+        four_ = mul(two, two);
+        next_[0] = turn(start);
+        next_[1] = mul(next_[0], one);
+        next_[2] = mul(next_[0], two);
+        next_[3] = mul(next_[1], two);
     }
 
     void fill(Sample* out, int64_t count) {
@@ -114,14 +119,21 @@ class Fft {
    public:
     explicit Fft(int size) : size_(size), twiddles_(size) {
         for (int k = 0; k < size; k++) twiddles_[k] = unit(-kTau * k / size);
+        for (int turns = 1; turns < 4; turns++)
+            for (int k = 0; k < size / 4; k++) first_[turns - 1].push_back(twiddles_[turns * k & (size - 1)]);
     }
 
     int size() const { return size_; }
 
     // In place; `spare` has room for as many.
-    void run(Sample* data, Sample* spare) const {
+    void run(Sample* __restrict data, Sample* __restrict spare) const {
         Sample *from = data, *to = spare;
         int left = size_, done = 1;
+        if (left >= 4) {
+            first(data, spare);
+            left /= 4;
+            done = 4;
+        }
         for (; left >= 4; left /= 4, done *= 4) {
             radix4(from, to, left / 4, done);
             std::swap(from, to);
@@ -138,7 +150,29 @@ class Fft {
     }
 
    private:
-    void radix4(const Sample* from, Sample* to, int quarter, int done) const {
+    // The first step, whose results are 4 apart: they are made side by side, and put there.
+    void first(Sample* __restrict data, Sample* __restrict spare) const {
+        const int quarter = size_ / 4;
+        const Sample *a = data, *b = a + quarter, *c = b + quarter, *d = c + quarter;
+        const Sample *w1 = first_[0].data(), *w2 = first_[1].data(), *w3 = first_[2].data();
+        Sample *one = spare, *two = one + quarter, *three = two + quarter, *four = three + quarter;
+        for (int k = 0; k < quarter; k++) {
+            const Sample sum = a[k] + c[k], difference = a[k] - c[k], other = b[k] + d[k], rest = b[k] - d[k];
+            const Sample turned(rest.imag(), -rest.real());
+            one[k] = sum + other;
+            two[k] = mul(w1[k], difference + turned);
+            three[k] = mul(w2[k], sum - other);
+            four[k] = mul(w3[k], difference - turned);
+        }
+        for (int k = 0; k < quarter; k++) {
+            data[4 * k] = one[k];
+            data[4 * k + 1] = two[k];
+            data[4 * k + 2] = three[k];
+            data[4 * k + 3] = four[k];
+        }
+    }
+
+    void radix4(const Sample* __restrict from, Sample* __restrict to, int quarter, int done) const {
         const int mask = size_ - 1;
         for (int j = 0; j < quarter; j++) {
             const Sample w1 = twiddles_[j * done], w2 = twiddles_[2 * j * done & mask], w3 = twiddles_[3 * j * done & mask];
@@ -157,7 +191,7 @@ class Fft {
     }
 
     int size_;
-    std::vector<Sample> twiddles_;
+    std::vector<Sample> twiddles_, first_[3];  // of the first step: once, twice and three times the angle
 };
 
 }  // namespace gr_ros2

@@ -9,7 +9,8 @@ namespace {
 constexpr double kTiny = 1e-30;
 constexpr double kSmallestNoise = 1e-6;
 constexpr int kPad = 4;       // FFT bins per bin of the preamble's length
-constexpr int kStep = 64;     // positions searched at a time
+constexpr int kLanes = 8, kSums = 4;  // 32 positions are searched at a time: two sums of each fit into registers
+using Lanes = float __attribute__((vector_size(kLanes * sizeof(float))));
 constexpr double kFar = 1e6;  // samples that no burst can be late
 using Bits = std::vector<uint8_t>;
 enum Digit { kOver, kZero, kOne, kDigits };  // of a sequence of bits: none, a zero, a one
@@ -32,7 +33,7 @@ struct Scratch {
     std::vector<Sample> raw, turned, other;                // per symbol of a chunk
     std::vector<float> heights;
     std::vector<double> drift, places, angles;
-    std::vector<int> decided;
+    Nearest decided;
     Bits sent;
 };
 
@@ -197,7 +198,6 @@ class Linear final : public Modem {
         s.drift.resize(p_.chunk);
         const int blocks = std::max(1, p_.chunk / p_.block);
         for (auto* one : {&s.places, &s.angles}) one->resize(blocks + 1);
-        s.decided.resize(symbols(lengths_.longest()));
         return s;
     }
 
@@ -207,36 +207,49 @@ class Linear final : public Modem {
         const int64_t steps = samples.count - sps;
         for (auto* one : {&s.re, &s.im, &s.power}) one->resize(steps);
         for (auto* one : {&s.match, &s.chance}) one->resize(positions);
-        float *re = s.re.data(), *im = s.im.data(), *power = s.power.data();
+        float *re = s.re.data(), *im = s.im.data(), *power = s.power.data(), *chance = s.chance.data();
         for (int64_t k = 0; k < steps; k++) {
             const Sample p = mul_conj(samples.at[k + sps], samples.at[k]);
             re[k] = p.real();
             im[k] = p.imag();
             power[k] = square(p);
         }
-        for (int64_t at = 0; at < positions; at += kStep) {
-            float a[kStep] = {}, b[kStep] = {}, c[kStep] = {};
-            const int width = static_cast<int>(std::min<int64_t>(kStep, positions - at));
+        // Sums over `count` steps are made of sums over 1, 2, 4, ... of them.
+        std::fill_n(chance, positions, 0.0f);
+        int64_t known = steps;
+        for (int64_t many = 1, over = 0; many <= count; many *= 2) {
+            if (count & many) {
+                for (int64_t k = 0; k < positions; k++) chance[k] += power[k + over * sps];
+                over += many;
+            }
+            known -= many * sps;
+            for (int64_t k = 0; 2 * many <= count && k < known; k++) power[k] += power[k + many * sps];
+        }
+        int64_t at = 0;
+        for (; at + kSums * kLanes <= positions; at += kSums * kLanes) {
+            Lanes a[kSums] = {}, b[kSums] = {};
             for (int j = 0; j < count; j++) {
                 const int64_t from = at + static_cast<int64_t>(j) * sps;
-                if (width == kStep) add<kStep>(steps_[j], re + from, im + from, power + from, kStep, a, b, c);
-                else add<0>(steps_[j], re + from, im + from, power + from, width, a, b, c);
+                for (int k = 0; k < kSums; k++) {
+                    Lanes one, other;
+                    std::memcpy(&one, re + from + k * kLanes, sizeof one);
+                    std::memcpy(&other, im + from + k * kLanes, sizeof other);
+                    a[k] += steps_[j] * one;
+                    b[k] += steps_[j] * other;
+                }
             }
-            for (int k = 0; k < width; k++) {
-                s.match[at + k] = a[k] * a[k] + b[k] * b[k];
-                s.chance[at + k] = c[k];
+            for (int k = 0; k < kSums; k++) {
+                const Lanes match = a[k] * a[k] + b[k] * b[k];
+                std::memcpy(&s.match[at + k * kLanes], &match, sizeof match);
             }
         }
-    }
-
-    // A width that the compiler knows lets it keep the sums in registers.
-    template <int Known>
-    static void add(float sign, const float* re, const float* im, const float* power, int width, float* a, float* b,
-                    float* c) {
-        for (int k = 0; k < (Known ? Known : width); k++) {
-            a[k] += sign * re[k];
-            b[k] += sign * im[k];
-            c[k] += power[k];
+        for (; at < positions; at++) {
+            float a = 0, b = 0;
+            for (int j = 0; j < count; j++) {
+                a += steps_[j] * re[at + static_cast<int64_t>(j) * sps];
+                b += steps_[j] * im[at + static_cast<int64_t>(j) * sps];
+            }
+            s.match[at] = a * a + b * b;
         }
     }
 
@@ -375,10 +388,9 @@ class Linear final : public Modem {
 
     // Samples by which a chunk's symbols came late, as their decisions say; `other` holds what straightened them.
     double chunk_lateness(Samples samples, double at, const Sample* points, int count, Scratch& s) const {
-        for (int k = 0; k < count; k++) {
-            const Sample decided = points_.point(points_.nearest(points[k]));
-            s.turned[k] = mul(mul(s.turned[k], s.other[k]), std::conj(decided));
-        }
+        points_.nearest(points, count, s.decided);
+        for (int k = 0; k < count; k++)
+            s.turned[k] = mul_conj(mul(s.turned[k], s.other[k]), {s.decided.real[k], s.decided.imag[k]});
         double heights[3];
         for (int off = -1; off <= 1; off++) {
             between(samples, at + off, count, s.other.data());
@@ -413,24 +425,21 @@ class Linear final : public Modem {
     // Points made as large as the constellation's, and their soft bits.
     void decide(Sample* points, int payload, float* soft, Scratch& s) const {
         double energy = 0, alike = 0, rest = 0;
+        points_.nearest(points, payload, s.decided);
+        const float *real = s.decided.real.data(), *imag = s.decided.imag.data();
         for (int k = 0; k < payload; k++) {
-            s.decided[k] = points_.nearest(points[k]);
-            const Sample decided = points_.point(s.decided[k]);
-            energy += square(decided);
-            alike += mul_conj(points[k], decided).real();
+            energy += static_cast<double>(real[k] * real[k] + imag[k] * imag[k]);
+            alike += static_cast<double>(points[k].real() * real[k] + points[k].imag() * imag[k]);
         }
         const double gain = std::max(alike / std::max(energy, 1e-20), 1e-20);
+        const auto scale = static_cast<float>(gain);
         for (int k = 0; k < payload; k++)
-            rest += square(points[k] - points_.point(s.decided[k]) * static_cast<float>(gain));
+            rest += static_cast<double>(square(points[k] - Sample(real[k] * scale, imag[k] * scale)));
         const double noise = rest / payload / (gain * gain);
         const auto sharpness = static_cast<float>(1 / std::max(noise, kSmallestNoise * points_.power()));
         const auto inverse = static_cast<float>(1 / gain);
-        float likely[64];
-        for (int k = 0; k < payload; k++) {
-            points[k] *= inverse;
-            for (int q = 0; q < p_.order; q++) likely[q] = points_.likelihood(points[k], q) * sharpness;
-            points_.soft_of(likely, soft + static_cast<size_t>(k) * p_.point_bits);
-        }
+        for (int k = 0; k < payload; k++) points[k] *= inverse;
+        points_.soft(points, payload, sharpness, s.decided, soft);
     }
 
     // Bits that are 1 where a phase is that of the symbol before; the first one's before is the preamble's last.

@@ -56,6 +56,7 @@ struct Clock {
 struct Scratch {
     std::vector<double> products[2], powers;                       // running sums
     std::vector<Sample> rotation, first, second, profile, spare;   // an FFT long
+    std::vector<Sample> powers_of;                                 // of a turn: none to half an FFT
     std::vector<Sample> rows, model, turns;                        // a chunk of symbols by used carriers
     std::vector<float> energies, heights;
     std::vector<Sample> gains, before, sum, step, known;           // per used carrier
@@ -77,15 +78,12 @@ std::vector<T> copied(const T* from, size_t count) {
     return std::vector<T>(from, from + count);
 }
 
-void matrix_times(const Sample* matrix, const Sample* vector, Sample* out, int count) {
-    for (int row = 0; row < count; row++, matrix += count) {
-        float real = 0, imag = 0;
-        for (int k = 0; k < count; k++) {
-            const Sample p = mul(matrix[k], vector[k]);
-            real += p.real();
-            imag += p.imag();
-        }
-        out[row] = {real, imag};
+// Of a matrix column by column: sums that stand side by side.
+void matrix_times(const Sample* __restrict columns, const Sample* __restrict vector, Sample* __restrict out, int count) {
+    std::fill_n(out, count, Sample());
+    for (int column = 0; column < count; column++, columns += count) {
+        const Sample by = vector[column];
+        for (int row = 0; row < count; row++) out[row] += mul(columns[row], by);
     }
 }
 
@@ -106,7 +104,6 @@ class Ofdm final : public Modem {
           back_(p.prefix / 4),
           used_(p.carrier_count),
           carriers_(copied(p.carriers, p.carrier_count)),
-          data_(copied(p.data, p.data_count)),
           pilots_(copied(p.pilots, p.pilot_count)),
           once_(copied(p.once, p.once_count)),
           twice_(copied(p.twice, p.twice_count)),
@@ -127,6 +124,7 @@ class Ofdm final : public Modem {
           bpsk_(bpsk()),
           fft_(p.size),
           roots_(kToneSize) {
+        arrange(p.data);
         const Sample* points = p.points;
         const uint8_t* marks = p.marks;
         for (int mcs = 0; mcs < p.mcs_count; mcs++) {
@@ -244,7 +242,7 @@ class Ofdm final : public Modem {
             const Sample* word = symbol < 2 ? &words_[symbol * used_] : known_.data();
             for (int c = 0; c < used_; c++) grid[bins_[c]] = word[c];
             for (int d = 0; symbol >= 2 && d < p_.data_count; d++) {
-                Sample& at = grid[bins_[data_[d]]];
+                Sample& at = grid[bins_[d]];
                 if (symbol == 2) at = (d < kWordBits ? header[d] : 0) ^ header_mask_[d] ? 1.0f : -1.0f;
                 else if (taken < frame_bits) {
                     int value = 0;
@@ -261,6 +259,30 @@ class Ofdm final : public Modem {
     }
 
    private:
+    // The used carriers with those of data first, in order: then what is done for each of them needs no index.
+    void arrange(const int32_t* data) {
+        std::vector<int32_t> order = copied(data, p_.data_count), place(used_);
+        for (int c = 0; c < used_; c++)
+            if (std::find(order.begin(), order.end(), c) == order.end()) order.push_back(c);
+        for (int k = 0; k < used_; k++) place[order[k]] = k;
+        const auto sort = [&](auto& values) {
+            auto before = values;
+            for (size_t k = 0; k < values.size(); k++) values[k] = before[k / used_ * used_ + order[k % used_]];
+        };
+        sort(carriers_);
+        sort(words_);
+        sort(known_);
+        sort(word_weight_);
+        for (auto* matrix : {&smooth_, &smooth_words_}) {
+            const auto rows = *matrix;
+            for (int column = 0; column < used_; column++)
+                for (int row = 0; row < used_; row++)
+                    (*matrix)[column * used_ + row] = rows[order[row] * used_ + order[column]];
+        }
+        for (auto* some : {&pilots_, &once_, &twice_})
+            for (int& c : *some) c = place[c];
+    }
+
     // What packets of one MCS are sent with.
     struct Mcs {
         Lengths lengths;
@@ -337,6 +359,7 @@ class Ofdm final : public Modem {
     Scratch& prepared() const {
         Scratch& s = scratch();
         for (auto* one : {&s.rotation, &s.first, &s.second, &s.profile, &s.spare}) one->resize(p_.size);
+        s.powers_of.resize(half_ + 1);
         const int rows = std::max(p_.chunk, kHead);
         for (auto* one : {&s.rows, &s.model, &s.turns}) one->resize(static_cast<size_t>(rows) * used_);
         s.energies.resize(static_cast<size_t>(rows) * used_);
@@ -525,33 +548,37 @@ class Ofdm final : public Modem {
         const int64_t base = std::llrint(clock.begin + clock.pace * symbol);
         const int64_t first = std::max<int64_t>(0, base + static_cast<int64_t>(symbol) * symbol_ + p_.prefix - back_);
         Rotation(0, -frequency).fill(s.rotation.data(), p_.size);
+        Rotation(-frequency * static_cast<double>(first), -frequency * symbol_).fill(s.straight.data(), count);
         const float scale = 1.0f / p_.size;
+        const double late = clock.begin + clock.pace * symbol - static_cast<double>(base);
+        const bool moved = late != 0 || clock.pace != 0;
+        if (moved) {
+            advance(late, s, s.step.data());
+            advance(clock.pace, s, s.known.data());
+        }
         for (int row = 0; row < count; row++) {
             const int64_t at = first + static_cast<int64_t>(row) * symbol_;
             const int have = static_cast<int>(std::max<int64_t>(0, std::min<int64_t>(p_.size, samples.count - at)));
-            const Sample start = unit(-frequency * static_cast<double>(at));
-            Sample *body = s.first.data(), *out = &s.rows[static_cast<size_t>(row) * used_];
-            for (int k = 0; k < have; k++) body[k] = mul(mul(samples.at[at + k], s.rotation[k]), start);
+            const Sample start = s.straight[row] * scale, *in = samples.at + at, *turned = s.rotation.data();
+            Sample* __restrict body = s.first.data();
+            Sample* __restrict out = &s.rows[static_cast<size_t>(row) * used_];
+            for (int k = 0; k < have; k++) body[k] = mul(in[k], turned[k]);
             std::fill(body + have, body + p_.size, Sample());
             fft_.run(body, s.spare.data());
-            for (int c = 0; c < used_; c++) out[c] = body[bins_[c]] * scale;
-            const double late = clock.begin + clock.pace * (symbol + row) - static_cast<double>(base);
-            if (late != 0) {
-                advance(late, s.step.data());
-                for (int c = 0; c < used_; c++) out[c] = mul(out[c], s.step[c]);
+            for (int c = 0; c < used_; c++) out[c] = mul(body[bins_[c]], start);
+            for (int c = 0; moved && c < used_; c++) {
+                out[c] = mul(out[c], s.step[c]);
+                s.step[c] = mul(s.step[c], s.known[c]);
             }
         }
     }
 
     // What brings carriers forward by a fraction of a sample, or some.
-    void advance(double samples, Sample* out) const {
-        const double step = kTau / p_.size * samples;
-        // Carriers are in order, with few gaps: one recurrence passes all of them.
-        Turn next = turn(step * carriers_[0]);
-        const Turn one = turn(step);
+    void advance(double samples, Scratch& s, Sample* out) const {
+        Rotation(0, kTau / p_.size * samples).fill(s.powers_of.data(), half_ + 1);
         for (int c = 0; c < used_; c++) {
-            out[c] = Sample(next);
-            for (int k = carriers_[c]; c + 1 < used_ && k < carriers_[c + 1]; k++) next = mul(next, one);
+            const Sample turned = s.powers_of[std::abs(carriers_[c])];
+            out[c] = carriers_[c] < 0 ? std::conj(turned) : turned;
         }
     }
 
@@ -617,7 +644,7 @@ class Ofdm final : public Modem {
             model(s, count, used, &certain, &all);
             for (int i = 0; i < count; i++) {
                 const Sample *in = rows + i * used_, *sent = &s.model[i * used_], *gains = s.gains.data();
-                Sample* out = &s.turns[i * used_];
+                Sample* __restrict out = &s.turns[i * used_];
                 float re = 0, im = 0;
                 for (int c = 0; c < used_; c++) {
                     out[c] = mul_conj(in[c], mul(gains[c], sent[c]));
@@ -629,19 +656,20 @@ class Ofdm final : public Modem {
             tone(s, count);
             const double more = lateness(s, count, &firm);
             late += more;
-            advance(more, s.step.data());
+            advance(more, s, s.step.data());
             for (int c = 0; c < used_; c++) {
                 s.total[c] = std::min(s.weight[c], static_cast<float>(p_.memory));
                 s.sum[c] = s.before[c] * s.total[c];
             }
             for (int i = 0; i < count; i++) {
-                Sample* in = rows + i * used_;
-                const Sample *sent = &s.model[i * used_], straight = s.straight[i];
+                Sample *__restrict in = rows + i * used_, *__restrict sum = s.sum.data();
+                const Sample *sent = &s.model[i * used_], *step = s.step.data(), straight = s.straight[i];
                 const float* energies = &s.energies[i * used_];
+                float* __restrict total = s.total.data();
                 for (int c = 0; c < used_; c++) {
-                    in[c] = mul(mul(in[c], straight), s.step[c]);
-                    s.sum[c] += mul_conj(in[c], sent[c]);
-                    s.total[c] += energies[c];
+                    in[c] = mul(mul(in[c], straight), step[c]);
+                    sum[c] += mul_conj(in[c], sent[c]);
+                    total[c] += energies[c];
                 }
             }
             for (int c = 0; c < used_; c++) s.sum[c] /= s.total[c];
@@ -656,23 +684,24 @@ class Ofdm final : public Modem {
     // What was sent, as far as is known: pilots, and what the points that were received are expected to be.
     void model(Scratch& s, int count, int used, double* certain, double* all) const {
         for (int i = 0; i < count; i++) {
-            Sample* sent = &s.model[i * used_];
-            float* energies = &s.energies[i * used_];
+            Sample* __restrict sent = &s.model[i * used_];
+            float* __restrict energies = &s.energies[i * used_];
             std::copy(known_.begin(), known_.end(), sent);
             std::fill_n(energies, used_, 1.0f);
             const int first = i * p_.data_count, here = std::max(0, std::min(p_.data_count, used - first));
+            const float *real = &s.seen.means[0][first], *imag = &s.seen.means[1][first];
+            const float *one = &s.seen.squares[0][first], *other = &s.seen.squares[1][first];
             float squares = 0, powers = 0;
             for (int d = 0; d < here; d++) {
-                const float re = s.seen.means[0][first + d], im = s.seen.means[1][first + d];
-                const float power = s.seen.squares[0][first + d] + s.seen.squares[1][first + d];
-                sent[data_[d]] = {re, im};
-                energies[data_[d]] = power;
+                const float re = real[d], im = imag[d], power = one[d] + other[d];
+                sent[d] = {re, im};
+                energies[d] = power;
                 squares += re * re + im * im;
                 powers += power;
             }
             for (int d = here; d < p_.data_count; d++) {
-                sent[data_[d]] = Sample();
-                energies[data_[d]] = 0;
+                sent[d] = Sample();
+                energies[d] = 0;
             }
             *certain += squares;
             *all += powers;
@@ -682,20 +711,25 @@ class Ofdm final : public Modem {
     // Points as received, and how sharp each is.
     void weigh(Scratch& s, const Sample* rows, float noise, const Constellation& points, int used) const {
         for (int d = 0; d < p_.data_count; d++) {
-            const Sample gain = s.gains[data_[d]];
+            const Sample gain = s.gains[d];
             const float power = square(gain) + static_cast<float>(kTiny);
             s.inverse[d] = std::conj(gain) / power;
             s.sharpness[d] = 1.0f / std::max(noise / power, kSmallestNoise * points.power());
         }
         for (int first = 0; first < used; first += p_.data_count, rows += used_) {
             const int here = std::min(p_.data_count, used - first);
+            const Sample *in = rows, *inverse = s.inverse.data();
+            Sample* __restrict point = &s.seen.points[first];
+            float *__restrict real = &s.seen.parts[0][first], *__restrict imag = &s.seen.parts[1][first];
             for (int d = 0; d < here; d++) {
-                const Sample point = mul(rows[data_[d]], s.inverse[d]);
-                s.seen.points[first + d] = point;
-                s.seen.parts[0][first + d] = point.real();
-                s.seen.parts[1][first + d] = point.imag();
-                s.seen.sharpness[first + d] = s.sharpness[d];
+                const float a = in[d].real(), b = in[d].imag(), c = inverse[d].real(), e = inverse[d].imag();
+                real[d] = a * c - b * e;
+                imag[d] = a * e + b * c;
             }
+            for (int d = 0; d < here; d++) {
+                point[d] = {real[d], imag[d]};
+            }
+            std::copy_n(s.sharpness.begin(), here, &s.seen.sharpness[first]);
         }
         points.weigh(s.seen, used);
     }
@@ -754,7 +788,7 @@ class Ofdm final : public Modem {
     OfdmParameters p_;  // its numbers; arrays are copied below
     Lengths lengths_;   // of the first MCS
     int symbol_, half_, window_, back_, used_, most_points_ = 0, longest_ = 0;
-    std::vector<int32_t> carriers_, data_, pilots_, once_, twice_, shifts_, bins_;
+    std::vector<int32_t> carriers_, pilots_, once_, twice_, shifts_, bins_;
     std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_, advances_;
     std::vector<uint8_t> headers_, header_mask_;
     std::vector<float> signs_;
