@@ -446,6 +446,9 @@ effects(
     ),
     airtime=Elsewhere("radio/test_two_radios.py::test_each_radio_has_a_name_a_phy_a_front_end_and_airtime_of_its_own"),
     packet_len=Elsewhere("radio/test_bound_topics.py::test_a_radio_has_longer_packets_for_what_goes_over_it_alone"),
+    medium=Elsewhere(
+        "radio/test_radios_apart.py::test_a_shared_channel_carries_what_is_bound_to_it_to_robots_that_have_it_alone"
+    ),
 )
 effects(
     "Link",

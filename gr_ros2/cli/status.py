@@ -65,7 +65,8 @@ def radio_words(stats: Stats) -> list[str]:
 def bound_words(radio: Mapping[str, Any]) -> str:
     """What goes over one of several radios alone, and whether it has a way."""
     bound = radio["bound"]
-    words = f"{', '.join(bound['topics'])}; {bound['packets']} packets sent, {bound['waiting']} messages wait"
+    mcs = f", sent with {radio['phy']['mcs']}" if "mcs" in radio["phy"] else ""
+    words = f"{', '.join(bound['topics'])}{mcs}; {bound['packets']} packets sent, {bound['waiting']} messages wait"
     if not radio["present"]:
         return f"{words}, until the device is back"
     return words if bound["heard"] else f"{words}; nobody is heard there, so nothing says that they arrive"

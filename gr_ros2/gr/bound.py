@@ -5,16 +5,19 @@ after those that a fast one has carried since: reliable messages would wait for 
 came. So what goes over one radio alone has numbers, seals, reports and repairs of its own, as a second link would.
 
 *On the air.* Each packet of such an endpoint stands behind the byte ``BOUND``, with which no other packet begins, and
-is sealed with keys of its own.
+is sealed with keys of its own. A radio on whose channel other robots send too (slots, ALOHA) carries nothing else of
+this robot, and its packets are those of robots that have it as their only radio.
 
-*Who has one.* A radio that some topic of this robot names, from the start on; another one from the first such packet on
-that comes over it, so that a robot takes what others have bound. That one sends nothing before it has heard a robot.
+*Who has one.* A radio that some topic of this robot names, or that shares its channel, from the start on; another one
+from the first such packet on that comes over it, so that a robot takes what others have bound. That one sends nothing
+before it has heard a robot.
 
 *Observers* are told what comes out. So that topic ids of several endpoints are not mixed up, those of a radio's own are
 greater by ``APART`` times the number of the radio, counted from 1.
 
 *Services* that are bound are announced and called there, and what fills gaps (:mod:`gr_ros2.gr.backfill`) crosses
-there. What is offered and bound is asked for over all radios, and sent over its own.
+there. What is offered and bound is asked for over all radios, and sent over its own; over a radio that shares its
+channel, it is asked for there.
 
 *Airtime.* The credits of the radio are for both endpoints, see :mod:`gr_ros2.link.shared_credits`.
 """
@@ -36,6 +39,7 @@ from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.radio_ports import RadioPorts
 from gr_ros2.gr.receiving import ReceivingBlock
 from gr_ros2.gr.starts import bound_state_file
+from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link import AirPacket, SentPacket
 from gr_ros2.link.air import Air
 from gr_ros2.link.endpoint import OpenEndpoint
@@ -69,12 +73,19 @@ class OwnWay:
     :param packet_len: bytes of its longest packet, with the byte before it
     :param sends: whether it may send
     :param air: what an endpoint has to know of it
+    :param shares: whether other robots send on its channel, so that it carries nothing else of this robot
     """
 
     name: str
     packet_len: int
     sends: bool
     air: Air
+    shares: bool = False
+
+    @property
+    def mark(self) -> bytes:
+        """What stands before each packet."""
+        return b"" if self.shares else BOUND
 
 
 def bound_to_none(options: SendOptions) -> bool:
@@ -123,9 +134,11 @@ class BoundEnd:
     :ivar named: whether a topic of this robot is bound to the radio
     :ivar sends: whether it sends now
     :ivar calls: its services; None where it goes one way, or topics leave no room for calls
+    :ivar wishes: what others ask for there
     :ivar backfill: what crosses later; None where nothing does
     """
 
+    wishes: LiveWishes | None = None
     calls: LiveCalls | None = None
     backfill: LiveBackfill | None = None
 
@@ -147,8 +160,8 @@ class BoundEnd:
         own = replace(
             config,
             topics=config.topics if self.named else {},
-            offer={},
-            packet_len=way.packet_len - len(BOUND),
+            offer={word: how for word, how in config.offer.items() if way.shares and how.via == way.name},
+            packet_len=way.packet_len - len(way.mark),
             state=str(bound_state_file(config.state, config.robot_id, radio)),
         )
         topics = known if own.sends else Registry.empty()
@@ -160,7 +173,9 @@ class BoundEnd:
         self._credits = SharedCredits(main.unused(radio))
         self._running = self.sends = False
         counted = start_of(own)
-        self._start = counted if counted.keys is None else replace(counted, keys=counted.keys.bound())
+        if counted.keys is not None and not way.shares:
+            counted = replace(counted, keys=counted.keys.bound())
+        self._start = counted
         try:
             self.end: LiveEnd[OpenEndpoint] = LiveEnd(
                 lambda events: make_endpoint(own, topics, air=way.air, start=self._start, observer=events, calls=calls)
@@ -180,6 +195,8 @@ class BoundEnd:
             self.sink = ReceivingBlock(own, published, self.end, graph, observer=told, clock=clock)
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
+                if way.shares:
+                    self.wishes = LiveWishes(own, self.calls, self.source, graph, clock=clock)
                 if self.named and config.backfill.topics:
                     self.backfill = LiveBackfill(config, self.end, self.source, share=way.air.airtime_share)
         except GrRos2Error:
@@ -215,7 +232,13 @@ class BoundEnd:
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
-        for part in (self.backfill, self.calls, getattr(self, "source", None), getattr(self, "sink", None)):
+        for part in (
+            self.backfill,
+            self.wishes,
+            self.calls,
+            getattr(self, "source", None),
+            getattr(self, "sink", None),
+        ):
             if part is not None:
                 part.close()
         self._start.close()
@@ -228,6 +251,9 @@ class BoundEnd:
 
     def granted(self, packets: int, since: float | None) -> int:
         """The radio takes so many further packets; returns how many of them the endpoint with all radios may send."""
+        if self.way.shares:
+            self.source.grant(packets, since)
+            return 0
         wanted_by = {ALL} if self._main.wants(self._radio) else set()
         if self.sends and self.source.wants(self._radio):
             wanted_by.add(ALONE)
@@ -253,8 +279,8 @@ class BoundEnd:
 
     def send(self, packets: list[SentPacket], *, adaptive: bool) -> None:
         """Packets of this endpoint leave."""
-        self._ports.send_bound(self._radio, packets, adaptive=adaptive)
-        if not self._paced:
+        self._ports.send_bound(self._radio, packets, self.way.mark, adaptive=adaptive)
+        if not self._paced or self.way.shares:
             return
         with self._lock:
             for _ in packets:
@@ -267,7 +293,7 @@ class BoundEnd:
         if self._paced:
             with self._lock:
                 self._credits.forget()
-                self._follow()
+                self._follow()  # a radio that shares its channel has not been told of any
 
     def stats(self) -> dict[str, Any]:
         """A snapshot of both halves."""
@@ -278,6 +304,7 @@ class BoundEnd:
             "source": self.source.stats(),
             "sink": self.sink.stats(),
             "heard": heard,
+            "rate": self.source.rate(),
             "calls": {} if self.calls is None else self.calls.stats(),
             "backfill": {} if self.backfill is None else self.backfill.stats(),
         }
@@ -289,7 +316,7 @@ class BoundEnd:
                 return
             with self.end.lock:
                 heard = self.end.endpoint.received.packets > 0  # none counts that was not opened
-            if self.named or heard:
+            if self.named or self.way.shares or heard:
                 self.sends = True
                 self.source.start()
 
@@ -317,7 +344,7 @@ class BoundEnds:
         named = names_of(config)
         try:
             for radio, way in ways.items():
-                if way.name in named:
+                if way.name in named or way.shares:
                     self._ends[radio] = self._make(radio)
         except GrRos2Error:
             self.close()
@@ -347,6 +374,10 @@ class BoundEnds:
 
     def take(self, radio: int, packets: Sequence[AirPacket]) -> list[AirPacket]:
         """Take what is for one of these of the packets that have come over a radio; returns the others."""
+        if radio in self._ways and self._ways[radio].shares:
+            if (end := self._of(radio)) is not None:
+                end.take(packets)
+            return []
         mine = [packet for packet in packets if packet.data.startswith(BOUND)]
         end = self._of(radio) if mine else None
         if end is None:
@@ -377,7 +408,7 @@ class BoundEnds:
 
     def source_of(self, via: str) -> LinkSendingBlock | None:
         """What sends over a radio alone, by its name."""
-        return next((end.source for end in self._ends.values() if end.named and end.way.name == via), None)
+        return next((end.source for end in self._ends.values() if end.way.name == via), None)
 
     @property
     def calls(self) -> list[LiveCalls]:

@@ -13,7 +13,7 @@ from gr_ros2.link.bond import Bond
 from gr_ros2.phy.pdus import PduPort, port_of
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire import BOUND, QOS_LATENCY
+from gr_ros2.wire import QOS_LATENCY
 
 
 class RadioPorts:
@@ -60,9 +60,13 @@ class RadioPorts:
             self._send_over(radio, share, adaptive)
             self.left(radio, share)
 
-    def send_bound(self, radio: int, packets: list[SentPacket], *, adaptive: bool) -> None:
-        """Send packets of the endpoint that has one radio alone. Called without a lock."""
-        self._send_over(radio, [sent._replace(data=BOUND + sent.data) for sent in packets], adaptive)
+    def send_bound(self, radio: int, packets: list[SentPacket], mark: bytes, *, adaptive: bool) -> None:
+        """Send packets of the endpoint that has one radio alone. Called without a lock.
+
+        :param mark: what stands before each
+        """
+        marked = [sent._replace(data=mark + sent.data) for sent in packets] if mark else packets
+        self._send_over(radio, marked, adaptive)
 
     def _send_over(self, radio: int, packets: list[SentPacket], adaptive: bool) -> None:
         port = self._ports[radio]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -129,6 +130,9 @@ class RosLink(LinkBlock):
         ways: Mapping[int, OwnWay] | None = None,
     ) -> None:
         super().__init__(config, 1 if bond is None else len(bond.carries))
+        own = config
+        if apart := {way.name for way in (ways or {}).values() if way.shares}:
+            own = replace(config, offer={word: how for word, how in config.offer.items() if how.via not in apart})
         known = registry
         if known is None:
             known = Registry.from_csv(config.registry) if config.registry else Registry.empty()
@@ -155,7 +159,7 @@ class RosLink(LinkBlock):
         published = heard.with_options(config.publish.topics, announced=True)
         try:
             self.source = LinkSendingBlock(
-                config, topics, sending, graph, backpressure=backpressure, takes=bound_to_none, **common
+                own, topics, sending, graph, backpressure=backpressure, takes=bound_to_none, **common
             )
             self.sink = ReceivingBlock(config, published, self.end, graph, **common)
             if ways and isinstance(self.source.ports, RadioPorts):
@@ -174,7 +178,7 @@ class RosLink(LinkBlock):
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
                 self.wishes = LiveWishes(
-                    config,
+                    own,
                     self.calls,
                     self.source,
                     graph,

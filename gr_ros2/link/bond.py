@@ -13,7 +13,7 @@ packets that the endpoint has taken count as heard. A radio has at most ``OUTSTA
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 from gr_ros2.link.airtime import OUTSTANDING
@@ -40,14 +40,15 @@ class Bond:
     """The radios of one robot, by their numbers from 0 on.
 
     :param airtimes: s that the longest packet occupies on each
+    :param apart: those that carry nothing here
     :ivar present: whether the device of each is there
     :ivar carries: whether each carries packets that leave only once
     :ivar sent, copied, skipped, came, copies: packets that each has carried alone, and as a copy; copies for which it
         had no room; packets that came over it first, and as a copy
     """
 
-    def __init__(self, airtimes: Sequence[float]) -> None:
-        self._airtimes = tuple(airtimes)
+    def __init__(self, airtimes: Sequence[float], apart: Collection[int] = ()) -> None:
+        self._airtimes, self._apart = tuple(airtimes), frozenset(apart)
         every = range(len(self._airtimes))
         self.sent, self.copied, self.skipped, self.came, self.copies = ([0 for _ in every] for _ in range(5))
         self.present = [True for _ in every]
@@ -96,7 +97,7 @@ class Bond:
             return [first]
         radios = [first]
         for radio, present in enumerate(self.present):
-            if radio == first or not present:
+            if radio == first or not present or radio in self._apart:
                 continue
             if self._takes(radio):
                 self.copied[radio] += 1
@@ -166,6 +167,8 @@ class Bond:
 
     def heard(self, radio: int) -> dict[int, float]:
         """Share of the packets of each robot that were to come over every radio and came over this one, 0..1."""
+        if radio in self._apart:
+            return {}
         return {src_id: min(shares[radio], 1.0) for src_id, shares in self._heard.items()}
 
     def _taken(self, src_id: int, data: bytes) -> None:
@@ -181,9 +184,11 @@ class Bond:
     def _choose(self) -> None:
         """Find the radios that carry packets: those that every robot is heard over, and not much slower ones."""
         good = [all(2 * shares[r] >= max(shares) for shares in self._heard.values()) for r in range(len(self.present))]
-        usable = [present and fine for present, fine in zip(self.present, good, strict=True)]
+        ours = [radio not in self._apart for radio in range(len(self.present))]
+        here = [own and present for own, present in zip(ours, self.present, strict=True)]
+        usable = [there and fine for there, fine in zip(here, good, strict=True)]
         if not any(usable):
-            usable = self.present if any(self.present) else [True for _ in self.present]
+            usable = here if any(here) else ours
         most = LIKE * min(takes for takes, use in zip(self._airtimes, usable, strict=True) if use)
         self.carries = [use and takes <= most for takes, use in zip(self._airtimes, usable, strict=True)]
 

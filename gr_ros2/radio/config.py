@@ -25,10 +25,12 @@ from gr_ros2.settings.config import (
     ChannelConfig,
     ClockConfig,
     DiagnosticsConfig,
+    Medium,
     PacketLen,
     PhyConfig,
     Text,
     build,
+    check_medium,
 )
 from gr_ros2.settings.effect import ActsWhere
 from gr_ros2.settings.fields import AUTO, Auto
@@ -54,6 +56,8 @@ class RadioConfig:
     """bytes of the longest packet of topics whose ``via`` names it, the same at all robots; auto = the link's"""
     airtime: Airtime | Auto = AUTO
     """how much it may send, with an account of its own: settings, or the name of a band; auto = as the link says"""
+    medium: Medium | Auto = AUTO
+    """when it sends; with slots or aloha it carries only what names it in ``via``; auto = as the link says"""
 
 
 class OwnRadio(NamedTuple):
@@ -68,6 +72,12 @@ class OwnRadio(NamedTuple):
     front_end: Mapping[str, Any]
     airtime: AirtimeConfig
     packet_len: int
+    medium: Medium
+
+    @property
+    def shares(self) -> bool:
+        """Whether other robots send on its channel."""
+        return self.medium != "exclusive"
 
     @property
     def front_end_name(self) -> str:
@@ -85,9 +95,9 @@ class OwnRadio(NamedTuple):
         :raises ConfigError: for a wrong setting
         """
         rate = self.phy.sample_rate
-        longest = max(packet_len, self.packet_len)
+        longest = self.packet_len if self.shares else max(packet_len, self.packet_len)
         phy = configured(self.phy, longest, 0.0 if rate == AUTO else rate)
-        if packet_len != self.packet_len and not phy.any_length:
+        if packet_len != self.packet_len and not (self.shares or phy.any_length):
             raise ConfigError(
                 f"radio {self.called}: packet_len = {self.packet_len}, where that of the link is {packet_len}, and phy "
                 f"{self.phy.name} sends packets of one length; leave it out, or set lengths: any in the phy's options"
@@ -107,6 +117,7 @@ class OwnRadio(NamedTuple):
             raise ValueError(
                 f"{where}phy.sample_rate = auto: a link needs one; set it to what the radio can do, samples/s"
             )
+        check_medium(self.medium, self.phy, self.airtime, where)
         check_band(self.airtime, self.front_end_options, 0.0 if rate == AUTO else rate)
 
 
@@ -142,8 +153,8 @@ class LinkConfig(AirConfig, RobotConfig):
         ActsWhere(("front_end",), lambda link: not link.radios, "with radios, each has its own; leave it out"),
         ActsWhere(
             ("medium",),
-            lambda link: not link.radios,
-            "slots are those of one channel, and several radios have one each; leave radios or medium out",
+            lambda link: not link.radios or any(radio.medium == AUTO for radio in link.radios),
+            "each radio has its own; leave it out",
         ),
         ActsWhere(
             ("publish.stamps",),
@@ -185,22 +196,36 @@ class LinkConfig(AirConfig, RobotConfig):
             raise ValueError(f"radios: {len(names)} of 2 to {_MOST_RADIOS}; one alone is front_end")
         if len(set(names)) < len(names):
             raise ValueError(f"radios: two are called {max(names, key=names.count)!r}; give each a name of its own")
+        if all(own.shares for own in self.own_radios):
+            raise ValueError(
+                f"radios: all have medium {self.own_radios[0].medium}, so none carries what names no radio in via; set "
+                "medium: exclusive at one, or run a link for each"
+            )
         if words := sorted(BOUND_TO_NONE.intersection(names)):
             raise ValueError(f"radios: one is called {words[0]!r}, which means another thing in via; call it otherwise")
 
     def _check_bound(self, least: int) -> None:
         """:raises ValueError: for topics that cannot go over one radio alone"""
-        lengths = {own.called: own.packet_len for own in self.own_radios}
+        names, bound = [own.called for own in self.own_radios], set[str]()
         for part, chosen in (("topics", self.topics), ("offer", self.offer)):
             for word, options in chosen.items():
                 if (via := options.via) in BOUND_TO_NONE:
                     continue
-                if via not in lengths:
-                    raise ValueError(f"{part}.{word}.via = {via!r}: best, all, or one of {', '.join(lengths)}")
-                if lengths[via] < least + len(BOUND):
-                    raise ValueError(
-                        f"packet_len = {lengths[via]} of radio {via}: topics bound to it need {least + len(BOUND)}"
-                    )
+                bound.add(via)
+                if via not in names:
+                    raise ValueError(f"{part}.{word}.via = {via!r}: best, all, or one of {', '.join(names)}")
+        for own in self.own_radios:
+            needed = least if own.shares else least + len(BOUND)
+            if own.packet_len < needed and (own.shares or own.called in bound):
+                raise ValueError(
+                    f"packet_len = {own.packet_len} of radio {own.called}: topics bound to it need {needed}"
+                )
+
+    @property
+    def has_slots(self) -> bool:
+        return any((self.medium if own.medium == AUTO else own.medium) == "slots" for own in self.radios) or (
+            not self.radios and super().has_slots
+        )
 
     @property
     def remark(self) -> str:
@@ -220,6 +245,7 @@ class LinkConfig(AirConfig, RobotConfig):
                 radio.front_end,
                 self.airtime if radio.airtime == AUTO else radio.airtime,
                 self.packet_len if radio.packet_len == AUTO else radio.packet_len,
+                self.medium if radio.medium == AUTO else radio.medium,
             )
             for radio in radios
         )

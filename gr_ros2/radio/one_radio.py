@@ -237,6 +237,7 @@ def join_bound(
         sink["dropped"] = dict(Counter(sink["dropped"]) + Counter(stats["sink"]["dropped"]))
         if "radios" in radios:
             topics = stats["source"]["topics"]
+            radios["radios"][names[number]]["phy"].update(stats["rate"])
             radios["radios"][names[number]]["bound"] = {
                 "topics": sorted(topics),
                 "waiting": sum(topic["queued"] for topic in topics.values()),

@@ -116,9 +116,9 @@ class RobotLink(Flowgraph):
         config, radios = self.config, self.radios
         self._clock = self.front_end.clock
         if len(radios) > 1:
-            self.bond = Bond([radio.front_end.airtime(config.packet_len) for radio in radios])
-            if any(radio.phy.mcs_table for radio in radios):
-                raise ConfigError("radios: with several, each has one rate; set rate: fixed in the options of its phy")
+            apart = [number for number, radio in enumerate(radios) if radio.own.shares]
+            airtimes = [one.front_end.airtime(None if one.own.shares else config.packet_len) for one in radios]
+            self.bond = Bond(airtimes, apart)
         self._ros = RosSide(
             config,
             radios,

@@ -530,6 +530,14 @@ class PhyConfig:
         return self.name != "direct"
 
 
+def check_medium(medium: Medium, phy: PhyConfig, airtime: AirtimeConfig, where: str = "") -> None:
+    """:raises ValueError: for a medium that does not fit PHY and airtime limit"""
+    if medium != "exclusive" and not phy.takes_airtime:
+        raise ValueError(f"{where}medium = {medium!r}: phy direct takes no airtime; choose another")
+    if airtime.listen_before_send and medium != "exclusive":
+        raise ValueError(f"{where}airtime.listen_before_send: medium = {medium!r} has times of its own; leave it out")
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class AirConfig:
     """How robots send, which is the same for all that share a channel."""
@@ -546,14 +554,16 @@ class AirConfig:
     airtime: Airtime = Field(default_factory=AirtimeConfig)
     """how much a robot may send: settings, or the name of a band"""
 
+    @property
+    def has_slots(self) -> bool:
+        """Whether packets are sent in slots."""
+        return self.medium == "slots"
+
     @model_validator(mode="after")
     def _medium_fits(self) -> AirConfig:
-        if self.relay != "off" and self.medium != "slots":
+        if self.relay != "off" and not self.has_slots:
             raise ValueError(f"relay = {self.relay!r}: the packets of slots name who hears whom; set medium: slots")
-        if self.medium != "exclusive" and not self.phy.takes_airtime:
-            raise ValueError(f"medium = {self.medium!r}: phy direct takes no airtime; choose another")
-        if self.airtime.listen_before_send and self.medium != "exclusive":
-            raise ValueError(f"airtime.listen_before_send: medium = {self.medium!r} has times of its own; leave it out")
+        check_medium(self.medium, self.phy, self.airtime)
         if self.airtime.rule is not None and not self.phy.takes_airtime:
             raise ValueError("airtime: phy direct takes no airtime, so there is nothing to limit; leave it out")
         return self

@@ -96,7 +96,7 @@ def test_a_radio_that_is_pulled_and_plugged_in_carries_again(tmp_path: Path, clo
         ({"radios": [{"front_end": {"name": "sim"}}]}, "1 of 2 to 4; one alone is front_end"),
         ({"radios": [{"front_end": {"name": "sim"}}] * 2}, "two are called 'sim'; give each a name of its own"),
         ({"front_end": {"name": "udp"}}, "front_end = {'name': 'udp'}: with radios, each has its own"),
-        ({"medium": "slots"}, "several radios have one each"),
+        ({"medium": "slots"}, "radios: all have medium slots"),
         ({"radios": [], "topics": {"odom": {"via": "all"}}}, "topics.odom.via = 'all': a robot with one radio"),
         ({"record": "samples"}, "several radios have no signal in common"),
         ({"radios": [{"name": "a", "front_end": {}}, {"name": "b", "front_end": {}}]}, "front_end.name is missing"),
@@ -122,10 +122,3 @@ def test_what_several_radios_cannot_have_is_said(change: dict[str, Any], problem
     with pytest.raises(ConfigError) as refused:
         link_from({"robot": 1, "radios": radios, **change})
     assert problem in str(refused.value)
-
-
-def test_a_rate_that_adapts_is_refused_with_several_radios(tmp_path: Path) -> None:
-    phy = {"name": "ofdm", "sample_rate": 1e6, "options": {"rate": "adaptive"}}
-    radios = [{"name": name, "front_end": {"name": "sim"}, "phy": phy} for name in ("a", "b")]
-    with pytest.raises(ConfigError, match="each has one rate"):
-        RobotLink(config(1, {"name": "sim"}, radios=radios, state=str(tmp_path / "state")))

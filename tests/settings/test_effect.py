@@ -117,7 +117,12 @@ IDLE: dict[tuple[type[Any], str], tuple[Values, Values, Values, str]] = {
     },
     (Scenario, "robots.*.offer"): ({"robots": [{}, {"offer": ["scan"]}]}, {}, {}, "leave it out"),
     (LinkConfig, "front_end"): ({"front_end": {"name": "udp"}}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave it out"),
-    (LinkConfig, "medium"): ({"medium": "slots"}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave radios or medium out"),
+    (LinkConfig, "medium"): (
+        {"medium": "slots"},
+        {"radios": [{**radio, "medium": "exclusive"} for radio in TWO_RADIOS]},
+        {"radios": ()},
+        "each radio has its own",
+    ),
     (LinkConfig, "record"): ({"record": "heard"}, {"radios": TWO_RADIOS}, {"radios": ()}, "leave it out"),
     (Scenario, "controller"): (
         {"controller": "ros"},
