@@ -74,7 +74,7 @@ def fill(outage_s: float, loss: float = 0.0) -> Filled:
     )
     receiver = EndpointV1(None, Settings(2, packet_len=PACKET_LEN), boot=2000)
     config = BackfillConfig(topics=("odom",), for_s=2 * OUTAGE_S, memory_mb=100)
-    backfill = Backfill(config, sender, share=1.0, chosen=lambda topic: topic == ODOM, wall_s=lambda at: at)
+    backfill = Backfill(config, sender, share=1.0, chosen=lambda topic: topic == ODOM, wall_ahead=lambda: 0.0)
     notes.append(backfill.note)
     for end in (sender, receiver):
         end.pace.use_credit()

@@ -11,7 +11,7 @@ more the oldest goes and is counted; a message is kept once; none that nobody ha
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from heapq import heappop, heappush
 from math import inf
 from struct import Struct
@@ -254,11 +254,12 @@ class MessagesForLater:
         """Whether something that fills a gap waits or is under way."""
         return bool(self._filling)
 
-    def take(self, wall_s: Callable[[float], float], most: int = PIECE) -> list[Later]:
+    def take(self, wall_ahead: float, most: int = PIECE) -> list[Later]:
         """The oldest messages that fill gaps, so many bytes of them, or one; :meth:`taken` says under which serial they
         are submitted.
 
-        :param wall_s: s since 1970 at a time of ``now``, by the clock as it stands: it may have been set in the outage
+        :param wall_ahead: s by which the clock of the wall is ahead of ``now`` at present: it may have been set in the
+            outage
         """
         if self.unheard and not self._gaps and self._left:
             self._fill_later(next(iter(self._left)))
@@ -271,7 +272,7 @@ class MessagesForLater:
             if taken and size > most:
                 break
             taken.append(heappop(self._gaps))
-            found.append(Later(topic_id, serial, max(round(wall_s(at) * 1e6), 0), payload or b"", began))
+            found.append(Later(topic_id, serial, max(round((at + wall_ahead) * 1e6), 0), payload or b"", began))
         self._taken = taken
         return found
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import click
 
 from gr_ros2.calls.backfill import Missing, read_later
+from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import BagError, GrRos2Error, WireError
 from gr_ros2.core.files import make_folder
@@ -97,7 +98,7 @@ class OutputBag(Closing):
         elif isinstance(event, Lost):
             self._note_lost(self._run, event.src_id, event.topic_id, key=event.key)
         elif isinstance(event, Delivered) and not event.again:
-            came = time.time() - (self._run.clock() - now)
+            came = now + wall_ahead(self._run.clock)
             fillers = self._filling(self._run)
             if (event.src_id, event.topic_id) in fillers:
                 self._fill(self._run, event, came)

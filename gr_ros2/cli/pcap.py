@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.link.events import BoundPacket, Received, ReceiverEvent, Rejected, SenderEvent, SentPacket
@@ -50,7 +51,7 @@ class PacketCapture(Closing):
     instruments = False
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        self._offset = time.time() - clock()
+        self._offset = wall_ahead(clock)
         self.name = f"capture {path}"
         self.packets = 0
         """Packets in the file."""
@@ -74,7 +75,7 @@ class PacketCapture(Closing):
 
     def run_started(self, run: LiveRun) -> None:
         """Take the run's clock."""
-        self._offset = time.time() - run.clock()
+        self._offset = wall_ahead(run.clock)
 
     def run_ended(self, result: RunResult | None) -> None:
         """Do nothing: the code that opened the capture closes it."""

@@ -12,12 +12,13 @@ is kept on.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from math import inf
 from typing import Any
 
 from gr_ros2.calls.backfill import Later, MessagesForLater, Missing, write_later
+from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.gr.bulk_topic import add_bulk_topic
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.sending import SendingBlock
@@ -43,7 +44,7 @@ class Backfill:
     :param endpoint: its observer calls :meth:`note`
     :param share: part of the time that its transmitter may send
     :param chosen: whether what was lost of a topic is filled later
-    :param wall_s: the time of this computer at a time of the link, s since 1970
+    :param wall_ahead: s by which the clock of the wall is ahead of that of the link
     :ivar kept: what is kept
     """
 
@@ -54,10 +55,10 @@ class Backfill:
         *,
         share: float,
         chosen: Callable[[int], bool],
-        wall_s: Callable[[float], float],
+        wall_ahead: Callable[[], float],
     ) -> None:
         self._receipts, self._robots = endpoint.receipts_of(config.robots), config.robots
-        self._endpoint, self._share, self._chosen, self._wall_s = endpoint, share, chosen, wall_s
+        self._endpoint, self._share, self._chosen, self._wall_ahead = endpoint, share, chosen, wall_ahead
         self.kept = MessagesForLater(config.for_s, round(config.memory_mb * 1e6))
         self._allowed, self._looked = 0.0, inf
         self._tried, self._pause_s = -inf, 0.0
@@ -101,13 +102,13 @@ class Backfill:
             self._allowed = min(self._allowed + free, 1e9)
         if not self.kept.unheard:
             self._pause_s = 0.0
-            while self._may_submit and (found := self.kept.take(self._wall_s)):
+            while self._may_submit and (found := self.kept.take(self._wall_ahead())):
                 self._submit(found, now)
             if self._may_submit and not len(self.kept) and (missing := self.kept.tell()):
                 self._submit(missing, now)
         elif self.kept.tries or now < self._tried + self._pause_s or not self._may_submit:
             return
-        elif found := self.kept.take(self._wall_s, most=0):
+        elif found := self.kept.take(self._wall_ahead(), most=0):
             # One message tells whether somebody hears again, where nothing else leaves that would.
             self._tried, self._pause_s = now, min(max(1.0, 2 * self._pause_s), SELDOM_S)
             self._submit(found, now)
@@ -138,7 +139,7 @@ class LiveBackfill:
                 end.endpoint,
                 share=share,
                 chosen=self._is_chosen,
-                wall_s=lambda at: time.time() + at - self._clock(),
+                wall_ahead=partial(wall_ahead, self._clock),
             )
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="gr-ros2-backfill", daemon=True)

@@ -10,11 +10,11 @@ from __future__ import annotations
 import logging
 import socket
 import struct
-import time
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from typing import Any
 
+from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.core.errors import shortened
 from gr_ros2.settings.config import ClockConfig
 from gr_ros2.settings.fields import AUTO
@@ -40,8 +40,8 @@ class ClockWatch:
     :param heard: returns the robots that are heard now, each with its ``clock``
     :param ask: asks a robot
     :param set_wall: told the clock of the wall minus ``now``, s, at each look
-    :param wall: s since 1970; None where the clock of the link is not this computer's (a simulation in lock step), so
-        that nobody is asked and nothing is said of clocks
+    :param ahead: s by which the clock of the wall is ahead of ``now``; None where the clock of the link is not this
+        computer's (a simulation in lock step), so that nobody is asked and nothing is said of clocks
     :ivar given: samples that chrony has taken
     """
 
@@ -53,11 +53,11 @@ class ClockWatch:
         heard: Callable[[float], Sequence[Mapping[str, Any]]],
         ask: Callable[[int], object],
         set_wall: Callable[[float], None],
-        wall: Callable[[], float] | None = time.time,
+        ahead: Callable[[], float] | None = wall_ahead,
     ) -> None:
         every = config.every_s
         self.every_s = (CHRONY_S if config.chrony else MINE_S if mine else 0.0) if every == AUTO else every
-        self._config, self._heard, self._ask, self._set_wall, self._wall = config, heard, ask, set_wall, wall
+        self._config, self._heard, self._ask, self._set_wall, self._ahead = config, heard, ask, set_wall, ahead
         self._asked: dict[int, float] = {}
         self._wall_s: float | None = None
         self._jumps: dict[int, int] = {}
@@ -73,9 +73,9 @@ class ClockWatch:
 
         :param now: s, monotonic
         """
-        if self._wall is None:
+        if self._ahead is None:
             return
-        wall_s = self._wall() - now
+        wall_s = self._ahead()
         if self._wall_s is not None and abs(wall_s - self._wall_s) >= SET_S:
             self._set[None] = now, wall_s - self._wall_s
         self._wall_s = wall_s

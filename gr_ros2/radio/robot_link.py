@@ -17,6 +17,7 @@ from functools import partial
 from math import inf
 from typing import Any
 
+from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.watch import Watch
 from gr_ros2.gr.calls import LiveCalls
@@ -137,11 +138,11 @@ class RobotLink(Flowgraph):
         if all(radio.phy.has_airtime for radio in radios):  # without, nothing sets a pace
             self.source.use_credit()
         # A clock that a medium process tells stands still now and then, so it does not say how far others are ahead.
-        wall = time.time if self._clock is time.monotonic else None
+        ahead = wall_ahead if self._clock is time.monotonic else None
         told = about(config, [radio.phy for radio in radios])
         asked_by: Mapping[int, float] = {}
         if hasattr(self.end.endpoint, "questions"):  # the paper's robots ask nothing
-            introduce(self.end, told, lambda: self.radio.snr_db, 0.0 if wall is None else wall() - self._clock())
+            introduce(self.end, told, lambda: self.radio.snr_db, 0.0 if ahead is None else ahead())
             asked_by = self.end.endpoint.questions.asked_by
         self._clocks = ClockWatch(
             config.clock,
@@ -149,7 +150,7 @@ class RobotLink(Flowgraph):
             heard=partial(peers, self.end),
             ask=self.ping,
             set_wall=partial(set_wall, self.end),
-            wall=wall,
+            ahead=ahead,
         )
         self._stack.callback(self._clocks.close)
         self.findings = LinkFindings(

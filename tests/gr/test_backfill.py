@@ -59,7 +59,7 @@ class Filling(Robot):
             self.end,
             share=self.share,
             chosen=lambda topic: topic == ODOM,
-            wall_s=lambda at: at + self.ahead_s,
+            wall_ahead=lambda: self.ahead_s,
         )
 
 

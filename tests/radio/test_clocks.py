@@ -30,7 +30,7 @@ class Robots:
             heard=lambda _: self.heard,
             ask=lambda robot: self.asked.append((robot, self.now)),
             set_wall=self.walls.append,
-            wall=lambda: 1e9 + self.now + self.set_by_s,
+            ahead=lambda: 1e9 + self.set_by_s,
         )
 
     def look(self, now: float, *robots: int, hops: int = 0) -> None:
@@ -79,7 +79,7 @@ def test_a_link_whose_clock_is_simulated_says_nothing_of_clocks() -> None:
         raise AssertionError
 
     watch = ClockWatch(
-        build(ClockConfig, {"every_s": 1}), mine=False, heard=fails, ask=fails, set_wall=fails, wall=None
+        build(ClockConfig, {"every_s": 1}), mine=False, heard=fails, ask=fails, set_wall=fails, ahead=None
     )
     watch.look(0.0)
     watch.look(12.0)
