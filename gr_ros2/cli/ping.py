@@ -129,10 +129,11 @@ def _ping(ask: Ask, robot: int, count: int | None, interval: float, *, as_json: 
             told = ask(False)  # the answer to the last question has come by now; this one's is not waited for
     except KeyboardInterrupt:
         pass
+    told = told and {**told, "asked": max(asked, told["asked"])}  # the link may ask too
     if as_json:
-        click.echo(json.dumps({**told, "asked": asked}))
+        click.echo(json.dumps(told or {"asked": asked}))
     elif told:
-        console.print(f"robot {robot}: {in_words({**told, 'asked': asked})}", soft_wrap=True)
+        console.print(f"robot {robot}: {in_words(told)}", soft_wrap=True)
     return 0 if told.get("answered") else FAILED
 
 

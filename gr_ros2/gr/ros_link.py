@@ -186,7 +186,7 @@ class RosLink(LinkBlock):
                     alone=None if self.bound is None else self.bound.source_of,
                 )
                 self.throughput = LiveThroughput(
-                    config, self.end, self.calls, self.sink, share=air.airtime_share, clock=clock
+                    config, self.end, self.calls, self.sink, share=air.airtime_share, sends=air.hears, clock=clock
                 )
                 if config.backfill.topics:
                     self.backfill = LiveBackfill(config, self.end, self.source, share=air.airtime_share)

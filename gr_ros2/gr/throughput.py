@@ -137,6 +137,7 @@ class LiveThroughput:
     """The measurements of one robot's link.
 
     :param share: part of the time that its transmitter may send
+    :param sends: whether it may send at all
     """
 
     def __init__(
@@ -147,10 +148,11 @@ class LiveThroughput:
         sink: ReceivingBlock,
         *,
         share: float,
+        sends: bool,
         clock: Callable[[], float],
     ) -> None:
         self._config, self._end, self._calls, self._sink = config, end, calls, sink
-        self._share, self._clock = share, clock
+        self._share, self._sends, self._clock = share, sends, clock
         self._lock = threading.Lock()
         """Protects what follows; no other lock is taken while it is held."""
         self._run: _Run | None = None
@@ -177,8 +179,8 @@ class LiveThroughput:
         """
         if not 1 <= for_s <= LONGEST_S:
             raise ConfigError(f"for = {for_s} s: write 1 to {LONGEST_S} s")
-        if not self._config.sends:
-            raise ConfigError("this robot sends nothing (direction: receive), so it cannot ask another one")
+        if not self._sends:
+            raise ConfigError("this robot does not transmit, so it cannot ask another one")
         self._calls.check_heard(robot)
         number, now = secrets.randbits(32), self._clock()
         with self._lock:
@@ -236,7 +238,7 @@ class LiveThroughput:
                 told = Carried(MeasureOutcome.UNKNOWN)
             elif self._thread is not None or self._closed.is_set():
                 told = Carried(MeasureOutcome.BUSY)
-            elif not self._config.sends:
+            elif not self._sends:
                 told = Carried(MeasureOutcome.SENDS_NOT)
             else:
                 began = now + QUIET_S
@@ -260,7 +262,7 @@ class LiveThroughput:
             case MeasureOutcome.BUSY:
                 run.refused = f"robot {run.robot} measures the link to another robot now; ask again later"
             case MeasureOutcome.SENDS_NOT:
-                run.refused = f"robot {run.robot} sends nothing (direction: receive)"
+                run.refused = f"robot {run.robot} sends nothing"
             case MeasureOutcome.UNKNOWN:
                 run.refused = f"robot {run.robot} has started again meanwhile"
 

@@ -101,6 +101,8 @@ def survey(
     """
     picture: GridPicture | None = None
     if pose is None:
+        if not file.exists():
+            raise ConfigError(f"{file}: no such survey to show; to drive one, name --pose TOPIC of this robot")
         rows = read_table(file)
     else:
         chosen = find_link(pid)

@@ -73,6 +73,8 @@ def test_what_tells_no_place_is_said(ends: Ends, tmp_path: Path, monkeypatch: py
     told = ends.run("survey", str(tmp_path / "a.csv"), "--pose", "odom", "--pid", "1", "--domain-id", str(domain_id))
     assert told.returncode == 2
     assert "--pose /odom: nobody publishes it" in told.stderr
-    assert ends.run("survey", str(tmp_path / "no.csv")).returncode == 2
+    none = ends.run("survey", str(tmp_path / "no.csv"))
+    assert none.returncode == 2
+    assert "no such survey to show; to drive one, name --pose TOPIC" in none.stderr
     bad = ends.run("survey", str(tmp_path / "a.csv"), "--pose", "odom", "--base", "3", "--pid", "1")
     assert "write two numbers, such as 3.5,-2" in bad.stderr

@@ -51,6 +51,17 @@ def test_a_link_is_filled_each_way_and_its_topics_go_first(tmp_path: Path) -> No
         assert one.status()["sink"]["publish_failed"] == 0
 
 
+def test_a_robot_without_topics_measures_too(tmp_path: Path) -> None:
+    with Links(tmp_path, {"topics": []}, TOPICS, bit_rate=BIT_RATE) as links:
+        one, two = (links.start(number, str(number), "0", command=PEER) for number in (1, 2))
+        links.meet()
+        for link, other in ((one, "2"), (two, "1")):
+            told = measured(link, other, "--for", "1")
+            assert told["state"] == "done"
+            assert told["there"]["messages"] > 0
+            assert told["back"]["messages"] > 0
+
+
 @pytest.mark.slow
 def test_no_more_leaves_than_the_airtime_limit_allows(tmp_path: Path) -> None:
     limited = {**TOPICS, "airtime": {"duty_cycle": 0.1, "window_s": 10}}
