@@ -53,11 +53,13 @@ def radio_words(stats: Stats) -> list[str]:
     for name, radio in stats.get("radios", {}).items():
         state = "carries" if radio["carries"] else "stands by" if radio["present"] else "gone"
         heard = ", ".join(f"robot {robot} {share:.0%}" for robot, share in radio["heard"].items())
-        lines.append(
-            f"radio {name} ({radio['phy']['name']}, {radio['phy']['airtime_s'] * 1e3:.3g} ms a packet): {state}; "
-            f"{radio['sent']} packets and {radio['copied']} copies sent; heard: {heard or 'nobody'}"
-        )
-        if (bound := radio.get("bound")) and bound["topics"]:
+        what = f"radio {name} ({radio['phy']['name']}, {radio['phy']['airtime_s'] * 1e3:.3g} ms a packet): "
+        if radio["apart"]:
+            lines.append(f"{what}{'' if radio['present'] else 'gone; '}carries only what names it")
+        else:
+            sent = f"{radio['sent']} packets and {radio['copied']} copies sent"
+            lines.append(f"{what}{state}; {sent}; heard: {heard or 'nobody'}")
+        if (bound := radio.get("bound")) and (bound["topics"] or radio["apart"]):
             lines.append(f"radio {name} alone: {bound_words(radio)}")
     return lines
 
@@ -66,7 +68,8 @@ def bound_words(radio: Mapping[str, Any]) -> str:
     """What goes over one of several radios alone, and whether it has a way."""
     bound = radio["bound"]
     mcs = f", sent with {radio['phy']['mcs']}" if "mcs" in radio["phy"] else ""
-    words = f"{', '.join(bound['topics'])}{mcs}; {bound['packets']} packets sent, {bound['waiting']} messages wait"
+    words = f"{', '.join(bound['topics']) or 'no topic'}{mcs}; {bound['packets']} packets sent"
+    words += f", {bound['waiting']} messages wait"
     if not radio["present"]:
         return f"{words}, until the device is back"
     return words if bound["heard"] else f"{words}; nobody is heard there, so nothing says that they arrive"

@@ -307,6 +307,7 @@ class BoundEnd:
             "rate": self.source.rate(),
             "calls": {} if self.calls is None else self.calls.stats(),
             "backfill": {} if self.backfill is None else self.backfill.stats(),
+            "wishes": {} if self.wishes is None else self.wishes.stats(),
         }
 
     def _begin(self) -> None:

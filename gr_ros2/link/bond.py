@@ -41,6 +41,7 @@ class Bond:
 
     :param airtimes: s that the longest packet occupies on each
     :param apart: those that carry nothing here
+    :ivar apart: the same
     :ivar present: whether the device of each is there
     :ivar carries: whether each carries packets that leave only once
     :ivar sent, copied, skipped, came, copies: packets that each has carried alone, and as a copy; copies for which it
@@ -48,7 +49,7 @@ class Bond:
     """
 
     def __init__(self, airtimes: Sequence[float], apart: Collection[int] = ()) -> None:
-        self._airtimes, self._apart = tuple(airtimes), frozenset(apart)
+        self._airtimes, self.apart = tuple(airtimes), frozenset(apart)
         every = range(len(self._airtimes))
         self.sent, self.copied, self.skipped, self.came, self.copies = ([0 for _ in every] for _ in range(5))
         self.present = [True for _ in every]
@@ -97,7 +98,7 @@ class Bond:
             return [first]
         radios = [first]
         for radio, present in enumerate(self.present):
-            if radio == first or not present or radio in self._apart:
+            if radio == first or not present or radio in self.apart:
                 continue
             if self._takes(radio):
                 self.copied[radio] += 1
@@ -167,7 +168,7 @@ class Bond:
 
     def heard(self, radio: int) -> dict[int, float]:
         """Share of the packets of each robot that were to come over every radio and came over this one, 0..1."""
-        if radio in self._apart:
+        if radio in self.apart:
             return {}
         return {src_id: min(shares[radio], 1.0) for src_id, shares in self._heard.items()}
 
@@ -184,7 +185,7 @@ class Bond:
     def _choose(self) -> None:
         """Find the radios that carry packets: those that every robot is heard over, and not much slower ones."""
         good = [all(2 * shares[r] >= max(shares) for shares in self._heard.values()) for r in range(len(self.present))]
-        ours = [radio not in self._apart for radio in range(len(self.present))]
+        ours = [radio not in self.apart for radio in range(len(self.present))]
         here = [own and present for own, present in zip(ours, self.present, strict=True)]
         usable = [there and fine for there, fine in zip(here, good, strict=True)]
         if not any(usable):

@@ -193,6 +193,7 @@ def together(bond: Bond, radios: Sequence[OneRadio], each: Sequence[Mapping[str,
             **stats,
             "present": bond.present[number],
             "carries": bond.carries[number],
+            "apart": number in bond.apart,
             "heard": bond.heard(number),
             **{name: getattr(bond, name)[number] for name in ("sent", "copied", "skipped", "came", "copies")},
         }
@@ -218,13 +219,13 @@ def join_bound(
     """Count what goes over one radio alone too: its packets, topics and services, and of each of several radios what is
     bound to it.
 
-    :param halves: the statistics of both halves of the link, its ``calls`` and ``backfill``
+    :param halves: the statistics of both halves of the link, its ``calls``, ``backfill`` and ``wishes``
     :param names: of the radios
     :param bound: what the endpoints that have one radio alone say, by its number
     """
     for number, stats in bound.items():
         source, sink = halves["source"], halves["sink"]
-        for part in ("calls", "backfill"):
+        for part in ("calls", "backfill", "wishes"):
             halves[part] = _added(halves[part], stats[part])
         source["air"] = dict(Counter(source["air"]) + Counter(stats["source"]["air"]))
         for half, counters in (("source", _SENT), ("sink", _CAME)):
@@ -252,14 +253,14 @@ def _sum(parts: Sequence[Mapping[str, Any]], name: str) -> Any:
 
 
 def _added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Counters, lists of names and counters by name, of two parts together; either may be empty."""
+    """Counters, lists and counters by name, of two parts together; either may be empty."""
     found = {**other, **one}
     for name in one.keys() & other.keys():
         both = one[name], other[name]
         if isinstance(both[0], Mapping):
             found[name] = dict(Counter(both[0]) + Counter(both[1]))
         else:
-            found[name] = sorted(both[0] + both[1]) if isinstance(both[0], list) else both[0] + both[1]
+            found[name] = sorted(both[0] + both[1], key=str) if isinstance(both[0], list) else both[0] + both[1]
     return found
 
 

@@ -438,6 +438,7 @@ class RobotLink(Flowgraph):
             "sink": self.sink.stats(),
             "calls": {} if self.calls is None else self.calls.stats(),
             "backfill": {} if self._ros.link.backfill is None else self._ros.link.backfill.stats(),
+            "wishes": {} if self._ros.link.wishes is None else self._ros.link.wishes.stats(),
         }
         if self._ros.link.bound is not None:
             join_bound(halves, radios, [one.name for one in self.radios], self._ros.link.bound.stats())
@@ -446,7 +447,6 @@ class RobotLink(Flowgraph):
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,
             **halves,
             "peers": peers(self.end, self._clock()),
-            "wishes": {} if self._ros.link.wishes is None else self._ros.link.wishes.stats(),
             **radios,
             "clocks": {"set": self._clocks.lines(self._clock()), "given_to_chrony": self._clocks.given},
             "incomplete": self.incomplete(),

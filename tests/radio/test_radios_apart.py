@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from gr_ros2.cli.status import radio_words
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
@@ -110,6 +111,9 @@ def test_a_shared_channel_carries_what_is_bound_to_it_to_robots_that_have_it_alo
         stats = fleet.robots[number].link.stats()
         assert stats["radios"]["far"]["copied"] == stats["radios"]["far"]["sent"] == 0
         assert not stats["radios"]["far"]["carries"]
+        words = "\n".join(radio_words(stats))
+        assert "carries only what names it" in words
+        assert f"radio far alone: /robot_{number}/chat; " in words
         assert stats["sink"]["rejected"] == {}
     assert fleet.robots[3].link.stats()["sink"]["rejected"] == {}
 
@@ -140,6 +144,7 @@ def test_over_a_shared_channel_services_are_called_and_topics_asked_for(tmp_path
     wait_for(lambda: listed() == ["scan"], "what is offered over this channel")
     wishes.want(1, "scan")
     wait_for(lambda: wishes.wish(1, "scan")["state"] == "sent", "the answer")
+    assert [wish["words"] for wish in fleet.robots[1].link.stats()["wishes"]["wanted"]] == ["robot 3 wants scan"]
     wait_for(scan.matched, "the link to take it")
     scan.publish(told := message(1, 60))
     wait_for(lambda: heard == [told], "the message")
