@@ -228,15 +228,16 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
 
     def offers(asks: Any) -> dict[str, Any]:
         asked = build(_Asked, asks, OFFERS)
-        return running.wishes.offers(asked.robot, anew=asked.anew)
+        return running.wishes_of(asked.robot).offers(asked.robot, anew=asked.anew)
 
     def want(asks: Any) -> dict[str, Any]:
         wish = build(_Wish, asks, WANT)
+        wishes = running.wishes_of(wish.robot)
         if wish.how == "want":
-            running.wishes.want(wish.robot, wish.topic, wish.rate, wish.for_s)
+            wishes.want(wish.robot, wish.topic, wish.rate, wish.for_s)
         elif wish.how == "give_up":
-            running.wishes.give_up(wish.robot, wish.topic)
-        return running.wishes.wish(wish.robot, wish.topic)
+            wishes.give_up(wish.robot, wish.topic)
+        return wishes.wish(wish.robot, wish.topic)
 
     def measure(asks: Any) -> dict[str, Any]:
         asked = build(_Measure, asks, MEASURE)

@@ -42,6 +42,7 @@ from gr_ros2.gr.starts import bound_state_file
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link import AirPacket, SentPacket
 from gr_ros2.link.air import Air
+from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.link.events import (
     APART,
@@ -193,6 +194,7 @@ class BoundEnd:
             )
             published = known.with_options(config.publish.topics, announced=True)
             self.sink = ReceivingBlock(own, published, self.end, graph, observer=told, clock=clock)
+            self.sink.outputs.other_clocks = self._clock_of
             if calls:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
                 if way.shares:
@@ -310,6 +312,12 @@ class BoundEnd:
             "wishes": {} if self.wishes is None else self.wishes.stats(),
         }
 
+    def _clock_of(self, robot: int) -> ClockOffset | None:
+        """What the endpoint with all radios knows of a robot's clock."""
+        live = self._main.live
+        with live.lock:
+            return live.endpoint.clock_of(robot, self._clock())
+
     def _begin(self) -> None:
         """Send, if there is a reason."""
         with self._lock:
@@ -341,6 +349,7 @@ class BoundEnds:
         """Held while one is made, started or stopped."""
         self._running = False
         self._failed: set[int] = set()
+        self._introduce: Callable[[int, BoundEnd], None] = lambda _radio, _end: None
         self._ends: dict[int, BoundEnd] = {}
         named = names_of(config)
         try:
@@ -372,6 +381,13 @@ class BoundEnds:
         """Leave the ROS graph. Idempotent."""
         for end in self._ends.values():
             end.close()
+
+    def introduce_with(self, introduce: Callable[[int, BoundEnd], None]) -> None:
+        """Introduce each, with the number of its radio, also those that are made later."""
+        with self._lock:
+            self._introduce = introduce
+            for radio, end in self._ends.items():
+                introduce(radio, end)
 
     def take(self, radio: int, packets: Sequence[AirPacket]) -> list[AirPacket]:
         """Take what is for one of these of the packets that have come over a radio; returns the others."""
@@ -442,6 +458,7 @@ class BoundEnds:
                     self._failed.add(radio)
                     _log.warning("topics that others have bound to one radio do not come out: %s", error)
                     return None
+                self._introduce(radio, end)
                 end.start()
                 self._ends = {**self._ends, radio: end}
             return self._ends.get(radio)

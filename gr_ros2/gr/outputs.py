@@ -99,6 +99,8 @@ class Outputs:
         self._owner, self._settings, self._graph, self._end = owner, config.publish, graph, live.endpoint
         self._lock = live.lock
         self._tell, self._clock, self._failures, self._log = tell, clock, failures, log
+        self.other_clocks: Callable[[int], ClockOffset | None] = lambda _src_id: None
+        """What is known of a robot's clock elsewhere; called without the lock."""
         self._outputs: dict[Key, Output] = {}
         self.frames = FrameReceiver()
         self._prefix = FramePrefix(config.publish.frame_prefix, failures.counters)
@@ -353,7 +355,8 @@ class Outputs:
         if self._sim_time:
             return None  # all of them follow one /clock
         with self._lock:
-            return self._end.clock_of(src_id, self._clock())
+            known = self._end.clock_of(src_id, self._clock())
+        return self.other_clocks(src_id) if known is None else known
 
     def _moved(self, stamps: MovedStamps, type_name: str, payload: bytes, clock: ClockOffset | None) -> bytes:
         """A message with stamps of this robot's clock, as far as the other one's is known."""

@@ -19,7 +19,7 @@ from gr_ros2.gr.health import LOCKED
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.phy import Phy
-from gr_ros2.radio.config import LinkConfig
+from gr_ros2.radio.config import LinkConfig, OwnRadio
 from gr_ros2.state.keys import read_key_file
 
 _FORMAT = {
@@ -38,29 +38,32 @@ _SAME_FREQUENCY = 1e-4
 """Relative difference below which two frequencies are the same: clocks may be 100 ppm apart."""
 
 
-def about(config: LinkConfig, phys: Sequence[Phy]) -> dict[str, Any]:
+def about(config: LinkConfig, phys: Sequence[Phy], radio: OwnRadio | None = None) -> dict[str, Any]:
     """What this end tells those who ask: ``packet_len``, numbers for settings of the PHY and for the key, a text.
 
     :param phys: that of each radio
+    :param radio: the only one that those have who ask; None: all of the link
     """
+    radios = config.own_radios if radio is None else (radio,)
+    packet_len = config.packet_len if radio is None else radio.packet_len
     options = [
         {
             "name": phy.name,
             "options": repr(phy.options),
             "rate": phy.sample_rate if phy.has_samples else 0,
-            **({} if own.packet_len == config.packet_len else {"packet_len": own.packet_len}),
+            **({} if own.packet_len == packet_len else {"packet_len": own.packet_len}),
         }
-        for phy, own in zip(phys, config.own_radios, strict=True)
+        for phy, own in zip(phys, radios, strict=True)
     ]
     digest = zlib.crc32(json.dumps(options if phys[1:] else options[0], sort_keys=True).encode())
     key = int.from_bytes(hashlib.sha256(read_key_file(config.key)[0]).digest()[:4], "big") if config.key else 0
     names = ", ".join(f"{phy.name} {phy.sample_rate:g}" if phy.has_samples else phy.name for phy in phys)
-    front_end = config.own_radios[0].front_end_options
+    front_end = radios[0].front_end_options
     sends = front_end.get("frequency")
     receives = front_end.get("frequency_rx", sends)
     tuned = "" if sends is None or phys[1:] else f", sends at {sends} Hz, receives at {receives} Hz"
     text = f"{__version__} {names}{tuned}"
-    return {"packet_len": config.packet_len, "phy": digest, "key": key, "text": text}
+    return {"packet_len": packet_len, "phy": digest, "key": key, "text": text}
 
 
 def introduce(

@@ -20,6 +20,7 @@ from typing import Any
 from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.watch import Watch
+from gr_ros2.gr.bound import BoundEnd
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
@@ -143,13 +144,15 @@ class RobotLink(Flowgraph):
         asked_by: Mapping[int, float] = {}
         if hasattr(self.end.endpoint, "questions"):  # the paper's robots ask nothing
             introduce(self.end, told, lambda: self.radio.snr_db, 0.0 if ahead is None else ahead())
+            if link.bound is not None:
+                link.bound.introduce_with(partial(self._introduce, told))
             asked_by = self.end.endpoint.questions.asked_by
         self._clocks = ClockWatch(
             config.clock,
             mine=config.publish.stamps == "mine",
-            heard=partial(peers, self.end),
+            heard=self._heard,
             ask=self.ping,
-            set_wall=partial(set_wall, self.end),
+            set_wall=self._set_wall,
             ahead=ahead,
         )
         self._stack.callback(self._clocks.close)
@@ -173,6 +176,34 @@ class RobotLink(Flowgraph):
         if config.diagnostics.period_s:
             self._diagnostics = Diagnostics(config.diagnostics, graph, self.node_name, self.stats, clock=self._clock)
             self._stack.callback(self._diagnostics.stop)
+
+    def _introduce(self, told: Mapping[str, Any], number: int, bound: BoundEnd) -> None:
+        """Have the endpoint of one radio tell those who ask what this robot is, and what time it has.
+
+        :param told: of all radios
+        """
+        one = self.radios[number]
+        own = about(self.config, [one.phy], one.own) if one.own.shares else told
+        introduce(bound.end, own, lambda: one.radio.snr_db, self.end.endpoint.questions.wall_s)
+
+    @property
+    def _ends(self) -> list[LiveEnd[Any]]:
+        """The endpoint with all radios, and those that have one alone."""
+        return [self.end, *(bound.end for bound in self._ros.link.bound or ())]
+
+    def _heard(self, now: float) -> list[dict[str, Any]]:
+        """The robots that are heard over any of them."""
+        return [*{peer["robot"]: peer for live in reversed(self._ends) for peer in peers(live, now)}.values()]
+
+    def _set_wall(self, wall_s: float) -> None:
+        for live in self._ends:
+            set_wall(live, wall_s)
+
+    def _end_with(self, robot: int) -> LiveEnd[Any]:
+        """The first of them that hears a robot, or else the one with all radios."""
+        now = self._clock()
+        heard = ((live, peers(live, now)) for live in self._ends)
+        return next((live for live, known in heard if robot in {peer["robot"] for peer in known}), self.end)
 
     @property
     def radio(self) -> Radio:
@@ -384,7 +415,7 @@ class RobotLink(Flowgraph):
         :param anew: forget the earlier ones
         :raises ConfigError: for a number that no robot has
         """
-        return {**ping(self.end, robot, self._clock(), anew=anew), **self.source.rate()}
+        return {**ping(self._end_with(robot), robot, self._clock(), anew=anew), **self.source.rate()}
 
     @property
     def wishes(self) -> LiveWishes:
@@ -395,6 +426,17 @@ class RobotLink(Flowgraph):
         if self._ros.link.wishes is None:
             raise ConfigError(f"link {self.config.name}: nobody can be asked over it; that needs direction: both")
         return self._ros.link.wishes
+
+    def wishes_of(self, robot: int) -> LiveWishes:
+        """The same, over a radio over which a robot is heard.
+
+        :raises ConfigError: where nobody can be asked
+        """
+        if self.calls is None or robot not in self.calls.heard():
+            for bound in self._ros.link.bound or ():
+                if bound.wishes is not None and bound.calls is not None and robot in bound.calls.heard():
+                    return bound.wishes
+        return self.wishes
 
     @property
     def throughput(self) -> LiveThroughput:
@@ -410,7 +452,7 @@ class RobotLink(Flowgraph):
 
     def clocks(self) -> dict[int, ClockOffset]:
         """What is known of the clocks of the robots that are heard."""
-        heard = peers(self.end, self._clock())
+        heard = self._heard(self._clock())
         return {peer["robot"]: ClockOffset(**peer["clock"]) for peer in heard if peer["clock"] is not None}
 
     @property

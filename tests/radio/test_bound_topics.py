@@ -16,9 +16,11 @@ from gr_ros2.cli.main import run
 from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.status import radio_words
 from gr_ros2.core.errors import ConfigError
+from gr_ros2.gr.bound import BoundEnds
 from gr_ros2.link.events import AirPacket
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.observe.positions import humble_types
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.live_settings import LiveSettings
 from gr_ros2.state.keys import new_key_file
@@ -200,6 +202,33 @@ def test_a_robot_that_has_bound_nothing_hears_what_others_have(
     wait_for(lambda: left(team)["heard"] == [2], "its reports")
     team.talk(0, 3)
     assert left(team, 2)["topics"] == []
+
+
+def test_the_clock_of_a_robot_is_known_for_what_is_bound_too(tmp_path: Path, closing: ExitStack) -> None:
+    registry, kind = tmp_path / "topics.csv", "geometry_msgs/msg/PointStamped"
+    registry.write_text(f"place,{kind}\n")
+    mine = {"publish": {"stamps": "mine"}, "topics": [], "registry": "", "clock": {"every_s": 0.2}}
+    values = {"topics": {"place": {"via": "left"}}, "registry": str(registry)}
+    team = Team(tmp_path, (FAST, FAST), closing, second=mine, **values)
+    near, far = team.robots[1].link, MemoryMiddleware(domain_id=domain(1))
+    closing.callback(far.close)
+
+    def known() -> bool:
+        near.check()
+        return 1 in near.clocks()
+
+    wait_for(known, "its clock")
+    place = far.advertise("/robot_1/place", kind, QOS)
+    wait_for(place.matched, "the link to take places")
+    store = humble_types()
+    header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](5, 0), "map")
+    point = store.types[kind](header, store.types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0))
+    place.publish(bytes(store.serialize_cdr(point, kind)))
+    wait_for(lambda: near.stats()["sink"]["topics"].get("/rx_robot_1/place", {}).get("delivered"), "a place")
+    bounds = near.sink.apart
+    assert isinstance(bounds, BoundEnds)
+    (bound,) = bounds
+    assert bound.sink.stats()["stamps_not_moved"] == 0
 
 
 def test_a_robot_with_one_radio_hears_what_others_have_bound_to_theirs(tmp_path: Path, closing: ExitStack) -> None:

@@ -150,6 +150,17 @@ def test_over_a_shared_channel_services_are_called_and_topics_asked_for(tmp_path
     wait_for(lambda: heard == [told], "the message")
     assert odom is not None
 
+    def answered(one: int, other: int) -> bool:
+        told = fleet.robots[one].link.ping(other)
+        return told["answered"] > 0 and told["about"] is not None and told["clock_s"] is not None
+
+    for one, other in ((1, 3), (3, 1)):
+        wait_for(lambda: answered(one, other), "an answer")  # noqa: B023
+    assert 3 in fleet.robots[1].link.clocks()
+    own = fleet.robots[1].link.wishes_of(3)
+    own.offers(3, anew=True)
+    wait_for(lambda: own.offers(3)["age_s"] is not None, "what robot 3 offers")
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize("medium", ["slots", "aloha"])
