@@ -98,21 +98,22 @@ class _Told:
     """Tells an observer what comes out over one radio alone, and the packets.
 
     :param apart: by how much topic ids are greater there
+    :param mark: what stands before each packet
     """
 
-    def __init__(self, observer: LinkObserver, apart: int) -> None:
-        self._observer, self._apart = observer, apart
+    def __init__(self, observer: LinkObserver, apart: int, mark: bytes) -> None:
+        self._observer, self._apart, self._mark = observer, apart, mark
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
         """Packets that leave; topic ids of what is sent are not known there."""
         if isinstance(event, SentPacket):
-            self._observer.sender_event(src_id, BoundPacket(BOUND + event.data, event.now))
+            self._observer.sender_event(src_id, BoundPacket(self._mark + event.data, event.now))
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
         """Packets; messages that come out, or do not, and what they are."""
         apart = self._apart
         if isinstance(event, Received | Rejected):
-            self._observer.receiver_event(BoundPacket(BOUND + event.data, now), now)
+            self._observer.receiver_event(BoundPacket(self._mark + event.data, now), now)
         elif isinstance(event, Delivered | Lost):
             self._observer.receiver_event(event._replace(topic_id=event.topic_id + apart), now)
         elif isinstance(event, Announced):
@@ -181,7 +182,7 @@ class BoundEnd:
             self.end: LiveEnd[OpenEndpoint] = LiveEnd(
                 lambda events: make_endpoint(own, topics, air=way.air, start=self._start, observer=events, calls=calls)
             )
-            told = None if observer is None else _Told(observer, self.apart)
+            told = None if observer is None else _Told(observer, self.apart, way.mark)
             self.source = LinkSendingBlock(
                 own,
                 topics,

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from gr_ros2.cli.capture import packets_in
+from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.status import radio_words
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -88,7 +90,10 @@ def test_a_shared_channel_carries_what_is_bound_to_it_to_robots_that_have_it_alo
         new_key_file(path := tmp_path / "key")
         keys = {"key": str(path)}
     topics: dict[str, Any] = {"chat": {"via": "far"}, "news": {}}
-    fleet = Fleet(tmp_path, closing, medium, {1: {"topics": topics}, 2: {"topics": topics}}, **keys)
+    capture = closing.enter_context(PacketCapture(tmp_path / "one.pcapng"))
+    fleet = Fleet(
+        tmp_path, closing, medium, {1: {"topics": topics, "observer": capture}, 2: {"topics": topics}}, **keys
+    )
     fleet.meet()
     graph = MemoryMiddleware(domain_id=domain(1))
     closing.callback(graph.close)
@@ -116,6 +121,9 @@ def test_a_shared_channel_carries_what_is_bound_to_it_to_robots_that_have_it_alo
         assert f"radio far alone: /robot_{number}/chat; " in words
         assert stats["sink"]["rejected"] == {}
     assert fleet.robots[3].link.stats()["sink"]["rejected"] == {}
+    fleet.robots[1].link.stop()
+    captured = [packet for packet, _ in packets_in((tmp_path / "one.pcapng").read_bytes(), None, "")]
+    assert {packet[1] for packet in captured} == {1, 2, 3}, "as they are on the air, without a byte before them"
 
 
 def test_over_a_shared_channel_services_are_called_and_topics_asked_for(tmp_path: Path, closing: ExitStack) -> None:
