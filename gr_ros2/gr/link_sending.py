@@ -10,7 +10,7 @@ from gr_ros2.gr.sending import SendingBlock, Sharing
 from gr_ros2.gr.subscriptions import OpenSubscriptions
 from gr_ros2.link.endpoint import OpenEndpoint
 from gr_ros2.settings.config import replaced
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.settings.robot import RobotConfig
 
 
@@ -81,6 +81,11 @@ class LinkSendingBlock(SendingBlock):
     def together(self) -> list[LinkSendingBlock]:
         """This block, and those of the same robot that send over one radio alone."""
         return [self, *(() if self.sharing is None else self.sharing.sources)]
+
+    @property
+    def sent(self) -> dict[str, Topic]:
+        """The topics that these subscribe to, by their names on the ROS graph."""
+        return {name: topic for block in self.together for name, topic in block.subscriptions.subscribed.items()}
 
     def set_topics(self, topics: Any) -> None:
         """Use other options of single topics, of which ``live_options`` may change. A message is for the robot that

@@ -53,7 +53,7 @@ class LiveSettings:
             self._setters[name](value)
             return shortened(f"{name} = {value}")
         topic, option = place
-        sent = {name: topic for each in self._source.together for name, topic in each.subscriptions.subscribed.items()}
+        sent = self._source.sent
         topic = sent[topic].name if topic in sent else topic  # as status writes it
         given = self._source.config.topics
         known = next((other for other in given if other.lstrip("/") == topic.lstrip("/")), topic)

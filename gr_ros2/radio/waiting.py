@@ -107,9 +107,8 @@ class Waiting:
 
         :raises MiddlewareError: when the graph cannot be asked
         """
-        together = self._source.together
-        missing = [name for source in together for name in source.found.unmatched()]
-        types = {name: topic.type_name for each in together for name, topic in each.subscriptions.subscribed.items()}
+        missing = [name for block in self._source.together for name in block.found.unmatched()]
+        types = {name: topic.type_name for name, topic in self._source.sent.items()}
         self._had |= types.keys() - set(missing)
         line = waiting_line(missing, types, self._others(), left=self._had) if missing else self._sent()
         if line == self._last:
@@ -126,8 +125,7 @@ class Waiting:
         """That every topic has a publisher; with the topics and services, where the user did not name them."""
         if not self._source.found.choice.open:
             return ALL_THERE
-        subscribed = [pair for source in self._source.together for pair in source.subscriptions.subscribed.items()]
-        topics = [name for name, topic in subscribed if not topic.action]
+        topics = [name for name, topic in self._source.sent.items() if not topic.action]
         found = self._source.found.offered
         offered = f"; services and actions: {_listed(sorted(found))}" if found else ""
         return f"{ALL_THERE}: {_listed(topics)}{offered}"
