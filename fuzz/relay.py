@@ -11,6 +11,7 @@ from gr_ros2.link.v1.custody import MOST_HELD, Custody
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sent_topics import SentTopics
 from gr_ros2.relay.gain import Gains, Stream
+from gr_ros2.relay.memory import Memory
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Receipt, Relayed, read_carried, read_relayed, write_carried, write_relayed
@@ -36,6 +37,7 @@ def relay(data: bytes) -> None:
         routes=Routes(),
         room=200,
         most=10_000,
+        share=Memory(10_000).share(),
         dropped=Counter(),
         drop=lambda _: None,
         ended=lambda *_: None,

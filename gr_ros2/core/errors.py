@@ -73,6 +73,12 @@ class WireError(GrRos2Error, ValueError):
 
     kind = "wire"
 
+    def alone(self) -> WireError:
+        """The error without where it was raised: that would keep what was in the packet, in a cycle of references that
+        a large process collects seldom."""
+        self.__traceback__ = self.__context__ = self.__cause__ = None
+        return self
+
 
 class LengthError(WireError):
     """More or fewer bytes than ``packet_len`` allows."""

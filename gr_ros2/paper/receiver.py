@@ -77,7 +77,7 @@ class Receiver:
             packet = V0.decode(data, self.robot.packet_len)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
-            events.append(Rejected(data, error))
+            events.append(Rejected(data, error.alone()))
             return events
         self.stats.packets += 1
         events.append(Received(data, packet, packet.src_id, 0, packet.seq, crc32(data), arrival.at, arrival.snr_db))

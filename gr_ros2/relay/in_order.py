@@ -29,8 +29,9 @@ DOUBLED = 6
 """This time is doubled so often at most."""
 WINDOW = 32
 """Messages of a topic that are sent before a robot has told that it has the first of them."""
-_COST = 500
-"""Bytes that a message takes beside its payload."""
+COST = 2300
+"""Bytes that a message takes beside its payload, one alone in its topic, sent to eight robots (measured with
+``tracemalloc``)."""
 Order = tuple[int, int]
 """Number of the packet in which a message began, and its place there."""
 
@@ -125,7 +126,7 @@ class InOrder:
         row.late, row.newest = late, order
         row.orders.append(order)
         row.kept.append(kept)
-        lost = self._quotas.put(Name(stream, order), via, len(message.payload) + _COST)
+        lost = self._quotas.put(Name(stream, order), via, len(message.payload))
         for name in lost:
             self._remove(name)
         return len(lost)

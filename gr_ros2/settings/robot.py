@@ -199,7 +199,8 @@ class RobotConfig:
     max_sources: Annotated[int, Field(ge=1, le=BROADCAST + 1, title="Most senders at a time")] = 16
     """robots heard at a time; packets of more are dropped"""
     max_source_bytes: Annotated[Bytes, Field(title="Memory per sender (bytes)")] = 72_000_000
-    """memory per robot heard, a quarter of it for incomplete messages; the oldest goes first"""
+    """memory per robot known, a quarter of it for incomplete messages, and as much for all that is relayed; the oldest
+    goes first"""
     debug: Annotated[bool, Field(title="Debug log")] = False
     """readable log of headers, topic ids and entries"""
     conditions: ClassVar[tuple[ActsWhere, ...]] = (

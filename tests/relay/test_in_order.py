@@ -5,7 +5,8 @@ from __future__ import annotations
 from math import inf
 
 from gr_ros2.relay.gain import EXPIRES_S, Gains, Stream
-from gr_ros2.relay.in_order import AGAIN_S, InOrder, Kept, Name
+from gr_ros2.relay.in_order import AGAIN_S, COST, InOrder, Kept, Name
+from gr_ros2.relay.memory import Memory
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Relayed
@@ -20,7 +21,7 @@ def at_robot_2(*, most: int = 100) -> tuple[Gains, InOrder]:
     gains.neighbour(1, 0.0, [2], 1)
     gains.neighbour(3, 0.0, [2, 4], 2)
     gains.neighbour(4, 0.0, [2, 3], 2)
-    return gains, InOrder(gains, Quotas(most, 1 << 20))
+    return gains, InOrder(gains, Quotas(most, Memory(1 << 20).share(), COST))
 
 
 def keep(kept: InOrder, *numbers: int, until: float = inf, late: int = 0) -> None:

@@ -275,7 +275,7 @@ def test_wishes() -> None:
 def test_rows_add_up_to_a_table() -> None:
     case = VECTORS["announced"]
     messages = [bytes.fromhex(text) for text in case["messages"]]
-    known = AnnouncedTopics(None, 0)
+    known = AnnouncedTopics(None, 10_000)
     for number, message in enumerate(messages):
         known.take(message, (number, 0))
     assert known.take(messages[0], (0, 0)) is None, "an older row"

@@ -6,11 +6,12 @@ one; messages that arrive before theirs are kept, within bounds.
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Callable
 from math import inf
 
-from gr_ros2.core.errors import CodecError
+from gr_ros2.core.errors import CodecError, EntryBoundsError
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.order import Ready
@@ -19,8 +20,9 @@ from gr_ros2.wire.table import AnnouncedTopic, read_table, write_table
 
 _WAITING = 256
 """Number of messages of unknown topics, or coded in an unknown way, that are kept until the table arrives."""
-
-
+_COST, _ROW_COST = 400, 700
+"""Bytes beside its payload that a message takes which waits, and that a row takes beside its texts (measured with
+``tracemalloc``)."""
 ARRIVING_S = 1.0
 """s for which more of what a robot sends again is waited for before it is asked for it; more on a slow channel."""
 
@@ -29,7 +31,7 @@ class AnnouncedTopics:
     """The table of topics of one start of one robot.
 
     :param decoder_for: makes the decoder for its messages from its table of topics
-    :param most: bytes of messages that may wait for the table
+    :param most: bytes of the table, and of messages that may wait for it
     :ivar topics: those that are offered, by topic id
     :ivar digest: sum of the marks of the rows that are known
     :ivar newest: number of the packet that brought the newest row, and when, s
@@ -49,13 +51,13 @@ class AnnouncedTopics:
         self._decoder_for = decoder_for
         self._codec: MessageCodec | None = None
         self._waiting: deque[Ready] = deque()
-        self._bytes = 0
+        self._bytes = self._row_bytes = 0
         self._most = most
 
     @property
     def held(self) -> int:
-        """Bytes of the messages that wait for a table."""
-        return self._bytes
+        """Bytes of the table and of the messages that wait for it."""
+        return self._bytes + self._row_bytes
 
     def topic_of(self, ready: Ready | Relayed) -> AnnouncedTopic | None:
         """The topic of a message; None if the message has to wait for a table."""
@@ -69,11 +71,11 @@ class AnnouncedTopics:
     def wait(self, ready: Ready) -> list[Ready]:
         """Keep a message until a table arrives; returns the messages that are given up for it."""
         self._waiting.append(ready)
-        self._bytes += len(ready.payload)
+        self._bytes += len(ready.payload) + _COST
         given_up = []
-        while len(self._waiting) > _WAITING or self._bytes > self._most:
+        while self._waiting and (len(self._waiting) > _WAITING or self.held > self._most):
             given_up.append(self._waiting.popleft())
-            self._bytes -= len(given_up[-1].payload)
+            self._bytes -= len(given_up[-1].payload) + _COST
         return given_up
 
     def take(self, table: bytes, order: tuple[int, int], *, direct: bool = True) -> tuple[AnnouncedTopic, ...] | None:
@@ -82,7 +84,7 @@ class AnnouncedTopics:
 
         :param order: of the message that it is
         :param direct: it comes from the robot itself: whatever others say, only its own rows are older or newer
-        :raises WireError: it cannot be read
+        :raises WireError: it cannot be read, or is too large
         """
         rows = [row for row in read_table(table) if order >= self._orders.get(row.topic_id, order)]
         if direct:
@@ -91,6 +93,10 @@ class AnnouncedTopics:
         if not changed:
             return None
         replaced = [self._rows[topic_id] for topic_id in changed if topic_id in self._rows]
+        row_bytes = self._row_bytes + sum(map(_size, changed.values())) - sum(map(_size, replaced))
+        if row_bytes > self._most:
+            raise EntryBoundsError(f"a table of topics of {row_bytes} bytes, where {self._most} are free for it")
+        self._row_bytes = row_bytes
         self._rows.update(changed)
         marks = sum(row.mark for row in changed.values()) - sum(row.mark for row in replaced)
         self.digest = (self.digest + marks) & 0xFFFF_FFFF
@@ -127,3 +133,8 @@ class AnnouncedTopics:
     def unknown(self, ready: Ready) -> Fate:
         """The fate of a message that is given up because its table did not arrive."""
         return Fate.UNKNOWN_DICTIONARY if ready.topic_id in self.topics else Fate.UNKNOWN_TOPIC
+
+
+def _size(row: AnnouncedTopic) -> int:
+    """Bytes that a row takes."""
+    return _ROW_COST + sum(map(sys.getsizeof, (row.name, row.type_name, row.codec)))

@@ -28,6 +28,7 @@ from gr_ros2.link.v1.peers import Peers
 from gr_ros2.link.v1.sent_packets import SentPackets
 from gr_ros2.link.v1.sent_topics import LONG_CARRIED, SentTopics
 from gr_ros2.relay.gain import Gains
+from gr_ros2.relay.memory import Share
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.ages import age_code, limit_code
@@ -59,8 +60,10 @@ _TRIES = 6
 """The same is doubled with each try, so often at most."""
 _ARRIVALS = 16
 """Own messages that have come, from which it follows how long others may take."""
-_RECEIPTS = 16
-"""Topics of which a receipt tells."""
+_RECEIPTS, _MOST_RECEIPTS = 16, 256
+"""Topics of which a receipt tells, and of which one waits for each robot."""
+_COST = 2000
+"""Bytes that a message of another robot takes beside its payload."""
 
 
 class _Name(NamedTuple):
@@ -128,7 +131,8 @@ class Custody:
     :param gains: knows who hears whom
     :param routes: over whom other robots are reached
     :param room: bytes of the longest body
-    :param most: bytes of messages of others that may be held, and of own ones of a topic
+    :param most: bytes of own messages of a topic that may be held
+    :param share: of the memory, for those of others
     :param dropped: counts what is lost
     :param drop: called with own messages that are too late
     :param ended: called with own messages that have come, or of which this is not known and that are kept no longer
@@ -145,6 +149,7 @@ class Custody:
         routes: Routes,
         room: int,
         most: int,
+        share: Share,
         dropped: Counter[str],
         drop: Callable[[list[Dropped[Message]]], None],
         ended: Callable[[int, int, int, bool], None],
@@ -153,7 +158,7 @@ class Custody:
         self._src_id, self._start, self._boot = own[0], own[1] & 0xFFFF, own[1]
         self._topics, self._packets, self._peers, self._gains = topics, packets, peers, gains
         self._room, self._most, self._dropped, self._drop, self._ended = room, most, dropped, drop, ended
-        self._quotas: Quotas[_Name] = Quotas(MOST_HELD, most)
+        self._quotas: Quotas[_Name] = Quotas(MOST_HELD, share, _COST)
         self._held: dict[_Name, _Held] = {}
         self._own: dict[tuple[int, int], list[_Held]] = {}
         """Own messages by topic and robot, in order."""
@@ -201,7 +206,7 @@ class Custody:
         self._held[held.name] = held
         self._bytes += len(held.message.payload)
         if held.own is None:
-            for lost in self._quotas.put(held.name, held.came, len(held.message.payload)):
+            for lost in self._quotas.put(held.name, held.came, 2 * len(held.message.payload)):  # also as it leaves
                 self._dropped["custody_full"] += 1
                 self._forget(self._held[lost])
 
@@ -376,6 +381,8 @@ class Custody:
         """Tell a robot what has come of its messages."""
         waiting = self._receipts.setdefault(robot, {})
         waiting[receipt.start, receipt.topic_id] = receipt
+        if len(waiting) > _MOST_RECEIPTS:
+            del waiting[next(iter(waiting))]
 
     def _tell(self, now: float) -> None:
         """Make receipts. Until one has left, the next one waits, and tells of all that has come by then."""

@@ -169,6 +169,7 @@ class EndpointV1:
                 routes=relaying.routes,
                 room=room,
                 most=settings.max_source_bytes,
+                share=relaying.memory.share(),
                 dropped=self.received.dropped,
                 drop=messages.drop,
                 ended=messages.ledger.ended,

@@ -19,6 +19,7 @@ from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.relay.gain import EXPIRES_S
+from gr_ros2.relay.memory import Share
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.v1 import BROADCAST
@@ -34,7 +35,7 @@ class FarRobots:
     :param outcomes: takes what comes of it
     :param routes: over whom robots are reached
     :param make_inbox: makes the inbox of a far robot from its id, its boot number and the first packet that counts
-    :param most: bytes of tables of far robots
+    :param share: of the memory, for tables of far robots
     :ivar inboxes: of robots that are or were known over others only
     :ivar hops: over how many robots the newest message of each robot came; 0 for directly
     :ivar there: when each robot was there last, s
@@ -47,7 +48,7 @@ class FarRobots:
         routes: Routes,
         make_inbox: Callable[[int, int, int], Inbox],
         *,
-        most: int,
+        share: Share,
     ) -> None:
         self.inboxes: dict[int, Inbox] = {}
         self.hops: dict[int, int] = {}
@@ -56,7 +57,7 @@ class FarRobots:
         self._make_inbox = make_inbox
         self._here: dict[int, tuple[int, float]] = {}
         """Robots that are reached over others: boot number, and when something of them last came, s."""
-        self._quotas: Quotas[int] = Quotas(BROADCAST, most)
+        self._quotas: Quotas[int] = Quotas(BROADCAST, share)
         self._first_made: dict[int, float] = {}
         """When that was made with which each start in ``inboxes`` began, s."""
         self._came: dict[int, float] = {}

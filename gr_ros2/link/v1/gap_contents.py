@@ -14,7 +14,7 @@ from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.wire.control import MAP
 from gr_ros2.wire.v1 import MAX_MESSAGE, EntryV1, Part, fit, read_body
 
-_MANY = 1024
+_MANY = 256
 """Packets noted before the notes about known ones are dropped."""
 
 

@@ -27,22 +27,27 @@ from gr_ros2.wire.control import MAP, Control, LeftOut
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import SPAN, TABLE_TOPIC, EntryV1, read_body
 
-_PACKET_COST, _EQUATION_COST = 250, 350
-"""Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries and
-of the list of gaps)."""
+_PACKET_COST, _EQUATION_COST = 350, 430
+"""Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries that
+have just grown, and of what is noted of missing packets)."""
+_ROBOT_COST = 1_200_000
+"""Bytes that a robot takes beside its packets and messages, at most: numbers of its packets and repairs, messages that
+may come again, packets that cannot be opened yet. A share of a small memory."""
 
 
 class Bounds(NamedTuple):
     """How the memory for one robot (``max_source_bytes``) is divided.
 
+    :param most: bytes of packets and messages
     :param span: packets remembered
     :param equations: equations held; together they take up to a half
     :param fragments: bytes of incomplete messages
     :param ordered: bytes of messages that may wait for an earlier one, whatever else is kept; above it, they wait no
         longer, unless what the others leave of the memory has room for them
-    :param unknown: bytes of messages that may wait for the table of topics
+    :param unknown: bytes of the table of topics, and of messages that may wait for it
     """
 
+    most: int
     span: int
     equations: int
     fragments: int
@@ -51,12 +56,14 @@ class Bounds(NamedTuple):
 
     @classmethod
     def of(cls, most: int, room: int) -> Bounds:
-        """:param room: bytes of the longest body"""
+        """:param most: bytes in all, what is noted of the robot included
+        :param room: bytes of the longest body"""
+        most -= min(_ROBOT_COST, most // 8)
         packets = most // 2
         equations = max(min(MOST_EQUATIONS, packets // 4 // (room + _EQUATION_COST)), MAP)
         rest = packets - equations * (room + _EQUATION_COST)
         span = max(min(SPAN, rest // (room + _PACKET_COST)), MAP)
-        return cls(span, equations, most // 4, most // 8, most // 8)
+        return cls(most, span, equations, most // 4, most // 8, most // 8)
 
 
 class Inbox:
@@ -108,7 +115,7 @@ class Inbox:
         self.decoder.begin(first)
         self.decoder.newest = first - 1
         self.first, self._give_up_s, self._heard = first, give_up_s, inf
-        self._most = settings.max_source_bytes
+        self._most = bounds.most
         self._reassembly = Reassembly(bounds.fragments)
         self.order = Order(
             self.decoder,

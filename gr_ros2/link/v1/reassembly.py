@@ -12,6 +12,7 @@ number of incomplete messages.
 
 from __future__ import annotations
 
+import sys
 from bisect import bisect_right, insort
 from collections import OrderedDict
 from collections.abc import Callable
@@ -22,8 +23,9 @@ from math import inf
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.wire.v1 import Part
 
-_PARTIAL_COST, _FRAGMENT_COST = 450, 130
-"""Bytes of bookkeeping per message and per fragment held (measured with ``tracemalloc``)."""
+_PARTIAL_COST, _FRAGMENT_COST = 500, 80
+"""Bytes of bookkeeping per message and per fragment held, beside the dictionary and the list of a message (measured
+with ``tracemalloc`` where the others have just grown)."""
 _FEW = 64
 
 
@@ -33,6 +35,7 @@ class PartialMessage:
 
     :param starts: offsets of its pieces, in order
     :param newest: packet of its newest fragment, and its place among the entries there
+    :param cost: bytes that it takes, bookkeeping included
     :param place: its place among the entries of the packet in which it began; -1 until that packet is here
     :param made: when it was made, s, as far as its origin told that it had waited
     """
@@ -44,6 +47,7 @@ class PartialMessage:
     pieces: dict[int, bytes] = field(default_factory=dict)
     starts: list[int] = field(default_factory=list)
     size: int = 0
+    cost: int = 0
     total: int = -1
     newest: tuple[int, int] = (-1, -1)
     place: int = -1
@@ -93,6 +97,8 @@ class Reassembly:
         """By topic id and packet in which they began; the message longest without a new fragment first."""
         self._begins: dict[int, list[int]] = {}
         """By topic id: a heap of the packets in which its messages began; some of them may be over."""
+        self._noted = 0
+        """Packets in these."""
         self._grown: dict[int, PartialMessage] = {}
         """By topic id: the message that had the last fragment."""
         self._held = 0
@@ -118,11 +124,10 @@ class Reassembly:
         partial = self._partials.get(name)
         if partial is None:
             partial = self._partials[name] = PartialMessage(part.topic_id, begin, part.coded, now)
-            begins = self._begins.setdefault(part.topic_id, [])
-            heappush(begins, begin)
-            if len(begins) > 2 * len(self._partials) + _FEW:
-                begins[:] = sorted(other for topic_id, other in self._partials if topic_id == part.topic_id)
-            self._held += _PARTIAL_COST
+            heappush(self._begins.setdefault(part.topic_id, []), begin)
+            self._noted += 1
+            if self._noted > 2 * len(self._partials) + _FEW:
+                self._note_anew()
         else:
             self._partials.move_to_end(name)
         partial.last = now
@@ -134,7 +139,10 @@ class Reassembly:
             partial.pieces[offset] = payload
             insort(partial.starts, offset)
             partial.size += len(payload)
-            self._held += len(payload) + _FRAGMENT_COST
+        lists = sys.getsizeof(partial.pieces) + sys.getsizeof(partial.starts)
+        cost = _PARTIAL_COST + partial.size + len(partial.pieces) * _FRAGMENT_COST + lists
+        self._held += cost - partial.cost
+        partial.cost = cost
         if not (part.offset or part.back):
             partial.place = place
         if part.last:
@@ -169,6 +177,7 @@ class Reassembly:
         """Give up messages that began before a later message of the same topic that has been delivered."""
         ended, begins = [], self._begins.get(topic_id, [])
         while begins and begins[0] < begin:
+            self._noted -= 1
             partial = self._partials.get((topic_id, heappop(begins)))
             if partial is not None:
                 ended.append(self._release(partial))
@@ -179,13 +188,14 @@ class Reassembly:
         begins = self._begins.get(topic_id, [])
         while begins and (topic_id, begins[0]) not in self._partials:
             heappop(begins)
+            self._noted -= 1
         return (begins[0], self._partials[topic_id, begins[0]].place) if begins else None
 
     def clear(self) -> list[PartialMessage]:
         """Give up everything."""
         ended = list(self._partials.values())
         self._partials.clear()
-        self._begins.clear()
+        self._note_anew()
         self._grown.clear()
         self._held = 0
         return ended
@@ -210,9 +220,14 @@ class Reassembly:
 
     def _release(self, partial: PartialMessage) -> PartialMessage:
         del self._partials[partial.topic_id, partial.begin]
-        self._held -= partial.size + _PARTIAL_COST + len(partial.pieces) * _FRAGMENT_COST
+        self._held -= partial.cost
         if self._grown.get(partial.topic_id) is partial:
             del self._grown[partial.topic_id]
-        if not self._partials:
-            self._begins.clear()
         return partial
+
+    def _note_anew(self) -> None:
+        """Note where the messages began that are not over."""
+        self._begins.clear()
+        for topic_id, begin in sorted(self._partials):
+            self._begins.setdefault(topic_id, []).append(begin)
+        self._noted = len(self._partials)

@@ -141,7 +141,7 @@ class ReceivingSide:
             self._receive(arrival, now, began if came is None else came)
         except WireError as error:
             self.stats.rejected[error.kind] += 1
-            self._outcomes.events.append(Rejected(arrival.data, error))
+            self._outcomes.events.append(Rejected(arrival.data, error.alone()))
         facts, self._facts = self._facts, []
         return self._outcomes.take(), facts
 

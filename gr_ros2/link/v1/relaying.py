@@ -38,6 +38,7 @@ from gr_ros2.link.v1.sent_on import REPAIRED_S, SentOn, ToPass
 from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.relay.gain import TOLD, Gains, Stream
 from gr_ros2.relay.in_order import Kept, Name
+from gr_ros2.relay.memory import Memory
 from gr_ros2.relay.routes import Routes
 from gr_ros2.settings.registry import CALLS_TYPE
 from gr_ros2.wire.ages import age_of
@@ -73,11 +74,12 @@ class Relaying:
     :param outcomes: takes what comes of it
     :param packet_len: bytes of a packet
     :param repairs: whether lost packets are repaired
-    :param most: bytes of messages that are kept to be sent on, of those carried here that wait, and of far tables
+    :param most: bytes of all that is kept of messages of other robots
     :param slower: see :class:`gr_ros2.relay.gain.Gains`
     :param make_inbox: see :class:`FarRobots`
     :ivar gains: who lacks what
     :ivar routes: over whom robots are reached
+    :ivar memory: shared by all that is kept: far tables, the two kinds of what is sent on, what is carried here and on
     :ivar far: the robots that are known over others
     :ivar sent_on: what is sent on
     """
@@ -97,15 +99,16 @@ class Relaying:
         self.src_id, self._packet_len = src_id, packet_len
         self._neighbours, self._dropped = neighbours, outcomes.stats.dropped
         self.gains, self.routes = Gains(src_id, slower), Routes(slower)
-        self.far = FarRobots(neighbours, outcomes, self.routes, make_inbox, most=most)
-        self.sent_on = SentOn(self.gains, self._dropped, most, repairs=repairs)
+        self.memory = Memory(most, kinds=5)
+        self.far = FarRobots(neighbours, outcomes, self.routes, make_inbox, share=self.memory.share())
+        self.sent_on = SentOn(self.gains, self._dropped, self.memory, repairs=repairs)
         self.custody: Custody
         self._telling = deque[Stream | None]()
         """What is told next: a reliable topic for all, or None for the newest message of the next of the others."""
         self._swept = 0.0
         self._tables: dict[int, tuple[int, bytes, float]] = {}
         """Robots that are heard: boot number, table, and when it was last worth sending on."""
-        self._carried_here = Sequences[Ready](most)
+        self._carried_here = Sequences[Ready](self.memory.share())
         self.found: Callable[[int, float], None] = lambda _, __: None
         """Called with a robot that is reached over others for the first time."""
 
@@ -265,11 +268,13 @@ class Relaying:
                 self._dropped[error.kind] += 1
             return
         self.far.hops[message.origin] = message.hops
-        new = self._carried_here.take(message, ready, kept.made, now)
+        inbox = self.far.inbox(message.origin, message.start)
+        known = inbox is not None and message.topic_id in inbox.announced.topics
+        new = self._carried_here.take(message, ready, kept.made, now, known=known)
         if not new:
             self._dropped["custody_full" if new is None else "relayed_before"] += 1
         reported = taker == self.src_id and not message.hops  # its origin learns from a report that it is here
-        if (inbox := self.far.inbox(message.origin, message.start)) is not None:
+        if inbox is not None:
             self._due(inbox, now, receipts=not reported)
         if not new and not reported:
             self._confirm(message.origin, message.start, message.topic_id)

@@ -4,8 +4,8 @@ Of reliable topics for all, all messages in their order (``relay.in_order``); of
 (``relay.gain``). Both compete with own messages by what they are worth. A table is of use only whole, and may take many
 packets: these are repaired for ``REPAIRED_S``.
 
-Invariant: what is kept is bounded by ``MOST_STREAMS``, ``MOST_KEPT`` and the bytes given; of the neighbours that
-brought it, the one with most of it loses first.
+Invariant: what is kept is bounded by ``MOST_STREAMS``, ``MOST_KEPT`` and its shares of the memory; of the neighbours
+that brought it, the one with most of it loses first.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from typing import NamedTuple
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.sent_topics import RELAYED, RELAYED_IN_ORDER, RELAYED_TABLES, SentTopic, SentTopics
 from gr_ros2.relay.gain import OWN, Gains, Stream
-from gr_ros2.relay.in_order import InOrder, Kept, Name
+from gr_ros2.relay.in_order import COST, InOrder, Kept, Name
+from gr_ros2.relay.memory import Memory
 from gr_ros2.relay.quotas import Quotas
 from gr_ros2.wire import QOS_DEFAULT
 from gr_ros2.wire.ages import age_code
@@ -29,6 +30,9 @@ MOST_STREAMS = 4096
 """Topics of other robots of which a message is kept to be sent on."""
 MOST_KEPT = 4096
 """Messages of reliable topics for all that are kept to be sent on."""
+_COST = 4500
+"""Bytes that the newest message of a topic takes beside its payload, with what is known of who has it (measured with
+``tracemalloc``)."""
 REPAIRED_S = 20.0
 """s for which a table is repaired after it has left: another one follows then at the latest."""
 Repaired = Callable[[int, float], bool]
@@ -52,18 +56,18 @@ class SentOn:
 
     :param gains: knows who lacks what
     :param dropped: counts what is not sent on any more
-    :param most: bytes of messages that are kept, of each of the two kinds
+    :param memory: where both kinds of messages have a share
     :param repairs: whether lost packets are repaired
     :ivar in_order: the messages of reliable topics for all
     :ivar relayed: messages sent on, by origin and topic id
     """
 
-    def __init__(self, gains: Gains, dropped: Counter[str], most: int, *, repairs: bool) -> None:
+    def __init__(self, gains: Gains, dropped: Counter[str], memory: Memory, *, repairs: bool) -> None:
         self.relayed: Counter[tuple[int, int]] = Counter()
-        self.in_order = InOrder(gains, Quotas(MOST_KEPT, most))
+        self.in_order = InOrder(gains, Quotas(MOST_KEPT, memory.share(), COST))
         self._gains, self._dropped, self._repairs = gains, dropped, repairs
         self._newest: dict[Stream, ToPass] = {}
-        self._quotas: Quotas[Stream] = Quotas(MOST_STREAMS, most)
+        self._quotas: Quotas[Stream] = Quotas(MOST_STREAMS, memory.share(), _COST)
         self._offered: dict[int, tuple[Stream, ToPass]] = {}
         """What is in a queue of the newest messages or of tables, by its id."""
         self._next: Name | None = None

@@ -6,8 +6,8 @@ for these, and for no others: their origin hands them on until it is told that t
 A message that came over others may be false. Where it has put later ones off, one that was made ``EXPIRES_S`` after it
 came begins anew.
 
-Invariants: a message is given out once, and none after a later one of its topic; memory is bounded by ``most`` bytes
-and ``MOST_STREAMS`` topics.
+Invariants: a message is given out once, and none after a later one of its topic; memory is bounded by a share of it
+and by ``MOST_STREAMS`` topics.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from math import inf
 from typing import Generic, TypeVar
 
 from gr_ros2.relay.gain import EXPIRES_S, Stream
+from gr_ros2.relay.memory import Share
 from gr_ros2.wire.relayed import PLACES, Relayed
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
 MOST_STREAMS = 1024
 """Topics of which it is known what has come; of others, everything counts as new."""
-_COST = 250
-"""Bytes that a message which waits takes beside its payload."""
+_COST, _STREAM_COST = 900, 700
+"""Bytes that a message which waits takes beside its payload, and a topic (measured with ``tracemalloc``)."""
 T = TypeVar("T")
 
 
@@ -56,25 +57,29 @@ class _Sequence(Generic[T]):
 class Sequences(Generic[T]):
     """Messages that wait for those before them.
 
-    :param most: bytes of messages that may wait
+    :param share: of the memory
     """
 
-    def __init__(self, most: int) -> None:
-        self._most, self._bytes = most, 0
+    def __init__(self, share: Share) -> None:
+        self._share = share
         self._all: dict[Stream, _Sequence[T]] = {}
 
-    def take(self, message: Relayed, item: T, made: float, now: float) -> bool | None:
+    def take(self, message: Relayed, item: T, made: float, now: float, *, known: bool = True) -> bool | None:
         """Keep a message until its turn.
 
         :param item: what is given out with it
         :param made: when it was made, s
+        :param known: it can be delivered as soon as it is the next of its topic
         :return: whether it is new; None if there is no room for it
         """
         stream = Stream(message.origin, message.start, message.topic_id)
         sequence = self._all.get(stream)
         passed = sequence is not None and (message.number, message.place) <= sequence.newest
+        if sequence is None and self._share.full and not known:
+            return None
         if sequence is None or (passed and made > sequence.came + EXPIRES_S):
             self._drop(stream)
+            self._share.held += _STREAM_COST
             sequence, passed = _Sequence(message.place - message.waits), False
         self._all.pop(stream, None)
         self._all[stream] = sequence
@@ -86,9 +91,10 @@ class Sequences(Generic[T]):
         sequence.floor = max(sequence.floor, place - message.waits)
         if place in sequence.waiting:
             return False
-        if self._bytes + len(message.payload) + _COST > self._most and place > max(sequence.next, sequence.floor):
+        self._share.held += len(message.payload) + _COST
+        if self._share.full and not (known and place <= max(sequence.next, sequence.floor)):
+            self._share.held -= len(message.payload) + _COST
             return None
-        self._bytes += len(message.payload) + _COST
         sequence.waiting[place], sequence.came = (message, item), now
         return True
 
@@ -101,7 +107,7 @@ class Sequences(Generic[T]):
         for stream, sequence in self._all.items():
             wanted = stream[:2] == (origin, start) and stream.topic_id in known
             while wanted and (out := sequence.take_out()) is not None:
-                self._bytes -= len(out[0].payload) + _COST
+                self._share.held -= len(out[0].payload) + _COST
                 found.append(out[1])
         return found
 
@@ -112,4 +118,6 @@ class Sequences(Generic[T]):
 
     def _drop(self, stream: Stream) -> None:
         gone = self._all.pop(stream, None)
-        self._bytes -= sum(len(message.payload) + _COST for message, _ in gone.waiting.values()) if gone else 0
+        if gone is not None:
+            waiting = sum(len(message.payload) + _COST for message, _ in gone.waiting.values())
+            self._share.held -= waiting + _STREAM_COST

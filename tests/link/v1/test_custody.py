@@ -13,6 +13,7 @@ from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.link.v1.sequences import Sequences
+from gr_ros2.relay.memory import Memory
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.relayed import PLACES, Relayed, read_carried, write_carried
@@ -183,7 +184,7 @@ def test_what_is_kept_stays_in_order_however_many_after_it_are_given_up() -> Non
     for n in range(PLACES + 10):
         messages.submit(1, b"goal %d" % n, line.now, 2.0)
         line.run(0.5)
-    here, kept = Sequences[bytes](100_000), custody_of(line.robots[0])
+    here, kept = Sequences[bytes](Memory(100_000).share()), custody_of(line.robots[0])
     (own,) = kept._own.values()
     for held in reversed(own):
         held.taker = 2

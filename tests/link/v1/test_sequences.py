@@ -11,6 +11,7 @@ from gr_ros2.link.v1 import sequences
 from gr_ros2.link.v1.custody import WINDOW
 from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.relay.gain import Stream
+from gr_ros2.relay.memory import Memory
 from gr_ros2.wire.relayed import FIRST_PLACE, PLACES, Relayed
 
 OF = Stream(1, 7, 3)
@@ -46,7 +47,7 @@ class Origin:
 def test_everything_comes_once_and_in_order_unless_it_is_given_up(seed: int, gives_up: bool) -> None:
     """Also where a robot on the way hands a message on much later, when its place has come round."""
     rng = random.Random(seed)
-    origin, here = Origin(), Sequences[int](100_000)
+    origin, here = Origin(), Sequences[int](Memory(100_000).share())
     got: list[int] = []
     under_way: list[tuple[int, Relayed]] = []
     over: set[int] = set()
@@ -70,7 +71,7 @@ def test_everything_comes_once_and_in_order_unless_it_is_given_up(seed: int, giv
 
 
 def test_a_robot_that_starts_anew_waits_for_what_its_origin_keeps_and_for_nothing_else() -> None:
-    here = Sequences[int](1000)
+    here = Sequences[int](Memory(5000).share())
     assert take(here, message(12, waits=2), 12)
     assert here.due(1, 7) == []
     assert here.newest(OF) is None
@@ -83,7 +84,7 @@ def test_a_robot_that_starts_anew_waits_for_what_its_origin_keeps_and_for_nothin
 
 
 def test_what_waits_is_bounded_and_may_come_again() -> None:
-    here = Sequences[int](2000)
+    here = Sequences[int](Memory(4500).share())
     assert [take(here, message(n, waits=n, size=300), n) for n in range(1, 6)] == [
         True,
         True,
@@ -98,7 +99,7 @@ def test_what_waits_is_bounded_and_may_come_again() -> None:
 
 
 def test_topics_are_bounded() -> None:
-    here = Sequences[int](1 << 30)
+    here = Sequences[int](Memory(1 << 30).share())
     for start in range(sequences.MOST_STREAMS + 1):
         take(here, message(1, waits=1)._replace(start=start), start)
     assert here.due(1, 0) == []
