@@ -162,7 +162,7 @@ class InOrder:
     @staticmethod
     def _believed(row: _Row, robot: int, order: Order, now: float) -> Order:
         """Up to where a robot that tells an order has all. What has not come here for ``EXPIRES_S`` may be false: who
-        was told it takes true messages again by then, and is sent what comes here."""
+        was told it takes true messages again by then, and is sent what comes here from then on."""
         if order <= row.newest:
             row.beyond.pop(robot, None)
             return order
@@ -170,7 +170,7 @@ class InOrder:
         if first <= row.newest:
             first, since = order, now
         row.beyond[robot] = first, since
-        return order if now <= since + EXPIRES_S else row.newest
+        return order if now <= since + EXPIRES_S else min(row.has.get(robot, row.newest), row.newest)
 
     def heard(self, via: int, name: Name, now: float) -> None:
         """A robot has sent a message on: those that it hears should have it, too."""

@@ -81,6 +81,8 @@ def test_who_was_told_a_number_too_high_gets_what_comes_once_it_has_expired() ->
         assert chosen(kept, second + 0.5) is None
     keep(kept, 3)
     assert chosen(kept, second + 0.5) == 3
+    kept.told(3, told(30_000), second + 0.6)
+    assert chosen(kept, second + 0.7) == 3, "it tells so again and again, more often than messages leave"
 
 
 def test_who_has_more_than_is_here_gets_none_of_it_when_it_comes() -> None:

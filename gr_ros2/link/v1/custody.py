@@ -416,6 +416,8 @@ class Custody:
                 continue
             if (number, place) > self._newest.get((topic_id, robot), (-1, 0)):
                 self._dropped["false_origin"] += 1  # no such message has been made
+                for held in self._own.get((topic_id, robot), []):  # a robot that was told of one has refused these
+                    held.due = min(held.due, max(now, held.left + PATIENCE_S)) if held.due < inf else inf
                 continue
             own = self._own.get((topic_id, robot), [])
             while own and (own[0].message.number, own[0].message.place) <= (number, place):

@@ -152,6 +152,13 @@ class DeliveryRules:
             self._came.pop(topic_id, None)
         return not doubted
 
+    def begin_anew(self, topic_id: int) -> None:
+        """What came over others of a topic was false: what it put off is not passed over."""
+        self._came.pop(topic_id, None)
+        self.newest.pop(topic_id, None)
+        if topic_id in self._direct:
+            self.newest[topic_id] = self._direct[topic_id]
+
     def silent_before(self, number: int) -> None:
         """The robot was silent for long before its packets reached a number: what comes of earlier ones is that old."""
         self._silent_before = number

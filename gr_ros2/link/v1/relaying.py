@@ -270,6 +270,8 @@ class Relaying:
         self.far.hops[message.origin] = message.hops
         inbox = self.far.inbox(message.origin, message.start)
         known = inbox is not None and message.topic_id in inbox.announced.topics
+        if inbox is not None and self._carried_here.refutes(message, kept.made):
+            inbox.deliveries.begin_anew(message.topic_id)
         new = self._carried_here.take(message, ready, kept.made, now, known=known)
         if not new:
             self._dropped["custody_full" if new is None else "relayed_before"] += 1

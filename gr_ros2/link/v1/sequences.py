@@ -72,12 +72,12 @@ class Sequences(Generic[T]):
         :param known: it can be delivered as soon as it is the next of its topic
         :return: whether it is new; None if there is no room for it
         """
-        stream = Stream(message.origin, message.start, message.topic_id)
+        stream, false = Stream(message.origin, message.start, message.topic_id), self.refutes(message, made)
         sequence = self._all.get(stream)
         passed = sequence is not None and (message.number, message.place) <= sequence.newest
         if sequence is None and self._share.full and not known:
             return None
-        if sequence is None or (passed and made > sequence.came + EXPIRES_S):
+        if sequence is None or false:
             self._drop(stream)
             self._share.held += _STREAM_COST
             sequence, passed = _Sequence(message.place - message.waits), False
@@ -97,6 +97,12 @@ class Sequences(Generic[T]):
             return None
         sequence.waiting[place], sequence.came = (message, item), now
         return True
+
+    def refutes(self, message: Relayed, made: float) -> bool:
+        """Whether a message shows that the last one of its topic that was given out was false."""
+        sequence = self._all.get(Stream(message.origin, message.start, message.topic_id))
+        passed = sequence is not None and (message.number, message.place) <= sequence.newest
+        return sequence is not None and passed and made > sequence.came + EXPIRES_S
 
     def due(self, origin: int, start: int, known: Container[int] = range(TABLE_TOPIC)) -> list[T]:
         """The messages of a start of a robot whose turn has come.

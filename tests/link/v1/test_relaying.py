@@ -17,6 +17,7 @@ from gr_ros2.link.v1.sent_on import REPAIRED_S, SentOn, ToPass
 from gr_ros2.link.v1.sent_topics import RELAYED_TABLES, SentTopics
 from gr_ros2.mac import Slots
 from gr_ros2.relay.gain import Gains
+from gr_ros2.relay.memory import Memory
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
@@ -183,7 +184,7 @@ def test_a_table_that_comes_while_another_one_leaves_is_sent_on() -> None:
     gains = Gains(2)
     for robot_id in (1, 3):
         gains.neighbour(robot_id, 0.0)
-    sent_on, topics = SentOn(gains, Counter(), 10_000, repairs=True), SentTopics(None, ())
+    sent_on, topics = SentOn(gains, Counter(), Memory(10_000, 2), repairs=True), SentTopics(None, ())
     topics.relay()
     queue, table = topics[RELAYED_TABLES].queue, Relayed(1, 5, 10, 0, TABLE_TOPIC, 0, b"table" * 40)
     sent_on.take(1, ToPass(table, 0.0, inf), 0.0)

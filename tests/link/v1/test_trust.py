@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.link.events import Delivered
+from gr_ros2.link.v1.custody import PATIENCE_S
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
@@ -253,6 +254,23 @@ def test_a_false_message_for_one_robot_puts_true_ones_off_for_a_while_only(heard
     line.run(10)
     assert [payload for payload in last.delivered(1) if payload.startswith(b"goal")] == goals
     assert told(first) == [True] * 10
+
+
+def test_what_a_false_message_puts_off_comes_soon_once_it_has_expired(soon: None) -> None:  # noqa: ARG001
+    """What was refused is handed on again by the rule of the first try, not after twice as long with each."""
+    line = with_goals(cell=False)
+    first, liar, last = line.robots
+    carries(liar, 3, Relayed(1, first.boot & 0xFFFF, LAST_NUMBER, 130, 1, 1, b"false", dst_id=3), line.now)
+    line.run(2)
+    goals = [b"goal %d" % n for n in range(5)]
+    for goal in goals[:-1]:
+        first.end.messages.submit(1, goal, line.now)
+        line.run(1)
+    line.run(100)
+    assert not {*goals} & {*last.delivered(1)}
+    first.end.messages.submit(1, goals[-1], line.now)
+    line.run(PATIENCE_S + 10)
+    assert [payload for payload in last.delivered(1) if payload in goals] == goals
 
 
 def test_a_receipt_of_what_was_never_made_ends_nothing() -> None:
