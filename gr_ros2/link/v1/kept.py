@@ -163,12 +163,14 @@ class KeptMessages:
         self._send_rows(new, self._table_qos, now)
 
     def _tell_anew(self, now: float) -> bool:
-        """Send all rows of the table, first those of topics whose messages wait; returns whether there are any."""
+        """Send all rows of the table: those that wait already, then first those of topics whose messages wait; returns
+        whether there are any."""
         self._starting_until = min(self._starting_until, now + STARTING_S * self._settings.slower)
         queue = self._topics[TABLE_TOPIC].queue
-        for message in [message for message in queue if not message.started]:
-            queue.remove(message)
-        leaving = {message.payload for message in queue}
+        leaving = set[bytes]()
+        for message in queue:
+            message.qos = self._table_qos
+            leaving.add(message.payload)
         waits = {topic_id for topic_id, topic in self._topics.items() if topic.queue}
         rows = [self._rows[topic_id] for topic_id in sorted(self._rows, key=lambda topic_id: topic_id not in waits)]
         self._send_rows([row for row in rows if row.payload not in leaving], self._table_qos, now)

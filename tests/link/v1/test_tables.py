@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.link.events import Announced
+from gr_ros2.link.events import Announced, SentPacket
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
 from gr_ros2.wire.table import AnnouncedTopic
-from gr_ros2.wire.v1 import TABLE_TOPIC, Part
+from gr_ros2.wire.v1 import TABLE_TOPIC, PacketV1, Part
 from tests.link.v1.air import Air, Robot, registry
 from tests.link.v1.test_ages import MODES
 from tests.link.v1.test_waits import hold_back
@@ -186,3 +186,21 @@ def test_what_had_to_wait_for_its_turn_is_sent_again_when_it_is_asked_for(topic_
         air.run(0.5)
     air.robots.append(late)
     assert air.run(10.0, lambda: b"map" in late.delivered()) <= 3.0
+
+
+def test_every_row_leaves_however_often_the_table_is_asked_for_meanwhile() -> None:
+    """Where it is asked for again before it has left, rows of topics whose messages wait always went first: in a cell
+    of six at 50 % loss two rows of six never came."""
+    one = Robot(1, registry(text=DEFAULT, path=DEFAULT, scan=DEFAULT, joint_states=DEFAULT), mode="encrypt")
+    air = Air(one, Robot(2, mode="encrypt"))
+    air.run(5.0)
+    for number in range(200):
+        one.end.messages.submit(number % 2, b"text %30d" % number, air.now)
+    met = len(one.events)
+    for _ in range(20):
+        one.end.messages.kept.asked(TABLE_TOPIC, air.now)
+        air.run(0.02)
+        hold_back(one, 1.2, air.run)
+    sent = [event.packet for event in one.events[met:] if isinstance(event, SentPacket)]
+    parts = [part for packet in sent if isinstance(packet, PacketV1) for part in packet.body if isinstance(part, Part)]
+    assert {part.payload[1] for part in parts if part.topic_id == TABLE_TOPIC and not part.offset} == {0, 1, 2, 3}
