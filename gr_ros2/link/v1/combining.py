@@ -130,10 +130,11 @@ class Combining:
         newest = window[0].number
         if not packets.full(newest) and newest > proven:
             return window
-        for number in range(max(newest, proven) + 1, min(packets.newest, window[-1].number + MAX_WINDOW - 1) + 1):
-            record = packets.records.get(number)
-            if record is not None and not record.skipped and not packets.full(number):
-                return [record, *packets.live(newest + 1, number - 1, now)[::-1], *window]
+        numbers = range(max(newest, proven) + 1, min(packets.newest, window[-1].number + MAX_WINDOW - 1) + 1)
+        later = [packets.records[number] for number in numbers if number in packets.records]
+        for record in sorted(later, key=lambda record: not record.lasts(now)):
+            if not record.skipped and not packets.full(record.number):
+                return [record, *packets.live(newest + 1, record.number - 1, now)[::-1], *window]
         while window and packets.full(window[0].number):
             window = window[1:]
         return window if window and window[0].number > proven else []

@@ -188,3 +188,18 @@ def test_a_peer_is_told_what_is_over_beside_one_that_lacks_much_that_is_older() 
             covered.update(range(repair.number - repair.mask.bit_length() + 1, repair.number + 1))
             assert 280 not in window_numbers(repair.number, repair.mask)
     assert {1, 280} <= covered
+
+
+def test_what_a_peer_takes_for_a_replay_is_combined_with_a_packet_that_is_repaired_itself() -> None:
+    """With one that carries nothing of use any more, half of the peers could use none of these combinations."""
+    sender = RepairWindow("thrifty", ROOM, shares=True)
+    sender.peers.meet(2, 0.0)
+    for number in range(1, 7):
+        over = Lifetime(expires=-inf, fresh=True)
+        sender.sent(number, b"body", b"", (over,) if number == 5 else (Lifetime(in_order=True, left=True),), 0.0)
+    sender.peers.prove(2, 4)
+    sender.peers.report(2, 6, 0b01_1110, settled=False, loss=0.3, now=1.0)
+    repair = sender.urgent(2.0)
+    assert isinstance(repair, Repair)
+    assert set(window_numbers(repair.number, repair.mask)) >= {1, 6}
+    assert 5 not in window_numbers(repair.number, repair.mask)
