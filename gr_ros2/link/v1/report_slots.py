@@ -9,7 +9,7 @@ from gr_ros2.link.events import SentPacket
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.neighbours import Neighbour
 from gr_ros2.link.v1.reports import Reporter
-from gr_ros2.link.v1.requests import Requests
+from gr_ros2.link.v1.requests import ASK_LEN, Requests
 from gr_ros2.link.v1.shared import KEPT_UP
 from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 from gr_ros2.wire.control import MAP, REPORT_LEN
@@ -57,7 +57,7 @@ class ReportSlots:
         self._allowed = float(FIRST * REPORT_LEN * (settings.slower > 1))
         """Bytes of reports that may leave on a shared channel."""
         self._mask_len = MASK_LEN if settings.repair != "off" else 0
-        self.reserved = 0
+        self.reserved = self._mask_room = 0
         self._unheard = 0.0
         """New packets since a report became due and found no room, weighted."""
         self._unasked = 0
@@ -81,8 +81,9 @@ class ReportSlots:
             del due[int(self._allowed / REPORT_LEN) :]
             size = sum(report.size for report in due)
             self._allowed -= size
-            mask_len = min(self._mask_len, 1 + self._writer.newest // 8)  # that of the longest window so far
-            self.reserved = mask_len + (size + LENGTH_LEN * bool(due)) * (not last)
+            room = size + (ASK_LEN + 1) * self.requests.crowded
+            self._mask_room = min(self._mask_len, 1 + self._writer.newest // 8)  # of the longest window so far
+            self.reserved = self._mask_room + (room + LENGTH_LEN * bool(room)) * (not last)
         return due
 
     @property
@@ -103,7 +104,7 @@ class ReportSlots:
 
         :param free: bytes that they may take
         """
-        free -= LENGTH_LEN * self._shares
+        free -= LENGTH_LEN * self._shares + self._mask_room
         for report in due:
             if free >= report.size:
                 free -= report.size

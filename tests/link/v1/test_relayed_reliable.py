@@ -8,12 +8,16 @@ from math import inf
 
 import pytest
 
+from gr_ros2.link.events import SentPacket
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.order import ALL, Order, Ready
+from gr_ros2.link.v1.report_slots import MASK_LEN
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.link.v1.sent_on import REPAIRED_S
 from gr_ros2.settings.config import SendOptions
+from gr_ros2.wire.control import Ask
+from gr_ros2.wire.v1 import PacketV1, write_body
 from tests.link.v1.air import Robot, registry
 from tests.link.v1.test_relaying import Line, robot
 
@@ -89,6 +93,25 @@ def test_short_packets_that_relay_leave_turns_for_repairs_and_reports(mode: Seal
         everybody.run(0.8)
     rest(everybody, 20, goals)
     assert whole(everybody, goals)
+
+
+def test_requests_leave_the_mask_of_a_repair_its_room() -> None:
+    """They filled it where packets are short, so that repairs named everything in their span, what is over too."""
+    everybody = Cell(*(robot(src_id, "encrypt", TOPICS, packet_len=64) for src_id in (1, 2, 3)), loss=0.4)
+    for again in (everybody.robots[2], everybody.robots[1]):
+        for number in range(60):
+            for one in everybody.robots:
+                one.end.messages.submit(1, b"goal %40d" % number, everybody.now)
+            everybody.run(0.3)
+        again.start()
+    everybody.run(10)
+    events = [event for one in everybody.robots for event in one.events if isinstance(event, SentPacket)]
+    new = [event.packet for event in events if event.entries and event.number > 8 * MASK_LEN]
+    room = everybody.robots[0].end._writer.room
+    bodies = [packet.body for packet in new if isinstance(packet, PacketV1)]
+    asking = [body for body in bodies if any(isinstance(entry, Ask) for entry in body)]
+    assert asking
+    assert max(len(write_body(body, room)) for body in bodies) <= room - MASK_LEN
 
 
 @pytest.mark.parametrize("mode", ["none", "encrypt"])
