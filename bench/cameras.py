@@ -221,8 +221,6 @@ def _joins(kbit_s: float, loss: float, seed: int) -> float:
 
 SEEDS = (1, 2, 3)
 """Draws of losses, of which each figure is the mean."""
-PEERS_KBIT_S = 64
-"""Where packets are lost it has to be better from here on: at 32 a fixed rate shows more pictures, twice as old."""
 BEHIND, BEHIND_LOST = 5, 1
 """% by which the best peer may be better in age, pictures/s or PSNR; the second where packets are lost, for a picture
 that is on its way when the count ends."""
@@ -264,9 +262,8 @@ def cameras() -> list[Row]:
             if p95:
                 rows.append(Row(f"{what}, p95 of the age", pull.p95_ms, "ms", "≤", p95))
                 rows.append(Row(f"{what}, frames", pull.per_s, "/s", "≥", 14, "{:.1f}"))
-            if kbit_s >= PEERS_KBIT_S or not loss:
-                behind = 100 * max(_behind(pull, peer) for peer in (jpeg, fixed))
-                rows.append(Row(f"{what}, worse than a peer by", behind, "%", "≤", BEHIND_LOST if loss else BEHIND))
+            behind = 100 * max(_behind(pull, peer) for peer in (jpeg, fixed))
+            rows.append(Row(f"{what}, worse than a peer by", behind, "%", "≤", BEHIND_LOST if loss else BEHIND))
             older = pull.odometry_ms / alone.odometry_ms
             rows.append(Row(f"{what}, odometry older than alone", older, "times", "≤", 1.5, "{:.2f}"))
     joined = np.mean([_joins(128, loss, seed) for loss in (0.0, 0.2) for seed in SEEDS])

@@ -79,6 +79,16 @@ def test_it_waits_until_the_frame_before_will_have_left_when_coding_is_done() ->
     assert request.budget == pytest.approx(PART * RATE * PERIOD - 80, abs=1)
 
 
+def test_on_a_slow_link_the_next_is_coded_while_a_small_one_waits() -> None:
+    """Both leave in one packet, and what is shown is the newer one."""
+    slow, most = FREE._replace(rate=500.0), 2 * LEAST_BYTES
+    pull, now = running()
+    assert pull.pull(now, slow._replace(waiting=most + 1)) is None
+    request = pull.pull(now, slow._replace(waiting=most))
+    assert request is not None
+    assert request.budget == LEAST_BYTES
+
+
 def test_one_frame_is_coded_at_a_time() -> None:
     pull, now = running()
     assert pull.pull(now, FREE)
@@ -90,7 +100,7 @@ def test_one_frame_is_coded_at_a_time() -> None:
 
 def test_on_a_channel_that_others_fill_frames_come_as_seldom_as_there_is_room_for_them() -> None:
     """Otherwise frames of the least size would take most of a slow channel from the others."""
-    pull, rate, sizes = FramePull(), 100.0, []
+    pull, rate, sizes = FramePull(), 110.0, []
     for number in range(1000):
         pull.offer(b"message", number * PERIOD)
         if request := pull.pull(number * PERIOD, FREE._replace(rate=rate)):
