@@ -22,7 +22,6 @@ from tests.company import pytest_runtest_makereport, pytest_runtest_protocol  # 
 from tests.lab.record.results import RESULT
 from tests.missing import pytest_pycollect_makemodule  # noqa: F401
 from tests.outcomes import (  # noqa: F401
-    FIRST,
     pytest_addoption,
     pytest_configure,
     pytest_runtest_logreport,
@@ -67,10 +66,6 @@ os.environ.setdefault(
 _STATE = tempfile.TemporaryDirectory(prefix="gr_ros2-state-")
 os.environ["XDG_STATE_HOME"] = _STATE.name
 
-# Tests in real time are those of the first worker (`tests/outcomes.py`): it goes before the others.
-if os.environ.get("PYTEST_XDIST_WORKER", FIRST) != FIRST:
-    os.nice(2)
-
 # A shell script's background jobs ignore Ctrl-C, and so would every program that a test starts and interrupts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -90,11 +85,13 @@ GROUPS = {
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Workers of ``-n auto``: three more than cores, since tests wait half of the time: for radios, pages, programs.
+    """Workers of ``-n auto``: two more than cores, since tests often wait: two groups in real time for radios and for
+    pages, others for programs.
 
-    Each imports everything once. With four on two cores a sixth of the processors' time was unused.
+    Each worker imports everything once, and tests in real time suffer from more: with five on two cores, all took a
+    quarter more of the processors' time, and longer.
     """
-    return len(os.sched_getaffinity(0)) + 3
+    return len(os.sched_getaffinity(0)) + 2
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups

@@ -18,11 +18,6 @@ import pytest
 
 from tests.company import LATE
 
-REAL_TIME = "real_time"
-"""The marker of tests in real time, and the name of their group."""
-FIRST = "gw0"
-"""The worker whose they are, as xdist names it."""
-
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--outcomes", type=Path, metavar="FILE", help="write there what became of every test")
@@ -36,9 +31,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """xdist's own for groups, of which that in real time is for the first worker.
-
-    Two errors of pytest-xdist 3.8 are corrected: waits without end after a worker's crash.
+    """xdist's own for groups. Two errors of pytest-xdist 3.8 are corrected: waits without end after a worker's crash.
 
     What the worker had finished is given out again, as units of no test, and no answer to one ever comes. And a worker
     begins a test when it knows the next one, but the successor gets one unit only.
@@ -48,11 +41,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     from xdist.scheduler import LoadGroupScheduling
 
     class Scheduler(LoadGroupScheduling):
-        def _assign_work_unit(self, node: Any) -> None:
-            if REAL_TIME in self.workqueue:
-                self.workqueue.move_to_end(REAL_TIME, last=node.gateway.id != FIRST)
-            super()._assign_work_unit(node)
-
         def _reschedule(self, node: Any) -> None:
             for scope in [scope for scope, unit in self.workqueue.items() if all(unit.values())]:
                 del self.workqueue[scope]

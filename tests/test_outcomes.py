@@ -136,22 +136,6 @@ def test_what_fails_in_real_time_beside_other_programs_is_late_and_repeated_alon
     )
 
 
-MINE = """
-@pytest.mark.xdist_group("real_time")
-@pytest.mark.parametrize("number", range(5))
-def test_mine(number): assert os.environ["PYTEST_XDIST_WORKER"] == "gw0"
-
-@pytest.mark.xdist_group("more")
-@pytest.mark.parametrize("number", range(9))
-def test_more(number): pass
-"""
-
-
-@pytest.mark.slow
-def test_those_in_real_time_are_of_the_first_worker_though_others_begin_with_more(tmp_path: Path) -> None:
-    assert judged(tmp_path, MINE) == (0, ["34 passed, 0 failed"])
-
-
 @pytest.mark.slow
 def test_what_fails_alone_too_fails(tmp_path: Path) -> None:
     status, said = judged(tmp_path, "def test_bad(): assert 0\n")

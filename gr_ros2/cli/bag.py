@@ -169,10 +169,11 @@ class OutputBag(Closing):
     def _note_lost(self, run: LiveRun, src_id: int, topic_id: int, count: int = 1, key: Hashable = None) -> None:
         """Messages are missing in the bag, unless they come later."""
         channel = self._channel(run, (src_id, topic_id))
-        if channel is None:
+        name = _name(src_id, key) if isinstance(key, Key) else None
+        if channel is None or name in self._known:  # it filled a gap before it was given up
             return
-        if isinstance(key, Key) and len(self._lost) < _REMEMBERED:
-            self._lost[_name(src_id, key)] = channel.topic
+        if name is not None and len(self._lost) < _REMEMBERED:
+            self._lost[name] = channel.topic
         else:
             self._given_up[channel.topic] += count
 

@@ -114,6 +114,13 @@ def test_the_bag_says_what_is_missing_at_the_end(tmp_path: Path) -> None:
     assert lost_of(tmp_path / "bag") == {"/rx_robot_2/chat": 2 + 1 + 10}
 
 
+def test_what_filled_a_gap_before_the_receiver_gave_it_up_is_not_missing(tmp_path: Path) -> None:
+    with opened(tmp_path / "bag") as bag:
+        bag.receiver_event(fills(Later(0, 5, 0, message(1, 50), (30, 1))), 0.0)
+        bag.receiver_event(Lost(2, 0, "given_up", Key(7, 30, 1)), 0.0)
+    assert lost_of(tmp_path / "bag") == {}
+
+
 def test_what_cannot_be_read_is_counted(tmp_path: Path) -> None:
     with opened(tmp_path / "bag") as bag:
         bag.receiver_event(Delivered(2, 2, b"\xffjunk", 0), 0.0)

@@ -25,7 +25,7 @@ def measured(monkeypatch: pytest.MonkeyPatch, steps: Iterator[float]) -> str:
 
     calls = SimpleNamespace(link_calls={}, check_heard=lambda _: None, ask=lambda *_: True)
     parts: list[Any] = [SimpleNamespace(sends=True), SimpleNamespace(), calls, SimpleNamespace()]
-    of = LiveThroughput(*parts, share=1.0, clock=clock)
+    of = LiveThroughput(*parts, share=1.0, sends=True, clock=clock)
     monkeypatch.setattr(of, "_drop", lambda _: None)
     of.measure(2, 5)
     assert wait_until(lambda: of.look()["state"] == "failed", 60.0, lambda _: None)

@@ -168,8 +168,8 @@ def test_what_cannot_be_is_said_and_leaves_nothing(tmp_path: Path, blobs: Path) 
     with pytest.raises(BagError, match="no such file"):
         run(tmp_path / "nothing", tmp_path / "out.mcap")
     damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(next(blobs.glob("*.mcap")).read_bytes()[:2000])
-    with pytest.raises(BagError, match="cannot be read"):
+    damaged.write_bytes(bytes(2000))
+    with pytest.raises(BagError, match="neither an MCAP nor"):
         run(damaged, tmp_path / "out.mcap")
     with pytest.raises(BagError, match="exists already"):
         run(blobs, damaged)
