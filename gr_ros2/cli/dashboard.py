@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -178,7 +177,7 @@ def dashboard(place: str, pid: int | None, wait: float, browser: bool) -> None:
         found.extend([] if url is None else [url])
         return url is not None
 
-    if not wait_until(find, wait, lambda _: time.sleep(_ASK_S)):
+    if not wait_until(find, wait, look_s=_ASK_S):
         raise RunError(
             f"{address}:{port}: no dashboard there, and no run or link of yours goes on; start one, or --wait"
         )

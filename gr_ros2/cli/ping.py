@@ -168,7 +168,7 @@ def check(settings: LinkConfig, duration: float | None, against: Path | None = N
                 told[peer["robot"]] = link.ping(peer["robot"])
             return _answered(told)
 
-        wait_until(answered, CHECK_S if duration is None else duration, lambda _: time.sleep(_CHECK_EVERY_S))
+        wait_until(answered, CHECK_S if duration is None else duration, look_s=_CHECK_EVERY_S)
         stats = link.stats()
     if not told:
         console.print("no other end is heard:")

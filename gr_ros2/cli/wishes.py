@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -52,7 +51,7 @@ def _until(look: Callable[[], Mapping[str, Any]], done: Callable[[Mapping[str, A
         told = look()
         return done(told)
 
-    wait_until(over, _PATIENCE_S, lambda _: time.sleep(_LOOK_S))
+    wait_until(over, _PATIENCE_S, look_s=_LOOK_S)
     return told
 
 

@@ -45,16 +45,22 @@ class Watch:
         return self.age(0.0 if changed else inf, now)
 
 
-def wait_until(over: Callable[[], object], timeout_s: float, pause: Callable[[float], object] = time.sleep) -> bool:
+def wait_until(
+    over: Callable[[], object],
+    timeout_s: float,
+    pause: Callable[[float], object] = time.sleep,
+    look_s: float = LOOK_S,
+) -> bool:
     """Wait until something is over, for so many s of this process's own time at most.
 
     :param over: called again and again until it returns something true
     :param pause: waits for at most so many s
+    :param look_s: s from one look to the next, ``LOOK_S`` at most
     :return: whether it was over in time
     """
     watch = Watch()
     while not over():
         if watch.age(inf, time.monotonic()) >= timeout_s:
             return False
-        pause(min(LOOK_S, timeout_s))
+        pause(min(look_s, timeout_s))
     return True

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Collection, Generator
+from contextlib import suppress
 from io import SEEK_CUR, SEEK_SET, BufferedReader, BytesIO, RawIOBase
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -227,11 +228,9 @@ def _decompressed(compression: str, data: bytes) -> bytes:
     if compression not in kinds:
         return b""
     reader, raw = kinds[compression](), bytearray()
-    try:
+    with suppress(Exception):  # each library has errors of its own
         for at in range(0, len(data), _PIECE):
             raw += reader.decompress(data[at : at + _PIECE])
-    except Exception:  # noqa: BLE001 - each library has errors of its own
-        return bytes(raw)
     return bytes(raw)
 
 

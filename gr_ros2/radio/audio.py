@@ -187,7 +187,7 @@ class AudioFrontEnd(BurstFrontEnd):
 
     def drain(self, packets: int) -> None:  # noqa: ARG002 - all that were handed over
         if self.transmits and self._transmitting is not None:
-            wait_until(lambda: self._transmitting.idle, _DRAIN_S, lambda _: time.sleep(0.01))
+            wait_until(lambda: self._transmitting.idle, _DRAIN_S, look_s=0.01)
 
     def _device_said(self) -> str:
         chosen = self.options

@@ -223,9 +223,7 @@ class LinkConfig(AirConfig, RobotConfig):
 
     @property
     def has_slots(self) -> bool:
-        return any((self.medium if own.medium == AUTO else own.medium) == "slots" for own in self.radios) or (
-            not self.radios and super().has_slots
-        )
+        return any(own.medium == "slots" for own in self.own_radios)
 
     @property
     def remark(self) -> str:

@@ -211,7 +211,7 @@ class _Drive:
             found = (info.type_name for info in self._graph.discover() if info.topic == topic and info.publishers)
             return next(found, None)
 
-        wait_until(lambda: look() is not None, _FOUND_S, lambda _: time.sleep(_LOOK_S))
+        wait_until(lambda: look() is not None, _FOUND_S, look_s=_LOOK_S)
         if (type_name := look()) is None:
             there = ", ".join(sorted({info.topic for info in self._graph.discover() if info.publishers})[:20])
             raise ConfigError(f"--pose {topic}: nobody publishes it; on the graph are {there or 'no topics'}")

@@ -173,7 +173,7 @@ def _busy() -> float:
 
 
 def _wait_matched(limit_s: float, *parts: Worker) -> bool:
-    return wait_until(lambda: all(part.call("matched") for part in parts), limit_s, lambda _: time.sleep(_POLL_S))
+    return wait_until(lambda: all(part.call("matched") for part in parts), limit_s, look_s=_POLL_S)
 
 
 def _drain(limit_s: float, listeners: Sequence[Worker], expected: int) -> None:
@@ -184,4 +184,4 @@ def _drain(limit_s: float, listeners: Sequence[Worker], expected: int) -> None:
         found = sum(robot.call("count") for robot in listeners)
         return found >= expected or quiet.still_s(found, time.monotonic()) > _QUIET_S
 
-    wait_until(over, limit_s, lambda _: time.sleep(_POLL_S))
+    wait_until(over, limit_s, look_s=_POLL_S)

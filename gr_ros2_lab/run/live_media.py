@@ -130,7 +130,7 @@ class LockedSteps(LiveMedium):
 
     def start(self, robots: int) -> None:
         self._thread.start()
-        if not wait_until(lambda: self._found(robots), _FOUND_S, lambda _: time.sleep(POLL_S)):
+        if not wait_until(lambda: self._found(robots), _FOUND_S, look_s=POLL_S):
             raise RunError(
                 f"{self._process.robots} of {robots} robots have answered the medium within {_FOUND_S:g} s; this "
                 "computer is too slow for them: take fewer, or simulated time"

@@ -302,7 +302,7 @@ class _Run:
             self._wait(lambda: not task.uncommanded(), _CONTROLLERS_S, what, remedy)
 
     def _wait(self, condition: Callable[[], bool], most_s: float, otherwise: str, remedy: str) -> None:
-        if not wait_until(condition, most_s, lambda _: time.sleep(_POLL_S)):
+        if not wait_until(condition, most_s, look_s=_POLL_S):
             raise RunError(f"{self.scenario.name}: {otherwise} within {most_s:g} s; {remedy}")
 
     def _sim_matched(self) -> bool:
