@@ -87,8 +87,9 @@ class DeliveryRules:
         self._silent_before = 0
         self._relays = settings.relay
         self._limits: dict[int, _Limits] = {}
-        self._reached: deque[tuple[int, float, bool]] = deque(maxlen=_REACHED)
-        """Numbers that the robot's packets have reached, when, s, and whether it may have reached them long before."""
+        self._reached: deque[tuple[int, float, float]] = deque(maxlen=_REACHED)
+        """Numbers that the robot's packets have reached, when, s, and the last time at which it is known to have stood
+        there; -inf where it may have gone on long before."""
         self._over: dict[tuple[int, tuple[int, int]], None] = {}
         """Messages that came over other robots, by topic id and order: they may come again."""
         self._came: dict[int, float] = {}
@@ -101,24 +102,31 @@ class DeliveryRules:
 
         :param late: it may have reached it long before
         """
-        self._reached.append((number, now, late))
+        self._reached.append((number, now, -inf if late else now))
+
+    def stands(self, number: int, now: float) -> None:
+        """The newest number of the robot is still this one, as a packet shows that has no number of its own."""
+        if self._reached and self._reached[-1][0] == number:
+            self._reached[-1] = number, self._reached[-1][1], now
+        else:
+            self._reached.append((number, now, now))
 
     def made(self, number: int, now: float, repaired_s: float = inf, *, repaired: bool) -> float:
         """When what began in a packet of this robot was made at the latest, s: before a packet arrived that left after
-        it. One that had to be repaired may have left right after the packet before it, unless its robot repairs it no
-        longer than it is of use: then it came in time if it came soon after it was missed. What it had waited at its
-        robot is not counted.
+        it. One that had to be repaired may have left right after the robot stood at the number before it, unless its
+        robot repairs it no longer than it is of use: then it came in time if it came soon after it was missed. What it
+        had waited at its robot is not counted.
 
         :param number: of the packet
         :param repaired_s: s for which its robot repairs the packet
         :param repaired: whether a packet with a part of it had to be repaired
         """
         before, after = now - UNKNOWN_S, now
-        for reached, at, late in reversed(self._reached):
+        for reached, at, stood in reversed(self._reached):
             if reached >= number:
                 after = at
-            elif not late:
-                before = at
+            elif stood > -inf:
+                before = stood
                 break
         made = before if repaired and repaired_s == inf else after
         if repaired and self.sealed_after is not None:

@@ -235,6 +235,8 @@ class Inbox:
         :param over: the sender repairs no packet up to that number
         """
         self._advance(number, now, here=False)
+        if number >= self.decoder.newest:
+            self.deliveries.stands(number, self.began)
         self.decoder.advance(number)
         if over:
             self.order.repaired_from(number + 1)

@@ -84,6 +84,25 @@ def test_what_its_origin_may_repair_for_longer_counts_from_the_packet_before(tog
 
 
 @pytest.mark.parametrize("mode", MODES)
+def test_a_packet_that_another_radio_overtakes_is_no_older_than_the_last_hello(mode: SealMode) -> None:
+    """It also has what is never too old, so that it may be a repeat of one that left right after the one before."""
+    sender, receiver = Robot(1, rows(scan=SCAN, text=SendOptions()), mode=mode), Robot(2, mode=mode)
+    air = Air(sender, receiver)
+    air.run(20 * WITHIN_S)  # hellos say that nothing has left meanwhile
+    now, number = air.now, sender.end.window.packets.newest
+    sender.end.messages.submit(1, b"scan", now)
+    sender.end.messages.submit(2, b"text", now)
+    one = sender.slot(now)
+    sender.end.messages.submit(2, b"more", now)
+    other = sender.slot(now)
+    assert sender.end.window.packets.newest == number + 2
+    for data in (other, one):
+        assert data is not None
+        receiver.receive(data, now)
+    assert b"scan" in receiver.delivered()
+
+
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("after_s", LATE_S)
 def test_what_repair_brings_counts_from_the_packet_before_it(mode: SealMode, after_s: float) -> None:
     sender, receiver = Robot(1, rows(scan=SCAN, text=SendOptions()), mode=mode), Robot(2, mode=mode)

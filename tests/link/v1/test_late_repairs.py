@@ -73,6 +73,17 @@ def test_the_age_of_what_is_repaired_is_unknown_where_nothing_before_it_came() -
     assert rules.made(7, 110.0, repaired=True) < -1000.0
 
 
+def test_what_is_repaired_is_younger_than_the_last_hello_before_it() -> None:
+    rules = DeliveryRules(Settings(2), {})
+    rules.stands(6, 90.0)  # the first hello of a robot that was heard
+    rules.stands(6, 98.0)
+    rules.reached(8, 110.0)
+    assert rules.made(7, 110.0, repaired=True) == 98.0
+    rules.stands(8, 112.0)
+    assert rules.made(8, 120.0, repaired=False) == 110.0
+    assert rules.made(9, 120.0, repaired=True) == 112.0
+
+
 def test_a_late_message_tells_no_way() -> None:
     routes = Routes()
     routes.note(1, 2, 0, 100.0)
