@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from statistics import mean, median
 from tempfile import TemporaryDirectory
@@ -28,6 +28,7 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.robot_link import RobotLink
+from tests.domains import free_ports
 
 REPEATS, MEASURED_S = 3, 8.0
 FAST, SLOW = 100_000, 10_000
@@ -125,7 +126,7 @@ def _keep(kept: list[tuple[float, bytes]], payload: bytes) -> None:
 def _pair(rates: Mapping[str, int], **values: Any) -> Iterator[_Pair]:
     names = tuple(rates)
     with TemporaryDirectory() as folder, ExitStack() as stack:
-        ports = {(number, name): _free_port() for number in (1, 2) for name in names}
+        ports = dict(zip(product((1, 2), names), free_ports(2 * len(names)), strict=True))
         wires: dict[str, list[_Wire]] = {name: [] for name in names}
         links = []
         for number in (1, 2):
@@ -156,13 +157,6 @@ def _pair(rates: Mapping[str, int], **values: Any) -> Iterator[_Pair]:
         for link in links:
             stack.enter_context(link)
         yield pair
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        port: int = one.getsockname()[1]
-        return port
 
 
 def _text(number: int, length: int) -> bytes:

@@ -49,7 +49,7 @@ from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from gr_ros2_lab.study.sweep.figures import curves_figure, heat_figure
 from gr_ros2_lab.study.sweep.summaries import rows_of, summaries
-from tests.domains import free_domains
+from tests.domains import free_domains, free_ports
 from tests.gr.probe import Probe
 from tests.lab.study.sweeps import plan
 from tests.lab.study.test_sweep_summaries import IMU, ODOM, results, topic
@@ -230,7 +230,7 @@ def linked(front_end: str = "udp", *, options: Mapping[str, Any] = MappingProxyT
         folder = stack.enter_context(TemporaryDirectory())
         own: Any = {"device": f"tcp://127.0.0.1:{server.getsockname()[1]}"}
         if front_end == "udp":
-            own = {"listen": str(_free_port()), "send_to": ["127.0.0.1:9"]}
+            own = {"listen": str(*free_ports(1)), "send_to": ["127.0.0.1:9"]}
         values = {
             "phy": {"name": "modem"},
             "front_end": {"name": front_end, **own, **options},
@@ -254,13 +254,6 @@ def printed(*settings: str) -> str:
         words = [f"--set={setting}" for setting in ("time=packets", "duration_s=0.2", *settings)]
         output = CliRunner().invoke(run, ["paper-direct", "--out", folder, *words]).output
         return re.sub(r"[\d.]+", "", output.replace(folder, ""))
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
-        found.bind(("", 0))
-        port: int = found.getsockname()[1]
-        return port
 
 
 def replayed(**options: Any) -> tuple[Any, ...]:

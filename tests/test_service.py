@@ -18,7 +18,7 @@ import pytest
 from gr_ros2.cli import control_socket
 from gr_ros2.cli.status import status_of
 from gr_ros2.state.keys import new_key_file
-from tests.radio.cables import free_ports
+from tests.domains import free_ports
 from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -115,7 +115,7 @@ def root() -> Iterator[Path]:
 
 def test_two_links_of_one_machine_are_found_by_root_and_end(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    ports = free_ports(2, socket.SOCK_DGRAM)
+    ports = free_ports(2)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(root))
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     patterns = tuple(f"{root}/{pattern}".lstrip("/") for pattern in control_socket._OF_OTHERS)

@@ -17,6 +17,8 @@ FIRST = 41
 """The domain that is tried first, so that a run alone on its computer always has the same."""
 FREE = (*range(FIRST, 100), *range(1, FIRST), *range(215, 231))
 """Not the default 0. Their ports lie below and above those that the system hands out (32768 to 60999)."""
+_MULTICAST = 0, 1
+"""Ports of a domain that all its participants share: none can join where another program has one for itself."""
 _PARTICIPANTS = 8
 """Number of a domain's participants that are looked for."""
 
@@ -53,12 +55,12 @@ class ReservedDomain(Closing):
 
 
 def _unused(number: int) -> bool:
-    """Whether the domain's first participants would get their ports (RTPS 2.5, section 9.6.2.3). Programs that are not
-    gr-ros2 reserve nothing."""
-    for participant in range(_PARTICIPANTS):
+    """Whether the domain and its first participants would get their ports (RTPS 2.5, section 9.6.2.3). Programs that
+    are not gr-ros2 reserve nothing."""
+    for port in (*_MULTICAST, *range(10, 10 + 2 * _PARTICIPANTS)):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
-                probe.bind(("", 7400 + 250 * number + 10 + 2 * participant))
+                probe.bind(("", 7400 + 250 * number + port))
             except OSError:
                 return False
     return True

@@ -20,8 +20,8 @@ from gr_ros2.cli.link import _answers
 from gr_ros2.cli.status import PING, SET, STATUS
 from gr_ros2.core.errors import RunError
 from gr_ros2.radio.live_settings import LiveSettings
+from tests.domains import free_ports
 from tests.middleware.support import message
-from tests.radio.cables import free_ports
 from tests.radio.robots import Robot
 from tests.waiting import PATIENCE_S, wait_for
 
@@ -30,7 +30,7 @@ from tests.waiting import PATIENCE_S, wait_for
 def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
     """One whose link can be asked."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    own, other = free_ports(2, socket.SOCK_DGRAM)
+    own, other = free_ports(2)
     udp = {"name": "udp", "listen": f"127.0.0.1:{own}", "send_to": [f"127.0.0.1:{other}"]}
     modem = {"name": "modem", "options": {"bit_rate": 1e6}}
     with (

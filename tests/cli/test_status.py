@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -22,7 +21,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli import main as command_line
-from tests.radio.cables import free_ports
+from tests.domains import free_ports
 from tests.waiting import PATIENCE_S, wait_for
 
 COMMAND = [sys.executable, "-m", "gr_ros2.cli"]
@@ -34,7 +33,7 @@ class Ends:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.env = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder / "state")}
-        ports = free_ports(2, socket.SOCK_DGRAM)
+        ports = free_ports(2)
         self.files = [folder / "one.yaml", folder / "two.yaml"]
         for number, (file, own, other) in enumerate(zip(self.files, ports, reversed(ports), strict=True), 1):
             file.write_text(

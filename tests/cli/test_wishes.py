@@ -6,7 +6,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -24,9 +23,8 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.cli import main as command_line
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
-from tests.domains import free_domains
+from tests.domains import free_domains, free_ports
 from tests.middleware.support import CUSTOM
-from tests.radio.cables import free_ports
 from tests.waiting import PATIENCE_S, wait_for
 
 COMMAND = [sys.executable, "-m", "gr_ros2.cli"]
@@ -40,7 +38,7 @@ class Fleet:
         self.env = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder / "state")}
         self._folder = folder
         self._domains = dict(zip((1, 2, 3, 4), free_domains(4), strict=True))
-        self._ports = dict(zip((1, 2, 3, 4), free_ports(4, socket.SOCK_DGRAM), strict=True))
+        self._ports = dict(zip((1, 2, 3, 4), free_ports(4), strict=True))
         key = folder / "fleet.key"
         self._run("key", "new", str(key))
         for number, port in self._ports.items():

@@ -5,14 +5,13 @@ missing.
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
 
 import pytest
 
+from tests.domains import free_ports
 from tests.packages import REPOSITORY
-from tests.radio.cables import free_ports
 
 LABORATORY = ("gr_ros2_lab", "matplotlib", "plotext", "pyarrow", "jinja2", "bokeh", "tornado", "distributed", "dask")
 _BLOCKED = f"""
@@ -42,7 +41,7 @@ def test_what_a_robot_installs_has_none_of_them() -> None:
 @pytest.mark.slow
 def test_a_link_runs_without_them() -> None:
     pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
-    own, other = free_ports(2, socket.SOCK_DGRAM)
+    own, other = free_ports(2)
     done = on_a_robot(
         *("link", "--robot", "1", "--radio", "udp", "--listen", f"127.0.0.1:{own}", "--peer", f"127.0.0.1:{other}"),
         *("--set", "graph.middleware=memory", "--duration", "1"),

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -26,7 +27,7 @@ from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.settings.files import REGISTRY_DIR
 from gr_ros2_lab.record.result import Result, read_result
 from tests.browser import FIND, Browser, needed
-from tests.domains import free_domains
+from tests.domains import free_domains, free_ports
 from tests.waiting import PATIENCE_S, wait_for
 
 pytestmark = needed
@@ -176,8 +177,8 @@ def stop(process: subprocess.Popen[str], out: Path) -> Result:
 def test_it_shows_what_the_result_says_sliders_act_and_it_returns_with_the_next_run(
     viewer: Viewer, tmp_path: Path
 ) -> None:
-    with program(tmp_path / "out") as (process, url):
-        port = int(re.findall(r"\d+", url)[-1])
+    (port,) = free_ports(1, socket.SOCK_STREAM)
+    with program(tmp_path / "out", port) as (process, url):
         viewer.driver.get(url)
         viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "a delivery on the page")
         first = viewer.topic(ODOM)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 import subprocess
 import threading
 from http.client import HTTPConnection
@@ -21,6 +22,7 @@ from gr_ros2.dashboard.live_page import LivePage
 from gr_ros2.dashboard.server import Dashboard
 from gr_ros2.dashboard.state import DashboardState
 from tests.dashboard.feed import NAMES, REGISTRY, Feed, at
+from tests.domains import free_ports
 from tests.waiting import PATIENCE_S
 
 
@@ -96,7 +98,7 @@ def test_it_knows_whether_others_can_open_it(address: str, exposed: bool) -> Non
 
 
 def test_it_goes_and_leaves_no_thread() -> None:
-    dashboard = Dashboard(port=0)
+    dashboard = Dashboard(port=free_ports(1, socket.SOCK_STREAM)[0])
     dashboard.start()
     dashboard.close()
     dashboard.close()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -16,8 +15,8 @@ from typing import Any
 from unittest.mock import patch
 
 from gr_ros2.cli.main import run
+from tests.domains import free_ports
 from tests.e2e.support import COMMAND
-from tests.radio.cables import free_ports
 from tests.spoken import Spoken
 from tests.waiting import wait_for
 
@@ -68,7 +67,7 @@ class Links:
     def __init__(self, folder: Path, *settings: Mapping[str, Any], bit_rate: int = 1_000_000) -> None:
         self._folder = folder
         self._env = {"XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder / "state")}
-        ports = free_ports(len(settings), socket.SOCK_DGRAM)
+        ports = free_ports(len(settings))
         self.files = []
         for number, (own, port) in enumerate(zip(settings, ports, strict=True), 1):
             others = [f"127.0.0.1:{other}" for other in ports if other != port]

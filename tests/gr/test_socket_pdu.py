@@ -13,18 +13,13 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.paper import RosSink, RosSource
 from gr_ros2.settings.registry import Registry
+from tests.domains import free_ports
 from tests.gr.ends import link
 from tests.waiting import wait_for
 
 REGISTRY = Registry.from_rows({"text": "std_msgs/String"})
 PACKET_LEN = 64
 MESSAGES = 400
-
-
-def free_port(kind: str) -> str:
-    with socket.socket(type=socket.SOCK_STREAM if kind == "TCP" else socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return str(probe.getsockname()[1])
 
 
 def text(number: int) -> bytes:
@@ -62,7 +57,7 @@ def test_all_packets_come_through_a_socket(blocks: list[Any], kind: str, mtu: in
         sink, source = RosSink(REGISTRY, graph_domain_id=172, **shared), RosSource(REGISTRY, **sends, **shared)
     receiver, sender = gr.top_block(), gr.top_block()
     blocks += [here, there, sink, source, receiver, sender]
-    port = free_port(kind)
+    port = str(*free_ports(1, socket.SOCK_STREAM if kind == "TCP" else socket.SOCK_DGRAM))
     receiver.msg_connect(network.socket_pdu(f"{kind}_SERVER", "127.0.0.1", port, mtu, False), "pdus", sink, "pdus")
     receiver.start()
     sender.msg_connect(source, "pdus", network.socket_pdu(f"{kind}_CLIENT", "127.0.0.1", port, mtu, False), "pdus")

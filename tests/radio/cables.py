@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
+from tests.domains import free_ports
 from tests.waiting import wait_for
 
 _CHUNK = 4096
@@ -72,20 +73,6 @@ class SerialCable:
             self.pull()
 
 
-def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_STREAM) -> list[int]:
-    """Ports of this machine that are free now, below those that programs get without asking for one.
-
-    direwolf takes none above 49151.
-    """
-    found: list[int] = []
-    while len(found) < count:
-        port = random.randrange(20_000, 32_000)
-        with suppress(OSError), socket.socket(socket.AF_INET, kind) as one:
-            one.bind(("127.0.0.1", port))
-            found.append(port)
-    return found
-
-
 class Direwolves:
     """Two direwolf TNCs at 9600 baud. The audio that one sends is what the other hears.
 
@@ -100,8 +87,8 @@ class Direwolves:
     )
 
     def __init__(self, folder: Path) -> None:
-        audio = free_ports(2, socket.SOCK_DGRAM)
-        self.kiss = free_ports(2)
+        audio = free_ports(2)
+        self.kiss = free_ports(2, socket.SOCK_STREAM)
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._programs: list[subprocess.Popen[bytes]] = []

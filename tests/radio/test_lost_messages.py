@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,8 @@ from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.lost_messages import LOST_TYPE, LostMessages, _types
-from tests.domains import domain
+from tests.domains import domain, free_ports
 from tests.middleware.support import CUSTOM
-from tests.radio.cables import free_ports
 from tests.radio.robots import Robot
 from tests.waiting import wait_for
 
@@ -54,7 +52,7 @@ def test_each_event_tells_what_was_lost_since_the_last_one() -> None:
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def test_a_bag_of_a_link_says_what_is_missing_in_it(tmp_path: Path, storage: StoragePlugin) -> None:
     """What is recorded and what the events in the same bag tell as lost is all that was said."""
-    ports = free_ports(2, socket.SOCK_DGRAM)
+    ports = free_ports(2)
     ends = [
         {"name": "udp", "listen": f"127.0.0.1:{own}", "send_to": [f"127.0.0.1:{other}"]}
         for own, other in (ports, reversed(ports))

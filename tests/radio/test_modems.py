@@ -11,7 +11,8 @@ import pytest
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.radio.radio import make_radio
-from tests.radio.cables import Direwolves, SerialCable, free_ports
+from tests.domains import free_ports
+from tests.radio.cables import Direwolves, SerialCable
 from tests.radio.robots import Robot
 from tests.waiting import wait_for
 
@@ -35,7 +36,7 @@ def talk(one: Robot, two: Robot, first: int, count: int = 5) -> None:
 
 
 def udp_ends() -> list[dict[str, Any]]:
-    ports = free_ports(2, socket.SOCK_DGRAM)
+    ports = free_ports(2)
     return [
         {"name": "udp", "listen": f"127.0.0.1:{own}", "send_to": [f"127.0.0.1:{other}"]}
         for own, other in (ports, reversed(ports))

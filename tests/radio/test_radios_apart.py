@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,10 +16,9 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
 from gr_ros2.state.keys import new_key_file
-from tests.domains import domain
+from tests.domains import domain, free_ports
 from tests.middleware.calling import Adder, Caller
 from tests.middleware.support import CUSTOM, message
-from tests.radio.cables import free_ports
 from tests.radio.robots import QOS, RATE, Robot
 from tests.radio.team import FAST, Team, modem
 from tests.waiting import wait_for
@@ -43,8 +41,8 @@ class Fleet:
     def __init__(
         self, folder: Path, closing: ExitStack, medium: str, settings: dict[int, dict[str, Any]], **values: Any
     ) -> None:
-        far = free_ports(3, socket.SOCK_DGRAM)
-        near = free_ports(2, socket.SOCK_DGRAM)
+        far = free_ports(3)
+        near = free_ports(2)
         registry = folder / "topics.csv"
         registry.write_text(f"chat,{CUSTOM}\nnews,{CUSTOM}\n")
         self.robots: dict[int, Robot] = {}
@@ -199,7 +197,7 @@ def test_a_radio_on_a_shared_channel_comes_back_and_either_end_may_start_again(
 def test_an_adaptive_rate_is_that_of_what_is_bound(tmp_path: Path, closing: ExitStack, via: str) -> None:
     pytest.importorskip("zmq", reason="needs pyzmq")
     zmq = [f"ipc://{tmp_path}/{number}" for number in (1, 2)]
-    udp = [f"127.0.0.1:{port}" for port in free_ports(2, socket.SOCK_DGRAM)]
+    udp = [f"127.0.0.1:{port}" for port in free_ports(2)]
     robots = []
     for at in (0, 1):
         radios = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,8 +18,8 @@ from gr_ros2.mac import Aloha, Slots
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.settings.config import build
 from gr_ros2_lab.medium.process import MediumConfig, MediumProcess
+from tests.domains import free_ports
 from tests.middleware.support import message
-from tests.radio.cables import free_ports
 from tests.radio.robots import Robot, config
 from tests.waiting import wait_for
 
@@ -164,7 +163,7 @@ def accesses(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Access, float]]:
 
 
 def test_the_guard_is_what_the_front_end_may_be_late_by(accesses: list[tuple[Access, float]]) -> None:
-    (port,) = free_ports(1, socket.SOCK_DGRAM)
+    (port,) = free_ports(1)
     options = {"name": "udp", "listen": f"127.0.0.1:{port}", "send_to": ["127.0.0.1:9"]}
     link = RobotLink(config(1, options, medium="slots", phy={"name": "modem", "options": {"bit_rate": 9600}}))
     try:

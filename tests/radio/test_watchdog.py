@@ -16,7 +16,7 @@ import pytest
 
 from gr_ros2.core.errors import RadioError
 from gr_ros2.radio import robot_link
-from tests.radio.cables import free_ports
+from tests.domains import free_ports
 from tests.radio.robots import ROOT, Robot
 from tests.waiting import PATIENCE_S, wait_for
 
@@ -24,7 +24,7 @@ MODEM = {"name": "modem", "options": {"bit_rate": 1e6}}
 
 
 def udp() -> dict[str, object]:
-    own, other = free_ports(2, socket.SOCK_DGRAM)
+    own, other = free_ports(2)
     return {"name": "udp", "listen": f"127.0.0.1:{own}", "send_to": [f"127.0.0.1:{other}"]}
 
 
