@@ -85,8 +85,11 @@ def flowgraph(home: Path) -> tuple[Path, list[int]]:
     return on_own_domains("psk_loopback.grc", home)
 
 
-def carries(domains: list[int]) -> None:
-    """Wait until a message crosses the flowgraph that runs elsewhere."""
+def carries(domains: list[int], runs: Callable[[], bool], log: Path) -> None:
+    """Wait until a message crosses the flowgraph that runs elsewhere. One that has ended is not waited for.
+
+    :param log: what the flowgraph says
+    """
     heard: list[bytes] = []
     said = b"\0\1\0\0" + bytes(720)
     with (
@@ -95,7 +98,13 @@ def carries(domains: list[int]) -> None:
     ):
         two.subscribe("/rx_robot_1/odom", ODOM, Qos(depth=0), heard.append)
         publisher = one.advertise("/robot_1/odom", ODOM, Qos(depth=1))
-        wait_for(lambda: publisher.publish(said) or heard, "a message on the other side")
+
+        def found() -> bool:
+            assert runs(), f"the flowgraph has ended: {log.read_text()}"
+            return publisher.matched()
+
+        wait_for(found, "the flowgraph to find the publisher")
+        wait_for(lambda: found() and (publisher.publish(said) or heard), "a message on the other side")
     assert heard[0] == said
 
 
@@ -109,7 +118,7 @@ def test_plain_grcc_and_plain_python(home: Path, flowgraph: tuple[Path, list[int
     with (home / "log").open("w") as log:
         running = subprocess.Popen(command, env=plain(home), stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=home)
     try:
-        carries(domains)
+        carries(domains, lambda: running.poll() is None, home / "log")
     finally:
         running.send_signal(signal.SIGINT)
         running.wait(PATIENCE_S)
@@ -300,7 +309,9 @@ def test_the_window_draws_an_example_runs_it_and_closes(
     started = home / "started"
     # GRC runs a flowgraph without a window in one, after -e: the command in one word, from 3.10.12 on in several.
     terminal = home / "terminal"
-    terminal.write_text(f"#!/bin/sh\necho $$ > {started}.new\nmv {started}.new {started}\nshift\nexec $*\n")
+    terminal.write_text(
+        f"#!/bin/sh\necho $$ > {started}.new\nmv {started}.new {started}\nshift\nexec $* >{started}.log 2>&1\n"
+    )
     terminal.chmod(0o755)
     preferences = home / ".gnuradio" / "config.conf"
     preferences.write_text(f"{preferences.read_text()}xterm_executable = {terminal}\n")
@@ -315,9 +326,8 @@ def test_the_window_draws_an_example_runs_it_and_closes(
         wait_for(lambda: colours(pixels) > empty + 100, "blocks to be drawn")
         keyboard.press(window, F6, path.with_suffix(".py").is_file, "the flowgraph to be generated")
         wait_for(started.is_file, "the flowgraph to be run")
-        carries(domains)
         process = Path("/proc") / started.read_text().strip()
-        assert process.exists()
+        carries(domains, process.exists, started.with_suffix(".log"))
         said = subprocess.run(["gnuradio-config-info", "--version"], env=environ, capture_output=True, text=True)
         if said.stdout.startswith("3.10.12."):  # its window forgets what it runs, so F7 does nothing
             os.kill(int(process.name), signal.SIGTERM)
