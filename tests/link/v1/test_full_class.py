@@ -104,8 +104,7 @@ def test_hellos_leave_in_time(medium: str) -> None:
     assert max(after - at for at, after in pairwise(hellos)) < 2 * SELDOM_S + LATENCY_S + 0.5
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("medium", MEDIA)
+@pytest.mark.parametrize(("medium", "mode"), list(zip(MEDIA, MODES, strict=True)))
 def test_a_long_table_reaches_a_robot_that_comes_later(medium: str, mode: SealMode) -> None:
     topics = registry(joy=LATENCY, **{f"topic_{n}_with_a_long_name": SendOptions() for n in range(40)})
     one, other, late = busy(1, medium, mode, topics), plain(2, medium, mode), plain(3, medium, mode)
@@ -117,8 +116,7 @@ def test_a_long_table_reaches_a_robot_that_comes_later(medium: str, mode: SealMo
         assert len(each.end.neighbours.all[1].inbox.announced.topics) == 41
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("medium", MEDIA)
+@pytest.mark.parametrize(("medium", "mode"), list(zip(MEDIA, reversed(MODES), strict=True)))
 def test_it_asks_for_what_others_keep(medium: str, mode: SealMode) -> None:
     """They say nothing else; and it lacks more than fits a packet."""
     kept = {f"map{n}": SendOptions(durability="transient_local", qos="bulk") for n in range(60)}

@@ -1,4 +1,4 @@
-"""Two hours of three keyed robots in a row, in slots of .15 s: losses, outages of up to 200 s, restarts."""
+"""An hour of three keyed robots in a row, in slots of .15 s: losses, outages of up to 200 s, restarts."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_nothing_stops_in_hours_with_outages_and_restarts(monkeypatch: pytest.Mo
     monkeypatch.setattr(test_relaying, "SLOT_S", SLOT_S)
     hours, rng = Hours(*(robot(n, "encrypt", TOPICS, packet_len=220) for n in (1, 2, 3)), loss=0.1), random.Random(1)
     hours.invariant.bound = 400
-    for part in range(30):
+    for part in range(16):
         hours.out = rng.randrange(3)
         hours.talk(rng.choice([12, 60, 200]))
         if part % 10 == 9:

@@ -67,8 +67,12 @@ def grow_old(robot: Robot, numbers: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("relaying", "loss", "mode"),
+    [(False, 0.01, "encrypt"), (True, 0.1, "encrypt"), (False, 0.5, "none"), (True, 0.1, "none")],
+    indirect=["relaying"],
+)
 @pytest.mark.usefixtures("relaying")
-@pytest.mark.parametrize(("loss", "mode"), [(0.01, "none"), (0.1, "none"), (0.5, "none"), (0.1, "encrypt")])
 def test_messages_with_outages_restarts_reordering_and_duplicates(loss: float, mode: SealMode) -> None:
     """In each run both ends have several lives, in which packet numbers pass their half and come round."""
     rng = random.Random(int(loss * 1000))

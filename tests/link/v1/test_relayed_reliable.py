@@ -69,8 +69,7 @@ def rest(line: Line, seconds: float, goals: list[bytes]) -> None:
     line.run(3)
 
 
-@pytest.mark.parametrize("mode", ["none", "encrypt"])
-@pytest.mark.parametrize("loss", [0.0, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize(("loss", "mode"), [(0.0, "encrypt"), (0.1, "none"), (0.2, "encrypt"), (0.3, "none")])
 def test_a_relayed_message_neither_overtakes_nor_delays_what_repair_brings(loss: float, mode: SealMode) -> None:
     everybody = cell(mode, loss)
     goals = talk(everybody, 100)
@@ -114,11 +113,10 @@ def test_requests_leave_the_mask_of_a_repair_its_room() -> None:
     assert max(len(write_body(body, room)) for body in bodies) <= room - MASK_LEN
 
 
-@pytest.mark.parametrize("mode", ["none", "encrypt"])
-def test_a_robot_out_of_reach_does_not_delay_rare_messages_to_another_one(mode: SealMode) -> None:
+def test_a_robot_out_of_reach_does_not_delay_rare_messages_to_another_one() -> None:
     """Since it lacks an old message, no repair says of all newer packets which of them need not be waited for."""
     topics = registry(odom=SendOptions(queue="latest", reliability="best_effort"), goal=SendOptions())
-    everybody = Cell(*(robot(src_id, mode, topics, relay=False) for src_id in (1, 2, 3)), loss=0.2)
+    everybody = Cell(*(robot(src_id, "encrypt", topics, relay=False) for src_id in (1, 2, 3)), loss=0.2)
     one, two, _ = everybody.robots
     everybody.run(6)
     everybody.apart = lambda one, other: 2 in (one, other)
@@ -146,8 +144,9 @@ PATTERNS: dict[str, Callable[[float, int, int], bool]] = {
 }
 
 
-@pytest.mark.parametrize("relay", [False, True])
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize(
+    ("pattern", "relay"), [*((pattern, True) for pattern in PATTERNS), ("from all", False), ("again and again", False)]
+)
 def test_some_seconds_out_of_reach_cost_nothing(pattern: str, relay: bool) -> None:
     everybody = cell("encrypt", 0.1, relay=relay)
     everybody.apart = lambda one, other: PATTERNS[pattern](everybody.now, one, other)
@@ -219,8 +218,7 @@ def test_all_of_a_reliable_topic_crosses_a_line() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["none", "encrypt"])
-@pytest.mark.parametrize("loss", [0.1, 0.3])
+@pytest.mark.parametrize(("loss", "mode"), [(0.1, "none"), (0.3, "encrypt")])
 def test_long_messages_cross_a_line_in_one_try(loss: float, mode: SealMode) -> None:
     """What of them is lost is repaired hop by hop, however long that takes; nobody sends them anew meanwhile."""
     line = Line(*(robot(src_id, mode, TOPICS) for src_id in (1, 2, 3)), loss=loss)

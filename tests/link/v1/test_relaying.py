@@ -168,7 +168,7 @@ def test_packets_for_others_keep_their_slots_and_are_confirmed_by_that_robot_onl
     assert everybody[2].end.received.dropped["not_for_us"] > 100
 
 
-@pytest.mark.parametrize(("loss", "seed"), [(0.0, 1), (0.1, 1), (0.3, 1), (0.3, 3), (0.4, 5)])
+@pytest.mark.parametrize(("loss", "seed"), [(0.0, 1), (0.3, 3), (0.4, 5)])
 def test_tables_of_many_packets_cross_a_line(loss: float, seed: int) -> None:
     """They are of use only whole: they are repaired, have slots for all their packets, and those that a robot lacks go
     first."""
