@@ -86,12 +86,8 @@ def received_at_samples(name: str, robots: int, load: float) -> Received:
     return received(make_medium(paths(robots, 1), [of] * robots, samples=True, shared=True), of, sent)
 
 
-CELLS = [(2, 0.3), (6, 1.0)]
-
-
-@pytest.mark.parametrize("name", ["ofdm", "psk", "gfsk"])
 @pytest.mark.slow
-@pytest.mark.parametrize(("robots", "load"), CELLS)
+@pytest.mark.parametrize(("name", "robots", "load"), [("ofdm", 6, 1.0), ("psk", 2, 0.3), ("gfsk", 6, 1.0)])
 def test_both_levels_receive_the_same(name: str, robots: int, load: float) -> None:
     """At least 97 % of all receptions are equal, and the PDR of every pair is within its 99 % interval, over all pairs:
     each is tested at 1 % divided by their number."""

@@ -76,7 +76,10 @@ def medium(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Start]:
 
 
 @pytest.mark.parametrize(
-    ("medium", "mode"), [({}, "lockstep"), ({"time": "real"}, "real")], indirect=["medium"], ids=["lockstep", "real"]
+    ("medium", "mode"),
+    [({}, "lockstep"), pytest.param({"time": "real"}, "real", marks=pytest.mark.real_time)],
+    indirect=["medium"],
+    ids=["lockstep", "real"],
 )
 def test_links_of_two_processes_hear_each_other_also_after_the_medium_was_killed(
     medium: Start, mode: str, tmp_path: Path

@@ -133,8 +133,8 @@ def test_six_topics_share_a_link_that_carries_a_third_of_them() -> None:
     done = run("six-topics-paced", duration=38.0)
     topics = books(done)
     assert topics["odom"].delivered / done.duration_s >= 15
-    seeds = (books(run("six-topics-paced", f"seed={seed}", duration=38.0)) for seed in (1, 2, 3))
-    assert fmean(found["cmd_vel"].latency_s.p99 for found in seeds) <= 0.100
+    others = (books(run("six-topics-paced", f"seed={seed}", duration=38.0)) for seed in (1, 2))
+    assert fmean(found["cmd_vel"].latency_s.p99 for found in (topics, *others)) <= 0.100
     assert topics["map"].delivered == 1
     assert all(longest_silence(done, name) < 5 for name in topics if name != "map"), "which is sent once"
 

@@ -247,7 +247,7 @@ def test_what_cannot_be_planned(overrides: list[str], says: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "duration", "rows"), [("team", 6.0, 3), ("two-robots-half-duplex", 6.0, 2), ("twenty-robots", 1.0, 19)]
+    ("name", "duration", "rows"), [("team", 6.0, 3), ("two-robots-half-duplex", 6.0, 2), ("twenty-robots", 0.5, 19)]
 )
 def test_robots_on_one_channel_are_forecast_together(name: str, duration: float, rows: int) -> None:
     """Robot 1 of a run counts what it hears; a forecast counts what the first robot hears that hears a sender. Without
