@@ -86,7 +86,7 @@ def holes(number: int, width: int, height: int) -> Array:
     return np.rint(metres * 1000).astype("<u2")
 
 
-@pytest.mark.parametrize("budget", [240, 400, 800, 1600, 3800])
+@pytest.mark.parametrize("budget", [240, 800, 3800])
 def test_depth_with_many_holes_is_within_its_budget_and_smaller_where_that_is_short(budget: int) -> None:
     topic = CodedTopic(IMAGE)
     encoder, decoder = topic.encoder(), topic.decoder()

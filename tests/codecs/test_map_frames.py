@@ -281,7 +281,7 @@ def test_a_robot_that_joins_gets_the_newest_map_of_each_publisher() -> None:
         assert shown(robot, OTHERS)[-1] == OTHERS[2]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_receivers_that_lost_different_maps_all_end_with_the_newest(seed: int) -> None:
     """Outages of either, a robot that starts again, and publishers that do."""
     air, rng = of_two(0.1, receivers=2, seed=seed), random.Random(seed)
