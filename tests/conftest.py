@@ -122,7 +122,6 @@ def pytest_collection() -> Iterator[None]:
     """
     gc.disable()
     yield
-    gc.collect()
     gc.freeze()
     gc.set_threshold(100_000)
     gc.enable()
