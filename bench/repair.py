@@ -13,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import inf
+from statistics import mean
 from typing import Any, Literal
 
 from bench.rows import Row
@@ -264,6 +265,8 @@ ODOMETRY = (
 BUSY_HZ = 55.0
 """Messages/s for which repair hardly has the slots that it needs: at 20 % loss 13.75 of 20 per second, if it knew the
 losses at once. Of an ideal sender's messages 98 % arrive within 267 ms."""
+BUSY_RUNS = 8
+"""Runs at that rate: the PDR of one is .94 to .99 one-way."""
 
 
 def repair(seed: int = 1) -> list[Row]:
@@ -285,8 +288,8 @@ def repair(seed: int = 1) -> list[Row]:
             if p99 is not None:
                 add(f"{name}, {way}: p99", outcome.p99 * 1e3, "ms", "≤", p99)
     for way, back, least in (("one-way", None, 0.97), ("with reports", 0.2, 0.995)):
-        busy = run(hz=BUSY_HZ, loss=0.2, back=back, seed=seed)
-        add(f"odometry at {BUSY_HZ:g} Hz, 20% lost, {way}: PDR", busy.pdr[0], "", "≥", least)
+        busy = mean(run(hz=BUSY_HZ, loss=0.2, back=back, seed=seed + more).pdr[0] for more in range(BUSY_RUNS))
+        add(f"odometry at {BUSY_HZ:g} Hz, 20% lost, {way}, mean of {BUSY_RUNS}: PDR", busy, "", "≥", least)
     thrifty = run(loss=0.2, back=0.2, repair="thrifty", seed=seed)
     add("thrifty, 20% lost: PDR", thrifty.pdr[0], "", "≥", 0.998)
     add("thrifty, 20% lost: p99", thrifty.p99 * 1e3, "ms", "≤", 250)

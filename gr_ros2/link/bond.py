@@ -120,10 +120,7 @@ class Bond:
         return self._lacked[radio] or (waiting and self.carries[radio])
 
     def arrive(self, radio: int, data: bytes) -> bool:
-        """A packet comes over a radio. False for a copy of one that came over another: the endpoint does not see it.
-
-        Of a packet that is sent again unchanged, one may count as a copy; the next one does not.
-        """
+        """A packet comes over a radio. False for a copy of one that came over another: the endpoint does not see it."""
         known, bit = self._known.get(data), 1 << radio
         if known is None or known.radios & bit:
             self.came[radio] += 1

@@ -14,7 +14,7 @@ is only one, nothing is chosen here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 from gr_ros2.link.rate import RateController
@@ -78,8 +78,6 @@ class Audiences:
         """By topic: when the newest message was submitted that each of those got that are behind, s."""
         self._lost: dict[int, dict[int, float]] = {}
         """By number of a packet: with which probability each robot does not hear it that it was not for."""
-        self._reached: dict[int, int] = {}
-        """The newest packet that was for each robot."""
 
     def of(self, now: float) -> tuple[Audience, ...]:
         """Those for whom the next packet may be, the fastest first; () where every packet suits all."""
@@ -207,21 +205,11 @@ class Audiences:
             return
         number = self._packets.newest
         reached = self._robots if robots is None else robots
-        self._reached.update(dict.fromkeys(reached, number))
         self._lost[number] = {robot: self._rate.lost(robot, mcs, now) for robot in self._robots - reached}
         if len(self._lost) > _REMEMBERED:
             self._lost = {n: lost for n, lost in self._lost.items() if n > number - _REMEMBERED // 2}
             if not any(self._lost.values()):
                 self._lost = {}
-
-    def sent_again(self, record: Sent, robots: Iterable[int]) -> None:
-        """A packet leaves so that these robots hear it too."""
-        for lifetime in record.lifetimes:
-            lifetime.completes = True
-        for robot in robots:
-            if self._reached.get(robot, -1) < record.number:  # it has heard none after it, and does not miss it
-                self._reached[robot] = record.number
-                self._lost.get(record.number, {}).pop(robot, None)
 
     def not_for(self, robot: int, number: int) -> float:
         """Share of the newest packets up to a number that a robot is expected to have missed, as they were not for it:

@@ -3,10 +3,13 @@
 *The rule.* New packets go first, except that a packet which a report names as lost, and for which later messages wait,
 goes before them. In a slot without a new packet:
 
-1. if there is one peer and its reports name a lost packet that is still alive, that packet is sent again unchanged;
-   the newest such packet goes first;
+1. if there is one peer and its reports name a lost packet that is still alive, that packet is repaired alone; the
+   newest such packet goes first;
 2. otherwise the slot carries a linear combination over GF(256) of live packets (``combining``). A thrifty sender sends
    it only if it is worth the slot (``thrift``).
+
+A packet that is repaired alone is a combination of one, and never the same packet again: a receiver that has heard
+nothing since would take it for new, and a command in it for fresh.
 
 What is alive says ``sent_packets``, what reports tell ``peers``, and what holds while nobody reports ``unreported``.
 """
@@ -69,13 +72,10 @@ class RepairWindow:
         self.thrift = Thrift(self.packets, self.peers)
         self._combining = Combining(self.packets, room)
 
-    def sent(
-        self, number: int, body: bytes, data: bytes, lifetimes: tuple[Lifetime, ...], now: float, *, skipped: int = 0
-    ) -> None:
+    def sent(self, number: int, body: bytes, lifetimes: tuple[Lifetime, ...], now: float, *, skipped: int = 0) -> None:
         """A source packet left.
 
         :param body: its entries, without padding
-        :param data: the packet as it was sent
         :param lifetimes: lifetimes of the messages in it; () for a packet that is not worth repairing
         :param skipped: bits of the peers for which it was sent too fast
         """
@@ -84,7 +84,7 @@ class RepairWindow:
             self._unreported.sent(number, lifetimes)
         elif self._shared is not None:
             self._shared.sent(number, lifetimes, self.peers.loss)
-        self.packets.add(number, body, data, lifetimes, now, skipped=skipped)
+        self.packets.add(number, body, lifetimes, now, skipped=skipped)
 
     @property
     def mode(self) -> RepairMode:
@@ -96,8 +96,8 @@ class RepairWindow:
             return self._repair
         return "thrifty" if self.peers.all else "idle"
 
-    def next(self, now: float, held: Callable[[float], bool] = _never) -> Sent | Repair | None:
-        """What an idle slot carries: a packet sent again unchanged, a combination, or nothing.
+    def next(self, now: float, held: Callable[[float], bool] = _never) -> Repair | None:
+        """What an idle slot carries: a combination or nothing.
 
         :param held: whether a repair has to wait, at this time in s; only asked if there is one. A thrifty sender has
             few repairs under way: what a report names as lost does not wait then
@@ -108,18 +108,18 @@ class RepairWindow:
         thrifty = mode == "thrifty"
         if self._shared is not None and self.peers and (again := self._urgent_of_all(now, idle=True)) is not None:
             return again
-        if thrifty and (again := self.peers.lost(now)) is not None:
-            return self._again(again, now)
+        if thrifty and (lost := self.peers.lost(now)) is not None:
+            return self._alone(lost, now)
         window = self._combining.window(now)
         if not window or (thrifty and not self.thrift.worth(window, now)):
             return None
         if held(now) and not (thrifty and self.peers.lack(window)):
             return None
-        if not thrifty and (again := self.peers.lost(now)) is not None:
-            return self._again(again, now)
+        if not thrifty and (lost := self.peers.lost(now)) is not None:
+            return self._alone(lost, now)
         return self._combination(window, now)
 
-    def urgent(self, now: float) -> Sent | Repair | None:
+    def urgent(self, now: float) -> Repair | None:
         """What goes before new packets, because later messages wait for it: a packet that a report names as lost, or,
         where there are no reports, a repair of a long message over the newest packets."""
         if self.mode == "off":
@@ -186,7 +186,7 @@ class RepairWindow:
                     return record.lifetimes
         return ()
 
-    def _urgent_of_all(self, now: float, *, idle: bool = False) -> Sent | Repair | None:
+    def _urgent_of_all(self, now: float, *, idle: bool = False) -> Repair | None:
         """What goes before new packets on a shared channel."""
         assert self._shared is not None
         if not self._shared.may_leave(idle=idle):
@@ -227,23 +227,22 @@ class RepairWindow:
             self._shared.tells(self.packets.told_of, now)
         return told
 
-    def complete(self, record: Sent, now: float) -> Sent | Repair | None:
+    def complete(self, record: Sent, now: float) -> Repair | None:
         """What brings a packet to the peers for which it was sent too fast."""
         record.skipped = 0
+        for lifetime in record.lifetimes:
+            lifetime.completes = True
         return self._bring(record, now)
 
-    def _bring(self, record: Sent, now: float) -> Sent | Repair | None:
+    def _bring(self, record: Sent, now: float) -> Repair | None:
         """What brings a packet back that peers lack."""
-        if self.peers.replayed(record.number):
-            return self._combination([record], now)
-        if self._shared is not None and len(self.peers.all) > 1:
+        if self._shared is not None and len(self.peers.all) > 1 and not self.peers.replayed(record.number):
             return self._for_all(now, record.number)
-        return self._again(record, now)
+        return self._alone(record, now)
 
-    def _again(self, record: Sent, now: float) -> Sent:
+    def _alone(self, record: Sent, now: float) -> Repair | None:
         record.at = now
-        self.peers.once.discard(record.number)
-        return record
+        return self._combination([record], now)
 
     def _combination(self, window: list[Sent], now: float) -> Repair | None:
         found = self._combining.combine(window, self.peers.provens, now)

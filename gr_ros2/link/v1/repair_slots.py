@@ -15,7 +15,6 @@ from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.packing import Packing
 from gr_ros2.link.v1.repair import RepairWindow
-from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.link.v1.shared import in_a_row
 from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 from gr_ros2.wire.control import LeftOut
@@ -143,16 +142,15 @@ class RepairSlots:
             return None
         peers = self._window.peers
         robots = [src_id for src_id, peer in peers.all.items() if record.skipped & peer.bit]
-        audiences.sent_again(record, robots)
         self._hold.repaired(waiting=False)
         again = self._window.complete(record, slot.now)
         return None if again is None else self._writer.repair(again, slot, robots)
 
-    def _lacking(self, chosen: Sent | Repair) -> list[int] | None:
-        """Those who lack a packet that is sent again as it was, where not all packets are for all; None for all."""
-        if self._audiences is None or isinstance(chosen, Repair) or not self._window.packets.parts:
+    def _lacking(self, chosen: Repair) -> list[int] | None:
+        """Those who lack a packet that is repaired alone, where not all packets are for all; None for all."""
+        if self._audiences is None or chosen.mask != 1 or not self._window.packets.parts:
             return None
-        return self._window.peers.lacking(chosen) or None
+        return self._window.peers.lacking(self._window.packets.records[chosen.number]) or None
 
     def _tell(self, number: int, slot: SendSlot) -> SentPacket | None:
         """Say that a packet is not repaired any more."""

@@ -5,7 +5,7 @@ A fleet shares keys. Each start of each robot seals with its own key. That key i
 (RFC 5869), with the robot's id and the number of the start, its *boot number*, half of which is random. So two robots
 that have one id by mistake do not share a key. The nonce consists of the full packet number (not only 16 bits of it)
 and the packet's repair id. No pair of key and nonce is used twice as long as a number is sent once, and a repair id
-once per number. A packet that is sent again is the same packet, byte for byte.
+once per number.
 
 Invariants: ``open`` returns a body only if the trailer belongs to the packet's bytes, its sender's boot number and its
 full packet number; otherwise it raises a named WireError. The hop count of a sealed packet is not covered, because

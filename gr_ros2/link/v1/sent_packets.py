@@ -26,7 +26,7 @@ _PARTED = 1024
 class Sent:
     """A source packet that left.
 
-    :param at: when it was last sent, s
+    :param at: when it was last sent, or repaired alone, s
     :param confirmed: one bit per peer
     :param skipped: bits of the peers for which it was sent too fast, as far as they have not got it since
     :param parted: bits of those for which it was sent too fast at first
@@ -35,7 +35,6 @@ class Sent:
 
     number: int
     body: bytes
-    data: bytes
     lifetimes: tuple[Lifetime, ...]
     at: float
     confirmed: int = 0
@@ -89,9 +88,7 @@ class SentPackets:
         """Repair ids already used, as bits, by number."""
         self._repair_id = 0
 
-    def add(
-        self, number: int, body: bytes, data: bytes, lifetimes: tuple[Lifetime, ...], now: float, *, skipped: int = 0
-    ) -> None:
+    def add(self, number: int, body: bytes, lifetimes: tuple[Lifetime, ...], now: float, *, skipped: int = 0) -> None:
         """A source packet left.
 
         :param skipped: the peers for which it was sent too fast
@@ -104,7 +101,7 @@ class SentPackets:
         if self.records or lifetimes:
             if not self.records:
                 self.oldest = self.needed = number
-            record = self.records[number] = Sent(number, body, data, lifetimes, now)
+            record = self.records[number] = Sent(number, body, lifetimes, now)
             if skipped:
                 record.skipped = record.parted = skipped
             if self.away and not record.in_order:

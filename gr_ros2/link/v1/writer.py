@@ -14,12 +14,10 @@ from gr_ros2.link.rate import RateController
 from gr_ros2.link.stats import SenderStats
 from gr_ros2.link.v1.combining import Repair
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.gf256 import combine
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Checksum, Keys
-from gr_ros2.link.v1.sent_packets import Sent
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.wire.v1 import (
     BROADCAST,
@@ -29,8 +27,6 @@ from gr_ros2.wire.v1 import (
     PacketV1,
     RepairHeader,
     body_room,
-    read_body,
-    read_header,
     write_body,
     write_header,
     write_repair_header,
@@ -118,7 +114,7 @@ class PacketWriter:
         number = self._window.packets.newest + 1
         body = write_body(entries, self.room)
         sent = self._close(qos, number, None, body, entries, kind="new", slot=slot, parts=parts, robots=robots)
-        self._window.sent(number, body, sent.data, lifetimes, slot.now, skipped=skipped)
+        self._window.sent(number, body, lifetimes, slot.now, skipped=skipped)
         if lifetimes:
             self._hold.left(slot.now, self._window.peers.loss)
         return sent
@@ -133,27 +129,14 @@ class PacketWriter:
         fields = RepairHeader(repair_id, oldest=not window.packets.unconfirmed(slot.now), clear=clear)
         return self._close(QOS_REPAIR, window.packets.newest, fields, body, entries, kind=kind, slot=slot)
 
-    def repair(self, chosen: Sent | Repair, slot: SendSlot, robots: Collection[int] | None = None) -> SentPacket:
-        """Write a combination of packets, or a packet again as it was.
+    def repair(self, chosen: Repair, slot: SendSlot, robots: Collection[int] | None = None) -> SentPacket:
+        """Write a combination of packets.
 
         :param robots: those who lack it; None where that is to be heard by all
         """
-        if isinstance(chosen, Repair):
-            number, mask, repair_id, oldest, combined = chosen
-            fields = RepairHeader(repair_id, mask, oldest)
-            return self._close(QOS_REPAIR, number, fields, combined, (), kind="repair", slot=slot, robots=robots)
-        if self._shares:  # with another block it is another packet, and needs a nonce of its own
-            again = self._window.packets.take_repair_id(chosen.number)
-            if again is None:
-                return self.control([], "repair", slot)
-            body = combine([(chosen.number, chosen.body)], again)
-            return self._close(QOS_REPAIR, chosen.number, RepairHeader(again, 1), body, (), kind="repair", slot=slot)
-        header = read_header(chosen.data, self._packet_len)
-        entries = tuple(read_body(chosen.body, self.room))
-        packet = PacketV1(header, entries, encrypted=self._encrypts)
-        return self._leave(
-            chosen.data, packet, chosen.number, NOT_A_REPAIR, kind="repair", slot=slot, parts=(), robots=robots
-        )
+        number, mask, repair_id, oldest, combined = chosen
+        fields = RepairHeader(repair_id, mask, oldest)
+        return self._close(QOS_REPAIR, number, fields, combined, (), kind="repair", slot=slot, robots=robots)
 
     def _close(
         self,
@@ -179,21 +162,6 @@ class PacketWriter:
             combined = body
         data = self._trailer.close(clear, body, number, repair_id, plain=plain)
         packet = PacketV1(header, tuple(entries), repair, combined, self._encrypts and not plain)
-        return self._leave(data, packet, number, repair_id, kind=kind, slot=slot, parts=parts, robots=robots)
-
-    def _leave(
-        self,
-        data: bytes,
-        packet: PacketV1,
-        number: int,
-        repair_id: int,
-        *,
-        kind: AirKind,
-        slot: SendSlot,
-        parts: tuple[SentEntry, ...],
-        robots: Collection[int] | None,
-    ) -> SentPacket:
-        """A packet leaves."""
         stats = self._stats
         stats.air[kind] += 1
         stats.packets += 1

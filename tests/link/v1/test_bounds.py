@@ -160,7 +160,7 @@ def test_a_report_costs_no_more_the_more_was_sent(mode: SealMode) -> None:
     air.run(1.0)
     window = one.end.window
     for number in range(window.packets.newest + 1, 20_000):
-        window.sent(number, b"", b"", (), 1.0)
+        window.sent(number, b"", (), 1.0)
     lines = [work(lambda: window.peers.report(2, 19_990, 0, settled=True, loss=0.1, now=air.now))[0] for _ in range(2)]
     assert lines[1] < MOST_LINES
 

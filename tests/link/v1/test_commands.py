@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import random
+from typing import Any
+
 import pytest
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.events import Delivered, Lost, ReceiverEvent
 from gr_ros2.link.queues import PublisherQos
+from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S, is_command
 from gr_ros2.settings.config import SendOptions, build
 from gr_ros2.settings.registry import Registry, Topic
@@ -151,3 +155,43 @@ def test_with_a_small_share_of_the_air_a_robot_says_as_much_less_about_itself() 
     (hellos, reports), (few_hellos, few_reports) = kinds(1.0), kinds(0.05)
     assert few_hellos < hellos / 4
     assert few_reports <= reports / 2
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize(("mode", "seed"), [("none", 3), ("none", 4), ("encrypt", 0), ("encrypt", 5)])
+def test_a_command_in_a_packet_that_is_sent_again_for_another_message_is_not_new(
+    mode: SealMode, seed: int, own: bool
+) -> None:
+    """A robot is cut off, and then does not get through for longer than it is cut off: what is heard of it first may be
+    a packet that it sends again.
+
+    :param own: whether the sender says that commands come in time; otherwise the receivers do
+    """
+    sends: dict[str, Any] = {} if own else {"commands": ()}
+    takes: dict[str, Any] = {} if own else {"deadlines": {"cmd_vel": COMMAND_DEADLINE_S}}
+    sender = Robot(1, robot().topics, mode=mode, packet_len=200, **sends)
+    receivers = [Robot(src_id, mode=mode, packet_len=200, **takes) for src_id in (2, 3, 4)]
+    air = Air(sender, *receivers, loss=0.4, seed=seed)
+    by_chance, rng = air.lost, random.Random(seed)
+    off, back = 12.0 + (3, 5, 0.8)[seed % 3], (1, 3, 0, 1)[seed % 4]
+
+    def lost(one: Robot, other: Robot) -> bool:
+        cut_off = 12 < air.now < off and sender in (one, other)
+        return cut_off or (off <= air.now < off + back and one is sender) or by_chance(one, other)
+
+    air.lost = lost
+    air.run(2.0)
+    ages: list[float] = []
+    while air.now < 32:
+        if rng.random() < 0.3:
+            sender.end.messages.submit(0, b"%f" % air.now, air.now)
+        if rng.random() < 0.3:
+            sender.end.messages.submit(1, b"%f" % air.now, air.now)
+        for _ in range(8):
+            air.step()
+            for receiver in receivers:
+                events = [event for event in receiver.events if isinstance(event, Delivered) and event.topic_id == 0]
+                ages += [air.now - float(event.payload) for event in events]
+                receiver.events.clear()
+    assert len(ages) > 80
+    assert max(ages) < 2 * COMMAND_DEADLINE_S

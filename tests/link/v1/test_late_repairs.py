@@ -21,7 +21,9 @@ from tests.link.v1.test_relayed_reliable import Cell, cell
 
 def repair_of(sender: Robot, number: int, now: float) -> bytes:
     """A packet of a sender once more, in a packet for repair."""
-    return sender.end._writer.repair(sender.end.window.packets.records[number], SendSlot(now)).data
+    repair = sender.end.window._combination([sender.end.window.packets.records[number]], now)
+    assert repair is not None
+    return sender.end._writer.repair(repair, SendSlot(now)).data
 
 
 def over(one: Robot, origin: Robot, number: int, text: bytes, now: float) -> list[bytes]:

@@ -61,11 +61,11 @@ def window(peers: int) -> RepairWindow:
     made = RepairWindow("thrifty", ROOM, shares=True)
     for src_id in range(peers):
         made.peers.meet(src_id, 0.0)
-    made.sent(1, b"old", b"", (Lifetime(expires=0.5),), 0.0)
+    made.sent(1, b"old", (Lifetime(expires=0.5),), 0.0)
     lifetime = Lifetime(in_order=True)
     for number in (2, 3, 4):
         lifetime.left = number == 4
-        made.sent(number, b"body %d" % number, b"", (lifetime,), float(number))
+        made.sent(number, b"body %d" % number, (lifetime,), float(number))
     return made
 
 
@@ -76,7 +76,7 @@ def test_one_repair_serves_peers_that_lack_different_packets() -> None:
     repair = made.urgent(5.0)
     assert isinstance(repair, Repair)
     assert (repair.number, repair.mask, repair.oldest) == (4, 0b111, True)
-    made.sent(5, b"new", b"", (Lifetime(),), 5.1)
+    made.sent(5, b"new", (Lifetime(),), 5.1)
     assert made.urgent(5.1) is None
 
 
@@ -108,7 +108,7 @@ def test_who_came_after_older_packets_is_repaired_without_them(proven: int) -> N
         sender.peers.meet(src_id, 0.0)
     sender.peers.prove(4, proven)
     for number in range(1, 61):
-        sender.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number / 10)
+        sender.sent(number, b"%d" % number, (Lifetime(in_order=True, left=True),), number / 10)
     sender.peers.leave(3)
     sender.peers.report(2, 60, (1 << 60) - 1, settled=True, loss=0.1, now=9.0)
     arrived = (1 << 29) - 1 ^ 1 << 20  # packets 32 to 60, but for 40
@@ -116,7 +116,7 @@ def test_who_came_after_older_packets_is_repaired_without_them(proven: int) -> N
     sender.peers.all[4].settled = 31 if not proven else 0
     repair = sender.urgent(9.0)
     while isinstance(repair, Repair) and 40 not in window_numbers(repair.number, repair.mask):
-        sender.sent(sender.packets.newest + 1, b"", b"", (), 9.0)
+        sender.sent(sender.packets.newest + 1, b"", (), 9.0)
         repair = sender.urgent(9.0)
     assert isinstance(repair, Repair)
     assert min(window_numbers(repair.number, repair.mask)) >= 31
@@ -126,12 +126,12 @@ def test_what_a_peer_lacks_stays_urgent_when_it_asks_for_a_proof_again() -> None
     sender = RepairWindow("thrifty", ROOM, shares=True)
     sender.peers.meet(2, 0.0)
     for number in range(1, 21):
-        sender.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number / 10)
+        sender.sent(number, b"%d" % number, (Lifetime(in_order=True, left=True),), number / 10)
     for now in (3.0, 4.0):
         sender.peers.report(2, 20, 0b1111, settled=True, loss=0.1, now=now)  # it lacks 1 to 16
         found = 0
         for _ in range(40):
-            sender.sent(sender.packets.newest + 1, b"", b"", (), now)
+            sender.sent(sender.packets.newest + 1, b"", (), now)
             found += sender.urgent(now) is not None
         assert found >= 16, "one repair for each"
         sender.peers.prove(2, 16, wanted=True)
@@ -142,7 +142,7 @@ def test_what_a_peer_lacked_before_it_was_out_of_range_is_urgent_when_it_is_back
     for src_id in (2, 3):
         sender.peers.meet(src_id, 0.0)
     for number in range(1, 21):
-        sender.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number / 10)
+        sender.sent(number, b"%d" % number, (Lifetime(in_order=True, left=True),), number / 10)
     sender.peers.report(2, 20, (1 << 20) - 1 ^ 1, settled=True, loss=0.1, now=3.0)  # it lacks 20
     sender.peers.leave(2)
     assert sender.urgent(3.0) is None
@@ -155,12 +155,12 @@ def test_a_peer_that_lacks_much_keeps_nothing_back_from_one_that_lacks_what_is_n
     for src_id in (2, 3):
         sender.peers.meet(src_id, 0.0)
     for number in range(1, 301):
-        sender.sent(number, b"%d" % number, b"", (Lifetime(in_order=True, left=True),), number / 10)
+        sender.sent(number, b"%d" % number, (Lifetime(in_order=True, left=True),), number / 10)
     sender.peers.report(2, 64, 0, settled=False, loss=0.1, now=40.0)  # it was out of range
     sender.peers.report(3, 300, (1 << 64) - 1 ^ 1, settled=True, loss=0.1, now=40.0)
     covered: set[int] = set()
     for _ in range(20):
-        sender.sent(sender.packets.newest + 1, b"", b"", (), 40.0)
+        sender.sent(sender.packets.newest + 1, b"", (), 40.0)
         repair = sender.urgent(40.0)
         if repair is not None:
             mask = repair.mask if isinstance(repair, Repair) else 1
@@ -175,13 +175,13 @@ def test_a_peer_is_told_what_is_over_beside_one_that_lacks_much_that_is_older() 
         sender.peers.meet(src_id, 0.0)
     for number in range(1, 301):
         expires = 39.0 if number == 280 else inf
-        sender.sent(number, b"%d" % number, b"", (Lifetime(expires, in_order=True, left=True),), number / 10)
+        sender.sent(number, b"%d" % number, (Lifetime(expires, in_order=True, left=True),), number / 10)
     everything = (1 << 64) - 1
     covered: set[int] = set()
     for now in range(40, 60):
         sender.peers.report(2, 64, 0, settled=False, loss=0.1, now=now)  # it was out of range
         sender.peers.report(3, 300, everything ^ 1 << 20, settled=True, loss=0.1, now=now)
-        sender.sent(sender.packets.newest + 1, b"", b"", (), now + 0.3)
+        sender.sent(sender.packets.newest + 1, b"", (), now + 0.3)
         over = sender.peers.given_up(now + 0.3, 0.2)
         repair = sender.tell(over, now + 0.3) if over >= 0 else sender.urgent(now + 0.3)
         if isinstance(repair, Repair):
@@ -196,7 +196,7 @@ def test_what_a_peer_takes_for_a_replay_is_combined_with_a_packet_that_is_repair
     sender.peers.meet(2, 0.0)
     for number in range(1, 7):
         over = Lifetime(expires=-inf, fresh=True)
-        sender.sent(number, b"body", b"", (over,) if number == 5 else (Lifetime(in_order=True, left=True),), 0.0)
+        sender.sent(number, b"body", (over,) if number == 5 else (Lifetime(in_order=True, left=True),), 0.0)
     sender.peers.prove(2, 4)
     sender.peers.report(2, 6, 0b01_1110, settled=False, loss=0.3, now=1.0)
     repair = sender.urgent(2.0)
