@@ -38,6 +38,7 @@ COMPILE = [
     "-fno-trapping-math",
     "-fno-signed-zeros",
     "-fassociative-math",
+    "-Wno-psabi",  # vectors pass between functions of one file alone, so how they do is nobody's matter
 ]
 VARIANTS = {"_baseline": []} | ({"_avx2": ["-mavx2", "-mfma"]} if MACHINE in ("x86_64", "AMD64") else {})
 """Libraries of compiled kernels: for every processor of the architecture (64-bit ARM has NEON), and for newer ones."""

@@ -28,12 +28,12 @@ PIECE = 8192
 REPEATS = 15
 Setting = tuple[str, dict[str, Any], int]
 TARGETS: list[tuple[Setting, float]] = [
-    (("ofdm", {}, 64), 6.5),
-    (("ofdm", {}, 1500), 4),
+    (("ofdm", {}, 64), 5),
+    (("ofdm", {}, 1500), 3),
     (("ofdm", {"payload_modulation": "64qam"}, 1500), 9.5),
-    (("psk", {}, 64), 6.5),
-    (("gfsk", {}, 64), 5.5),
-    (("lora", {}, 64), 6.5),
+    (("psk", {}, 64), 5),
+    (("gfsk", {}, 64), 4.5),
+    (("lora", {}, 64), 4.5),
 ]
 NOISE_TARGET = 1.8
 CODES = ("none", "cc", "ldpc", "polar")

@@ -28,7 +28,6 @@ inline float exp_below_0(float x) {
 
 // What a constellation made of received points. Both axes apart where it is square, real parts only for two points.
 struct Received {
-    std::vector<Sample> points;
     std::vector<float> parts[2];     // real, imaginary
     std::vector<float> sharpness;    // 1 / noise
     std::vector<float> means[2];     // of what was sent, per part
@@ -36,8 +35,14 @@ struct Received {
     std::vector<float> bits[3];      // soft, of one axis
     std::vector<float> likely;       // of every point, where axes cannot be told apart
 
+    Sample point(int k) const { return {parts[0][k], parts[1][k]}; }
+
+    void copy(int count, Sample* __restrict out) const {
+        const float *re = parts[0].data(), *im = parts[1].data();
+        for (int k = 0; k < count; k++) out[k] = {re[k], im[k]};
+    }
+
     void resize(int count, int constellation) {
-        points.resize(count);
         sharpness.resize(count);
         for (auto& one : bits) one.resize(count);
         for (int axis = 0; axis < 2; axis++) {
@@ -49,12 +54,13 @@ struct Received {
     }
 };
 
-// The likeliest points, their parts apart, and how likely each is.
+// The likeliest points, their parts apart.
 struct Nearest {
-    std::vector<float> most, real, imag;
+    std::vector<float> real, imag;
 
     void resize(int count) {
-        for (auto* one : {&most, &real, &imag}) one->resize(count);
+        real.resize(count);
+        imag.resize(count);
     }
 };
 
@@ -94,7 +100,7 @@ class Constellation {
         if (apart_) return;
         for (int i = 0; i < used; i++) {
             float* likely = &seen.likely[static_cast<size_t>(i) * count()];
-            for (int k = 0; k < count(); k++) likely[k] = likelihood(seen.points[i], k) * seen.sharpness[i];
+            for (int k = 0; k < count(); k++) likely[k] = likelihood(seen.point(i), k) * seen.sharpness[i];
         }
     }
 
@@ -134,21 +140,23 @@ class Constellation {
 
     // Of each received point the likeliest one of the constellation.
     void nearest(const Sample* received, int used, Nearest& found) const {
-        found.resize(used);
-        float *__restrict most = found.most.data(), *__restrict real = found.real.data(),
-              *__restrict imag = found.imag.data();
-        std::fill_n(most, used, -INFINITY);
-        std::fill_n(real, used, points_[0].real());
-        std::fill_n(imag, used, points_[0].imag());
-        for (const Sample point : points_) {
-            const float twice[2] = {2 * point.real(), 2 * point.imag()}, power = square(point);
-            for (int i = 0; i < used; i++) {
-                const float likely = received[i].real() * twice[0] + received[i].imag() * twice[1] - power;
-                const bool better = likely > most[i];
-                most[i] = better ? likely : most[i];
-                real[i] = better ? point.real() : real[i];
-                imag[i] = better ? point.imag() : imag[i];
+        found.resize((used + kLanes - 1) / kLanes * kLanes);
+        for (int at = 0; at < used; at += kLanes) {
+            Sample some[kLanes] = {};
+            std::copy_n(received + at, std::min(kLanes, used - at), some);
+            const Four low = four(some), high = four(some + kLanes / 2);
+            const Lanes x = GR_ROS2_MIX(Places, low, high, 0, 2, 4, 6, 8, 10, 12, 14);
+            const Lanes y = GR_ROS2_MIX(Places, low, high, 1, 3, 5, 7, 9, 11, 13, 15);
+            Lanes most = Lanes{} - INFINITY, real = Lanes{} + points_[0].real(), imag = Lanes{} + points_[0].imag();
+            for (const Sample point : points_) {
+                const Lanes likely = x * (2 * point.real()) + y * (2 * point.imag()) - square(point);
+                const auto better = likely > most;
+                most = better ? likely : most;
+                real = better ? Lanes{} + point.real() : real;
+                imag = better ? Lanes{} + point.imag() : imag;
             }
+            put(real, &found.real[at]);
+            put(imag, &found.imag[at]);
         }
     }
 

@@ -32,6 +32,15 @@ inline std::complex<T> mul_conj(std::complex<T> a, std::complex<T> b) {
     return {a.real() * b.real() + a.imag() * b.imag(), a.imag() * b.real() - a.real() * b.imag()};
 }
 
+// a times b, value by value
+inline void products(const Sample* a, const Sample* b, int count, Sample* __restrict out) {
+    for (int k = 0; k < count; k++) out[k] = mul(a[k], b[k]);
+}
+
+inline void turn_by(const Sample* a, int count, Sample* __restrict values) {
+    for (int k = 0; k < count; k++) values[k] = mul(values[k], a[k]);
+}
+
 inline float square(Sample a) { return a.real() * a.real() + a.imag() * a.imag(); }
 
 inline Turn turn(double angle) { return {std::cos(angle), std::sin(angle)}; }
@@ -114,84 +123,138 @@ inline double wrapped(double a, double n) {
     return rest < 0 ? rest + n : rest;
 }
 
-// Forward FFT of a power of 2 (Stockham, radix 4, one radix 2 where needed).
+// Values of two vectors at fixed places, those of the second one counted on. Each compiler has its own word for it.
+#if defined(__clang__)
+#define GR_ROS2_MIX(Places, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define GR_ROS2_MIX(Places, a, b, ...) __builtin_shuffle(a, b, Places{__VA_ARGS__})
+#endif
+
+constexpr int kLanes = 8;
+using Lanes = float __attribute__((vector_size(kLanes * sizeof(float))));
+using Places = int32_t __attribute__((vector_size(kLanes * sizeof(int32_t))));
+
+inline Lanes lanes(const float* from) {
+    Lanes values;
+    std::memcpy(&values, from, sizeof values);
+    return values;
+}
+
+inline void put(Lanes values, float* to) { std::memcpy(to, &values, sizeof values); }
+
+// Four samples side by side, real part first.
+using Four = Lanes;
+using Wholes = int64_t __attribute__((vector_size(4 * sizeof(int64_t))));
+
+inline Four four(const Sample* from) { return lanes(reinterpret_cast<const float*>(from)); }
+
+inline void put(Four values, Sample* to) { put(values, reinterpret_cast<float*>(to)); }
+
+// Real and imaginary parts the other way round.
+inline Four swapped(Four a) { return GR_ROS2_MIX(Places, a, a, 1, 0, 3, 2, 5, 4, 7, 6); }
+
+// Four factors as a product needs them: their real parts twice, and their imaginary ones with both signs.
+struct Factors {
+    Four real, imag;
+
+    Factors() = default;
+    Factors(Sample a, Sample b, Sample c, Sample d)
+        : real{a.real(), a.real(), b.real(), b.real(), c.real(), c.real(), d.real(), d.real()},
+          imag{-a.imag(), a.imag(), -b.imag(), b.imag(), -c.imag(), c.imag(), -d.imag(), d.imag()} {}
+
+    Four times(Four a) const { return a * real + swapped(a) * imag; }
+};
+
+// Forward FFT of a power of 2, at least 16 (Stockham, radix 4, one radix 2 where needed).
 class Fft {
    public:
-    explicit Fft(int size) : size_(size), twiddles_(size) {
-        for (int k = 0; k < size; k++) twiddles_[k] = unit(-kTau * k / size);
-        for (int turns = 1; turns < 4; turns++)
-            for (int k = 0; k < size / 4; k++) first_[turns - 1].push_back(twiddles_[turns * k & (size - 1)]);
+    explicit Fft(int size) : size_(size) {
+        const auto root = [&](int k) { return unit(-kTau * (k & (size - 1)) / size); };
+        for (int k = 0; k < size / 4; k += 4)
+            for (int turns = 1; turns < 4; turns++)
+                factors_.emplace_back(root(turns * k), root(turns * (k + 1)), root(turns * (k + 2)), root(turns * (k + 3)));
+        for (int done = 4; size / done >= 4; done *= 4)
+            for (int k = 0; k < size / done / 4; k++)
+                for (int turns = 1; turns < 4; turns++) {
+                    const Sample one = root(turns * k * done);
+                    factors_.emplace_back(one, one, one, one);
+                }
     }
 
     int size() const { return size_; }
 
     // In place; `spare` has room for as many.
     void run(Sample* __restrict data, Sample* __restrict spare) const {
-        Sample *from = data, *to = spare;
-        int left = size_, done = 1;
-        if (left >= 4) {
-            first(data, spare);
-            left /= 4;
-            done = 4;
-        }
+        if (result(data, spare) != data) std::memcpy(static_cast<void*>(data), spare, sizeof(Sample) * size_);
+    }
+
+    // The same, where it comes to lie: one of both.
+    const Sample* result(Sample* __restrict data, Sample* __restrict spare) const {
+        const Factors* by = first(data, spare);
+        Sample *from = spare, *to = data;
+        int left = size_ / 4, done = 4;
         for (; left >= 4; left /= 4, done *= 4) {
-            radix4(from, to, left / 4, done);
+            by = radix4(from, to, left / 4, done, by);
             std::swap(from, to);
         }
         if (left == 2) {
-            for (int k = 0; k < done; k++) {
-                const Sample a = from[k], b = from[k + done];
-                to[k] = a + b;
-                to[k + done] = a - b;
+            for (int k = 0; k < done; k += 4) {
+                const Four a = four(from + k), b = four(from + k + done);
+                put(a + b, to + k);
+                put(a - b, to + k + done);
             }
             std::swap(from, to);
         }
-        if (from != data) std::memcpy(static_cast<void*>(data), from, sizeof(Sample) * size_);
+        return from;
     }
 
    private:
-    // The first step, whose results are 4 apart: they are made side by side, and put there.
-    void first(Sample* __restrict data, Sample* __restrict spare) const {
-        const int quarter = size_ / 4;
-        const Sample *a = data, *b = a + quarter, *c = b + quarter, *d = c + quarter;
-        const Sample *w1 = first_[0].data(), *w2 = first_[1].data(), *w3 = first_[2].data();
-        Sample *one = spare, *two = one + quarter, *three = two + quarter, *four = three + quarter;
-        for (int k = 0; k < quarter; k++) {
-            const Sample sum = a[k] + c[k], difference = a[k] - c[k], other = b[k] + d[k], rest = b[k] - d[k];
-            const Sample turned(rest.imag(), -rest.real());
-            one[k] = sum + other;
-            two[k] = mul(w1[k], difference + turned);
-            three[k] = mul(w2[k], sum - other);
-            four[k] = mul(w3[k], difference - turned);
-        }
-        for (int k = 0; k < quarter; k++) {
-            data[4 * k] = one[k];
-            data[4 * k + 1] = two[k];
-            data[4 * k + 2] = three[k];
-            data[4 * k + 3] = four[k];
-        }
+    struct Quad {
+        Four one, two, three, four;
+    };
+
+    // One step of four values each, with the factors of this place.
+    static Quad butterfly(Four a, Four b, Four c, Four d, const Factors* by) {
+        constexpr Four kDown = {1, -1, 1, -1, 1, -1, 1, -1};
+        const Four sum = a + c, difference = a - c, other = b + d, turned = swapped(b - d) * kDown;
+        return {sum + other, by[0].times(difference + turned), by[1].times(sum - other), by[2].times(difference - turned)};
     }
 
-    void radix4(const Sample* __restrict from, Sample* __restrict to, int quarter, int done) const {
-        const int mask = size_ - 1;
-        for (int j = 0; j < quarter; j++) {
-            const Sample w1 = twiddles_[j * done], w2 = twiddles_[2 * j * done & mask], w3 = twiddles_[3 * j * done & mask];
-            const Sample* in = from + j * done;
-            Sample* out = to + 4 * j * done;
-            for (int k = 0; k < done; k++) {
-                const Sample a = in[k], b = in[k + quarter * done], c = in[k + 2 * quarter * done],
-                             d = in[k + 3 * quarter * done];
-                const Sample sum = a + c, difference = a - c, other = b + d, turned((b - d).imag(), -(b - d).real());
-                out[k] = sum + other;
-                out[k + done] = mul(w1, difference + turned);
-                out[k + 2 * done] = mul(w2, sum - other);
-                out[k + 3 * done] = mul(w3, difference - turned);
+    // The first step, whose results are 4 apart.
+    const Factors* first(const Sample* __restrict in, Sample* __restrict out) const {
+        const int quarter = size_ / 4;
+        const Factors* by = factors_.data();
+        for (int k = 0; k < quarter; k += 4, by += 3, in += 4, out += 16) {
+            const Quad q = butterfly(four(in), four(in + quarter), four(in + 2 * quarter), four(in + 3 * quarter), by);
+            const auto one = reinterpret_cast<Wholes>(q.one), two = reinterpret_cast<Wholes>(q.two);
+            const auto three = reinterpret_cast<Wholes>(q.three), four = reinterpret_cast<Wholes>(q.four);
+            const Wholes a = GR_ROS2_MIX(Wholes, one, two, 0, 4, 2, 6), b = GR_ROS2_MIX(Wholes, one, two, 1, 5, 3, 7);
+            const Wholes c = GR_ROS2_MIX(Wholes, three, four, 0, 4, 2, 6), d = GR_ROS2_MIX(Wholes, three, four, 1, 5, 3, 7);
+            put(reinterpret_cast<Four>(GR_ROS2_MIX(Wholes, a, c, 0, 1, 4, 5)), out);
+            put(reinterpret_cast<Four>(GR_ROS2_MIX(Wholes, b, d, 0, 1, 4, 5)), out + 4);
+            put(reinterpret_cast<Four>(GR_ROS2_MIX(Wholes, a, c, 2, 3, 6, 7)), out + 8);
+            put(reinterpret_cast<Four>(GR_ROS2_MIX(Wholes, b, d, 2, 3, 6, 7)), out + 12);
+        }
+        return by;
+    }
+
+    const Factors* radix4(const Sample* __restrict from, Sample* __restrict to, int quarter, int done,
+                          const Factors* by) const {
+        const int apart = quarter * done;
+        for (int j = 0; j < quarter; j++, by += 3, to += 4 * done) {
+            for (int k = 0; k < done; k += 4, from += 4) {
+                const Quad q = butterfly(four(from), four(from + apart), four(from + 2 * apart), four(from + 3 * apart), by);
+                put(q.one, to + k);
+                put(q.two, to + k + done);
+                put(q.three, to + k + 2 * done);
+                put(q.four, to + k + 3 * done);
             }
         }
+        return by;
     }
 
     int size_;
-    std::vector<Sample> twiddles_, first_[3];  // of the first step: once, twice and three times the angle
+    std::vector<Factors> factors_;  // of each step, three by three
 };
 
 }  // namespace gr_ros2

@@ -80,12 +80,15 @@ struct FrameForm {
 
     // The packet of these soft bits; false if the CRC-32 does not match.
     bool unwrap(const float* soft, int length, uint8_t* packet) const {
-        static thread_local std::vector<uint8_t> frame;
+        static thread_local std::vector<uint8_t> frame, bits;
         const int count = bytes(length), filled = count - kCrcLen;
         frame.resize(count);
-        for (int k = 0; k < count; k++, soft += kByteBits) {
+        bits.resize(static_cast<size_t>(count) * kByteBits);
+        uint8_t* one = bits.data();
+        for (int k = 0; k < count * kByteBits; k++) one[k] = soft[k] > 0;
+        for (int k = 0; k < count; k++, one += kByteBits) {
             int byte = 0;
-            for (int bit = 0; bit < kByteBits; bit++) byte |= (soft[bit] > 0) << place(bit);
+            for (int bit = 0; bit < kByteBits; bit++) byte |= one[bit] << place(bit);
             frame[k] = static_cast<uint8_t>(byte ^ mask[k]);
         }
         uint32_t crc = 0;

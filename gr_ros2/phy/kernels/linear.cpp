@@ -9,8 +9,7 @@ namespace {
 constexpr double kTiny = 1e-30;
 constexpr double kSmallestNoise = 1e-6;
 constexpr int kPad = 4;       // FFT bins per bin of the preamble's length
-constexpr int kLanes = 8, kSums = 4;  // 32 positions are searched at a time: two sums of each fit into registers
-using Lanes = float __attribute__((vector_size(kLanes * sizeof(float))));
+constexpr int kSums = 4;      // 32 positions are searched at a time: two sums of each fit into registers
 constexpr double kFar = 1e6;  // samples that no burst can be late
 using Bits = std::vector<uint8_t>;
 enum Digit { kOver, kZero, kOne, kDigits };  // of a sequence of bits: none, a zero, a one
@@ -335,7 +334,7 @@ class Linear final : public Modem {
             if (!(std::abs(late) < kFar)) return false;
             between(samples, at, count, s.raw.data());
             Rotation(-(phase + frequency * symbol), -frequency).fill(s.turned.data(), count);
-            for (int k = 0; k < count; k++) s.raw[k] = mul(s.raw[k], s.turned[k]);
+            turn_by(s.turned.data(), count, s.raw.data());
             const int blocks = std::max(1, count / p_.block);
             s.places[0] = known_at;
             s.angles[0] = known;
@@ -346,10 +345,8 @@ class Linear final : public Modem {
                 s.places[b + 1] = symbol + (from + to - 1) / 2.0;
             }
             interpolate(blocks, symbol, count, s);
-            for (int k = 0; k < count; k++) {
-                s.other[k] = unit_near(-s.drift[k]);
-                points[first + k] = mul(s.raw[k], s.other[k]);
-            }
+            for (int k = 0; k < count; k++) s.other[k] = unit_near(-s.drift[k]);
+            products(s.raw.data(), s.other.data(), count, points + first);
             known_at = symbol + count - 1;
             known = s.drift[count - 1];
             if (first + count < payload) late += chunk_lateness(samples, at, points + first, count, s);
@@ -389,8 +386,10 @@ class Linear final : public Modem {
     // Samples by which a chunk's symbols came late, as their decisions say; `other` holds what straightened them.
     double chunk_lateness(Samples samples, double at, const Sample* points, int count, Scratch& s) const {
         points_.nearest(points, count, s.decided);
-        for (int k = 0; k < count; k++)
-            s.turned[k] = mul_conj(mul(s.turned[k], s.other[k]), {s.decided.real[k], s.decided.imag[k]});
+        turn_by(s.other.data(), count, s.turned.data());
+        const float *real = s.decided.real.data(), *imag = s.decided.imag.data();
+        Sample* __restrict turned = s.turned.data();
+        for (int k = 0; k < count; k++) turned[k] = mul_conj(turned[k], {real[k], imag[k]});
         double heights[3];
         for (int off = -1; off <= 1; off++) {
             between(samples, at + off, count, s.other.data());
@@ -409,16 +408,18 @@ class Linear final : public Modem {
         const float weights[4] = {
             static_cast<float>(-x * (x - 1) * (x - 2) / 6), static_cast<float>((x + 1) * (x - 1) * (x - 2) / 2),
             static_cast<float>(-(x + 1) * x * (x - 2) / 2), static_cast<float>((x + 1) * x * (x - 1) / 6)};
-        for (int k = 0; k < count; k++) {
-            const int64_t place = base - 1 + static_cast<int64_t>(k) * p_.sps;
-            Sample sum;
+        const Four wide = {weights[0], weights[0], weights[1], weights[1], weights[2], weights[2], weights[3], weights[3]};
+        int64_t place = base - 1;
+        for (int k = 0; k < count; k++, place += p_.sps) {
             if (place >= 0 && place + 3 < samples.count) {
-                for (int j = 0; j < 4; j++) sum += weights[j] * samples.at[place + j];
+                const Four each = four(samples.at + place) * wide;
+                out[k] = {each[0] + each[2] + each[4] + each[6], each[1] + each[3] + each[5] + each[7]};
             } else {
+                Sample sum;
                 for (int j = 0; j < 4; j++)
                     if (place + j >= 0 && place + j < samples.count) sum += weights[j] * samples.at[place + j];
+                out[k] = sum;
             }
-            out[k] = sum;
         }
     }
 

@@ -9,7 +9,7 @@ namespace {
 constexpr double kTiny = 1e-20;
 constexpr int kHead = 3;          // two sync words and the header
 constexpr int kFieldBits = 12;     // bits of each header field: length, number
-constexpr int kToneSize = 1024;   // the finest grid of `tone`
+constexpr int kLeastTone = 8;     // places on a turn for each symbol that `tone` looks at
 constexpr float kSmallestNoise = 1e-6f;
 constexpr double kFar = 1e6;         // samples that no burst can be late
 
@@ -22,6 +22,48 @@ struct Place {
 
 struct Lateness {
     double late, variance;
+};
+
+inline float sum(Lanes values) {
+    float all = 0;
+    for (int k = 0; k < kLanes; k++) all += values[k];
+    return all;
+}
+
+// As many complex numbers at a time.
+struct Group {
+    Lanes re, im;
+
+    Group times(Group b) const { return {re * b.re - im * b.im, re * b.im + im * b.re}; }
+    Group times(Sample b) const { return {re * b.real() - im * b.imag(), re * b.imag() + im * b.real()}; }
+    Group times_conj(Group b) const { return {re * b.re + im * b.im, im * b.re - re * b.im}; }
+    void add(Group b) {
+        re += b.re;
+        im += b.im;
+    }
+};
+
+// Complex numbers whose parts stand apart.
+struct Split {
+    std::vector<float> re, im;
+
+    Split() = default;
+    explicit Split(size_t count) : re(count), im(count) {}
+
+    void resize(size_t count) {
+        re.resize(count);
+        im.resize(count);
+    }
+    Sample at(size_t k) const { return {re[k], im[k]}; }
+    void set(size_t k, Sample value) {
+        re[k] = value.real();
+        im[k] = value.imag();
+    }
+    Group group(size_t k) const { return {lanes(&re[k]), lanes(&im[k])}; }
+    void set(size_t k, Group values) {
+        put(values.re, &re[k]);
+        put(values.im, &im[k]);
+    }
 };
 
 // When a burst's symbols come: a Kalman filter of their timing and its rate of change.
@@ -57,11 +99,11 @@ struct Scratch {
     std::vector<double> products[2], powers;                       // running sums
     std::vector<Sample> rotation, first, second, profile, spare;   // an FFT long
     std::vector<Sample> powers_of;                                 // of a turn: none to half an FFT
-    std::vector<Sample> rows, model, turns;                        // a chunk of symbols by used carriers
+    Split rows, model, turns;                                      // a chunk of symbols by `wide_` carriers
     std::vector<float> energies, heights;
-    std::vector<Sample> gains, before, sum, step, known;           // per used carrier
+    Split gains, before, sum, step, known, taken;                  // per carrier
     std::vector<float> weight, total;
-    std::vector<Sample> inverse;                                   // per data carrier
+    Split inverse;                                                 // per data carrier
     std::vector<float> sharpness, header;
     std::vector<Sample> tone, straight;                            // per symbol
     std::vector<Sample> again, burst;                              // at the pace of this clock
@@ -78,14 +120,40 @@ std::vector<T> copied(const T* from, size_t count) {
     return std::vector<T>(from, from + count);
 }
 
-// Of a matrix column by column: sums that stand side by side.
-void matrix_times(const Sample* __restrict columns, const Sample* __restrict vector, Sample* __restrict out, int count) {
-    std::fill_n(out, count, Sample());
-    for (int column = 0; column < count; column++, columns += count) {
-        const Sample by = vector[column];
-        for (int row = 0; row < count; row++) out[row] += mul(columns[row], by);
+// A matrix column by column, for sums that stand side by side. Its rows are filled up to a multiple of `kLanes`.
+class Matrix {
+   public:
+    Matrix() = default;
+    Matrix(const std::vector<Sample>& columns, int count, int wide) : count_(count), wide_(wide), columns_(count * wide) {
+        for (int column = 0; column < count; column++)
+            for (int row = 0; row < count; row++) columns_.set(column * wide + row, columns[column * count + row]);
     }
-}
+
+    void times(const Split& vector, Split& out) const {
+        int row = 0;
+        for (; row + 4 * kLanes <= wide_; row += 4 * kLanes) rows<4>(vector, row, out);
+        switch ((wide_ - row) / kLanes) {
+            case 3: rows<3>(vector, row, out); break;
+            case 2: rows<2>(vector, row, out); break;
+            case 1: rows<1>(vector, row, out);
+        }
+    }
+
+   private:
+    // The sums of some rows stay in registers.
+    template <int Many>
+    void rows(const Split& vector, int row, Split& out) const {
+        Group sums[Many] = {};
+        for (int column = 0; column < count_; column++) {
+            const Sample by = vector.at(column);
+            for (int k = 0; k < Many; k++) sums[k].add(columns_.group(column * wide_ + row + k * kLanes).times(by));
+        }
+        for (int k = 0; k < Many; k++) out.set(row + k * kLanes, sums[k]);
+    }
+
+    int count_ = 0, wide_ = 0;
+    Split columns_;
+};
 
 Constellation bpsk() {
     const Sample points[2] = {{-1, 0}, {1, 0}};
@@ -103,6 +171,7 @@ class Ofdm final : public Modem {
           window_(symbol_ - p.size / 2),
           back_(p.prefix / 4),
           used_(p.carrier_count),
+          wide_((p.carrier_count + kLanes - 1) / kLanes * kLanes),
           carriers_(copied(p.carriers, p.carrier_count)),
           pilots_(copied(p.pilots, p.pilot_count)),
           once_(copied(p.once, p.once_count)),
@@ -112,8 +181,6 @@ class Ofdm final : public Modem {
           known_(copied(p.known, used_)),
           turns_(copied(p.turns, static_cast<size_t>(p.shift_count) * p.size)),
           whole_(copied(p.whole, 2 * p.size)),
-          smooth_(copied(p.smooth, static_cast<size_t>(used_) * used_)),
-          smooth_words_(copied(p.smooth_words, static_cast<size_t>(used_) * used_)),
           crosswise_(copied(p.crosswise, 2 * p.twice_count)),
           advances_(copied(p.advances, static_cast<size_t>(p.delay_count) * p.size)),
           headers_(copied(p.headers, static_cast<size_t>(p.mcs_count) * lengths_.count() * kWordBits)),
@@ -122,9 +189,8 @@ class Ofdm final : public Modem {
           delays_(copied(p.delays, p.delay_count)),
           weights_(copied(p.weights, static_cast<size_t>(p.fractions + 1) * p.weight_count)),
           bpsk_(bpsk()),
-          fft_(p.size),
-          roots_(kToneSize) {
-        arrange(p.data);
+          fft_(p.size) {
+        arrange(p);
         const Sample* points = p.points;
         const uint8_t* marks = p.marks;
         for (int mcs = 0; mcs < p.mcs_count; mcs++) {
@@ -138,8 +204,13 @@ class Ofdm final : public Modem {
         for (int mcs = 0; mcs < p.mcs_count; mcs++)
             longest_ = std::max(longest_, symbols({mcs, lengths_.longest()}) * symbol_);
         for (uint8_t bit : headers_) signs_.push_back(bit ? 1.0f : -1.0f);
-        for (int carrier : carriers_) bins_.push_back((carrier + p.size) % p.size);
-        for (int k = 0; k < kToneSize; k++) roots_[k] = unit(-kTau * k / kToneSize);
+        for (int carrier : carriers_) {
+            bins_.push_back((carrier + p.size) % p.size);
+            places_.push_back(kTau / p.size * carrier);
+        }
+        bins_.resize(wide_);
+        places_.resize(wide_);
+        for (int size = kLeastTone; size <= kLeastTone * std::max(p.chunk, 1); size *= 2) tones_.emplace_back(size, p.reach);
     }
 
     Search find(Samples samples) const override {
@@ -221,7 +292,7 @@ class Ofdm final : public Modem {
             const Lateness seen_late = decide(s, 0, rows, noise, points, used, 2);
             if (!(std::abs(seen_late.late) < kFar)) return kNoBurst;
             points.soft(s.seen, used, soft + static_cast<size_t>(done) * points.bits());
-            std::copy_n(s.seen.points.begin(), used, seen + done);
+            s.seen.copy(used, seen + done);
             done += used;
             clock.after(kHead + first + (rows - 1) / 2.0, seen_late);
             if (!std::isfinite(clock.begin)) return kNoBurst;
@@ -259,9 +330,10 @@ class Ofdm final : public Modem {
     }
 
    private:
-    // The used carriers with those of data first, in order: then what is done for each of them needs no index.
-    void arrange(const int32_t* data) {
-        std::vector<int32_t> order = copied(data, p_.data_count), place(used_);
+    // The used carriers with those of data first, in order: then what is done for each of them needs no index. They are
+    // filled up to a multiple of `kLanes` by carriers on which nothing is sent.
+    void arrange(const OfdmParameters& p) {
+        std::vector<int32_t> order = copied(p.data, p_.data_count), place(used_);
         for (int c = 0; c < used_; c++)
             if (std::find(order.begin(), order.end(), c) == order.end()) order.push_back(c);
         for (int k = 0; k < used_; k++) place[order[k]] = k;
@@ -273,15 +345,41 @@ class Ofdm final : public Modem {
         sort(words_);
         sort(known_);
         sort(word_weight_);
-        for (auto* matrix : {&smooth_, &smooth_words_}) {
-            const auto rows = *matrix;
+        word_weight_.resize(wide_, 1.0f);
+        split_words_.resize(static_cast<size_t>(2) * wide_);
+        split_known_.resize(wide_);
+        for (int c = 0; c < used_; c++) {
+            for (int word = 0; word < 2; word++) split_words_.set(word * wide_ + c, words_[word * used_ + c]);
+            split_known_.set(c, known_[c]);
+        }
+        const auto matrix = [&](const Sample* rows) {
+            std::vector<Sample> columns(static_cast<size_t>(used_) * used_);
             for (int column = 0; column < used_; column++)
                 for (int row = 0; row < used_; row++)
-                    (*matrix)[column * used_ + row] = rows[order[row] * used_ + order[column]];
-        }
+                    columns[column * used_ + row] = rows[order[row] * used_ + order[column]];
+            return Matrix(columns, used_, wide_);
+        };
+        smooth_ = matrix(p.smooth);
+        smooth_words_ = matrix(p.smooth_words);
         for (auto* some : {&pilots_, &once_, &twice_})
             for (int& c : *some) c = place[c];
     }
+
+    // How a phase step turns symbols, for steps a part of a turn apart.
+    struct Tones {
+        int size, reach, wide;
+        Split turns;  // symbols by steps
+
+        Tones(int size, double most)
+            : size(size),
+              reach(static_cast<int>(size * most / kTau)),
+              wide((2 * reach + kLanes) / kLanes * kLanes),
+              turns(static_cast<size_t>(size / kLeastTone) * wide) {
+            for (int k = 0; k < size / kLeastTone; k++)
+                for (int place = -reach; place <= reach; place++)
+                    turns.set(k * wide + place + reach, unit(-kTau * place * k / size));
+        }
+    };
 
     // What packets of one MCS are sent with.
     struct Mcs {
@@ -361,11 +459,11 @@ class Ofdm final : public Modem {
         for (auto* one : {&s.rotation, &s.first, &s.second, &s.profile, &s.spare}) one->resize(p_.size);
         s.powers_of.resize(half_ + 1);
         const int rows = std::max(p_.chunk, kHead);
-        for (auto* one : {&s.rows, &s.model, &s.turns}) one->resize(static_cast<size_t>(rows) * used_);
-        s.energies.resize(static_cast<size_t>(rows) * used_);
-        for (auto* one : {&s.gains, &s.before, &s.sum, &s.step, &s.known}) one->resize(used_);
-        for (auto* one : {&s.weight, &s.total}) one->resize(used_);
-        s.heights.resize(p_.size);
+        for (auto* one : {&s.rows, &s.model, &s.turns}) one->resize(static_cast<size_t>(rows) * wide_);
+        s.energies.resize(static_cast<size_t>(rows) * wide_);
+        for (auto* one : {&s.gains, &s.before, &s.sum, &s.step, &s.known, &s.taken}) one->resize(wide_);
+        for (auto* one : {&s.weight, &s.total}) one->resize(wide_);
+        s.heights.resize(std::max(p_.size, tones_.back().wide));
         s.inverse.resize(p_.data_count);
         s.sharpness.resize(p_.data_count);
         for (auto* one : {&s.tone, &s.straight}) one->resize(rows);
@@ -482,7 +580,7 @@ class Ofdm final : public Modem {
             const Sample p = mul_conj(two[k], one[k]);
             re += p.real();
             im += p.imag();
-            if (whole_[k] != Sample()) phases += p / (std::abs(p) + static_cast<float>(kTiny));
+            if (whole_[k] != Sample()) phases += p / (std::sqrt(square(p)) + static_cast<float>(kTiny));
         }
         const double angle = std::atan2(im, re);
         const Sample straight = unit(-angle);
@@ -550,68 +648,67 @@ class Ofdm final : public Modem {
         Rotation(0, -frequency).fill(s.rotation.data(), p_.size);
         Rotation(-frequency * static_cast<double>(first), -frequency * symbol_).fill(s.straight.data(), count);
         const float scale = 1.0f / p_.size;
-        const double late = clock.begin + clock.pace * symbol - static_cast<double>(base);
-        const bool moved = late != 0 || clock.pace != 0;
-        if (moved) {
-            advance(late, s, s.step.data());
-            advance(clock.pace, s, s.known.data());
-        }
+        advance(clock.begin + clock.pace * symbol - static_cast<double>(base), s, s.step);
+        advance(clock.pace, s, s.known);
         for (int row = 0; row < count; row++) {
             const int64_t at = first + static_cast<int64_t>(row) * symbol_;
             const int have = static_cast<int>(std::max<int64_t>(0, std::min<int64_t>(p_.size, samples.count - at)));
-            const Sample start = s.straight[row] * scale, *in = samples.at + at, *turned = s.rotation.data();
-            Sample* __restrict body = s.first.data();
-            Sample* __restrict out = &s.rows[static_cast<size_t>(row) * used_];
-            for (int k = 0; k < have; k++) body[k] = mul(in[k], turned[k]);
+            Sample* body = s.first.data();
+            products(samples.at + at, s.rotation.data(), have, body);
             std::fill(body + have, body + p_.size, Sample());
-            fft_.run(body, s.spare.data());
-            for (int c = 0; c < used_; c++) out[c] = mul(body[bins_[c]], start);
-            for (int c = 0; moved && c < used_; c++) {
-                out[c] = mul(out[c], s.step[c]);
-                s.step[c] = mul(s.step[c], s.known[c]);
+            const Sample* found = fft_.result(body, s.spare.data());
+            const Sample start = s.straight[row] * scale;
+            for (int c = 0; c < wide_; c++) s.taken.set(c, found[bins_[c]]);
+            for (int c = 0; c < wide_; c += kLanes) {
+                const Group step = s.step.group(c);
+                s.rows.set(row * wide_ + c, s.taken.group(c).times(step.times(start)));
+                s.step.set(c, step.times(s.known.group(c)));
             }
         }
     }
 
     // What brings carriers forward by a fraction of a sample, or some.
-    void advance(double samples, Scratch& s, Sample* out) const {
+    void advance(double samples, Scratch& s, Split& out) const {
         Rotation(0, kTau / p_.size * samples).fill(s.powers_of.data(), half_ + 1);
         for (int c = 0; c < used_; c++) {
             const Sample turned = s.powers_of[std::abs(carriers_[c])];
-            out[c] = carriers_[c] < 0 ? std::conj(turned) : turned;
+            out.re[c] = turned.real();
+            out.im[c] = carriers_[c] < 0 ? -turned.imag() : turned.imag();
         }
+        std::fill(out.re.begin() + used_, out.re.end(), 0.0f);
+        std::fill(out.im.begin() + used_, out.im.end(), 0.0f);
     }
 
     // Channel from both sync words, into `gains`; returns the noise on each carrier.
     float first_estimate(Scratch& s) const {
-        const Sample* rows = s.rows.data();
-        for (int c = 0; c < used_; c++)
-            s.sum[c] = mul_conj(rows[c], words_[c]) + mul_conj(rows[used_ + c], words_[used_ + c]);
-        matrix_times(smooth_words_.data(), s.sum.data(), s.gains.data(), used_);
+        for (int c = 0; c < wide_; c += kLanes) {
+            Group both = s.rows.group(c).times_conj(split_words_.group(c));
+            both.add(s.rows.group(wide_ + c).times_conj(split_words_.group(wide_ + c)));
+            s.sum.set(c, both);
+        }
+        smooth_words_.times(s.sum, s.gains);
         double noise = 0;
-        for (int word = 0; word < 2; word++) {
-            for (int c = 0; c < used_; c++) {
-                const int k = word * used_ + c;
-                noise += square(rows[k] - mul(s.gains[c], words_[k]));
-            }
+        for (int k = 0; k < 2 * wide_; k += kLanes) {
+            const Group expected = s.gains.group(k % wide_).times(split_words_.group(k)), seen = s.rows.group(k);
+            const Lanes re = seen.re - expected.re, im = seen.im - expected.im;
+            noise += sum(re * re + im * im);
         }
         return static_cast<float>(std::max(noise / p_.degrees, kTiny));
     }
 
     // Mean power of a burst over that of the noise in the sampled band, from both sync words.
     double signal_to_noise(const Scratch& s) const {
-        const Sample *rows = s.rows.data(), *next = rows + used_;
         double re = 0, im = 0, own = 0, empty = 0, all = 0;
         for (int k = 0; k < p_.twice_count; k++) {
-            const Sample a = mul(rows[twice_[k]], crosswise_[k]);
-            const Sample b = mul(next[twice_[k]], crosswise_[p_.twice_count + k]);
+            const Sample a = mul(s.rows.at(twice_[k]), crosswise_[k]);
+            const Sample b = mul(s.rows.at(wide_ + twice_[k]), crosswise_[p_.twice_count + k]);
             const Sample p = mul_conj(b, a);
             re += p.real();
             im += p.imag();
             own += square(a) + square(b);
         }
-        for (int c : once_) empty += square(rows[c]);
-        for (int k = 0; k < 2 * used_; k++) all += square(rows[k]);
+        for (int c : once_) empty += square(s.rows.at(c));
+        for (int k = 0; k < 2 * wide_; k++) all += square(s.rows.at(k));
         const double differ = own - 2 * std::sqrt(re * re + im * im);
         const double noise = std::max(empty + differ / p_.pair_weight, kTiny) / (used_ - 0.5);
         return (all - 2 * used_ * noise) * p_.power / (p_.word_weight_sum * noise * p_.size);
@@ -620,88 +717,80 @@ class Ofdm final : public Modem {
     // Symbols (rows from `row` on) to likelihoods of points, with a channel estimate that they have made better; returns
     // by how many samples they came late.
     Lateness decide(Scratch& s, int row, int count, float noise, const Constellation& points, int used, int rounds) const {
-        Sample* rows = &s.rows[static_cast<size_t>(row) * used_];
-        std::copy(s.gains.begin(), s.gains.end(), s.before.begin());
-        for (int i = 0; i < count; i++) {
-            float re = 0, im = 0;
-            for (int c : pilots_) {
-                const Sample p = mul_conj(rows[i * used_ + c], mul(s.gains[c], known_[c]));
-                re += p.real();
-                im += p.imag();
-            }
-            s.tone[i] = {re, im};
+        const int from = row * wide_, end = from + count * wide_;
+        s.before = s.gains;
+        for (int i = 0, at = from; at < end; i++, at += wide_) {
+            Sample all;
+            for (int c : pilots_) all += mul_conj(s.rows.at(at + c), mul(s.gains.at(c), known_[c]));
+            s.tone[i] = all;
         }
         tone(s, count);
-        for (int i = 0; i < count; i++) {
-            const Sample straight = s.straight[i];
-            for (int c = 0; c < used_; c++) rows[i * used_ + c] = mul(rows[i * used_ + c], straight);
-        }
+        for (int i = 0, at = from; at < end; i++, at += wide_)
+            for (int c = 0; c < wide_; c += kLanes) s.rows.set(at + c, s.rows.group(at + c).times(s.straight[i]));
         double late = 0, firm = kTiny;
         for (int round = 0; round < rounds; round++) {
-            weigh(s, rows, noise, points, used);
+            weigh(s, from, noise, points, used);
             points.expect(s.seen, used);
             double certain = 0, all = 0;
             model(s, count, used, &certain, &all);
-            for (int i = 0; i < count; i++) {
-                const Sample *in = rows + i * used_, *sent = &s.model[i * used_], *gains = s.gains.data();
-                Sample* __restrict out = &s.turns[i * used_];
-                float re = 0, im = 0;
-                for (int c = 0; c < used_; c++) {
-                    out[c] = mul_conj(in[c], mul(gains[c], sent[c]));
-                    re += out[c].real();
-                    im += out[c].imag();
+            for (int i = 0, at = 0; i < count; i++, at += wide_) {
+                Group turned = {};
+                for (int c = 0; c < wide_; c += kLanes) {
+                    const Group expected = s.gains.group(c).times(s.model.group(at + c));
+                    const Group turn = s.rows.group(from + at + c).times_conj(expected);
+                    s.turns.set(at + c, turn);
+                    turned.add(turn);
                 }
-                s.tone[i] = {re, im};
+                s.tone[i] = {sum(turned.re), sum(turned.im)};
             }
             tone(s, count);
             const double more = lateness(s, count, &firm);
             late += more;
-            advance(more, s, s.step.data());
-            for (int c = 0; c < used_; c++) {
-                s.total[c] = std::min(s.weight[c], static_cast<float>(p_.memory));
-                s.sum[c] = s.before[c] * s.total[c];
-            }
-            for (int i = 0; i < count; i++) {
-                Sample *__restrict in = rows + i * used_, *__restrict sum = s.sum.data();
-                const Sample *sent = &s.model[i * used_], *step = s.step.data(), straight = s.straight[i];
-                const float* energies = &s.energies[i * used_];
-                float* __restrict total = s.total.data();
-                for (int c = 0; c < used_; c++) {
-                    in[c] = mul(mul(in[c], straight), step[c]);
-                    sum[c] += mul_conj(in[c], sent[c]);
-                    total[c] += energies[c];
+            advance(more, s, s.step);
+            for (int c = 0; c < wide_; c += kLanes) {
+                const Lanes weight = lanes(&s.weight[c]), most = Lanes{} + static_cast<float>(p_.memory);
+                Lanes total = weight < most ? weight : most;
+                const Group before = s.before.group(c), step = s.step.group(c);
+                Group all_seen = {before.re * total, before.im * total};
+                for (int i = 0, at = c; i < count; i++, at += wide_) {
+                    const Group seen = s.rows.group(from + at).times(step.times(s.straight[i]));
+                    s.rows.set(from + at, seen);
+                    all_seen.add(seen.times_conj(s.model.group(at)));
+                    total += lanes(&s.energies[at]);
                 }
+                s.sum.set(c, Group{all_seen.re / total, all_seen.im / total});
+                put(total, &s.total[c]);
             }
-            for (int c = 0; c < used_; c++) s.sum[c] /= s.total[c];
-            matrix_times(smooth_.data(), s.sum.data(), s.gains.data(), used_);
+            smooth_.times(s.sum, s.gains);
             if (certain > (1 - p_.doubt) * all) break;
         }
         std::swap(s.weight, s.total);
-        weigh(s, rows, noise, points, used);
+        weigh(s, from, noise, points, used);
         return {late, noise / (2 * firm) + p_.unsteady};
     }
 
     // What was sent, as far as is known: pilots, and what the points that were received are expected to be.
     void model(Scratch& s, int count, int used, double* certain, double* all) const {
         for (int i = 0; i < count; i++) {
-            Sample* __restrict sent = &s.model[i * used_];
-            float* __restrict energies = &s.energies[i * used_];
-            std::copy(known_.begin(), known_.end(), sent);
-            std::fill_n(energies, used_, 1.0f);
-            const int first = i * p_.data_count, here = std::max(0, std::min(p_.data_count, used - first));
-            const float *real = &s.seen.means[0][first], *imag = &s.seen.means[1][first];
-            const float *one = &s.seen.squares[0][first], *other = &s.seen.squares[1][first];
+            const int at = i * wide_, first = i * p_.data_count, here = std::max(0, std::min(p_.data_count, used - first));
             float squares = 0, powers = 0;
+            const auto put_data = [&](const std::vector<float>& means, std::vector<float>& out) {
+                std::copy_n(&means[first], here, &out[at]);
+                std::fill_n(&out[at + here], p_.data_count - here, 0.0f);
+                for (int d = 0; d < here; d++) squares += means[first + d] * means[first + d];
+            };
+            put_data(s.seen.means[0], s.model.re);
+            put_data(s.seen.means[1], s.model.im);
+            const float *one = &s.seen.squares[0][first], *other = &s.seen.squares[1][first];
+            float* __restrict energies = &s.energies[at];
             for (int d = 0; d < here; d++) {
-                const float re = real[d], im = imag[d], power = one[d] + other[d];
-                sent[d] = {re, im};
-                energies[d] = power;
-                squares += re * re + im * im;
-                powers += power;
+                energies[d] = one[d] + other[d];
+                powers += energies[d];
             }
-            for (int d = here; d < p_.data_count; d++) {
-                sent[d] = Sample();
-                energies[d] = 0;
+            std::fill(energies + here, energies + p_.data_count, 0.0f);
+            for (int c = p_.data_count; c < wide_; c++) {
+                s.model.set(at + c, split_known_.at(c));
+                energies[c] = 1;
             }
             *certain += squares;
             *all += powers;
@@ -709,25 +798,23 @@ class Ofdm final : public Modem {
     }
 
     // Points as received, and how sharp each is.
-    void weigh(Scratch& s, const Sample* rows, float noise, const Constellation& points, int used) const {
+    void weigh(Scratch& s, int at, float noise, const Constellation& points, int used) const {
+        const float sharpest = kSmallestNoise * points.power(), *gains_re = s.gains.re.data(), *gains_im = s.gains.im.data();
+        float *__restrict by_re = s.inverse.re.data(), *__restrict by_im = s.inverse.im.data();
+        float* __restrict sharpness = s.sharpness.data();
         for (int d = 0; d < p_.data_count; d++) {
-            const Sample gain = s.gains[d];
-            const float power = square(gain) + static_cast<float>(kTiny);
-            s.inverse[d] = std::conj(gain) / power;
-            s.sharpness[d] = 1.0f / std::max(noise / power, kSmallestNoise * points.power());
+            const float inverse = 1.0f / (gains_re[d] * gains_re[d] + gains_im[d] * gains_im[d] + static_cast<float>(kTiny));
+            by_re[d] = gains_re[d] * inverse;
+            by_im[d] = -gains_im[d] * inverse;
+            sharpness[d] = 1.0f / std::max(noise * inverse, sharpest);
         }
-        for (int first = 0; first < used; first += p_.data_count, rows += used_) {
+        for (int first = 0; first < used; first += p_.data_count, at += wide_) {
+            const float *rows_re = &s.rows.re[at], *rows_im = &s.rows.im[at];
             const int here = std::min(p_.data_count, used - first);
-            const Sample *in = rows, *inverse = s.inverse.data();
-            Sample* __restrict point = &s.seen.points[first];
             float *__restrict real = &s.seen.parts[0][first], *__restrict imag = &s.seen.parts[1][first];
             for (int d = 0; d < here; d++) {
-                const float a = in[d].real(), b = in[d].imag(), c = inverse[d].real(), e = inverse[d].imag();
-                real[d] = a * c - b * e;
-                imag[d] = a * e + b * c;
-            }
-            for (int d = 0; d < here; d++) {
-                point[d] = {real[d], imag[d]};
+                real[d] = rows_re[d] * by_re[d] - rows_im[d] * by_im[d];
+                imag[d] = rows_re[d] * by_im[d] + rows_im[d] * by_re[d];
             }
             std::copy_n(s.sharpness.begin(), here, &s.seen.sharpness[first]);
         }
@@ -737,19 +824,17 @@ class Ofdm final : public Modem {
     // What straightens symbols of which each is turned further than the one before by the same angle: from `tone` into
     // `straight`.
     void tone(Scratch& s, int count) const {
-        int size = 8;
-        while (size < 8 * count) size *= 2;
-        const int reach = static_cast<int>(size * p_.reach / kTau), stride = kToneSize / size;
-        float heights[kToneSize / 4];
-        for (int place = -reach; place <= reach; place++) {
-            float re = 0, im = 0;
-            for (int k = 0; k < count; k++) {
-                const Sample p = mul(s.tone[k], roots_[static_cast<unsigned>(place * k * stride) & (kToneSize - 1)]);
-                re += p.real();
-                im += p.imag();
-            }
-            heights[place + reach] = std::sqrt(re * re + im * im);
+        int row = 0;
+        while (1 << row < count) row++;
+        const Tones& tones = tones_[row];
+        const int reach = tones.reach, size = tones.size;
+        float* const heights = s.heights.data();
+        for (int place = 0; place < tones.wide; place += kLanes) {
+            Group all = {};
+            for (int k = 0; k < count; k++) all.add(tones.turns.group(k * tones.wide + place).times(s.tone[k]));
+            put(all.re * all.re + all.im * all.im, heights + place);
         }
+        for (int place = 0; place < 2 * reach + 1; place++) heights[place] = std::sqrt(heights[place]);
         const int best = argmax(heights, 2 * reach + 1);
         double exact = best - reach;
         if (best > 0 && best < 2 * reach) {
@@ -770,16 +855,15 @@ class Ofdm final : public Modem {
 
     // Samples by which symbols come late, from by how little their carriers are turned.
     double lateness(Scratch& s, int count, double* firm) const {
-        std::fill(s.known.begin(), s.known.end(), Sample());
-        for (int i = 0; i < count; i++) {
-            const Sample *turns = &s.turns[i * used_], straight = s.straight[i];
-            for (int c = 0; c < used_; c++) s.known[c] += mul(straight, turns[c]);
-        }
         double top = 0, bottom = 0;
-        for (int c = 0; c < used_; c++) {
-            const double place = kTau / p_.size * carriers_[c];
-            top += place * s.known[c].imag();
-            bottom += place * place * std::abs(s.known[c].real());
+        for (int c = 0; c < wide_; c += kLanes) {
+            Group all = {};
+            for (int i = 0; i < count; i++) all.add(s.turns.group(i * wide_ + c).times(s.straight[i]));
+            for (int k = 0; k < kLanes; k++) {
+                const double place = places_[c + k];
+                top += place * all.im[k];
+                bottom += place * place * std::abs(all.re[k]);
+            }
         }
         *firm = std::max(bottom, kTiny);
         return -top / *firm;
@@ -787,16 +871,19 @@ class Ofdm final : public Modem {
 
     OfdmParameters p_;  // its numbers; arrays are copied below
     Lengths lengths_;   // of the first MCS
-    int symbol_, half_, window_, back_, used_, most_points_ = 0, longest_ = 0;
+    int symbol_, half_, window_, back_, used_, wide_, most_points_ = 0, longest_ = 0;
     std::vector<int32_t> carriers_, pilots_, once_, twice_, shifts_, bins_;
-    std::vector<Sample> words_, known_, turns_, whole_, smooth_, smooth_words_, crosswise_, advances_;
+    std::vector<Sample> words_, known_, turns_, whole_, crosswise_, advances_;
+    Split split_words_, split_known_;  // with the carriers that fill up
+    Matrix smooth_, smooth_words_;
+    std::vector<double> places_;       // phase by which a sample turns each carrier
+    std::vector<Tones> tones_;         // for 1, 2, 4, ... symbols
     std::vector<uint8_t> headers_, header_mask_;
     std::vector<float> signs_;
     std::vector<float> word_weight_, delays_, weights_;
     std::vector<Mcs> rates_;
     Constellation bpsk_;
     Fft fft_;
-    std::vector<Sample> roots_;
 };
 
 }  // namespace
