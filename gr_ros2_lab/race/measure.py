@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import ceil
 from typing import Literal
 
 import numpy as np
@@ -21,7 +22,7 @@ from gr_ros2.settings.registry import Registry
 from gr_ros2_lab.race.contenders import Races
 from gr_ros2_lab.race.links import LinkLog, LinkReport
 from gr_ros2_lab.race.race_settings import RaceRecording
-from gr_ros2_lab.record.metrics import Age, age
+from gr_ros2_lab.record.metrics import Age, age, age_quantile
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,9 @@ class RaceCell:
     :param discovery_bytes: bytes of all frames before the first message
     :param first_message: time from joining the network to the first delivery
     :param robots: 2 and more on one channel: all numbers are those of all pairs; None for a talker and a listener
+    :param latency_p99_of_sent: what 99 % of the messages sent are not later than, where one that is lost never comes;
+        None where more than 1 % are lost
+    :param age_p95: what the age does not exceed for 95 % of the time; of a team the mean of all pairs
     :param age_peak: the highest age of any pair
     :param all_heard: time from the last robot's joining until every robot has a message of every other one
     :param drops: frames and messages that were dropped on the way, by name
@@ -65,6 +69,8 @@ class RaceCell:
     drops: dict[str, int]
     busy: float
     robots: int | None = None
+    latency_p99_of_sent: float | None = None
+    age_p95: float | None = None
     age_peak: float | None = None
     all_heard: float | None = None
 
@@ -95,8 +101,10 @@ COLUMNS = {
     "pdr": Column("PDR", "most", "{:.3f}".format),
     "latency_p50": Column("latency p50 [ms]", "least", _ms),
     "latency_p99": Column("latency p99 [ms]", "least", _ms),
+    "latency_p99_of_sent": Column("p99 of sent [ms]", "least", _ms),
     "age_mean": Column("age mean [ms]", "least", _ms),
-    "age_peak": Column("age peak [ms]", "least", _ms, ("team",)),
+    "age_p95": Column("age p95 [ms]", "least", _ms),
+    "age_peak": Column("age peak [ms]", "least", _ms),
     "airtime_per_message": Column("airtime /msg [ms]", "least", _ms, ("two",)),
     "air_bytes_per_message": Column("air bytes /msg", "least", _whole),
     "discovery_bytes": Column("discovery bytes", "least", _whole),
@@ -184,6 +192,7 @@ def measure(
     altered = duplicates = sent = 0
     latencies: list[Floats] = []
     ages: list[Age] = []
+    p95s: list[float] = []
     firsts: list[float] = []
     for stream in seen.streams:
         t_sent = np.array(stream.t_sent)
@@ -202,9 +211,13 @@ def measure(
         if done.any():
             firsts.append(float(t_delivered[done].min()) - seen.began)
         found = age(t_sent[done], t_delivered[done], float(t_sent[-1])) if len(t_sent) else None
-        ages += [] if found is None else [found]
+        if found is not None:
+            ages.append(found)
+            p95s.append(age_quantile(t_sent[done], t_delivered[done], float(t_sent[-1]), 0.95) or 0.0)
     delivered = sum(map(len, latencies))
-    times = latency(np.sort(np.concatenate(latencies)))
+    arrived = np.sort(np.concatenate(latencies))
+    times = latency(arrived)
+    last_of_99 = ceil(0.99 * sent) - 1
     first = min((stream.t_sent[0] for stream in seen.streams if len(stream.t_sent)), default=np.inf)
     logs = (seen.air.forward, seen.air.reverse)
     before, _ = _traffic(logs, -np.inf, first)
@@ -232,6 +245,8 @@ def measure(
         drops={name: count for name, count in seen.air.drops.items() if count},
         busy=seen.busy,
         robots=robots,
+        latency_p99_of_sent=float(arrived[last_of_99]) if 0 <= last_of_99 < delivered else None,
+        age_p95=sum(p95s) / len(p95s) if p95s else None,
         age_peak=max((found.peak for found in ages), default=None),
         all_heard=max(firsts) if len(firsts) == len(seen.streams) else None,
     )

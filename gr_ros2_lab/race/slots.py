@@ -25,9 +25,10 @@ from gr_ros2_lab.run.load import make_phy
 from gr_ros2_lab.run.scenario import Scenario, scenario_from
 from gr_ros2_lab.run.simulate import Offered, Simulation
 
-HOST_S = LEAD_S + 0.0035
+HOST_S = LEAD_S + 0.002
 """s that are added to each delivery: a link composes a packet so long before its slot; and what two hops over DDS and
-Python add to the airtime in the race of two robots (docs/explanation/race.md: 5.1 ms in the median, 1.7 ms of airtime).
+Python add to the airtime in the race of two robots (``race --peers gr-ros2 --loss 0``: 3.7 ms in the median, 1.7 ms of
+airtime; 8.1 ms and 6.7 ms at a load of 200 %).
 """
 _TOPIC = "race"
 _QUIET_S = 3.0

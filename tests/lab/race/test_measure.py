@@ -55,7 +55,10 @@ def test_every_number_of_a_cell() -> None:
         "latency_p50": pytest.approx(0.5),
         "latency_p99": pytest.approx(0.25 + 0.99 * 0.5),
         # From 10.25 on the newest is that of 10, from 12.75 on that of 12, until the last was sent at 13.
+        "latency_p99_of_sent": None,
         "age_mean": pytest.approx((2.5 * (0.25 + 2.75) / 2 + 0.25 * (0.75 + 1.0) / 2) / 2.75),
+        "age_p95": pytest.approx(0.95 * 2.75),
+        "age_peak": pytest.approx(2.75),
         "airtime_per_message": pytest.approx(0.105 / 2),
         "air_bytes_per_message": pytest.approx(1050 / 2),
         "air_bytes_reverse": pytest.approx(50 / 1050),
@@ -64,6 +67,12 @@ def test_every_number_of_a_cell() -> None:
         "drops": {"on_air": 2},
     }
     assert {name: getattr(found, name) for name in expected} == expected
+
+
+def test_a_message_that_is_lost_is_later_than_all_others() -> None:
+    heard = [(10.25, text(0)), (11.5, text(1)), (12.125, text(2)), (13.75, text(3))]
+    assert measured(observed(heard)).latency_p99_of_sent == pytest.approx(0.75)  # type: ignore[attr-defined]
+    assert measured(observed(heard[:3])).latency_p99_of_sent is None  # type: ignore[attr-defined]
 
 
 def test_a_team_has_the_numbers_of_all_its_pairs() -> None:
@@ -75,6 +84,7 @@ def test_a_team_has_the_numbers_of_all_its_pairs() -> None:
         "delivered": 4,
         "pdr": 0.5,
         "age_mean": pytest.approx(((2.5 * 1.5 + 0.25 * 0.875) / 2.75 + 1.25) / 2),
+        "age_p95": pytest.approx((0.95 * 2.75 + 0.5 + 0.95 * 1.5) / 2),
         "age_peak": pytest.approx(2.75),
         "first_message": pytest.approx(1.25),
         "all_heard": pytest.approx(2.5),

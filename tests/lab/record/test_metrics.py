@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gr_ros2.observe.latency import latency, latency_cdf
 from gr_ros2_lab.record.ledger import TopicLedger
-from gr_ros2_lab.record.metrics import age, topic_metrics
+from gr_ros2_lab.record.metrics import age, age_quantile, age_sawtooth, topic_metrics
 
 
 def test_nothing_sent_has_no_numbers() -> None:
@@ -86,3 +86,17 @@ def test_age_agrees_with_watching_it(messages: list[tuple[float, float]], t_end:
     slack = 100 * step * len(messages) * 120 / (t_end - start) + 200 * step
     assert abs(found.mean - ages.mean()) <= slack
     assert found.peak >= found.mean >= 0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_age_that_is_not_exceeded_for_a_share_of_the_time(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    sent = np.sort(draw.uniform(0, 10, 20))
+    delivered = sent + draw.exponential(0.4, 20)
+    start, until, newest = age_sawtooth(sent, delivered, 11.0)
+    times = np.linspace(start[0], until[-1], 200_001)
+    ages = times - newest[np.searchsorted(start, times, "right") - 1]
+    for share in (0.0, 0.05, 0.5, 0.95, 1.0):
+        found = age_quantile(sent, delivered, 11.0, share)
+        assert found == pytest.approx(np.quantile(ages, share), abs=2e-4)
+    assert age_quantile(sent[:0], delivered[:0], 11.0, 0.95) is None
