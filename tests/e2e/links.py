@@ -38,14 +38,21 @@ class LinkProcess(Spoken):
         return status, out.getvalue() + err.getvalue()
 
     def status(self) -> Any:
-        """What it counts; {} before it answers."""
-        assert self.process.poll() is None, "\n".join(self.said)
-        status, said = self.ask("status", "--json")
-        return {} if status else json.loads(said)
+        """What it counts, once it answers: a link that starts does not, nor one that gets no processor for seconds."""
+        answers: list[str] = []
+
+        def answered() -> bool:
+            assert self.process.poll() is None, "\n".join(self.said)
+            status, said = self.ask("status", "--json")
+            answers.append(said)
+            return status == 0
+
+        wait_for(answered, "the link to answer")
+        return json.loads(answers[-1])
 
     def heard(self) -> dict[int, Any]:
         """The robots that it hears."""
-        return {peer["robot"]: peer for peer in self.status().get("peers", ())}
+        return {peer["robot"]: peer for peer in self.status()["peers"]}
 
     def transmit(self, *, on: bool) -> None:
         """Switch its sending off, as in an outage, or on again."""

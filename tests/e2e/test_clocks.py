@@ -80,9 +80,8 @@ def test_a_computer_whose_clock_is_wrong_is_taken_into_account(tmp_path: Path) -
         assert any(line.startswith("this computer's clock was set 30 s forward") for line in one.status()["findings"])
         assert close_to(clock(one), ahead_s - 90)
 
-        assert got(two), "robot 2 asks nobody, and publishes stamps as they are"
+        assert got(two), "robot 2 publishes stamps as they are"
         assert all(abs(stamp - true) <= ADJUSTED_S for true, stamp in got(two) if stamp < true + 10)
-        assert clock(two) is None
         assert one.end() == 0
         assert "clock of robot 2 3,510," in one.said[-1]
 

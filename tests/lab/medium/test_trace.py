@@ -131,6 +131,7 @@ def test_levels_follow_the_trace(tmp_path: Path, time: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 @pytest.mark.parametrize("measured", ["loss", "snr_db", "capacity"])
 def test_traces_act_in_real_time_as_in_simulated_time(tmp_path: Path, measured: str) -> None:
     """Good for the first of each two seconds; with a capacity, one opportunity each 130 ms."""
