@@ -208,7 +208,9 @@ class RepairDecoder:
         """Take the pivots out of each other's equations; return the packets that this determines.
 
         A repair that follows from the equations may name packets that they determine together, while none does so
-        alone: those of which older packets are not worth a repair any more, for instance.
+        alone: those of which older packets are not worth a repair any more, for instance. No equation reaches further
+        afterwards. The next repairs of few packets would otherwise replace such an equation again and again, and never
+        become as many as these packets, where the equations behind reach too far to be taken out.
         """
         equations, room = self._equations, self._room
         if not self._grown or len(equations) > MAX_WINDOW:
@@ -223,20 +225,20 @@ class RepairDecoder:
             before = left
             for other in pivots[index + 1 :]:
                 shift = other - pivot
-                if shift >= len(coefficients):
+                if left >> shift * 8 == 0:
                     break
                 factor = left >> shift * 8 & 255
                 if not factor or other not in equations or shift + len(equations[other][0]) > MAX_WINDOW:
                     continue
                 more, side = (int.from_bytes(held.translate(TIMES[factor]), "little") for held in equations[other])
                 left, right = left ^ more << shift * 8, right ^ side
+            size = (left.bit_length() + 7) >> 3
             if left == 1:
                 del equations[pivot]
                 found += self._accept(pivot, right.to_bytes(room, "little"))
                 if not equations:
                     break
-            elif left != before:
-                size = (left.bit_length() + 7) >> 3
+            elif left != before and size <= len(coefficients):
                 equations[pivot] = (left.to_bytes(size, "little"), right.to_bytes(room, "little"))
         return found
 

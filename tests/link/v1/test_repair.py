@@ -118,6 +118,25 @@ def test_packets_that_are_still_worth_it_are_recovered_without_the_others(count:
     assert found >= set(some)
 
 
+@pytest.mark.parametrize("seed", [41, 61, 140, 146, 258])
+def test_as_many_repairs_as_packets_bring_them_whatever_wider_ones_came_between(seed: int) -> None:
+    """Wider repairs, which together reach further than one equation may, tell too little for any packet."""
+    rng, receiver = random.Random(seed), decoder()
+    some = range(1, rng.randint(5, 50))
+    wide = [range(first, first + MAX_WINDOW) for first in (1, rng.randint(20, 80), rng.randint(80, 140))]
+    repairs = [some] * (len(some) + rng.randint(0, 20))
+    for numbers in wide:
+        repairs += [numbers] * rng.randint(1, 60)
+    rng.shuffle(repairs)
+    used = dict.fromkeys((numbers[-1] for numbers in repairs), -1)
+    found: set[int] = set()
+    for numbers in repairs:
+        used[numbers[-1]] += 1
+        combined = combine([(number, body(number)) for number in numbers], used[numbers[-1]])
+        found |= known(receiver.repair(numbers[-1], (1 << len(numbers)) - 1, used[numbers[-1]], combined))
+    assert found >= set(some)
+
+
 def test_memory_is_bounded() -> None:
     receiver = decoder(span=100)
     for number in range(0, 5000, 2):
