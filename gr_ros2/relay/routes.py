@@ -51,6 +51,10 @@ class Routes:
         """s for which a distance counts."""
         return STALE_S * self._slower()
 
+    def known(self, robot: int) -> bool:
+        """Whether a way to a robot was ever known."""
+        return robot in self._ways
+
     def doubt(self, robot: int, via: int, now: float) -> None:
         """What was handed to ``via`` for ``robot`` has not arrived."""
         self._doubted[robot, via] = now + DOUBT_S

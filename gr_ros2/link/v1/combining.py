@@ -124,7 +124,8 @@ class Combining:
         """The window, changed so that a repair can stand at its newest packet.
 
         A later packet is added with all live ones before it, because a receiver takes what a repair leaves out for
-        packets that are not repaired any more; or the newest packets of the window are left out.
+        packets that are not repaired any more, and what it names beside holes for packets that are still of use; or the
+        newest packets of the window are left out.
         """
         packets = self._packets
         newest = window[0].number
@@ -132,6 +133,7 @@ class Combining:
             return window
         numbers = range(max(newest, proven) + 1, min(packets.newest, window[-1].number + MAX_WINDOW - 1) + 1)
         later = [packets.records[number] for number in numbers if number in packets.records]
+        later = [record for record in later if record.alive(now) or not record.lifetimes]
         for record in sorted(later, key=lambda record: not record.lasts(now)):
             if not record.skipped and not packets.full(record.number):
                 return [record, *packets.live(newest + 1, record.number - 1, now)[::-1], *window]

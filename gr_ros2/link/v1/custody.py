@@ -170,8 +170,6 @@ class Custody:
         """By robot, and by its start and topic: what it is to be told."""
         self._arrivals = deque[float]((0.0,), maxlen=_ARRIVALS)
         """How long own messages took until it was known that they had come, s."""
-        self._reached: set[int] = set()
-        """Robots to which a way was known once."""
         self._bytes = self._place = 0
 
     def __len__(self) -> int:
@@ -224,20 +222,14 @@ class Custody:
             for message in [waiting for waiting in queue if not waiting.started]:
                 assert isinstance(message, Message)
                 robot = message.dst_id
-                if robot == BROADCAST or robot in full or not self._is_reached(robot, now):
-                    continue
+                if robot == BROADCAST or robot in full or not self.routes.known(robot):
+                    continue  # what is for a robot that was never reached is sent once, to whoever hears it
                 if self._is_full(message):
                     queue.closed = True
                     full.add(robot)
                 else:
                     queue.remove(message)
                     self._submit(message, now)
-
-    def _is_reached(self, robot: int, now: float) -> bool:
-        """Whether a way to a robot is known, or was; what is for any other is sent once, to whoever hears it."""
-        if robot not in self._reached and self._way(robot, self._src_id, now, now) is not None:
-            self._reached.add(robot)
-        return robot in self._reached
 
     def _is_full(self, message: Message) -> bool:
         stream = message.topic_id, message.dst_id

@@ -7,6 +7,7 @@ Invariants: no packet is taken twice; memory is bounded.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from math import inf
 from typing import NamedTuple
@@ -30,6 +31,8 @@ from gr_ros2.wire.v1 import SPAN, TABLE_TOPIC, EntryV1, read_body
 _PACKET_COST, _EQUATION_COST = 350, 430
 """Bytes beside the body that a packet held and an equation take (``sys.getsizeof`` and their share of dictionaries that
 have just grown, and of what is noted of missing packets)."""
+_NAMED = 64
+"""Newest repairs of which it is remembered that all packets that they name were of use when they left."""
 _ROBOT_COST = 1_200_000
 """Bytes that a robot takes beside its packets and messages, at most: numbers of its packets and repairs, messages that
 may come again, packets that cannot be opened yet. A share of a small memory."""
@@ -147,6 +150,8 @@ class Inbox:
             control=control,
             relaying=relaying,
         )
+        self._named: deque[tuple[int, int]] = deque(maxlen=_NAMED)
+        """Number and mask of these."""
         self._now = 0.0
         self._takes = False
         """Whether packets are taken that are known at once. The decoder has all of them from the first one on: whoever
@@ -216,6 +221,8 @@ class Inbox:
         window = mask.bit_length()
         if oldest:
             self.order.repaired_from(number - window + 1)
+        if mask + 1 != 1 << window or window == 1 or len(combined) + (window + 7) // 8 <= self._room:
+            self._named.append((number, mask))
         redundant = self.decoder.counts["redundant"]
         self._takes = True
         try:
@@ -228,6 +235,11 @@ class Inbox:
         if mask + 1 != 1 << window:
             self.order.left_out(number, mask)
         self._settle()
+
+    def _of_use(self, number: int) -> bool:
+        """Whether a packet was of use when a repair of it left, as one shows whose mask leaves nothing out but what is
+        not. Where a mask does not fit beside the bodies, a repair has all packets of its span, however old."""
+        return any(newest >= number and mask >> newest - number & 1 for newest, mask in self._named)
 
     def heard(self, number: int, now: float, *, over: bool = False) -> None:
         """Note the number at which a packet stands that is neither a source packet nor a repair.
@@ -323,7 +335,7 @@ class Inbox:
     def _recovered(self, found: tuple[int, bytes]) -> None:
         number, body = found
         entries = read_body(body, self._room)
-        self.messages.take(number, entries, -1, self._now, self.began, repaired=True)
+        self.messages.take(number, entries, -1, self._now, self.began, repaired=True, of_use=self._of_use)
 
     def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""

@@ -71,6 +71,8 @@ class RepairWindow:
         self.peers = Peers(self.packets, self._unreported, self._shared, slower=slower)
         self.thrift = Thrift(self.packets, self.peers)
         self._combining = Combining(self.packets, room)
+        self._no_place = False
+        """Whether the last combination could stand at no packet."""
 
     def sent(self, number: int, body: bytes, lifetimes: tuple[Lifetime, ...], now: float, *, skipped: int = 0) -> None:
         """A source packet left.
@@ -172,6 +174,8 @@ class RepairWindow:
         spans = bool(window) and window[0].number >= number >= window[-1].number
         record = packets.records.get(number)
         if record is not None and (not spans or self.peers.replayed(number)):
+            if not record.alive(now):  # it would be taken for one that is of use
+                return self._left_out(number, now)
             window = [record]
         return self._combination(window, now) if window else None
 
@@ -179,7 +183,8 @@ class RepairWindow:
         """The lifetimes of the newest live packet, if no further repair can stand at the newest number and something is
         alive; otherwise (). A packet with these lifetimes and no content makes room for repairs."""
         packets = self.packets
-        if packets.full(packets.newest) or packets.newest <= self.peers.proven:
+        if self._no_place or packets.full(packets.newest) or packets.newest <= self.peers.proven:
+            self._no_place = False
             for number in range(packets.newest, packets.needed - 1, -1):
                 record = packets.records.get(number)
                 if record is not None and record.alive(now):
@@ -246,6 +251,7 @@ class RepairWindow:
 
     def _combination(self, window: list[Sent], now: float) -> Repair | None:
         found = self._combining.combine(window, self.peers.provens, now)
+        self._no_place = found is None
         if found is None:
             return None
         repair, combined = found

@@ -119,6 +119,26 @@ def test_what_repair_brings_too_late_is_dropped_by_the_receiver_and_has_a_row(fo
     assert receiver.end.received.lost[1, 0, "late"] == follows
 
 
+def test_a_command_that_only_fills_a_repair_counts_from_the_packet_before_it() -> None:
+    """Where packets are full, a repair has no room to say which of its span it leaves out: it has all of them, and so
+    also a command between the parts of a text, however old that is."""
+    topics = Registry([Topic(0, "cmd_vel", TWIST), Topic(1, "text", "std_msgs/msg/String")])
+    sender, receiver = Robot(1, topics, hears=False, expected_loss=0.6), Robot(2)
+    air, texts = Air(sender, receiver), [b"a" * 150, b"b" * 150]
+    air.run(3.0)
+    air.lost = lambda _, __: True
+    for text in texts:
+        sender.end.messages.submit(1, text, air.now)
+        air.run(4 * SLOT_S)
+        sender.end.messages.submit(0, b"go " + text[:1], air.now)
+        air.run(SLOT_S)
+    air.run(1.0)
+    air.lost = lambda _, __: False
+    air.run(2.0)
+    assert receiver.delivered() == texts
+    assert receiver.end.received.lost[1, 0, "late"]
+
+
 def test_a_robot_that_hears_nobody_sends_beacons_alone_until_it_hears_somebody() -> None:
     def packets(beacon_s: float) -> tuple[int, int]:
         lone = Robot(1, robot().topics, beacon_s=beacon_s)

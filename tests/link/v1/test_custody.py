@@ -47,6 +47,17 @@ def until(line: Line, seconds: float, condition: Any) -> None:
     assert condition()
 
 
+def test_the_first_message_waits_for_a_robot_that_was_reached_before_any_was_for_it() -> None:
+    line = line_of(robot(1, topics=named(3)), robot(2), robot(3))
+    near = line.near
+    line.near = lambda one: [other for other in near(one) if 2 not in (one, other)]  # type: ignore[method-assign]
+    line.run(30)
+    line.robots[0].end.messages.submit(1, b"goal", line.now)
+    line.run(5)
+    line.near = near  # type: ignore[method-assign]
+    until(line, 60, lambda: b"goal" in line.robots[2].delivered(1))
+
+
 @pytest.mark.parametrize("mode", ["none", "encrypt"])
 def test_goals_arrive_in_order_and_once_beside_a_map_of_many_packets(mode: SealMode) -> None:
     line = line_of(robot(1, mode, named()), *(robot(src_id, mode) for src_id in (2, 3, LAST)))

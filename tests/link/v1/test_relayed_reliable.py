@@ -327,6 +327,27 @@ def test_who_still_repairs_what_was_missing_has_its_time_again() -> None:
     assert since == [100.0, 160.0]
 
 
+def test_a_robot_that_is_heard_now_and_then_does_not_keep_messages_for_ever() -> None:
+    order = Order(
+        RepairDecoder(60, lambda _: True, 1000),
+        1,
+        1.0,
+        sure=10_000,
+        fits=lambda _: True,
+        room=60,
+        quiet_s=3.0,
+        patience_s=60.0,
+    )
+    order.wait(Ready(1, (9, 0), b"later", -1, False, False, 1, 2, after=(8, 0)), 100.0)
+    came = []
+    for now in range(120, 500, 20):
+        order.wait_anew(now)
+        came += order.settle(now)
+        if came:
+            break
+    assert 200 < now <= 420
+
+
 def test_gaps_that_nobody_fills_pass_together() -> None:
     """One after the other, each took 60 s; a message that has just come has its time all the same."""
     decoder = RepairDecoder(60, lambda _: True, 1000)
