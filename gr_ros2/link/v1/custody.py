@@ -75,6 +75,10 @@ class _Name(NamedTuple):
     dst_id: int
 
 
+def _name(message: Relayed) -> _Name:
+    return _Name(message.origin, message.start, message.topic_id, message.number, message.place, message.dst_id)
+
+
 @dataclass(slots=True, eq=False)
 class _Held:
     """A message that is kept.
@@ -117,8 +121,7 @@ class _Held:
 
     @property
     def name(self) -> _Name:
-        message = self.message
-        return _Name(message.origin, message.start, message.topic_id, message.number, message.place, message.dst_id)
+        return _name(self.message)
 
 
 class Custody:
@@ -192,12 +195,22 @@ class Custody:
         name = held.name
         if name in self._held:
             self._dropped["relayed_before"] += 1
+            self.handed_back(self._src_id, message, came, now)
         elif message.hops >= MOST_HOPS:
             self._dropped["too_many_hops"] += 1
         else:
             if name in self._passed:  # whoever took it on has lost it
                 self.routes.doubt(message.dst_id, self._passed[name], now)
             self._hold(held)
+
+    def handed_back(self, taker: int, message: Relayed, by: int, now: float) -> None:
+        """A robot hands a message on that is held here: where it hands it back, it knows no other way.
+
+        :param taker: to whom it hands it
+        """
+        held = self._held.get(_name(message))
+        if held is not None and taker == self._src_id and held.taker == by and held.last >= 0:
+            held.due = now
 
     def _hold(self, held: _Held) -> None:
         held.long = held.long or any(other.long and other.stream == held.stream for other in self._held.values())

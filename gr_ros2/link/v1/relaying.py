@@ -211,6 +211,7 @@ class Relaying:
             return
         if origin == self.src_id:
             self._dropped["relayed_before"] += 1
+            self.custody.handed_back(taker, message, via, now)
             return
         self.routes.note(origin, via, message.hops, ready.made)
         kept = ToPass(message, made, made + min(limit_s, self._limit_s(message)))

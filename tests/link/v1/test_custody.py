@@ -58,6 +58,18 @@ def test_the_first_message_waits_for_a_robot_that_was_reached_before_any_was_for
     until(line, 60, lambda: b"goal" in line.robots[2].delivered(1))
 
 
+def test_who_gets_a_message_back_does_not_wait_for_a_receipt() -> None:
+    """It was handed to a robot that knows no other way; twice as long with each try, that would take minutes."""
+    line = line_of(robot(1), robot(2, topics=named()), robot(3), robot(LAST))
+    routes = custody_of(line.robots[1]).routes
+    routes.note(LAST, 1, 2, line.now)
+    routes.doubt(LAST, 3, line.now)
+    line.robots[1].end.messages.submit(1, b"goal", line.now)
+    line.run(1)
+    assert len(custody_of(line.robots[0])) == 1
+    until(line, custody.PATIENCE_S - 5, lambda: b"goal" in line.robots[-1].delivered(2))
+
+
 @pytest.mark.parametrize("mode", ["none", "encrypt"])
 def test_goals_arrive_in_order_and_once_beside_a_map_of_many_packets(mode: SealMode) -> None:
     line = line_of(robot(1, mode, named()), *(robot(src_id, mode) for src_id in (2, 3, LAST)))
