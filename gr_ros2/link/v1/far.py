@@ -62,8 +62,8 @@ class FarRobots:
         """When that was made with which each start in ``inboxes`` began, s."""
         self._came: dict[int, float] = {}
         """When something of its present start came over others, s."""
-        self._ahead: set[int] = set()
-        """Robots of which a message came over others with a number that they had not reached themselves."""
+        self._ahead: dict[int, float] = {}
+        """When, s, a message of a robot came over others with a number that it had not reached itself."""
 
     # ---- looking
 
@@ -115,19 +115,21 @@ class FarRobots:
         if (far := self.inboxes.get(robot)) is not None:
             if far.boot == neighbour.boot:
                 neighbour.inbox.adopt(far)
-                self._ahead.add(robot)
+                self._ahead[robot] = self._came.get(robot, now)
             self.forget(robot, Fate.SENDER_RESTARTED)
         for inbox in self.inboxes.values():
             inbox.order.wait_anew(now)
 
     def overruled(self, neighbour: Neighbour, number: int) -> bool:
-        """A robot itself has reached this number: whoever has said more was wrong. Returns whether somebody may have
-        done so."""
-        robot = neighbour.src_id
+        """A robot itself has reached this number: whoever has said more was wrong, unless it may have made that after
+        this packet. Returns whether somebody may have been wrong."""
+        robot, sealed_after = neighbour.src_id, neighbour.inbox.deliveries.sealed_after
         if robot not in self._ahead or number < neighbour.inbox.newest:
             return False
+        if sealed_after is not None and sealed_after(number) < self._ahead[robot]:
+            return False
         if neighbour.inbox.overrule(number):
-            self._ahead.discard(robot)
+            del self._ahead[robot]
         return True
 
     def replaced(self, before: Neighbour, now: float) -> None:
@@ -174,7 +176,7 @@ class FarRobots:
         robot = inbox.src_id
         neighbour = self._neighbours.all.get(robot)
         if neighbour is not None and number > neighbour.inbox.newest:
-            self._ahead.add(robot)
+            self._ahead[robot] = now
         self._came[robot] = now
         self.there[robot] = max(self.there.get(robot, -inf), made)
         boot, at = self._here.get(robot, (-1, -inf))

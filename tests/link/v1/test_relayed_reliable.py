@@ -183,6 +183,30 @@ def test_a_robot_that_starts_again_takes_nothing_from_the_others() -> None:
     assert came(first, 3)[-40:] == later == came(other, 3)[-40:]
 
 
+def test_what_came_over_others_is_not_false_because_a_packet_of_its_origin_comes_late() -> None:
+    """It was held back: the messages were made after it."""
+    everybody = cell("encrypt", 0.0)
+    first, _, third = everybody.robots
+    goals = talk(everybody, 10)
+    everybody.apart = lambda one, other: {one, other} == {0, 2}
+    goals += talk(everybody, 4, after=len(goals))
+    held: list[bytes] = []
+    send = first.slot
+
+    def slot(now: float) -> bytes | None:
+        data = send(now)
+        held.extend([data] if data is not None else [])
+        return data
+
+    first.slot = slot  # type: ignore[method-assign]
+    goals += talk(everybody, 30, after=len(goals))
+    third.receive(held[3], everybody.now, everybody.now)
+    goals += talk(everybody, 20, after=len(goals))
+    rest(everybody, 30, goals)
+    assert whole(everybody, goals)
+    assert third.end.received.lost[1, 1, "damaged"] == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_what_a_third_robot_hears_comes_out_once_and_in_order(seed: int) -> None:
