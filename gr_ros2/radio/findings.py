@@ -34,6 +34,9 @@ _ENERGY = ("energy", "bursts_in")
 _NO_PACKETS = ("malformed", "too_long")
 _TUNED = re.compile(r"sends at (\S+) Hz, receives at (\S+) Hz")
 """In the text of ``about``."""
+_RADIO = re.compile(r"; radio (.+?) ([0-9a-f]{8}) (\d+)(?=;)")
+"""There too, for each of several radios: its name, a number for the settings of its PHY, and its packet_len. What is
+cut off at the end of a packet tells nothing."""
 _SAME_FREQUENCY = 1e-4
 """Relative difference below which two frequencies are the same: clocks may be 100 ppm apart."""
 
@@ -55,15 +58,25 @@ def about(config: LinkConfig, phys: Sequence[Phy], radio: OwnRadio | None = None
         }
         for phy, own in zip(phys, radios, strict=True)
     ]
-    digest = zlib.crc32(json.dumps(options if phys[1:] else options[0], sort_keys=True).encode())
+    digest = zlib.crc32(json.dumps(options, sort_keys=True).encode()) if phys[1:] else _digest(options[0])
     key = int.from_bytes(hashlib.sha256(read_key_file(config.key)[0]).digest()[:4], "big") if config.key else 0
     names = ", ".join(f"{phy.name} {phy.sample_rate:g}" if phy.has_samples else phy.name for phy in phys)
+    if phys[1:]:
+        for own, told in zip(radios, options, strict=True):
+            names += f"; radio {own.called} {_digest(told):08x} {own.packet_len}"
+        names += ";"
     front_end = radios[0].front_end_options
     sends = front_end.get("frequency")
     receives = front_end.get("frequency_rx", sends)
     tuned = "" if sends is None or phys[1:] else f", sends at {sends} Hz, receives at {receives} Hz"
     text = f"{__version__} {names}{tuned}"
     return {"packet_len": packet_len, "phy": digest, "key": key, "text": text}
+
+
+def _digest(options: Mapping[str, Any]) -> int:
+    """A number for the settings of a PHY, whatever the length of packets."""
+    told = {name: value for name, value in options.items() if name != "packet_len"}
+    return zlib.crc32(json.dumps(told, sort_keys=True).encode())
 
 
 def introduce(
@@ -114,12 +127,7 @@ def ping(live: LiveEnd[OpenEndpoint], robot: int, now: float, *, anew: bool = Fa
 
 def differences(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """What does not match between this end and another one, which has told what it is."""
-    found = []
-    if other["packet_len"] != own["packet_len"]:
-        there, here = other["packet_len"], own["packet_len"]
-        found.append(f"packet_len is {there} there and {here} here; set the same at both ends")
-    if other["phy"] != own["phy"]:
-        found.append("phy has other settings there; set the same name, sample_rate and options at both ends")
+    found = _radios_differ(own, other)
     if other["key"] != own["key"]:
         found.append(f"key {other['key']:08x} there, {own['key']:08x} here; copy one file to both ends")
     here_hz, there_hz = _TUNED.search(own["text"]), _TUNED.search(other["text"])
@@ -137,6 +145,46 @@ def differences(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     if version and not __version__.startswith(version):
         found.append(f"gr-ros2 {version} there and {__version__} here")
     return found
+
+
+_SET = "has other settings there; set the same name, sample_rate and options at both ends"
+
+
+def _radios_differ(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """What does not match between the PHYs and packets of two ends. Of several radios those of one name are compared;
+    one that only one of the ends has is not missed. One alone may be any of several."""
+    here, there = _radios(own), _radios(other)
+    if here is not None and there is not None:
+        shared = sorted(here.keys() & there.keys())
+        found = [f"phy of radio {name} {_SET}" for name in shared if here[name][0] != there[name][0]]
+        for name, other_len, own_len in (
+            ("", other["packet_len"], own["packet_len"]),
+            *((f"radio {name}: ", there[name][1], here[name][1]) for name in shared),
+        ):
+            found += _packets_differ(name, other_len, own_len)
+        return found
+    one, several = (own, there) if here is None else (other, here)
+    if several is None:
+        differ = _packets_differ("", other["packet_len"], own["packet_len"])
+        return differ + [f"phy {_SET}"] * (other["phy"] != own["phy"])
+    like = {packet_len for phy, packet_len in several.values() if phy == one["phy"]}
+    if several and not like:
+        return [f"no radio has the phy of the other end: phy {_SET}"]
+    if own["packet_len"] == other["packet_len"] or one["packet_len"] in like or not several:
+        return []
+    return _packets_differ("", other["packet_len"], own["packet_len"])
+
+
+def _packets_differ(where: str, there: int, here: int) -> list[str]:
+    return [f"{where}packet_len is {there} there and {here} here; set the same at both ends"] * (there != here)
+
+
+def _radios(end: Mapping[str, Any]) -> dict[str, tuple[int, int]] | None:
+    """Settings of the PHY and packet_len of each of several radios, as far as they are known; None for one alone."""
+    text = str(end["text"])
+    if "," not in text.partition(", sends at")[0]:
+        return None
+    return {name: (int(phy, 16), int(packet_len)) for name, phy, packet_len in _RADIO.findall(text)}
 
 
 OUTRUN = ("superseded", "queue_bound", "stale", "cannot_complete")

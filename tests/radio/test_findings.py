@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from rich.console import Console
 from gr_ros2.cli.link import _live
 from gr_ros2.cli.status import peer_table
 from gr_ros2.dashboard.monitor import RunMonitor
+from gr_ros2.radio.config import LinkConfig, link_from
 from gr_ros2.radio.findings import about, compared, differences, heard_nobody, in_words
 from gr_ros2.state.keys import new_key_file
 from tests.radio.cables import SerialCable
@@ -99,6 +101,33 @@ def test_files_are_compared_without_hearing_the_other_end(tmp_path: Path) -> Non
     found = " ".join(compared(here, wrong))
     for said in ("packet_len is 80 there", "phy has other settings", "key ", "both are robot 1"):
         assert said in found
+
+
+def test_of_several_radios_those_of_one_name_are_compared() -> None:
+    def robot(number: int, **rates: int) -> LinkConfig:
+        radios = [
+            {
+                "name": name,
+                "phy": {"name": "modem", "options": {"bit_rate": rate}},
+                "front_end": {"name": "udp", "listen": "1"},
+                **({"packet_len": 128} if name == "far away" else {}),
+            }
+            for name, rate in rates.items()
+        ]
+        values = {"radios": radios} if radios[1:] else {**radios[0], "name": "link"}
+        return link_from({"robot": number, "packet_len": 96, **values})
+
+    three = robot(1, near=1000, **{"far away": 2000}, third=3000)
+    assert compared(three, robot(2, near=1000, third=3000)) == []
+    assert compared(three, robot(2, third=3000, other=1000)) == []
+    assert compared(three, robot(2, third=3000)) == compared(robot(2, third=3000), three) == []
+    assert compared(three, robot(2, **{"far away": 2000})) == [], "with the packet_len of that radio"
+    assert compared(three, robot(2, near=500, third=3000)) == [
+        "phy of radio near has other settings there; set the same name, sample_rate and options at both ends"
+    ]
+    assert "no radio has the phy of the other end" in compared(three, robot(2, near=500))[0]
+    long = replace(robot(2, near=1000, third=3000), packet_len=220)
+    assert compared(three, long)[0].startswith("packet_len is 220 there and 96 here")
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from gr_ros2.cli.status import radio_words
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.radio.config import link_from
+from gr_ros2.radio.findings import about, differences
 from gr_ros2.state.keys import new_key_file
 from tests.domains import domain, free_ports
 from tests.middleware.calling import Adder, Caller
@@ -166,6 +167,22 @@ def test_over_a_shared_channel_services_are_called_and_topics_asked_for(tmp_path
     own = fleet.robots[1].link.wishes_of(3)
     own.offers(3, anew=True)
     wait_for(lambda: own.offers(3)["age_s"] is not None, "what robot 3 offers")
+
+
+def test_robots_with_unlike_sets_of_radios_are_not_said_to_differ(tmp_path: Path, closing: ExitStack) -> None:
+    fleet = Fleet(tmp_path, closing, "slots", {}, topics=[])
+    fleet.meet()
+    told = {n: about(each.link.config, [one.phy for one in each.link.radios]) for n, each in fleet.robots.items()}
+
+    def asked(one: int, other: int) -> dict[str, Any] | None:
+        found: dict[str, Any] | None = fleet.robots[one].link.ping(other)["about"]
+        return found
+
+    for one, other in ((1, 2), (1, 3), (3, 1)):
+        wait_for(lambda: asked(one, other) is not None, "what the other robot is")  # noqa: B023
+        found = asked(one, other)
+        assert found is not None
+        assert differences(told[one], found) == [], (told[one], found)
 
 
 @pytest.mark.slow
