@@ -228,11 +228,11 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
 
     def offers(asks: Any) -> dict[str, Any]:
         asked = build(_Asked, asks, OFFERS)
-        return running.wishes_of(asked.robot).offers(asked.robot, anew=asked.anew)
+        return running.wishes.offers(asked.robot, anew=asked.anew)
 
     def want(asks: Any) -> dict[str, Any]:
         wish = build(_Wish, asks, WANT)
-        wishes = running.wishes_of(wish.robot)
+        wishes = running.wishes
         if wish.how == "want":
             wishes.want(wish.robot, wish.topic, wish.rate, wish.for_s)
         elif wish.how == "give_up":

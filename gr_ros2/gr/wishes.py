@@ -188,6 +188,10 @@ class LiveWishes:
             age_s = None if told.at == -inf else self._clock() - told.at
             return {"robot": robot, "age_s": age_s, "rows": [asdict(row) for row in told.rows]}
 
+    def hears(self, robot: int) -> bool:
+        """Whether a robot can be asked."""
+        return robot in self._calls.heard()
+
     def known(self) -> dict[int, list[dict[str, Any]]]:
         """What each robot that is heard offers, as far as it was asked and has answered."""
         heard = self._calls.heard()
@@ -216,6 +220,9 @@ class LiveWishes:
 
     def _wish(self, robot: int, name: str, wish: OwnWish | None) -> dict[str, Any]:
         told: dict[str, Any] = {"robot": robot, "topic": name, "state": "none", "words": f"{name}: nobody wants it"}
+        told["offered"] = wish is not None and not (
+            wish.answer is not None and wish.answer.outcome == WishOutcome.NOT_OFFERED
+        )
         if wish is None:
             return told
         left_s = max(wish.until - self._clock(), 0.0)

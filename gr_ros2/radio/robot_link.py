@@ -25,6 +25,7 @@ from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
 from gr_ros2.gr.throughput import LiveThroughput
+from gr_ros2.gr.wish_ways import WishWays, best_of
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.bond import Bond
 from gr_ros2.link.clocks import ClockOffset
@@ -169,8 +170,8 @@ class RobotLink(Flowgraph):
         if isinstance(graph, ServiceGraph):
             switch = TransmitSwitch(graph, self.node_name, lambda on: self.transmit(on=on))
             self._stack.callback(switch.close)
-            if link.wishes is not None:
-                asking = WishService(graph, self.node_name, link.wishes)
+            if self._wish_ways():
+                asking = WishService(graph, self.node_name, self.wishes)
                 self._stack.callback(asking.close)
         self._diagnostics: Diagnostics | None = None
         if config.diagnostics.period_s:
@@ -418,25 +419,20 @@ class RobotLink(Flowgraph):
         return {**ping(self._end_with(robot), robot, self._clock(), anew=anew), **self.source.rate()}
 
     @property
-    def wishes(self) -> LiveWishes:
-        """What is asked for from afar.
+    def wishes(self) -> WishWays:
+        """What is asked for from afar, over all radios.
 
         :raises ConfigError: where nobody can be asked
         """
-        if self._ros.link.wishes is None:
+        if not self._wish_ways():
             raise ConfigError(f"link {self.config.name}: nobody can be asked over it; that needs direction: both")
-        return self._ros.link.wishes
+        return WishWays(self._wish_ways)
 
-    def wishes_of(self, robot: int) -> LiveWishes:
-        """The same, over a radio over which a robot is heard.
-
-        :raises ConfigError: where nobody can be asked
-        """
-        if self.calls is None or robot not in self.calls.heard():
-            for bound in self._ros.link.bound or ():
-                if bound.wishes is not None and bound.calls is not None and robot in bound.calls.heard():
-                    return bound.wishes
-        return self.wishes
+    def _wish_ways(self) -> list[LiveWishes]:
+        """What is asked for over all radios, and over each that has one alone."""
+        link = self._ros.link
+        ways = [link.wishes, *(bound.wishes for bound in link.bound or ())]
+        return [wishes for wishes in ways if wishes is not None]
 
     @property
     def throughput(self) -> LiveThroughput:
@@ -484,6 +480,7 @@ class RobotLink(Flowgraph):
         }
         if self._ros.link.bound is not None:
             join_bound(halves, radios, [one.name for one in self.radios], self._ros.link.bound.stats())
+            halves["wishes"]["wants"] = best_of(halves["wishes"].get("wants", ()))
         return {
             "name": self.config.name,
             "uptime_s": 0.0 if self._started is None else self._clock() - self._started,

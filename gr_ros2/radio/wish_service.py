@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from gr_ros2.core.errors import ConfigError, MiddlewareError
-from gr_ros2.gr.wishes import LiveWishes
+from gr_ros2.gr.wish_ways import WishWays
 from gr_ros2.middleware.services import ServiceGraph, ServiceServer
 from gr_ros2.middleware.type_definitions import DAMAGED
 
@@ -49,7 +49,7 @@ class WishService:
     :raises MiddlewareError: when the service cannot be offered
     """
 
-    def __init__(self, graph: ServiceGraph, node_name: str, wishes: LiveWishes) -> None:
+    def __init__(self, graph: ServiceGraph, node_name: str, wishes: WishWays) -> None:
         self._wishes = wishes
         self._server: ServiceServer = graph.serve(f"/{node_name}/want", WANT_TYPE, self._request)
 

@@ -316,7 +316,8 @@ def request_of(values: dict[str, dict[str, Any]]) -> bytes:
 @pytest.mark.real_time
 def test_many_wishes_at_a_time_are_measured_at_once(robots: Robots, monkeypatch: pytest.MonkeyPatch) -> None:
     names = [f"scan_{number}" for number in range(6)]
-    wishes, sender = robots.links[1].wishes, robots.links[2].wishes
+    wishes, sender = robots.links[1].wishes, robots.links[2]._ros.link.wishes
+    assert sender is not None
     measured: list[int] = []
     measure = sender._measurements.measure
 

@@ -142,6 +142,24 @@ def test_over_a_shared_channel_services_are_called_and_topics_asked_for(tmp_path
     scan = far.advertise("/robot_1/scan", CUSTOM, QOS)
     odom = far.advertise("/robot_1/odom", CUSTOM, QOS)
     wishes = fleet.robots[3].link.wishes
+    both = fleet.robots[2].link.wishes
+
+    def offered() -> list[str]:
+        both.offers(1, anew=True)
+        wait_for(lambda: both.offers(1)["age_s"] is not None, "the lists of both radios")
+        return [row["name"] for row in both.offers(1)["rows"]]
+
+    wait_for(lambda: offered() == ["odom", "scan"], "what is offered over either")
+    told: list[tuple[bool, str]] = []
+    both.want(1, "scan", told=lambda done, words: told.append((done, words)))
+    wait_for(lambda: bool(told), "the answer of either")
+    assert told[0][0] and "robot 1 sends scan" in told[0][1]
+    wait_for(lambda: [w["state"] for w in fleet.robots[2].link.stats()["wishes"]["wants"]] == ["sent"], "one wish")
+    both.want(1, "nothing", told=lambda done, words: told.append((done, words)))
+    wait_for(lambda: len(told) == 2, "both answers")
+    assert not told[1][0] and "does not offer nothing" in told[1][1]
+    both.give_up(1, "scan")
+    wait_for(lambda: not fleet.robots[1].link.stats()["wishes"]["wanted"], "it to be given up")
 
     def listed() -> list[str]:
         wishes.offers(1, anew=True)
@@ -164,7 +182,7 @@ def test_over_a_shared_channel_services_are_called_and_topics_asked_for(tmp_path
     for one, other in ((1, 3), (3, 1)):
         wait_for(lambda: answered(one, other), "an answer")  # noqa: B023
     assert 3 in fleet.robots[1].link.clocks()
-    own = fleet.robots[1].link.wishes_of(3)
+    own = fleet.robots[1].link.wishes
     own.offers(3, anew=True)
     wait_for(lambda: own.offers(3)["age_s"] is not None, "what robot 3 offers")
 
