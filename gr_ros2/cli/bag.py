@@ -47,6 +47,10 @@ _Name = tuple[int, ...]
 """Of a message: its robot, the start of that, and where it began, or its serial number there."""
 
 
+_UNKNOWN_PLACE = -1 & 0xFF
+"""Place of a message in a name, where only the packet is known in which it began."""
+
+
 class OutputBag(Closing):
     """A bag being written: a :class:`gr_ros2.observe.observers.RunObserver`.
 
@@ -151,7 +155,8 @@ class OutputBag(Closing):
             known = self._is_known((event.src_id, boot, each.serial))
             if each.began is not None:
                 name = (event.src_id, boot, *each.began)
-                self._lost.pop(name, None)
+                if self._lost.pop(name, None) is None:  # of one whose first part is missing the place is not known
+                    self._lost.pop((*name[:3], _UNKNOWN_PLACE), None)
                 known = self._is_known(name) or known
             if not known:
                 made = each.made_us * 1e-6 - (0.0 if clock is None else clock.ahead_s)

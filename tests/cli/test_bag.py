@@ -121,6 +121,14 @@ def test_what_filled_a_gap_before_the_receiver_gave_it_up_is_not_missing(tmp_pat
     assert lost_of(tmp_path / "bag") == {}
 
 
+def test_a_message_of_which_the_first_part_was_missed_is_not_missing_once_it_has_filled_the_gap(tmp_path: Path) -> None:
+    with opened(tmp_path / "bag") as bag:
+        bag.receiver_event(Lost(2, 0, "overtaken", Key(7, 30, -1)), 0.0)
+        bag.receiver_event(Lost(2, 0, "overtaken", Key(7, 31, -1)), 0.0)
+        bag.receiver_event(fills(Later(0, 5, 0, message(1, 50), (30, 1))), 0.0)
+    assert lost_of(tmp_path / "bag") == {"/rx_robot_2/chat": 1}
+
+
 def test_what_cannot_be_read_is_counted(tmp_path: Path) -> None:
     with opened(tmp_path / "bag") as bag:
         bag.receiver_event(Delivered(2, 2, b"\xffjunk", 0), 0.0)
