@@ -45,8 +45,6 @@ _LONGEST_S = 86400.0
 _REMEMBERED = 100_000
 _Name = tuple[int, ...]
 """Of a message: its robot, the start of that, and where it began, or its serial number there."""
-
-
 _UNKNOWN_PLACE = -1 & 0xFF
 """Place of a message in a name, where only the packet is known in which it began."""
 

@@ -157,11 +157,9 @@ def _radios_differ(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str
     if here is not None and there is not None:
         shared = sorted(here.keys() & there.keys())
         found = [f"phy of radio {name} {_SET}" for name in shared if here[name][0] != there[name][0]]
-        for name, other_len, own_len in (
-            ("", other["packet_len"], own["packet_len"]),
-            *((f"radio {name}: ", there[name][1], here[name][1]) for name in shared),
-        ):
-            found += _packets_differ(name, other_len, own_len)
+        found += _packets_differ("", other["packet_len"], own["packet_len"])
+        for name in shared:
+            found += _packets_differ(f"radio {name}: ", there[name][1], here[name][1])
         return found
     one, several = (own, there) if here is None else (other, here)
     if several is None:

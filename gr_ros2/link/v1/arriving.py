@@ -33,11 +33,6 @@ _INCOMPLETE_S = 60.0
 """s that an incomplete message waits for its next fragment, unless its sender repairs it until it is here."""
 
 
-def _of_use(_number: int) -> bool:
-    """A packet that comes as it was sent is of use."""
-    return True
-
-
 def _waited(entries: Sequence[EntryV1]) -> Waited | None:
     """What a packet tells, behind its messages, of how long these have waited."""
     for entry in reversed(entries):
@@ -111,18 +106,16 @@ class ArrivingMessages:
         began: float,
         *,
         repaired: bool,
-        of_use: Callable[[int], bool] = _of_use,
+        of_use: bool = True,
     ) -> None:
         """Process the entries of a packet that is known now.
 
         :param began: when the packet that made it known began to arrive, s
-        :param of_use: whether it is known that the packet of this number was of use when it was repaired
+        :param of_use: whether it is known that the packet was of use when it was repaired
         """
         self._now, self._began = now, began
         self.order.contents.learn(number)
-        repaired_s = self._repaired_s(entries) if repaired else inf
-        if repaired_s < inf and not of_use(number):
-            repaired_s = inf
+        repaired_s = self._repaired_s(entries) if repaired and of_use else inf
         waited = _waited(entries)
         for place, entry in enumerate(entries):
             if not isinstance(entry, Part):

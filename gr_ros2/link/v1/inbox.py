@@ -335,7 +335,7 @@ class Inbox:
     def _recovered(self, found: tuple[int, bytes]) -> None:
         number, body = found
         entries = read_body(body, self._room)
-        self.messages.take(number, entries, -1, self._now, self.began, repaired=True, of_use=self._of_use)
+        self.messages.take(number, entries, -1, self._now, self.began, repaired=True, of_use=self._of_use(number))
 
     def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""

@@ -76,10 +76,8 @@ class PacketWriter:
         observer: Callable[[SenderEvent], None] | None,
         shares: bool = False,
     ) -> None:
-        self._shares = shares
         self._src_id, self._boot, self._dst_id = settings.src_id, boot, settings.dst_id
         self._hop = HOP if settings.dst_id != BROADCAST else 0
-        self._packet_len = settings.packet_len
         self._window, self._rate, self._stats, self._hold, self._observer = window, rate, stats, hold, observer
         self.sealed, self._encrypts = keys.sealed, keys.encrypts
         self.room = room_of(settings, keys, block=shares)
