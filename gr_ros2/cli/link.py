@@ -256,6 +256,7 @@ def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
             **running.stats(),
             "findings": running.findings.lines(),
             "limits": asdict(running.config.diagnostics),
+            "graph": {"domain_id": running.config.graph.domain_id, "namespace": running.config.namespace},
         },
         PING: ping,
         SET: change,

@@ -78,10 +78,11 @@ class SharedGraph(Completed):
         return map(CompletionItem, _SHARED)
 
 
-def shared_graph(whose: str) -> Callable[[Any], Any]:
+def shared_graph(whose: str, auto: str = "ROS_DOMAIN_ID") -> Callable[[Any], Any]:
     """The options that name the graph of a robot: ``middleware`` and ``domain_id``.
 
     :param whose: help of the first
+    :param auto: what that domain is, for the help of the second
     """
 
     def options(command: Any) -> Any:
@@ -89,7 +90,7 @@ def shared_graph(whose: str) -> Callable[[Any], Any]:
             "--domain-id",
             default=AUTO,
             type=OrAuto(click.IntRange(0, 232)),
-            help="ROS domain; default auto: ROS_DOMAIN_ID.",
+            help=f"ROS domain; default auto: {auto}.",
         )
         kind: dict[str, Any] = {
             "default": DEFAULT_MIDDLEWARE,

@@ -23,7 +23,7 @@ from gr_ros2.core.watch import wait_until
 from gr_ros2.middleware import Middleware, Qos, join_graph
 from gr_ros2.middleware.type_definitions import DAMAGED
 from gr_ros2.observe.positions import humble_types
-from gr_ros2.settings.fields import Auto
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.wire import BROADCAST
 from gr_ros2_lab.report.survey_figure import GridPicture, survey_figure
 from gr_ros2_lab.survey.geojson import geojson
@@ -62,7 +62,8 @@ class NumberPair(click.ParamType):
 @click.option(
     "--pose",
     metavar="TOPIC",
-    help="Where this robot is: odometry, a pose, NavSatFix, /tf. Default: none, so FILE is shown.",
+    help="Where this robot is, in its namespace or with a slash first: odometry, pose, NavSatFix, /tf. Default: none, "
+    "so FILE is shown.",
 )
 @click.option("--robot", type=click.IntRange(0, BROADCAST - 1), help="Robot that is heard; default: the first one.")
 @click.option(
@@ -76,7 +77,7 @@ class NumberPair(click.ParamType):
 @click.option("--map", "grid", metavar="TOPIC", default="/map", show_default=True, help="Map below the figure.")
 @click.option("--every", type=Number(0.1, 60), default=0.5, show_default=True, help="Seconds of one row.")
 @click.option("--duration", type=Number(0, min_open=True), help="Seconds; default until Ctrl-C.")
-@shared_graph("Of the robot's graph.")
+@shared_graph("Of the robot's graph.", "that of the link")
 @pid_option
 def survey(
     *,
@@ -106,8 +107,10 @@ def survey(
         rows = read_table(file)
     else:
         chosen = find_link(pid)
-        with join_graph(middleware, domain_id=domain_id, node_name="gr_ros2_survey") as graph:
-            drive = _Drive(graph, SurveyRecorder(robot), chosen)
+        own = status_of(chosen)["graph"]
+        joined = own["domain_id"] if domain_id == AUTO else domain_id
+        with join_graph(middleware, domain_id=joined, node_name="gr_ros2_survey") as graph:
+            drive = _Drive(graph, SurveyRecorder(robot), chosen, own["namespace"])
             drive.start(pose, frame, base)
             if their_pose is not None:
                 drive.follow(their_pose, frame, drive.recorder.there)
@@ -121,11 +124,12 @@ class _Drive:
     """Records what a link hears while a robot drives.
 
     :param pid: process of the link
+    :param namespace: of the robot's topics
     :ivar picture: the map, if one came
     """
 
-    def __init__(self, graph: Middleware, recorder: SurveyRecorder, pid: int) -> None:
-        self._graph, self.recorder, self._pid = graph, recorder, pid
+    def __init__(self, graph: Middleware, recorder: SurveyRecorder, pid: int, namespace: str) -> None:
+        self._graph, self.recorder, self._pid, self._namespace = graph, recorder, pid, namespace
         self.picture: GridPicture | None = None
         self._lock = threading.Lock()
         self._earth = GeoFrame()
@@ -136,7 +140,7 @@ class _Drive:
         :param base: where the other robot stands, in m, or in degrees where this one's places are
         :raises ConfigError: see :meth:`follow`
         """
-        if base is not None and self._type_of(topic) == FIX:
+        if base is not None and self._found(topic)[1] == FIX:
             self._earth, base = GeoFrame(GeoOrigin(*base)), (0.0, 0.0)
         self.recorder.base = base
         self.follow(topic, frame, self.recorder.here)
@@ -146,11 +150,11 @@ class _Drive:
 
         :raises ConfigError: when nobody publishes it, or its type tells no place
         """
-        type_name = self._type_of(topic)
+        name, type_name = self._found(topic)
         read = pose_reader(type_name, frame, self._earth)
         if read is None:
             raise ConfigError(
-                f"--pose {topic}: {type_name} tells no place; take Odometry, PoseStamped, PoseWithCovarianceStamped, "
+                f"--pose {name}: {type_name} tells no place; take Odometry, PoseStamped, PoseWithCovarianceStamped, "
                 "NavSatFix or /tf"
             )
 
@@ -159,7 +163,7 @@ class _Drive:
                 if (found := read(payload)) is not None:
                     take(Place(time.monotonic(), *found))
 
-        self._graph.subscribe("/" + topic.lstrip("/"), type_name, Qos(depth=_DEPTH), taken)
+        self._graph.subscribe(name, type_name, Qos(depth=_DEPTH), taken)
         if type_name == TRANSFORMS:
             self._graph.subscribe(_STATIC, TRANSFORMS, Qos(None, "transient_local", _DEPTH), taken)
 
@@ -200,22 +204,26 @@ class _Drive:
                 console.print(f"{count} looks had {why}, and count nowhere", soft_wrap=True)
         return self.recorder.finish()
 
-    def _type_of(self, topic: str) -> str:
-        """The type of a topic, as soon as somebody publishes it.
+    def _found(self, topic: str) -> tuple[str, str]:
+        """The whole name of a topic, relative to the robot's namespace or else to the root, and its type, as soon as
+        somebody publishes it.
 
         :raises ConfigError: when nobody does
         """
-        topic = "/" + topic.lstrip("/")
+        names = [topic] if topic.startswith("/") else [f"{self._namespace}/{topic}", f"/{topic}"]
 
-        def look() -> str | None:
-            found = (info.type_name for info in self._graph.discover() if info.topic == topic and info.publishers)
-            return next(found, None)
+        def published() -> dict[str, str]:
+            return {info.topic: info.type_name for info in self._graph.discover() if info.publishers}
 
-        wait_until(lambda: look() is not None, _FOUND_S, look_s=_LOOK_S)
-        if (type_name := look()) is None:
-            there = ", ".join(sorted({info.topic for info in self._graph.discover() if info.publishers})[:20])
-            raise ConfigError(f"--pose {topic}: nobody publishes it; on the graph are {there or 'no topics'}")
-        return type_name
+        wait_until(lambda: not published().keys().isdisjoint(names), _FOUND_S, look_s=_LOOK_S)
+        there = published()
+        for name in names:
+            if name in there:
+                return name, there[name]
+        raise ConfigError(
+            f"--pose {topic}: nobody publishes {' or '.join(dict.fromkeys(names))}; on the graph are "
+            f"{', '.join(sorted(there)[:20]) or 'no topics, and --domain-id takes another graph'}"
+        )
 
 
 def _line(row: SurveyRow) -> str:

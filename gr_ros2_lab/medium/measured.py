@@ -77,7 +77,9 @@ class SurveyedPlaces(Positions):
     def __init__(self, survey: Survey, channel: ScenarioChannel, motion: Motion, paths: Paths, *, levels: bool) -> None:
         self.survey, self._counts_levels = survey, levels
         if levels and not survey.has_snr:
-            raise ConfigError(f"channel.trace: {survey.name} has no SNR; take phy direct, for which its losses count")
+            raise ConfigError(
+                f"channel.trace: {survey.name} has no SNR; take phy direct or modem, for which its losses count"
+            )
         (survey.path_loss if levels else survey.loss_line).at(np.ones(1))  # says what it cannot tell
         robots = len(paths)
         super().__init__(channel, motion, 1.0, [0.0] * robots, [0.0] * robots, paths=paths)

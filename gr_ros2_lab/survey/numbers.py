@@ -28,7 +28,7 @@ def text_of(path: Path) -> str:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise ConfigError(f"{path}: has more than {MOST_BYTES:,} bytes; cut it")
-        return path.read_text("utf-8")
+        return path.read_text("utf-8-sig")  # as spreadsheets write it
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
 

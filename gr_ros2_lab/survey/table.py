@@ -18,7 +18,7 @@ import numpy as np
 
 from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
-from gr_ros2_lab.survey.fit import DistanceFit, fit_over_distance
+from gr_ros2_lab.survey.fit import DistanceFit, fit_odds, fit_over_distance
 from gr_ros2_lab.survey.numbers import read_numbers
 
 CELL_M = 1.0
@@ -161,18 +161,22 @@ class Survey:
 
         :raises ConfigError: when they tell none
         """
-        return fit_over_distance(self.apart, self._odds, self.name)
+        return fit_odds(self.apart, self.packets, self.lost, self.name)
 
     def words(self) -> str:
         """The fit in words, with its error; why there is none otherwise."""
         try:
             line = self.path_loss if self.has_snr else self.loss_line
         except ConfigError as error:
-            return str(error)
+            return str(error).removeprefix(f"{self.name}: ")
         farthest_m = float(self.apart.max())
         lost = f"{self.lost.sum() / (self.packets + self.lost).sum():.1%} of the packets lost"
         if not self.has_snr:
-            return f"{lost} at {line.points} places up to {farthest_m:.0f} m, and no SNR"
+            there = 1 / (1 + np.exp(float(line.at(self.apart.max()))))
+            return (
+                f"{lost} at {line.points} places up to {farthest_m:.0f} m, and no SNR; by the line that fits, of which "
+                f"they differ by {line.rms:.1%} rms, {there:.0%} at {farthest_m:.0f} m"
+            )
         return (
             f"{lost}; path loss exponent {line.exponent:.2f} ± {2 * line.slope_error:.2f}, SNR {line.at_1_m:.1f} dB at "
             f"1 m, from {line.points} places up to {farthest_m:.0f} m, which differ from it by {line.rms:.1f} dB rms"

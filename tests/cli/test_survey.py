@@ -43,15 +43,19 @@ def driving(domain_id: int) -> Iterator[None]:
         thread.join()
 
 
-def test_a_drive_becomes_a_table_a_figure_and_geojson(ends: Ends, tmp_path: Path) -> None:  # noqa: F811
+def test_a_drive_becomes_a_table_a_figure_and_geojson(
+    ends: Ends,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     (domain_id,) = free_domains(1)
-    process = ends.link(1)
+    process = ends.link(1, "--set", f"graph.domain_id={domain_id}", "--set", "graph.namespace=/gps")
     ends.link(2)
     wait_for(ends.heard, "the other robot")
     out = tmp_path / "survey.csv"
-    words = ("--domain-id", str(domain_id), "--every", "0.2", "--duration", "6", "--pid", str(process.pid))
+    words = ("--every", "0.2", "--duration", "6", "--pid", str(process.pid))
     with driving(domain_id):
-        done = ends.run("survey", str(out), "--pose", "gps/fix", "--base", "47.9999,9", *words)
+        done = ends.run("survey", str(out), "--pose", "fix", "--base", "47.9999,9", *words)
     rows = read_table(out)
     assert sum(row.packets for row in rows) > 1
     assert sum(row.lost for row in rows) == 0
@@ -65,14 +69,13 @@ def test_a_drive_becomes_a_table_a_figure_and_geojson(ends: Ends, tmp_path: Path
     assert first["geometry"]["coordinates"] == pytest.approx([9.0, 48.0], abs=1e-3)
     again = ends.run("survey", str(out))
     assert again.returncode == 0, again.stderr
-
-
-def test_what_tells_no_place_is_said(ends: Ends, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     monkeypatch.setattr("gr_ros2_lab.cli.survey._FOUND_S", 0.2)
-    (domain_id,) = free_domains(1)
-    told = ends.run("survey", str(tmp_path / "a.csv"), "--pose", "odom", "--pid", "1", "--domain-id", str(domain_id))
+    told = ends.run("survey", str(tmp_path / "a.csv"), "--pose", "odom", "--pid", str(process.pid))
     assert told.returncode == 2
-    assert "--pose /odom: nobody publishes it" in told.stderr
+    assert "--pose odom: nobody publishes /gps/odom or /odom; on the graph are no topics" in told.stderr
+
+
+def test_what_tells_no_place_is_said(ends: Ends, tmp_path: Path) -> None:  # noqa: F811
     none = ends.run("survey", str(tmp_path / "no.csv"))
     assert none.returncode == 2
     assert "no such survey to show; to drive one, name --pose TOPIC" in none.stderr

@@ -44,7 +44,7 @@ def arrived(chosen: Any) -> Any:
 
 
 def test_a_row_holds_until_the_next_and_the_trace_begins_again(tmp_path: Path) -> None:
-    trace = read_trace(written(tmp_path, "t_s,snr_db,note\n100,1,a\n101,2,b\n103,3,c\n"))
+    trace = read_trace(written(tmp_path, "\ufefft_s,snr_db,note\r\n100,1,a\r\n101,2,b\r\n103,3,c\r\n"))
     assert trace.snr_db is not None
     assert [float(trace.snr_db[trace.row(now)]) for now in (0, 0.99, 1, 2.9, 3, 4.4, 4.5, 5.6)] == [
         *(1, 1, 2, 2, 3, 3, 1, 2)
