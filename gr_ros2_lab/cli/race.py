@@ -18,9 +18,12 @@ _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
 _TEAM = {"packet_len": 96, "loss": (0.05,), "load": (2.0, 4.0)}
 """Packets carry a block for medium access, and the channel is scarce: below that all contenders carry everything."""
 
+_ROWS = ("steady", "outage-5", "outage-30", "late", "map", "camera")
+
 
 @click.command()
 @click.option("--short", is_flag=True, help="5 s a contender, at load 200 % and loss 5 % unless told otherwise.")
+@click.option("--row", type=click.Choice([*_ROWS]), help="What happens beside the odometry; default steady: nothing.")
 @click.option("--robots", type=int, metavar="N", help="2 to 10 robots on one channel, all to all; default one to one.")
 @click.option("--out", type=OUT_FOLDER, help="Folder for results; default results/race-TIME.")
 @click.option("--loss", metavar="PERCENT,...", help="Frames lost, both ways; default 0,5,20,40, of a team 5.")
@@ -42,6 +45,7 @@ def race(
     from gr_ros2.settings.config import build
     from gr_ros2_lab.race.race_settings import RaceSettings
     from gr_ros2_lab.race.results import notes, race_grid, write_race
+    from gr_ros2_lab.race.rows import ROWS
     from gr_ros2_lab.race.runner import run_race
 
     given = {
@@ -52,7 +56,13 @@ def race(
     }
     chosen = {name: value for name, value in given.items() if value is not None}
     settings = build(
-        RaceSettings, {**(_TEAM if options["robots"] else {}), **(_SHORT if short else {}), **chosen}, "race"
+        RaceSettings,
+        {
+            **(_TEAM if options["robots"] else ROWS[str(options["row"] or "steady")].settings),
+            **(_SHORT if short else {}),
+            **chosen,
+        },
+        "race",
     )
     out = out or Path("results") / f"race-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()

@@ -13,7 +13,8 @@ from typing import Any, Literal
 from gr_ros2.core.errors import ConfigError
 
 Stack = Literal["gr-ros2", "dds", "zenoh"]
-Races = Literal["two", "team"]
+Races = Literal["two", "row", "team"]
+"""The race of one robot and another with odometry alone, its rows with more, and that of a team."""
 
 
 def address_of(robot: int) -> str:
@@ -48,14 +49,14 @@ class Contender:
     :param settings: settings of both robots, and what the ``paper``'s blocks have beside them (`gr-ros2`);
         ``transport`` (multicast, udp or tcp) and ``congestion`` control of Zenoh; what waits in the ``queue`` of a
         topic of a team
-    :param races: between two robots, or among those of a team
+    :param races: in which it takes part
     """
 
     stack: Stack
     reliable: bool
     summary: str
     settings: dict[str, Any] = field(default_factory=dict)
-    races: tuple[Races, ...] = ("two", "team")
+    races: tuple[Races, ...] = ("two", "row", "team")
 
     @property
     def compresses(self) -> bool:
@@ -80,7 +81,7 @@ CONTENDERS = {
         ("two",),
     ),
     "gr-ros2-latest": Contender(
-        "gr-ros2", False, "the newest message of each robot only", {"queue": "latest"}, ("team",)
+        "gr-ros2", False, "the newest message of each robot only", {"queue": "latest"}, ("row", "team")
     ),
     "cyclone-best-effort": Contender("dds", False, "Cyclone DDS, best effort"),
     "cyclone-reliable": Contender("dds", True, "Cyclone DDS, reliable"),
@@ -137,12 +138,13 @@ def cyclone_uri(interface: str, peer: str = "") -> str:
     )
 
 
-def zenoh_config(transport: str, number: int, robots: int, interface: str) -> dict[str, Any]:
+def zenoh_config(transport: str, number: int, robots: int, interface: str, *, latched: bool = False) -> dict[str, Any]:
     """Configuration of a session with peers at known addresses. It sends as few and as small packets as possible.
 
     :param transport: multicast, or udp or tcp to each of the others
     :param number: of this robot, from 0; it connects to those after it
     :param robots: how many there are
+    :param latched: whether anything is kept for late joiners, for which Zenoh needs timestamps
     """
     begin = {
         "timeout_ms": -1,
@@ -160,7 +162,7 @@ def zenoh_config(transport: str, number: int, robots: int, interface: str) -> di
         "listen": {"endpoints": endpoints, **begin},
         "connect": {"endpoints": later, **begin},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "timestamping": {"enabled": False},
+        "timestamping": {"enabled": latched},
         "transport": {
             "shared_memory": {"enabled": False},
             "multicast": {"compression": {"enabled": True}},

@@ -40,6 +40,8 @@ class RaceTopic:
 
     name: str
     type_name: str
+    qos: Qos | None = None
+    """of its publisher; None: the contender's"""
 
 
 @dataclass(frozen=True)
@@ -76,15 +78,49 @@ class Playback:
     phase_s: float = 0.0
 
 
+class _Player(Closing):
+    """Publishes the messages of one recording at their times."""
+
+    def __init__(self, plays: Playback) -> None:
+        self.plays = plays
+        self._bag = BagMiddleware(path=plays.bag)
+        self._publisher: Publisher | None = None
+        self._published = 0
+        self.t_first = float("nan")
+        """When the first message was due, s monotonic."""
+
+    def play(self, publisher: Publisher) -> None:
+        """Begin now."""
+        self._publisher = publisher
+        self._bag.subscribe(self.plays.recorded, self.plays.topic.type_name, Qos(), self._publish)
+        self._bag.start()
+
+    @property
+    def over(self) -> bool:
+        """Whether it has published all."""
+        return self._published >= self.plays.messages
+
+    def _publish(self, payload: bytes) -> None:
+        assert self._publisher is not None
+        if not self._published:
+            self.t_first = time.monotonic()
+        if not self.over:
+            self._publisher.publish(payload)
+            self._published += 1
+
+    def close(self) -> None:
+        self._bag.close()
+
+
 class Network(ABC):
     """The connection of one end to the network that carries the messages."""
 
     @abstractmethod
-    def advertise(self, topic: str, type_name: str) -> Publisher:
+    def advertise(self, topic: RaceTopic) -> Publisher:
         """Create a publisher."""
 
     @abstractmethod
-    def subscribe(self, topic: str, type_name: str, callback: MessageCallback) -> Subscription:
+    def subscribe(self, topic: RaceTopic, callback: MessageCallback) -> Subscription:
         """Create a subscription."""
 
     @abstractmethod
@@ -102,11 +138,12 @@ class DdsNetwork(Network):
         self._graph = join_graph("dds", domain_id=domain_id, node_name="race", localhost_only=localhost_only)
         self._qos = qos
 
-    def advertise(self, topic: str, type_name: str) -> Publisher:
-        return self._graph.advertise(topic, type_name, self._qos)
+    def advertise(self, topic: RaceTopic) -> Publisher:
+        return self._graph.advertise(topic.name, topic.type_name, topic.qos or self._qos)
 
-    def subscribe(self, topic: str, type_name: str, callback: MessageCallback) -> Subscription:
-        return self._graph.subscribe(topic, type_name, replace(self._qos, depth=DEPTH), callback)
+    def subscribe(self, topic: RaceTopic, callback: MessageCallback) -> Subscription:
+        qos = topic.qos or replace(self._qos, depth=DEPTH)
+        return self._graph.subscribe(topic.name, topic.type_name, qos, callback)
 
     def close(self) -> None:
         self._graph.close()
@@ -126,21 +163,37 @@ class ZenohNetwork(Network):
         self._congestion = getattr(zenoh.CongestionControl, congestion)
         self._session: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
 
-    def advertise(self, topic: str, type_name: str) -> Publisher:  # noqa: ARG002 - Zenoh has no types
-        return _PlainZenohPublisher(
-            self._session.declare_publisher(
-                topic.lstrip("/"),
-                congestion_control=self._congestion,
-                reliability=self._reliability,
-            ),
-            self._session,
-        )
+    def advertise(self, topic: RaceTopic) -> Publisher:
+        """As rmw_zenoh does: what is latched is kept in a cache, which a late subscriber asks for."""
+        options = {"congestion_control": self._congestion, "reliability": self._reliability}
+        if topic.qos is not None and topic.qos.durability == "transient_local":
+            import zenoh
+            from zenoh import ext
 
-    def subscribe(self, topic: str, type_name: str, callback: MessageCallback) -> Subscription:  # noqa: ARG002
-        return _PlainZenohSubscription(
-            self._session.declare_subscriber(topic.lstrip("/"), lambda sample: callback(sample.payload.to_bytes())),
-            self._session,
-        )
+            options["congestion_control"] = zenoh.CongestionControl.BLOCK
+            made = ext.declare_advanced_publisher(
+                self._session,
+                topic.name.lstrip("/"),
+                cache=ext.CacheConfig(topic.qos.depth),
+                publisher_detection=True,
+                **options,
+            )
+        else:
+            made = self._session.declare_publisher(topic.name.lstrip("/"), **options)
+        return _PlainZenohPublisher(made, self._session)
+
+    def subscribe(self, topic: RaceTopic, callback: MessageCallback) -> Subscription:
+        def take(sample: Any) -> None:
+            callback(sample.payload.to_bytes())
+
+        if topic.qos is not None and topic.qos.durability == "transient_local":
+            from zenoh import ext
+
+            history = ext.HistoryConfig(detect_late_publishers=True)
+            made = ext.declare_advanced_subscriber(self._session, topic.name.lstrip("/"), take, history=history)
+        else:
+            made = self._session.declare_subscriber(topic.name.lstrip("/"), take)
+        return _PlainZenohSubscription(made, self._session)
 
     def close(self) -> None:
         self._session.close()
@@ -175,13 +228,15 @@ class _PlainZenohSubscription(Subscription):
         self._subscriber.undeclare()
 
 
-def join(contender: Contender, seat: Seat) -> Network:
+def join(contender: Contender, seat: Seat, topics: Sequence[RaceTopic]) -> Network:
     """Connect a program to the network of a contender.
 
+    :param topics: those that it will publish or hear
     :raises MiddlewareError: when that fails
     """
     if contender.stack == "zenoh":
-        config = zenoh_config(contender.settings["transport"], seat.number, seat.robots, INTERFACE)
+        latched = any(topic.qos is not None and topic.qos.durability == "transient_local" for topic in topics)
+        config = zenoh_config(contender.settings["transport"], seat.number, seat.robots, INTERFACE, latched=latched)
         return ZenohNetwork(config, contender.reliable, contender.settings["congestion"])
     if contender.stack == "gr-ros2":  # the local graphs lose nothing; the radio is between them
         return DdsNetwork(DOMAINS[seat.number], True, Qos("reliable", "volatile", DEPTH))
@@ -193,65 +248,54 @@ def join(contender: Contender, seat: Seat) -> Network:
 class RaceProgram(Closing):
     """A program of a robot.
 
-    :param plays: None: it only listens
-    :param hears: topics that it records
+    :param plays: what it publishes; none: it only listens
     """
 
-    def __init__(
-        self, contender: Contender, seat: Seat, plays: Playback | None = None, hears: Sequence[RaceTopic] = ()
-    ) -> None:
+    def __init__(self, contender: Contender, seat: Seat, plays: Sequence[Playback] = ()) -> None:
         self._contender, self._seat = contender, seat
-        self._plays, self._hears = plays, hears
-        self._bag = None if plays is None else BagMiddleware(path=plays.bag)
+        self._players = [_Player(playback) for playback in plays]
         self._network: Network | None = None
-        self._publisher: Publisher | None = None
+        self._publishers: list[Publisher] = []
         self._subscriptions: list[Subscription] = []
-        self._heard: list[list[tuple[float, bytes]]] = [[] for _ in hears]
+        self._heard: list[list[tuple[float, bytes]]] = []
         self._lock = threading.Lock()
-        self._published = 0
-        self._t_first = float("nan")
 
-    def connect(self) -> float:
-        """Join the network. Return the time at which joining began, s monotonic."""
+    def connect(self, hears: Sequence[RaceTopic] = ()) -> float:
+        """Join the network. Return the time at which joining began, s monotonic.
+
+        :param hears: topics that it records
+        """
         began = time.monotonic()
-        self._network = join(self._contender, self._seat)
-        for topic, heard in zip(self._hears, self._heard, strict=True):
-            taken = partial(self._take, heard)
-            self._subscriptions.append(self._network.subscribe(topic.name, topic.type_name, taken))
-        if self._plays is not None:
-            self._publisher = self._network.advertise(self._plays.topic.name, self._plays.topic.type_name)
+        self._network = join(self._contender, self._seat, [*hears, *(player.plays.topic for player in self._players)])
+        self._heard = [[] for _ in hears]
+        for topic, heard in zip(hears, self._heard, strict=True):
+            self._subscriptions.append(self._network.subscribe(topic, partial(self._take, heard)))
+        for player in self._players:
+            self._publishers.append(self._network.advertise(player.plays.topic))
         return began
 
     def matched(self) -> bool:
-        """Whether the program has found those that it hears, and those that hear it."""
-        found = self._publisher is None or self._publisher.matched() >= self._seat.robots - 1
-        return found and all(subscription.matched() > 0 for subscription in self._subscriptions)
+        """Whether its first topics have found those that hear them, and those that are heard."""
+        found = all(publisher.matched() >= self._seat.robots - 1 for publisher in self._publishers[:1])
+        heard = self._subscriptions if self._seat.shared else self._subscriptions[:1]
+        return found and all(subscription.matched() > 0 for subscription in heard)
 
-    def play(self, begin: float | None = None) -> float:
-        """Publish the messages at their recorded times. Return the time of the first one, s monotonic.
+    def play(self, begin: float) -> list[float]:
+        """Publish the messages at their recorded times. Return the time of the first one of each recording, s
+        monotonic.
 
-        :param begin: of all recordings, s monotonic; None: now
+        :param begin: of all recordings, s monotonic
         """
-        assert self._bag is not None
-        assert self._plays is not None
-        if begin is not None:
-            time.sleep(max(0.0, begin + self._plays.phase_s - time.monotonic()))
-        self._bag.subscribe(self._plays.recorded, self._plays.topic.type_name, Qos(), self._publish)
-        self._bag.start()
-        end = time.monotonic() + self._plays.duration_s + _LATE_S
-        while self._published < self._plays.messages and time.monotonic() < end:
+        order = sorted(zip(self._players, self._publishers, strict=True), key=lambda pair: pair[0].plays.phase_s)
+        for player, publisher in order:
+            time.sleep(max(0.0, begin + player.plays.phase_s - time.monotonic()))
+            player.play(publisher)
+        end = begin + max(player.plays.phase_s + player.plays.duration_s for player in self._players) + _LATE_S
+        while not all(player.over for player in self._players) and time.monotonic() < end:
             time.sleep(_POLL_S)
-        self._bag.close()
-        return self._t_first
-
-    def _publish(self, payload: bytes) -> None:
-        assert self._publisher is not None
-        assert self._plays is not None
-        if not self._published:
-            self._t_first = time.monotonic()
-        if self._published < self._plays.messages:
-            self._publisher.publish(payload)
-            self._published += 1
+        for player in self._players:
+            player.close()
+        return [player.t_first for player in self._players]
 
     def count(self) -> int:
         """Number of messages that have arrived."""
@@ -268,7 +312,7 @@ class RaceProgram(Closing):
             heard.append((now, payload))
 
     def close(self) -> None:
-        if self._bag is not None:
-            self._bag.close()
+        for player in self._players:
+            player.close()
         if self._network is not None:
             self._network.close()

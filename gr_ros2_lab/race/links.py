@@ -10,8 +10,9 @@ from __future__ import annotations
 import threading
 import time
 from array import array
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,7 +24,7 @@ from gr_ros2.gr import RosLink
 from gr_ros2.gr.factory import Start
 from gr_ros2.link import ReceiverEvent, SenderEvent
 from gr_ros2.link.events import SentPacket
-from gr_ros2.middleware import Middleware, join_graph
+from gr_ros2.middleware import Middleware, Qos, join_graph
 from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.loopback import LoopbackLink
@@ -31,8 +32,16 @@ from gr_ros2.phy.pdus import PDUS, packets_of, pdu_of
 from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
 from gr_ros2.radio.config import LinkConfig
 from gr_ros2.radio.robot_link import RobotLink
-from gr_ros2.settings.config import DEFAULT_MIDDLEWARE, ChannelConfig, DiagnosticsConfig, PhyConfig
-from gr_ros2.settings.registry import Registry
+from gr_ros2.settings.config import (
+    DEFAULT_MIDDLEWARE,
+    ChannelConfig,
+    DiagnosticsConfig,
+    PhyConfig,
+    QueuePolicy,
+    SendOptions,
+)
+from gr_ros2.settings.fields import AUTO, Auto
+from gr_ros2.settings.registry import NewTopic, Registry
 from gr_ros2.settings.robot import Direction, GraphConfig, PublishConfig
 from gr_ros2_lab.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2_lab.race.namespaces import inside
@@ -46,6 +55,8 @@ SOURCE_ID = 1
 DEPTH = 1000
 """Messages that the local graphs keep. The number is large, because no message may be lost there."""
 
+_NEVER = ((9e8, 1e9),)
+"""An outage in years: a channel that may lose packets, so that :meth:`_Air.set_loss` can act."""
 _POLL_S = 0.05
 _JOIN_S = 1.0
 _SHORT_FRAME = 100
@@ -77,7 +88,7 @@ class RaceRadio:
 
     def channel(self, direction: int) -> ChannelConfig:
         """The channel of one direction, 0 or 1."""
-        return ChannelConfig(packet_loss=self.packet_loss, seed=2 * self.seed + direction)
+        return ChannelConfig(packet_loss=self.packet_loss, seed=2 * self.seed + direction, outages=_NEVER)
 
 
 @dataclass
@@ -110,9 +121,12 @@ class RaceRosLink(Closing):
     Version 1 uses both directions: messages there, reports back. Version 0 sends nothing back.
 
     :param namespaces: paths of the namespaces of the sending and the receiving end
-    :param topic: its absolute name and its type
+    :param topics: name, type, and QoS where it is not that of the contender
     :param packet_len: bytes of the longest packet
     :param contender: the contender whose settings are used
+
+    Nothing is sent before :meth:`enter`.
+
     :raises GrRos2Error: when a part does not start
     """
 
@@ -120,12 +134,12 @@ class RaceRosLink(Closing):
         self,
         radio: RaceRadio,
         namespaces: tuple[str, str],
-        topic: tuple[str, str],
+        topics: Sequence[tuple[str, str, Qos | None]],
         packet_len: int,
         contender: Contender,
     ) -> None:
-        registry, self._logs = Registry.from_rows([topic]), (LinkLog(), LinkLog())
-        settings = dict(contender.settings)
+        settings, self._logs = dict(contender.settings), (LinkLog(), LinkLog())
+        registry = _registry(topics, settings.pop("queue", AUTO))
         paper = settings.pop("paper", None)
         phy, block = radio.with_frames_of(packet_len), partial(RosLink, start=Start(), registry=registry)
         ways: tuple[Direction, Direction] = ("both", "both")
@@ -155,14 +169,21 @@ class RaceRosLink(Closing):
                 stack.callback(self._links[-1].stop)
             self._source, self._sink = self._links[0].source, self._links[1].sink
             self._sink.outputs.announce(SOURCE_ID, [0])
-            for link in reversed(self._links):  # the receiving end listens when the sending end begins
-                link.start()
+            self.outputs = [
+                self._sink.registry[number].republished(self._sink.config.publish.as_, SOURCE_ID)
+                for number in range(len(topics))
+            ]
+            """The topics on which the receiving end publishes the messages."""
             self._stack = stack.pop_all()
 
-    @property
-    def output_topic(self) -> str:
-        """The topic on which the receiving end publishes the messages."""
-        return self._sink.registry[0].republished(self._sink.config.publish.as_, SOURCE_ID)
+    def enter(self, end: int) -> None:
+        """Start the link of an end, 0 or 1."""
+        self._links[end].start()
+
+    def set_loss(self, probability: float) -> None:
+        """Lose this share of all packets from now on, both ways."""
+        for link in self._links:
+            link.radio.set_packet_loss(probability)
 
     def matched(self) -> bool:
         """Whether both blocks have found the programs at their ends: each side of a match is told of it by itself."""
@@ -225,6 +246,14 @@ class RaceIpLink(Closing):
                 phy.prefer_latency()
                 self._links.append(link)
             self._stack = stack.pop_all()
+
+    def enter(self, end: int) -> None:
+        """Do nothing: IP is there from the beginning."""
+
+    def set_loss(self, probability: float) -> None:
+        """Lose this share of all frames from now on, both ways."""
+        for link in self._links:
+            link.set_packet_loss(probability)
 
     def matched(self) -> bool:
         """True: IP has no ends that must find each other."""
@@ -314,6 +343,17 @@ class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
         except OSError:
             self.refused += 1
         self.handled += 1
+
+
+def _registry(topics: Sequence[tuple[str, str, Qos | None]], queue: QueuePolicy | Auto) -> Registry:
+    """The topics with the options that a robot would have found on its graph; the first one waits in this queue."""
+    rows: list[NewTopic] = []
+    for name, type_name, qos in topics:
+        options = SendOptions(queue=queue if not rows else AUTO)
+        if qos is not None:
+            options = replace(options, reliability=qos.reliability or AUTO, durability=qos.durability or AUTO)
+        rows.append((name, type_name, options))
+    return Registry.empty().extended(rows)
 
 
 def _graph(domain_id: int) -> Middleware:

@@ -25,7 +25,8 @@ from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import PacketLen, SampleRate, Text, Traffic
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.wire import FORMATS
-from gr_ros2_lab.race.contenders import MTU, chosen
+from gr_ros2_lab.race.contenders import MTU, Races, chosen
+from gr_ros2_lab.race.rows import ROWS, RowName
 from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
 
@@ -53,6 +54,8 @@ class RaceSettings(Traffic):
 
     robots: Annotated[int, Field(ge=2, le=MOST_ROBOTS)] | None = None
     """all send to all others on one channel; null = one robot sends to another"""
+    row: RowName = "steady"
+    """of a race of two, what happens beside the odometry"""
     bag_topic: Text = AUTO
     """topic of the bag; auto where it has only one"""
     peers: tuple[str, ...] = ()
@@ -68,6 +71,13 @@ class RaceSettings(Traffic):
     packet_len: PacketLen = 64
     """bytes of gr-ros2's longest packets; of `gr-ros2-plain` they are as long as a message needs"""
 
+    @property
+    def races(self) -> Races:
+        """Which contenders and which numbers belong to it."""
+        if self.robots:
+            return "team"
+        return "two" if self.row == "steady" else "row"
+
 
 @plain_dataclass(frozen=True)
 class RaceRecording:
@@ -77,6 +87,7 @@ class RaceRecording:
     :param payloads: the messages, in order
     :param due: due time of each message, s after the first one
     :param phase_s: s from the beginning of all recordings to the first message
+    :param qos: of its publisher; None: the contender's
     """
 
     path: Path
@@ -85,6 +96,7 @@ class RaceRecording:
     payloads: tuple[bytes, ...]
     due: tuple[float, ...]
     phase_s: float = 0.0
+    qos: Qos | None = None
 
     @property
     def hz(self) -> float:
@@ -117,7 +129,9 @@ def check(settings: RaceSettings) -> None:
     :raises ConfigError: when a setting is wrong; the message names it
     :raises BackendMissingError: when a contender is not installed
     """
-    racing = chosen(settings.peers, "team" if settings.robots else "two").values()
+    if settings.robots and settings.row != "steady":
+        raise ConfigError(f"row = {settings.row!r}: of a race of two; leave out robots, or the row")
+    racing = chosen(settings.peers, settings.races).values()
     if any(contender.stack == "zenoh" for contender in racing) and find_spec("zenoh") is None:
         raise BackendMissingError("zenoh is not installed: pip install eclipse-zenoh==1.10.2, or race other --peers")
     PHY.load(PHY_NAME)(settings.packet_len, 1.0)
@@ -170,6 +184,26 @@ def read_recordings(settings: RaceSettings, folder: Path) -> list[RaceRecording]
         return [replace(recording, phase_s=(stamp - first) * 1e-9) for recording, stamp in found]
     recording, _ = _read(settings, settings.bag_path, settings.bag_topic)
     return [replace(recording, phase_s=number / robots / recording.hz) for number in range(robots)]
+
+
+def beside(settings: RaceSettings, folder: Path, stack: str) -> list[RaceRecording]:
+    """What a contender of a stack carries beside the odometry in this row, each written as a bag first.
+
+    :param folder: where the bags go
+    """
+    row, found = ROWS[settings.row], []
+    offers = list(row.offers(stack, settings.duration_s))
+    for number, (topic, type_name, qos) in enumerate(row.topics(stack)):
+        mine = [offer for offer in offers if offer.topic == topic]
+        path = folder / f"{stack}-{number}"
+        with BagMiddleware(path=path, mode="write") as bag:
+            publisher = bag.advertise(topic, type_name, qos)
+            for offer in mine:
+                publisher.publish_at(offer.payload, _SIM_START_NS + round(offer.t * 1e9))
+        due = tuple(offer.t - mine[0].t for offer in mine)
+        payloads = tuple(offer.payload for offer in mine)
+        found.append(RaceRecording(path, topic, type_name, payloads, due, mine[0].t, qos))
+    return found
 
 
 def _read(settings: RaceSettings, path: Path, asked: str) -> tuple[RaceRecording, int]:

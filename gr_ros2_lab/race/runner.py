@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gr_ros2.core.errors import RunError
@@ -20,7 +20,15 @@ from gr_ros2_lab.race.channel import RaceChannel
 from gr_ros2_lab.race.contenders import Contender, chosen
 from gr_ros2_lab.race.endpoints import Playback, RaceProgram, RaceTopic, Seat
 from gr_ros2_lab.race.links import LinkReport, RaceIpLink, RaceRadio, RaceRosLink
-from gr_ros2_lab.race.measure import Identity, Observed, RaceCell, RaceSender, RaceStream, measure
+from gr_ros2_lab.race.measure import (
+    Identity,
+    Observed,
+    RaceCell,
+    RaceSender,
+    RaceStream,
+    check_outage,
+    measure,
+)
 from gr_ros2_lab.race.namespaces import Namespace, check_means
 from gr_ros2_lab.race.race_settings import (
     DRAIN_S,
@@ -28,12 +36,14 @@ from gr_ros2_lab.race.race_settings import (
     Condition,
     RaceRecording,
     RaceSettings,
+    beside,
     check,
     conditions,
     read_recordings,
 )
+from gr_ros2_lab.race.rows import ROWS
 from gr_ros2_lab.race.slots import run_slots
-from gr_ros2_lab.race.workers import Worker
+from gr_ros2_lab.race.workers import PROCESSOR_S, Worker
 
 _POLL_S = 0.05
 _QUIET_S = 3.0
@@ -72,23 +82,27 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
         recordings = read_recordings(settings, Path(folder))
         senders = [RaceSender(recording, Identity(recording)) for recording in recordings]
         race = Race(settings, recordings[0])
+        others: dict[str, list[RaceSender]] = {}
         plan = [
             (condition, name, contender)
             for condition in conditions(settings, recordings)
-            for name, contender in chosen(settings.peers, "team" if settings.robots else "two").items()
+            for name, contender in chosen(settings.peers, settings.races).items()
         ]
         try:
             for number, (condition, name, contender) in enumerate(plan):
                 if on_cell is not None:
                     on_cell(number, len(plan), f"{name}, load {condition.load:.0%}, loss {condition.loss:.0%}")
                 if not settings.robots:
-                    seen = _run_cell(settings, senders[0], condition, contender)
+                    if contender.stack not in others:
+                        found = beside(settings, Path(folder), contender.stack)
+                        others[contender.stack] = [RaceSender(each, Identity(each)) for each in found]
+                    seen = _run_cell(settings, [senders[0], *others[contender.stack]], condition, contender)
                 elif contender.stack == "gr-ros2":
                     seen = run_slots(settings, senders, condition, contender)
                 else:
                     seen = _run_team(settings, senders, condition, contender)
                 values = {"load": condition.load, "loss": condition.loss, "sample_rate": condition.sample_rate}
-                race.cells.append(measure(seen, contender=name, robots=settings.robots, **values))
+                race.cells.append(measure(seen, contender=name, robots=settings.robots, row=settings.row, **values))
         except KeyboardInterrupt:
             race.interrupted = True
         except RunError as error:
@@ -96,34 +110,84 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
         return race
 
 
-def _run_cell(settings: RaceSettings, sender: RaceSender, condition: Condition, contender: Contender) -> Observed:
-    """One robot sends to another one; each direction has its own air."""
-    recording = sender.recording
+def _run_cell(
+    settings: RaceSettings, senders: Sequence[RaceSender], condition: Condition, contender: Contender
+) -> Observed:
+    """One robot sends to another one; each direction has its own air.
+
+    :param senders: of the odometry, and of what goes beside it in this row
+    """
+    row = ROWS[settings.row]
+    recordings = [sender.recording for sender in senders]
     radio = RaceRadio(condition.sample_rate, condition.loss, settings.seed)
+    timeout_s = MATCH_S + _PLAY_SLACK_S
     with ExitStack() as stack:
-        spaces = (stack.enter_context(Namespace()), stack.enter_context(Namespace()))
-        paths = (spaces[0].path, spaces[1].path)
-        topic = output = RaceTopic(recording.topic, recording.type_name)
+        paths = (stack.enter_context(Namespace()).path, stack.enter_context(Namespace()).path)
+        topics = [RaceTopic(recording.topic, recording.type_name, recording.qos) for recording in recordings]
+        outputs = list(topics)
+        plays = [_playback(settings, *pair) for pair in zip(recordings, topics, strict=True)]
+        # Processes take seconds to start, in which a link that is already there would send.
+        listener = stack.enter_context(Worker("listener", paths[1], RaceProgram, contender, Seat(1)))
+        talker = stack.enter_context(Worker("talker", paths[0], RaceProgram, contender, Seat(0), plays))
         if contender.stack == "gr-ros2":
-            packet_len = settings.packet_len if contender.compresses else recording.single_packet_len
-            arguments = (radio, paths, (topic.name, topic.type_name), packet_len, contender)
+            packet_len = settings.packet_len if contender.compresses else recordings[0].single_packet_len
+            rows = [(topic.name, topic.type_name, topic.qos) for topic in topics]
+            arguments = (radio, paths, rows, packet_len, contender)
             air = stack.enter_context(Worker("radio", "", RaceRosLink, *arguments))
-            output = RaceTopic(air.call("output_topic"), topic.type_name)
+            outputs = [replace(topic, name=name) for topic, name in zip(topics, air.call("outputs"), strict=True)]
         else:
             air = stack.enter_context(Worker("radio", "", RaceIpLink, radio, paths))
-        plays = _playback(settings, recording, topic)
-        listener = stack.enter_context(Worker("listener", paths[1], RaceProgram, contender, Seat(1), None, [output]))
-        talker = stack.enter_context(Worker("talker", paths[0], RaceProgram, contender, Seat(0), plays))
-        # The listener joins first, so that the talker can connect to it.
-        timeout_s = MATCH_S + _PLAY_SLACK_S
-        began = listener.call("connect", timeout_s=timeout_s)
-        talker.call("connect", timeout_s=timeout_s)
-        matched = _wait_matched(MATCH_S, talker, listener, air)
-        t_sent = sender.sent(talker.call("play", timeout_s=settings.duration_s + _PLAY_SLACK_S))
-        _drain(DRAIN_S, [listener], len(t_sent))
+        parts, matched, began = (talker, listener, air), False, 0.0
+        for end in (0,) if row.late else (1, 0):  # who receives listens first
+            air.call("enter", end)
+        if not row.late:
+            # The listener joins first, so that the talker can connect to it.
+            began = listener.call("connect", outputs, timeout_s=timeout_s)
+            talker.call("connect", timeout_s=timeout_s)
+            matched = _wait_matched(MATCH_S, *parts)
+        else:
+            talker.call("connect", timeout_s=timeout_s)
+        used = _processor_s(parts)
+        begin = time.monotonic() + _TO_BEGIN_S
+        talker.ask("play", begin)
+        outage = None
+        if row.late:
+            time.sleep(max(0.0, begin + row.begin_s - time.monotonic()))
+            began = time.monotonic()
+            air.call("enter", 1)
+            listener.call("connect", outputs, timeout_s=timeout_s)
+            matched = _wait_matched(MATCH_S, *parts[1:])
+        elif row.outage_s:
+            time.sleep(max(0.0, begin + row.begin_s - time.monotonic()))
+            outage = _outage(air, row.outage_s, condition.loss)
+        firsts = talker.answer(settings.duration_s + _PLAY_SLACK_S)
+        used = [after - before for before, after in zip(used, _processor_s(parts), strict=True)]
+        sent = [sender.sent(first) for sender, first in zip(senders, firsts, strict=True)]
+        _drain(DRAIN_S, [listener], sum(map(len, sent)))
         report: LinkReport = air.call("report")
-        (heard,) = listener.call("heard")
-        return Observed(began, matched, [RaceStream(sender.identity, t_sent, heard)], report, _busy())
+        streams = [
+            RaceStream(sender.identity, t_sent, heard)
+            for sender, t_sent, heard in zip(senders, sent, listener.call("heard"), strict=True)
+        ]
+        if outage is not None:
+            check_outage(outage, streams[0], report)
+        return Observed(
+            began, matched, streams[:1], report, _busy(), streams[1:], outage, (used[0] + used[1], used[2]), row.late
+        )
+
+
+def _processor_s(parts: Sequence[Worker]) -> list[float]:
+    return [part.call(PROCESSOR_S) for part in parts]
+
+
+def _outage(air: Worker, length_s: float, loss: float) -> tuple[float, float]:
+    """Lose everything for so long; begin and end, s monotonic."""
+    air.call("set_loss", 1.0)
+    begin = time.monotonic()
+    time.sleep(length_s)
+    end = time.monotonic()
+    air.call("set_loss", loss)
+    return begin, end
 
 
 def _run_team(
@@ -140,19 +204,21 @@ def _run_team(
         air = stack.enter_context(Worker("channel", "", RaceChannel, radio, paths))
         robots = []
         for number, (path, sender) in enumerate(zip(paths, senders, strict=True)):
-            plays = _playback(settings, sender.recording, topics[number])
-            hears = [topic for topic in topics if topic is not topics[number]]
-            arguments = (contender, Seat(number, count, shared=True), plays, hears)
+            plays = [_playback(settings, sender.recording, topics[number])]
+            arguments = (contender, Seat(number, count, shared=True), plays)
             robots.append(stack.enter_context(Worker(f"robot {number + 1}", path, RaceProgram, *arguments)))
         # One after the other, the last one first, to which the others connect. Of Zenoh's multicast the declarations
         # of robots that join at once go round for ever.
-        began = max(robot.call("connect", timeout_s=MATCH_S + _PLAY_SLACK_S) for robot in reversed(robots))
+        began = 0.0
+        for number, robot in reversed([*enumerate(robots)]):
+            hears = [topic for topic in topics if topic is not topics[number]]
+            began = max(began, robot.call("connect", hears, timeout_s=MATCH_S + _PLAY_SLACK_S))
         matched = _wait_matched(MATCH_S, *robots)
         begin = time.monotonic() + _TO_BEGIN_S
         for robot in robots:
             robot.ask("play", begin)
         firsts = [robot.answer(settings.duration_s + _PLAY_SLACK_S) for robot in robots]
-        t_sent = [sender.sent(first) for sender, first in zip(senders, firsts, strict=True)]
+        t_sent = [sender.sent(first) for sender, (first,) in zip(senders, firsts, strict=True)]
         _drain(DRAIN_S, robots, (count - 1) * sum(map(len, t_sent)))
         report: LinkReport = air.call("report")
         streams = []

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from multiprocessing.connection import Connection
@@ -20,6 +21,8 @@ from gr_ros2.core.errors import GrRos2Error, RunError
 from gr_ros2.core.watch import wait_until
 from gr_ros2_lab.race.namespaces import enter
 
+PROCESSOR_S = "processor_s"
+"""What to call for the processor time that all threads of a process have used so far, s."""
 _START_S = 60.0
 _END_S = 10.0
 _SPAWN = multiprocessing.get_context("spawn")
@@ -114,7 +117,7 @@ def _serve(
             line.send((False, None))
             while True:
                 method, arguments = line.recv()
-                found = getattr(served, method)
+                found = time.process_time if method == PROCESSOR_S else getattr(served, method)
                 line.send((False, found(*arguments) if callable(found) else found))
     except (EOFError, ConnectionError):
         return  # the owner has closed the connection, or has ended
