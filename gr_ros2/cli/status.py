@@ -174,7 +174,7 @@ def _troubles(stats: Stats) -> list[str]:
         "not published": sink["publish_failed"],
     }
     words = _reasons(lost)
-    return ([f"dropped: {words}"] if words else []) + list(stats.get("findings", ()))
+    return ([f"dropped: {words}"] if words else []) + [*stats.get("findings", ()), *stats["incomplete"]]
 
 
 def _reasons(counts: Mapping[str, int]) -> str:

@@ -128,6 +128,7 @@ class Watched:
             "warnings": [
                 *(f"{part.name.removeprefix(stats['name'] + ': ')}: {part.message}" for part in parts if part.level),
                 *stats.get("findings", ()),
+                *stats["incomplete"],
             ],
         }
 

@@ -34,7 +34,7 @@ class LinkProcess(Spoken):
     def ask(self, *words: str) -> tuple[int, str]:
         """How a command that asks this link ends, and what it says."""
         with patch.dict(os.environ, self._env), redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
-            status = run([*words, "--pid", str(self.process.pid)])
+            status = run([*words, *(("--pid", str(self.process.pid)) if words[0] != "top" else ())])
         return status, out.getvalue() + err.getvalue()
 
     def status(self) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from gr_ros2.state.keys import new_key_file
 from tests.cli.test_bag import lost_of
 from tests.e2e.links import LinkProcess, Links
 from tests.e2e.test_clocks import clock
+from tests.e2e.test_observers import disk, needs_root
 from tests.waiting import wait_for
 
 POINT = "geometry_msgs/msg/PointStamped"
@@ -117,3 +119,29 @@ def test_what_does_not_fit_is_given_up_and_the_bag_says_so(tmp_path: Path) -> No
         assert one.end() == 0
     assert len(made(bag)) > 50
     assert lost_of(bag) == {PLACES: given_up}
+
+
+@needs_root
+def test_a_full_disk_ends_the_bag_alone_and_status_says_so(tmp_path: Path) -> None:
+    with (
+        disk(tmp_path / "disk", "size=64k") as small,
+        Links(tmp_path, PLACE, {**PLACE, "backfill": {"topics": ["place"]}}) as links,
+    ):
+        one = links.start(1, "1", "0", "--bag", str(small / "bag"), command=PEER)
+        two = links.start(2, "2", "0", command=PEER)
+        links.meet()
+        wait_for(lambda: got(one) > 5, "places")
+        two.transmit(on=False)
+        wait_for(lambda: two.status()["backfill"]["kept"] > 20, "places that nobody heard")
+        with suppress(OSError), (small / "other").open("wb", buffering=0) as other:
+            while other.write(bytes(4096)):
+                pass
+        two.transmit(on=True)
+        wait_for(lambda: one.status()["incomplete"], "the disk to be full")
+        ended = f"bag {small / 'bag'}: ended ("
+        for words in ("status", "top"):
+            assert ended in " ".join(one.ask(words)[1].split()), words
+        before = got(one)
+        wait_for(lambda: got(one) > before + 10 and filled(two), "places that come, and fill no bag")
+        assert one.end() == 1
+    assert any(line.startswith(ended) and line.endswith("events missed") for line in one.said)
