@@ -106,7 +106,7 @@ def spectrum_table(radio: Told) -> Group:
     noise, parts = radio["noise_db"], radio["parts"]
     unit, name = (1e6, "MHz") if max(abs(part["from_hz"]) for part in parts) >= 1e6 else (1e3, "kHz")
     most = max(_LEAST_DB, *(part["peak_db"] - noise for part in parts))
-    middle = "" if radio["frequency"] is None else f" around {radio['frequency'] / 1e6:,.6g} MHz"
+    middle = "" if radio["frequency"] is None else f" around {radio['frequency'] / unit:,.6g} {name}"
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for column in (name, "over the noise", "peak", "busy"):
         table.add_column(column, justify="right")

@@ -96,6 +96,10 @@ class AudioFrontEnd(BurstFrontEnd):
         keyed = f", keying a transmitter by {chosen.ptt}" if chosen.keys else ""
         return f"sound around {chosen.centre_hz:g} Hz with level {chosen.level:g}{keyed}"
 
+    @property
+    def receive_frequency(self) -> float:
+        return float(self.options.centre_hz)
+
     def _open(self) -> None:
         self._check_asked()
         self._keyer: Keyer | None = None

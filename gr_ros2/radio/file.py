@@ -63,6 +63,7 @@ class FileFrontEnd(FrontEnd):
         super().__init__(phy, **options)
         self._recorder: SigmfRecorder | None = None
         self._replay: _Replay | None = None
+        self._frequency: float | None = None
         if self.options.read:
             about, samples = read_recording(Path(self.options.read))
             if about.sample_rate != phy.sample_rate:
@@ -71,6 +72,7 @@ class FileFrontEnd(FrontEnd):
                     f"instead of {phy.sample_rate:g}"
                 )
             self._replay = _Replay(samples, phy, self.options)
+            self._frequency = about.frequency
         if self.options.write and self.transmits:
             about = SigmfRecording(phy.sample_rate, None, f"sent with phy {phy.name}, {phy.packet_len} B packets")
             bursts = BurstCutter(phy.airtime_samples(), phy.any_length)
@@ -83,6 +85,10 @@ class FileFrontEnd(FrontEnd):
     @property
     def source(self) -> Any:
         return self._replay
+
+    @property
+    def receive_frequency(self) -> float | None:
+        return self._frequency
 
     @property
     def finished(self) -> bool:

@@ -23,6 +23,8 @@ STANDS_OUT = 4.0
 """Power over the floor from which on a part is busy: 6 dB."""
 SELDOM = 0.005
 """Share of the time up to which a part is not said to be busy: what no link notices."""
+_ALIKE = 0.9
+"""Ratio of the shares of two parts from which on one number says both."""
 MOST_SAID = 4
 """Stretches of the band that are said to be busy."""
 
@@ -120,5 +122,10 @@ def busy_words(parts: Sequence[Mapping[str, Any]], unit: float, name: str) -> st
             high += 1
         left.difference_update(range(low, high + 1))
         between = f"{parts[low]['from_hz'] / unit:,.7g} to {parts[high]['to_hz'] / unit:,.7g} {name}"
-        said.append(f"{between} for {busy[peak]:.1%} of the time")
+        least = min(busy[low : high + 1])
+        shares = f"{busy[peak]:.1%}"
+        if least < _ALIKE * busy[peak]:
+            middle = (parts[peak]["from_hz"] + parts[peak]["to_hz"]) / 2 / unit
+            shares = f"{least:.1%} to {shares}, most around {middle:,.7g} {name},"
+        said.append(f"{between} for {shares} of the time")
     return f"busy: {'; '.join(said)}" if said else "nothing stands out of the noise"

@@ -20,7 +20,7 @@ def robot(folder: Path) -> Path:
     """The settings of a link that hears a carrier."""
     samples = noise(400, np.random.default_rng(1))
     samples += carrier(400, 24)
-    front_end = {**recording(folder / "in", samples), "write": ""}
+    front_end = {**recording(folder / "in", samples, 433.2e6), "write": ""}
     file = folder / "robot.yaml"
     file.write_text(
         f"robot: /robot_1\ntopics: [odom]\ngraph: {{middleware: memory}}\nphy: {{name: psk, sample_rate: {RATE}}}\n"
@@ -33,8 +33,8 @@ def test_the_front_end_of_a_file_is_heard_and_nothing_is_sent(ends: Ends, tmp_pa
     file = robot(tmp_path)
     shown = ends.run("spectrum", str(file), "--for", "0.5", "--set", f"front_end.write={tmp_path / 'sent'}")
     assert (shown.returncode, shown.stderr) == (0, "")
-    assert "file, 1,000,000 samples/s; noise -" in shown.stdout
-    assert "busy: 250 to 281.25 kHz for 100.0% of the time" in shown.stdout
+    assert "file around 433.2 MHz, 1,000,000 samples/s; noise -" in shown.stdout
+    assert "busy: 433.45 to 433.4812 MHz for 100.0% of the time" in shown.stdout
     assert "█" * 40 in shown.stdout
     assert not list(tmp_path.glob("sent*"))
     told = ends.run("spectrum", str(file), "--for", "0.5", "--json")
@@ -89,7 +89,7 @@ def test_the_busiest_is_said_first_with_neighbours_that_are_like_it() -> None:
     busy = [0.02, 0.25, 0.3, 0.02, 0.004, 0.5, 0.01]
     parts = [{"from_hz": n * 1e3, "to_hz": (n + 1) * 1e3, "busy": share} for n, share in enumerate(busy)]
     assert busy_words(parts, 1e3, "kHz") == (
-        "busy: 5 to 6 kHz for 50.0% of the time; 1 to 3 kHz for 30.0% of the time; 0 to 1 kHz for 2.0% of the time; "
-        "3 to 4 kHz for 2.0% of the time"
+        "busy: 5 to 6 kHz for 50.0% of the time; 1 to 3 kHz for 25.0% to 30.0%, most around 2.5 kHz, of the time; "
+        "0 to 1 kHz for 2.0% of the time; 3 to 4 kHz for 2.0% of the time"
     )
     assert busy_words(parts[4:5], 1e3, "kHz") == "nothing stands out of the noise"

@@ -147,6 +147,7 @@ def test_silence_of_zeros_is_named_once_and_so_is_its_end(
     at(monkeypatch, "a", "a")
     monkeypatch.setattr(AudioFrontEnd, "loops_back", True)
     with Robot(1, dict(SOUND), hears=(1,), repair="off", phy=PHY) as alone:
+        assert alone.link.radio.front_end.receive_frequency == SOUND["centre_hz"]
         with caplog.at_level(logging.WARNING):
             alone.link.transmit(on=False)
             wait_for(lambda: serve(alone) and "digital silence" in caplog.text)
