@@ -121,7 +121,15 @@ setup(
             "dashboard/templates/*",
             "compression/dictionaries/*",
         ],
-        "gr_ros2_lab": ["py.typed", "scenarios/*", "sweeps/*", "losses/*", "losses/*/*", "report/templates/*"],
+        "gr_ros2_lab": [
+            "py.typed",
+            "scenarios/*",
+            "sweeps/*",
+            "losses/*",
+            "losses/*/*",
+            "race/*.cpp",
+            "report/templates/*",
+        ],
     },
     ext_modules=[
         *(kernels(variant, flags) for variant, flags in VARIANTS.items()),

@@ -66,12 +66,13 @@ BENCHMARKS = {
     "sound": "bench.sound",
     "sound_live": "bench.sound_live",
     "backfill": "bench.backfill",
+    "race_profiles": "bench.race_profiles",
 }
 """Name of each benchmark, which is a function of the module it stands in."""
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
     *("gate", "rate_rules", "cells", "first", "hidden", "changes", "scale", "crowd", "energy", "cameras", "clouds"),
-    *("sound", "sound_live", "backfill"),
+    *("sound", "sound_live", "backfill", "race_profiles"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

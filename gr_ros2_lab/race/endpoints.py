@@ -13,6 +13,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,8 @@ from gr_ros2.core.closing import Closing
 from gr_ros2.middleware import Publisher, Qos, Subscription, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.base import MessageCallback, Reliability
-from gr_ros2_lab.race.contenders import ADDRESSES, Contender, cyclone_uri, zenoh_config
+from gr_ros2_lab.race.contenders import ADDRESSES, QUEUE, Contender, cyclone_uri, fast_profiles, zenoh_config
+from gr_ros2_lab.race.fast import FastDds
 from gr_ros2_lab.race.links import DEPTH, DOMAINS
 from gr_ros2_lab.race.tun import INTERFACE
 
@@ -149,19 +151,54 @@ class DdsNetwork(Network):
         self._graph.close()
 
 
+class FastNetwork(Network):
+    """A ROS 2 node on Fast DDS.
+
+    :param profiles: as :func:`fast_profiles` makes them
+    :param qos: see :class:`DdsNetwork`
+    """
+
+    def __init__(self, profiles: str, qos: Qos) -> None:
+        self._graph, self._qos = FastDds(_DOMAIN, profiles), qos
+
+    def advertise(self, topic: RaceTopic) -> Publisher:
+        return self._graph.advertise(topic.name, topic.type_name, topic.qos or self._qos)
+
+    def subscribe(self, topic: RaceTopic, callback: MessageCallback) -> Subscription:
+        qos = topic.qos or replace(self._qos, depth=DEPTH)
+        return self._graph.subscribe(topic.name, topic.type_name, qos, callback)
+
+    def close(self) -> None:
+        self._graph.close()
+
+
 class ZenohNetwork(Network):
     """A Zenoh session.
 
     :param config: settings as in Zenoh's configuration file
+    :param changes: settings by path
+    :param priority: of what is volatile: a name in Zenoh's ``Priority``
     :param congestion: what a publisher does when its queue is full: a name in Zenoh's ``CongestionControl``
     """
 
-    def __init__(self, config: dict[str, Any], reliable: bool, congestion: str) -> None:
+    def __init__(
+        self,
+        config: dict[str, Any],
+        changes: dict[str, Any],
+        *,
+        reliable: bool,
+        congestion: str,
+        priority: str = "DATA",
+    ) -> None:
         import zenoh  # imported here, because the other contenders do not need it
 
         self._reliability = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
         self._congestion = getattr(zenoh.CongestionControl, congestion)
-        self._session: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        self._priority = getattr(zenoh.Priority, priority)
+        made = zenoh.Config.from_json5(json.dumps(config))
+        for path, value in changes.items():
+            made.insert_json5(path, json.dumps(value))
+        self._session: Any = zenoh.open(made)
 
     def advertise(self, topic: RaceTopic) -> Publisher:
         """As rmw_zenoh does: what is latched is kept in a cache, which a late subscriber asks for."""
@@ -179,7 +216,7 @@ class ZenohNetwork(Network):
                 **options,
             )
         else:
-            made = self._session.declare_publisher(topic.name.lstrip("/"), **options)
+            made = self._session.declare_publisher(topic.name.lstrip("/"), priority=self._priority, **options)
         return _PlainZenohPublisher(made, self._session)
 
     def subscribe(self, topic: RaceTopic, callback: MessageCallback) -> Subscription:
@@ -196,7 +233,10 @@ class ZenohNetwork(Network):
         return _PlainZenohSubscription(made, self._session)
 
     def close(self) -> None:
-        self._session.close()
+        import zenoh
+
+        with suppress(zenoh.ZError):  # the other end, to which it says farewell, is gone or not reached
+            self._session.close()
 
 
 class _PlainZenohPublisher(Publisher):
@@ -234,15 +274,27 @@ def join(contender: Contender, seat: Seat, topics: Sequence[RaceTopic]) -> Netwo
     :param topics: those that it will publish or hear
     :raises MiddlewareError: when that fails
     """
+    settings = {key: value for key, value in contender.settings.items() if key != QUEUE}
     if contender.stack == "zenoh":
         latched = any(topic.qos is not None and topic.qos.durability == "transient_local" for topic in topics)
-        config = zenoh_config(contender.settings["transport"], seat.number, seat.robots, INTERFACE, latched=latched)
-        return ZenohNetwork(config, contender.reliable, contender.settings["congestion"])
+        transport, how = settings.pop("transport"), {"congestion": settings.pop("congestion")}
+        if priority := settings.pop("priority", ""):
+            how["priority"] = priority
+        config, changes = zenoh_config(transport, seat.number, seat.robots, INTERFACE, settings)
+        stamped = latched or not settings  # rmw_zenoh stamps everything
+        changes = {**changes, "timestamping/enabled": stamped}
+        return ZenohNetwork(config, changes, reliable=contender.reliable, **how)
     if contender.stack == "gr-ros2":  # the local graphs lose nothing; the radio is between them
         return DdsNetwork(DOMAINS[seat.number], True, Qos("reliable", "volatile", DEPTH))
-    os.environ["CYCLONEDDS_URI"] = cyclone_uri(INTERFACE, "" if seat.shared else ADDRESSES[1 - seat.number])
     reliability: Reliability = "reliable" if contender.reliable else "best_effort"
-    return DdsNetwork(_DOMAIN, False, Qos(reliability, "volatile", _ROS_DEPTH))
+    qos, peer = (
+        Qos(reliability, "volatile", settings.pop("depth", _ROS_DEPTH)),
+        "" if seat.shared else ADDRESSES[1 - seat.number],
+    )
+    if contender.stack == "fast":
+        return FastNetwork(fast_profiles(ADDRESSES[seat.number], peer, settings), qos)
+    os.environ["CYCLONEDDS_URI"] = cyclone_uri(INTERFACE, peer, settings)
+    return DdsNetwork(_DOMAIN, False, qos)
 
 
 class RaceProgram(Closing):

@@ -46,7 +46,7 @@ from gr_ros2.settings.robot import Direction, GraphConfig, PublishConfig
 from gr_ros2_lab.race.contenders import ADDRESSES, MTU, Contender
 from gr_ros2_lab.race.namespaces import inside
 from gr_ros2_lab.race.race_settings import PHY_NAME
-from gr_ros2_lab.race.tun import Tun, loopback_up, own_air
+from gr_ros2_lab.race.tun import QUEUE_BYTES, Tun, loopback_up, own_air
 from gr_ros2_lab.run.paper_link import PaperLink
 
 DOMAINS = (1, 2)
@@ -219,17 +219,20 @@ class RaceIpLink(Closing):
     """IP between two namespaces, in both directions: a TUN device at each end, one frame of the same length per packet.
 
     :param namespaces: paths of the namespaces of the sending and the receiving end
+    :param queue_bytes: most bytes that wait before each interface
     :raises GrRos2Error: when a part does not start
     """
 
-    def __init__(self, radio: RaceRadio, namespaces: tuple[str, str]) -> None:
+    def __init__(self, radio: RaceRadio, namespaces: tuple[str, str], queue_bytes: int = QUEUE_BYTES) -> None:
         byte_airtime = (radio.airtime_s(MTU) - radio.airtime_s(_SHORT_FRAME)) / (MTU - _SHORT_FRAME)
         overhead = radio.airtime_s(_SHORT_FRAME) / byte_airtime - _SHORT_FRAME
         self._logs = (LinkLog(), LinkLog())
         with ExitStack() as stack:
             self._tuns: list[Tun] = []
             for namespace, own, other in zip(namespaces, ADDRESSES, reversed(ADDRESSES), strict=True):
-                setup = own_air(own, other, mtu=MTU, byte_rate=1 / byte_airtime, overhead=overhead)
+                setup = own_air(
+                    own, other, mtu=MTU, byte_rate=1 / byte_airtime, overhead=overhead, queue_bytes=queue_bytes
+                )
                 tun = Tun(namespace, setup)
                 stack.callback(tun.close)
                 self._tuns.append(tun)

@@ -54,6 +54,8 @@ class RaceCell:
     :param age_peak: the highest age of any pair
     :param all_heard: time from the last robot's joining until every robot has a message of every other one
     :param row: what happened beside the odometry, of which all numbers are but those of ``beside``
+    :param found_after: time from joining the network until both ends know of each other, after which the first message
+        is sent: the network's part of ``first_message``
     :param processor_per_message: processor time of all programs and of the radio's process, per message delivered
     :param processor_programs: that of the two programs alone, which ends with the interface of the network
     :param fresh_after: time from an outage's end until the newest message is ``FRESH_S`` old or less
@@ -94,6 +96,7 @@ class RaceCell:
     age_peak: float | None = None
     all_heard: float | None = None
     row: RowName = "steady"
+    found_after: float | None = None
     processor_per_message: float | None = None
     processor_programs: float | None = None
     fresh_after: float | None = None
@@ -150,6 +153,7 @@ COLUMNS = {
     "airtime_per_message": Column("airtime /msg [ms]", "least", _ms, ("two",)),
     "air_bytes_per_message": Column("air bytes /msg", "least", _whole),
     "discovery_bytes": Column("discovery bytes", "least", _whole, ("two", "team")),
+    "found_after": Column("found after [s]", "least", "{:.2f}".format, ("two",)),
     "first_message": Column("first message [s]", "least", "{:.2f}".format, ("two", "row"), ("late",)),
     "all_heard": Column("all hear all [s]", "least", "{:.2f}".format, ("team",)),
     "processor_per_message": Column("processor /msg [ms]", "least", _ms, ("two", "row")),
@@ -241,6 +245,7 @@ class Observed:
     :param outage: begin and end
     :param processor_s: processor time of the programs, and of the radio's process, from the first message to the last
     :param late: only what was sent after ``began`` counts as sent
+    :param found_after: see :class:`RaceCell`
     """
 
     began: float
@@ -252,6 +257,7 @@ class Observed:
     outage: tuple[float, float] | None = None
     processor_s: tuple[float, float] | None = None
     late: bool = False
+    found_after: float | None = None
 
 
 def check_outage(outage: tuple[float, float], stream: RaceStream, air: LinkReport) -> None:
@@ -339,6 +345,7 @@ def measure(
         age_peak=max((found.peak for found in ages), default=None),
         all_heard=max(firsts) if len(firsts) == len(seen.streams) else None,
         row=row,
+        found_after=seen.found_after,
         processor_per_message=sum(used) / delivered if used and delivered else None,
         processor_programs=used[0] / delivered if used and delivered else None,
         fresh_after=fresh_after,

@@ -25,7 +25,8 @@ from gr_ros2.phy import PHY, Phy
 from gr_ros2.settings.config import PacketLen, SampleRate, Text, Traffic
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.wire import FORMATS
-from gr_ros2_lab.race.contenders import MTU, Races, chosen
+from gr_ros2_lab.race.contenders import MTU, Contender, Races, chosen
+from gr_ros2_lab.race.fast import has_fast_dds, library
 from gr_ros2_lab.race.rows import ROWS, RowName
 from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
@@ -123,6 +124,14 @@ class Condition:
     loss: float
 
 
+def racing(settings: RaceSettings) -> dict[str, Contender]:
+    """The contenders that race, by name. Of Fast DDS only those that are named where it is not installed."""
+    found = chosen(settings.peers, settings.races)
+    if not settings.peers and not has_fast_dds():
+        return {name: contender for name, contender in found.items() if contender.stack != "fast"}
+    return found
+
+
 def check(settings: RaceSettings) -> None:
     """Check the settings before anything is started.
 
@@ -131,8 +140,10 @@ def check(settings: RaceSettings) -> None:
     """
     if settings.robots and settings.row != "steady":
         raise ConfigError(f"row = {settings.row!r}: of a race of two; leave out robots, or the row")
-    racing = chosen(settings.peers, settings.races).values()
-    if any(contender.stack == "zenoh" for contender in racing) and find_spec("zenoh") is None:
+    stacks = {contender.stack for contender in racing(settings).values()}
+    if "fast" in stacks:
+        library()
+    if "zenoh" in stacks and find_spec("zenoh") is None:
         raise BackendMissingError("zenoh is not installed: pip install eclipse-zenoh==1.10.2, or race other --peers")
     PHY.load(PHY_NAME)(settings.packet_len, 1.0)
 

@@ -1,4 +1,4 @@
-"""The results of the race: a table, also in Markdown, `race.json`, the cells as CSV and Parquet, one figure.
+"""The results of the race: a table, also in Markdown, `race.json`, cells as CSV and Parquet, one picture per question.
 
 Invariants: a file is written completely or not at all. Only the numbers decide which contender is marked as a winner.
 """
@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pa_parquet
 from matplotlib.figure import Figure
@@ -32,9 +31,33 @@ RACE_FILE = "race.json"
 WON = "*"
 OURS = "gr-ros2"
 """The contender with the program's own defaults."""
-_DRAWN = ("pdr", "age_mean", "latency_p99", "airtime_per_message", "first_message")
-_DRAWN_OF_TEAMS = ("pdr", "age_mean", "age_peak", "air_bytes_per_message", "all_heard")
-_LINEAR = {"pdr"}
+OURS_COLOUR, THEIRS_COLOUR = COLOURS[1], COLOURS[0]
+
+
+class _Question(NamedTuple):
+    """What a picture answers.
+
+    :param number: field of :class:`RaceCell`
+    """
+
+    text: str
+    number: str
+    logarithmic: bool = True
+
+
+QUESTIONS = {
+    "arrived": _Question("How many messages arrive?", "pdr", logarithmic=False),
+    "age": _Question("How old is what the receiver has, 95 % of the time?", "age_p95"),
+    "air": _Question("How much air does a message take?", "air_bytes_per_message"),
+    "processor": _Question("How much processor does a message take?", "processor_per_message"),
+    "first": _Question("When is the first message there?", "first_message"),
+    "heard": _Question("When do all hear all?", "all_heard"),
+    "fresh": _Question("How soon after an outage is the newest message fresh?", "fresh_after"),
+    "lost": _Question("How many messages does an outage cost?", "lost", logarithmic=False),
+    "beside": _Question("When is all there that goes beside the odometry?", "beside_done"),
+    "pictures": _Question("How many pictures arrive?", "beside_delivered", logarithmic=False),
+}
+"""The pictures of a race, by name: one question each."""
 
 
 def race_grid(race: Race) -> Grid:
@@ -127,41 +150,49 @@ def write_race(race: Race, out: Path) -> list[Path]:
         write_whole(out / "race.md", race_markdown(race), write_text),
         write_whole(out / "race.csv", table, write_csv),
         write_whole(out / "race.parquet", table, pa_parquet.write_table),
-        *save_figure(race_figure(race.cells), out, "race"),
+        *(
+            path
+            for name, figure in race_figures(race.cells).items()
+            for path in save_figure(figure, out, f"race-{name}")
+        ),
     ]
 
 
-def race_figure(cells: Sequence[RaceCell]) -> Figure:
-    """One row per number, one column per load. Bars are grouped by loss; each contender has its own colour."""
-    loads, losses = sorted({cell.load for cell in cells}), sorted({cell.loss for cell in cells})
+def race_figures(cells: Sequence[RaceCell]) -> dict[str, Figure]:
+    """A picture for each question that these cells answer, by name."""
+    asked = columns(cells)
+    questions = {name: question for name, question in QUESTIONS.items() if question.number in asked}
+    found = {name: _figure(cells, question) for name, question in questions.items()}
+    return {name: figure for name, figure in found.items() if figure is not None}
+
+
+def _figure(cells: Sequence[RaceCell], question: _Question) -> Figure | None:
+    """Bars of every contender, the shortest on top: one panel per load and loss. None: nobody has the number."""
+    groups = [
+        [(cell.contender, value) for cell in group if (value := getattr(cell, question.number)) is not None]
+        for group in by_condition(cells).values()
+    ]
+    if not any(groups):
+        return None
     names = [name for name in CONTENDERS if any(cell.contender == name for cell in cells)]
-    found = {(cell.contender, cell.load, cell.loss): cell for cell in cells}
-    drawn = _DRAWN_OF_TEAMS if any(cell.robots for cell in cells) else _DRAWN
-    figure = Figure(figsize=(2.2 + 3.6 * len(loads), 1.2 + 1.9 * len(drawn)), layout="constrained")
-    axes = figure.subplots(len(drawn), len(loads), squeeze=False, sharex=True, sharey="row")
-    places = np.arange(len(losses))
-    width = 0.84 / len(names)
-    for row, number in enumerate(drawn):
-        for column, load in enumerate(loads):
-            panel = axes[row][column]
-            for index, name in enumerate(names):
-                picked = [found.get((name, load, loss)) for loss in losses]
-                values = [np.nan if cell is None else getattr(cell, number) for cell in picked]
-                heights = np.array([np.nan if value is None else value for value in values], dtype=float)
-                heights *= 1000 if "[ms]" in COLUMNS[number].heading else 1
-                offset = (index - (len(names) - 1) / 2) * width
-                panel.bar(places + offset, heights, width, color=COLOURS[index], label=name)
-            if number not in _LINEAR:
-                panel.set_yscale("log")
-            panel.grid(axis="y", alpha=0.3)
-            if not row:
-                panel.set_title(f"load {load:.0%} of the link")
-            if not column:
-                panel.set_ylabel(COLUMNS[number].heading)
-    for panel in axes[-1]:
-        panel.set_xticks(places, [f"loss {loss:.0%}" for loss in losses])
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize="small", frameon=False)
+    column = COLUMNS[question.number]
+    figure = Figure(figsize=(1.4 + 3.2 * len(groups), 1.2 + 0.24 * len(names)), layout="constrained")
+    panels = figure.subplots(1, len(groups), squeeze=False, sharex=True)[0]
+    for panel, group, (load, loss) in zip(panels, groups, by_condition(cells), strict=True):
+        order = sorted(group, key=lambda pair: pair[1], reverse=column.better == "least")
+        for place, (name, value) in enumerate(order):
+            height = 1000 * value if "[ms]" in column.heading else value
+            panel.barh(place, height, color=OURS_COLOUR if name.startswith(OURS) else THEIRS_COLOUR)
+            panel.annotate(
+                column.shown(value), (height, place), (3, 0), textcoords="offset points", va="center", size=7
+            )
+        panel.set_yticks(range(len(order)), [name for name, _ in order], fontsize=7)
+        panel.set_title(f"load {load:.0%}, loss {loss:.0%}", fontsize=8)
+        panel.margins(x=0.15)
+        if question.logarithmic and all(value > 0 for _, value in group):
+            panel.set_xscale("log")
+    figure.suptitle(question.text, fontsize=9)
+    figure.supxlabel(column.heading, fontsize=8)
     return figure
 
 

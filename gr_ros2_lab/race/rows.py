@@ -27,7 +27,7 @@ _JPEG_QSCALE = 8
 """MJPEG's scale of quantization that comes nearest to quality 50 of libjpeg."""
 
 
-class Offer(NamedTuple):
+class RowMessage(NamedTuple):
     """A message beside the odometry, s after its first one."""
 
     t: float
@@ -70,13 +70,13 @@ class RaceRow:
             return (Beside("/robot_1/camera/image" + ("" if raw else "/compressed"), kind[raw], SENSOR),)
         return tuple(Beside(f"/robot_1/blob_{number}", BLOB, LATCHED) for number, _ in enumerate(self.latched))
 
-    def offers(self, stack: str, duration_s: float) -> Iterator[Offer]:
+    def offers(self, stack: str, duration_s: float) -> Iterator[RowMessage]:
         """What is published on these topics, topic by topic."""
         topics = self.topics(stack)
         for number, size in enumerate(self.latched):
-            yield Offer(0.0 if self.late else self.begin_s, topics[number].topic, blob(number, size))
+            yield RowMessage(0.0 if self.late else self.begin_s, topics[number].topic, blob(number, size))
         for number in range(int(duration_s * _FPS) if self.camera else 0):
-            yield Offer(number / _FPS, topics[0].topic, picture(number, compressed=topics[0].type_name != IMAGE))
+            yield RowMessage(number / _FPS, topics[0].topic, picture(number, compressed=topics[0].type_name != IMAGE))
 
 
 ROWS: dict[str, RaceRow] = {

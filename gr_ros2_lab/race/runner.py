@@ -17,7 +17,7 @@ from pathlib import Path
 from gr_ros2.core.errors import RunError
 from gr_ros2.core.watch import Watch, wait_until
 from gr_ros2_lab.race.channel import RaceChannel
-from gr_ros2_lab.race.contenders import Contender, chosen
+from gr_ros2_lab.race.contenders import QUEUE, Contender
 from gr_ros2_lab.race.endpoints import Playback, RaceProgram, RaceTopic, Seat
 from gr_ros2_lab.race.links import LinkReport, RaceIpLink, RaceRadio, RaceRosLink
 from gr_ros2_lab.race.measure import (
@@ -39,13 +39,17 @@ from gr_ros2_lab.race.race_settings import (
     beside,
     check,
     conditions,
+    racing,
     read_recordings,
 )
 from gr_ros2_lab.race.rows import ROWS
 from gr_ros2_lab.race.slots import run_slots
+from gr_ros2_lab.race.tun import QUEUE_BYTES
 from gr_ros2_lab.race.workers import PROCESSOR_S, Worker
 
 _POLL_S = 0.05
+_LOOK_S = 0.01
+"""s between two looks whether the ends have found each other, which the first message waits for."""
 _QUIET_S = 3.0
 """s. When no message has arrived for this time, no more are expected."""
 _PLAY_SLACK_S = 30.0
@@ -86,7 +90,7 @@ def run_race(settings: RaceSettings, on_cell: Callable[[int, int, str], None] | 
         plan = [
             (condition, name, contender)
             for condition in conditions(settings, recordings)
-            for name, contender in chosen(settings.peers, settings.races).items()
+            for name, contender in racing(settings).items()
         ]
         try:
             for number, (condition, name, contender) in enumerate(plan):
@@ -136,7 +140,9 @@ def _run_cell(
             air = stack.enter_context(Worker("radio", "", RaceRosLink, *arguments))
             outputs = [replace(topic, name=name) for topic, name in zip(topics, air.call("outputs"), strict=True)]
         else:
-            air = stack.enter_context(Worker("radio", "", RaceIpLink, radio, paths))
+            air = stack.enter_context(
+                Worker("radio", "", RaceIpLink, radio, paths, contender.settings.get(QUEUE, QUEUE_BYTES))
+            )
         parts, matched, began = (talker, listener, air), False, 0.0
         for end in (0,) if row.late else (1, 0):  # who receives listens first
             air.call("enter", end)
@@ -148,7 +154,8 @@ def _run_cell(
         else:
             talker.call("connect", timeout_s=timeout_s)
         used = _processor_s(parts)
-        begin = time.monotonic() + _TO_BEGIN_S
+        begin = time.monotonic()
+        found = begin - began if matched else None
         talker.ask("play", begin)
         outage = None
         if row.late:
@@ -172,7 +179,16 @@ def _run_cell(
         if outage is not None:
             check_outage(outage, streams[0], report)
         return Observed(
-            began, matched, streams[:1], report, _busy(), streams[1:], outage, (used[0] + used[1], used[2]), row.late
+            began,
+            matched,
+            streams[:1],
+            report,
+            _busy(),
+            streams[1:],
+            outage,
+            (used[0] + used[1], used[2]),
+            row.late,
+            found,
         )
 
 
@@ -239,7 +255,7 @@ def _busy() -> float:
 
 
 def _wait_matched(limit_s: float, *parts: Worker) -> bool:
-    return wait_until(lambda: all(part.call("matched") for part in parts), limit_s, look_s=_POLL_S)
+    return wait_until(lambda: all(part.call("matched") for part in parts), limit_s, look_s=_LOOK_S)
 
 
 def _drain(limit_s: float, listeners: Sequence[Worker], expected: int) -> None:

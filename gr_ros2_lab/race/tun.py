@@ -33,19 +33,22 @@ _TUN_WITHOUT_HEADER = 0x1001
 _FRAGMENTS_KEPT_S = 3
 
 
-def own_air(address: str, peer: str, *, mtu: int, byte_rate: float, overhead: float) -> tuple[str, ...]:
+def own_air(
+    address: str, peer: str, *, mtu: int, byte_rate: float, overhead: float, queue_bytes: int
+) -> tuple[str, ...]:
     """Commands that set up a point-to-point interface with a queue in the kernel.
 
     :param address, peer: IPv4 addresses of this end and the other
     :param mtu: bytes of the largest IP packet
     :param byte_rate: bytes/s that the link carries
+    :param queue_bytes: most bytes that wait in the queue
     :param overhead: airtime that the radio adds to each packet, as a number of bytes
     """
     return (
         f"ip link set {INTERFACE} mtu {mtu} txqueuelen {_RING_PACKETS} up",
         f"ip addr add {address} peer {peer} dev {INTERFACE}",
         f"tc qdisc replace dev {INTERFACE} root tbf rate {8 * byte_rate:.0f}bit burst {mtu + round(overhead)} "
-        f"limit {QUEUE_BYTES} overhead {round(overhead)} linklayer ethernet",
+        f"limit {queue_bytes} overhead {round(overhead)} linklayer ethernet",
     )
 
 

@@ -9,7 +9,7 @@ import pyarrow.parquet
 from gr_ros2.core.errors import RunError
 from gr_ros2_lab.race.contenders import CONTENDERS
 from gr_ros2_lab.race.race_settings import RaceRecording, RaceSettings
-from gr_ros2_lab.race.results import WON, ahead_of_ours, notes, race_grid, race_markdown, write_race
+from gr_ros2_lab.race.results import WON, ahead_of_ours, notes, race_figures, race_grid, race_markdown, write_race
 from gr_ros2_lab.race.runner import Race
 from tests.lab.race.support import cell
 
@@ -29,16 +29,12 @@ def test_the_table_has_a_section_per_condition_and_a_star_for_who_won() -> None:
 
 
 def test_everything_is_written_and_can_be_read_again(tmp_path: Path) -> None:
-    cells = [cell(name, drops={"on_air": number}) for number, name in enumerate(CONTENDERS)]
+    cells = [cell(name, age_p95=0.04, drops={"on_air": number}) for number, name in enumerate(CONTENDERS)]
     written = write_race(race(*cells, cell("gr-ros2", load=0.5, age_mean=None)), tmp_path / "out")
-    assert [path.name for path in written] == [
-        "race.json",
-        "race.md",
-        "race.csv",
-        "race.parquet",
-        "race.png",
-        "race.svg",
-    ]
+    pictures = ["race-arrived", "race-age", "race-air", "race-first"]
+    names = ["race.json", "race.md", "race.csv", "race.parquet"]
+    names += [f"{picture}.{kind}" for picture in pictures for kind in ("png", "svg")]
+    assert [path.name for path in written] == names
     assert all(path.stat().st_size for path in written)
     values = json.loads(written[0].read_text("utf-8"))
     assert [each["contender"] for each in values["cells"]] == [*CONTENDERS, "gr-ros2"]
@@ -75,3 +71,13 @@ def test_what_a_reader_must_not_miss_is_said() -> None:
     assert any("2 messages arrived altered" in line for line in lines)
     assert any("up to 2.5 programs per processor" in line for line in lines)
     assert lines[-1] == "stopped before all cells were run"
+
+
+def test_a_row_has_the_pictures_of_its_questions() -> None:
+    cells = [cell("gr-ros2", row="outage-5", fresh_after=0.1, lost=0), cell("zenoh-tcp", row="outage-5", lost=7)]
+    figures = race_figures(cells)
+    assert {"fresh", "lost"} <= set(figures)
+    assert "heard" not in figures
+    (panel,) = figures["lost"].axes
+    assert [label.get_text() for label in panel.get_yticklabels()] == ["zenoh-tcp", "gr-ros2"]  # the best on top
+    assert len(figures["fresh"].axes[0].patches) == 1
