@@ -99,7 +99,8 @@ class ReceivingBlock(HalfBlock):
         self._calls: Services | None = None
         self.apart: Apart | None = None
         """What takes packets that are not for the endpoint of this block."""
-        self._timer_idle = False
+        self._looks_at = -inf
+        """Time in s at which the thread of timeouts looks again by itself; -inf while it is awake."""
         self._failures = Failures(self._log, self._lock)
         self._types: TypeSearch | None = None
         self._said: set[str] = set()
@@ -243,7 +244,7 @@ class ReceivingBlock(HalfBlock):
                     events += caused
             if self._bond is not None and (asks := self._bond.asks()):
                 self._end.pace.credit(asks)
-            if self._timer_idle and self._end.next_timeout() is not None:
+            if self._looks_at > -inf and (at := self._end.next_timeout()) is not None and at < self._looks_at:
                 self.outputs.due.notify_all()
             if self._end.answers:
                 self.live.look()
@@ -302,12 +303,14 @@ class ReceivingBlock(HalfBlock):
                 events = self._end.handle_timeout(self.clock())
                 if self._bond is not None:
                     self._bond.note(events)
+                if self._end.answers:
+                    self.live.wake()  # what was missed is reported
                 if not events:
                     at = self._end.next_timeout()
                     if outputs.opening:
                         at = min(self.clock() + CHECK_S, inf if at is None else at)
-                    self._timer_idle = at is None
+                    self._looks_at = inf if at is None else at
                     outputs.due.wait(wait_until_s(at, self.clock(), _SHORTEST_WAIT_S))
-                    self._timer_idle = False
+                    self._looks_at = -inf
                 self._events += events
             self._settle()

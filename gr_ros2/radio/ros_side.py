@@ -77,6 +77,7 @@ class RosSide:
             hears=sends and config.receives and not loops_back,
             half_duplex=self.shares or all(getattr(each.options, "half_duplex", False) for each in front_ends),
             any_length=all(radio.phy.any_length for radio in main),
+            radios=len(main),
             # What any of several may carry is sent as robustly as each can: reports tell one SNR of them all.
             mcs_table=main[0].phy.mcs_table if len(radios) == 1 else (),
             airtime_s=front_end.airtime(config.packet_len),

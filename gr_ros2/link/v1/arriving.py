@@ -2,7 +2,7 @@
 
 Which messages wait for an earlier one says ``order``, which for the table of topics says ``announced``, and which are
 delivered says ``delivery``. Messages of topics without reliable publishers are delivered as they arrive, but never
-after a later message of the same topic.
+after a later message of the same topic; over several radios ``overtaking`` says which wait for an earlier one.
 
 Invariants: no message is delivered twice, or after a later message of its topic; every message of which a part arrived
 ends in one Delivered or Lost.
@@ -23,6 +23,7 @@ from gr_ros2.link.v1.delivery import UNKNOWN_S, DeliveryRules, for_all_in_order,
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Order, Ready
 from gr_ros2.link.v1.outcomes import Outcomes
+from gr_ros2.link.v1.overtaking import Overtaking
 from gr_ros2.link.v1.reassembly import PartialMessage, Reassembly
 from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.wire.control import Control, Waited
@@ -70,6 +71,7 @@ class ArrivingMessages:
     :param outcomes: takes what comes of its messages
     :param control: called with entries that are not messages
     :param relaying: is told of messages that came, where they are relayed
+    :param overtaking: which messages of other topics do; None where packets come in order
     :ivar order: which messages wait for an earlier one
     :ivar announced: the topics of the robot
     :ivar deliveries: which messages are delivered
@@ -82,6 +84,7 @@ class ArrivingMessages:
         settings: Settings,
         *,
         order: Order,
+        overtaking: Overtaking | None,
         announced: AnnouncedTopics,
         deliveries: DeliveryRules,
         reassembly: Reassembly,
@@ -92,7 +95,7 @@ class ArrivingMessages:
     ) -> None:
         self.src_id, self.boot = of
         self.order, self.announced, self.deliveries, self.reassembly = order, announced, deliveries, reassembly
-        self._settings, self._reports = settings, reports
+        self._settings, self._reports, self._overtaking = settings, reports, overtaking
         self._outcomes, self._stats = outcomes, outcomes.stats
         self._control, self._relaying = control, relaying
         self._now, self._began = 0.0, inf
@@ -187,10 +190,16 @@ class ArrivingMessages:
         topic = self.announced.topic_of(ready)
         if topic is None:
             self._await_table(ready)
-        elif not topic.reliable or ready.carried or self.order.passes(ready):
-            self._deliver(ready, topic)
-        else:
+        elif topic.reliable and not ready.carried and not self.order.passes(ready):
             self.order.wait(ready, self._now)
+        elif not self._may_overtake(ready, topic):
+            self._deliver(ready, topic)
+
+    def _may_overtake(self, ready: Ready, topic: AnnouncedTopic) -> bool:
+        """Whether a message waits because one before it may have been overtaken."""
+        if self._overtaking is None or topic.reliable or topic.fresh or ready.over is not None:
+            return False
+        return self._overtaking.holds(ready, self._now)
 
     def _await_table(self, ready: Ready) -> None:
         for lost in self.announced.wait(ready):
@@ -241,6 +250,16 @@ class ArrivingMessages:
                 self._of_another(ready)
             else:
                 self._deliver(ready, self.announced.topics[ready.topic_id])
+
+    def follow(self, waited: Iterable[Ready], now: float) -> None:
+        """Messages need not wait any more for those that were overtaken."""
+        self._now = now
+        for ready in waited:
+            topic = self.announced.topic_of(ready)
+            if topic is None:
+                self._await_table(ready)
+            else:
+                self._deliver(ready, topic)
 
     def _deliver(self, ready: Ready, topic: AnnouncedTopic) -> None:
         refusal = self.deliveries.refusal(ready, topic, self._now)

@@ -38,6 +38,7 @@ class Settings:
     :param half_duplex: whether sending and receiving share the airtime, so that reports take it from the other end
     :param access: decides when packets may leave on a channel that others share; None: whenever there is a credit
     :param relay: whether messages of other robots are sent on
+    :param radios: over how many radios packets come; those of several overtake each other
     :param hold_s: s that a complete message of a reliable topic waits for an earlier one whose sender gets no reports
     :param max_age_s: s for which a sealed message may have been withheld before it is refused; auto:
         ``MAX_AGE_S`` or, over other robots, a longer deadline, for calls and topics with a deadline or lifespan, no
@@ -67,6 +68,7 @@ class Settings:
     half_duplex: bool = False
     access: Access | None = field(default=None, compare=False)
     relay: bool = False
+    radios: int = 1
     hold_s: float = 1.0
     max_age_s: float | Auto = AUTO
     max_ages: Mapping[str, float] = field(default_factory=dict)
@@ -130,6 +132,7 @@ def end_settings(robot: RobotConfig, air: Air, *, loops_back: bool = False) -> S
         half_duplex=air.half_duplex,
         access=air.access(robot.robot_id),
         relay=air.relay,
+        radios=air.radios,
         hold_s=robot.hold_s,
         max_age_s=robot.max_age_s,
         max_ages={name: options.max_age_s for name, options in taken if options.max_age_s != AUTO},

@@ -22,6 +22,7 @@ from gr_ros2.link.v1.delivery import DeliveryRules
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Order, Ready, nobody
 from gr_ros2.link.v1.outcomes import Outcomes
+from gr_ros2.link.v1.overtaking import Overtaking
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
 from gr_ros2.wire.control import MAP, Control, LeftOut
@@ -132,6 +133,8 @@ class Inbox:
             incomplete=self._reassembly.oldest,
             brings=brings,
         )
+        several = settings.radios > 1
+        self._overtaking = Overtaking(self.decoder, self.order.contents) if several else None
         of = src_id, boot
         self.reports: Reporter = (
             SharedReporter(of, self.decoder, self.order, self._reassembly, settings)
@@ -142,6 +145,7 @@ class Inbox:
             of,
             settings,
             order=self.order,
+            overtaking=self._overtaking,
             announced=AnnouncedTopics(decoder_for, bounds.unknown),
             deliveries=self.deliveries,
             reassembly=self._reassembly,
@@ -194,6 +198,8 @@ class Inbox:
             return
         late = number < decoder.newest
         self._advance(number, now, here=True)
+        if self._overtaking is not None:
+            self._overtaking.came(number, now, late=late)
         self.reports.arrived(late=late)
         self._takes = True
         try:
@@ -272,13 +278,16 @@ class Inbox:
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do."""
-        times = self.order.next_timeout(), self.messages.next_expiry()
+        overtaken = None if self._overtaking is None else self._overtaking.next_timeout()
+        times = self.order.next_timeout(), self.messages.next_expiry(), overtaken
         return min((at for at in times if at is not None), default=None)
 
     def ended(self, now: float) -> None:
         """The sender has started again: no packet of this start comes any more, so nothing waits for one."""
         self._now = now
         self.messages.release(self.order.without(()), now)
+        if self._overtaking is not None:
+            self.messages.follow(self._overtaking.clear(), now)
         self.close(Fate.SENDER_RESTARTED)
 
     def close(self, reason: Fate) -> None:
@@ -299,8 +308,14 @@ class Inbox:
 
     def _settle(self) -> None:
         """Deliver the messages that waited for what is here or given up now."""
-        if not self._takes and (due := self.order.settle(self._now)):
+        if self._takes:
+            return
+        if due := self.order.settle(self._now):
             self.messages.release(due, self._now)
+        if self._overtaking is not None:
+            if lost := self._overtaking.lost(self._now):
+                self._missed(lost, counts=True)
+            self.messages.follow(self._overtaking.due(self._now), self._now)
 
     def _plausible(self, body: bytes) -> bool:
         try:
@@ -328,9 +343,19 @@ class Inbox:
         gone = number - newest - here
         if gone:
             met = newest >= self.first  # what came before the first packet that was heard is not lost
-            self._stats.missed[self.src_id] += gone * met
-            self.reports.missed(gone, counts=met)
             self.order.missing(now, newest + 1, newest + gone)
+            if self._overtaking is None or not met or gone > MAP:
+                self._missed(gone, counts=met)
+            else:
+                self._overtaking.missing(now, newest + 1, newest + gone)
+
+    def _missed(self, packets: int, *, counts: bool) -> None:
+        """Packets are missing.
+
+        :param counts: whether they were lost; otherwise nobody listened
+        """
+        self._stats.missed[self.src_id] += packets * counts
+        self.reports.missed(packets, counts=counts)
 
     def _recovered(self, found: tuple[int, bytes]) -> None:
         number, body = found
