@@ -19,14 +19,13 @@ from rich.console import Console
 from rich.live import Live
 
 from gr_ros2.calls.wish_frames import MOST_RATE
-from gr_ros2.cli.bag import bag_option, output_bag
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option, foxglove_option, foxglove_server
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import BackendName, Number, set_option
-from gr_ros2.cli.pcap import capture, pcap_option
 from gr_ros2.cli.ping import check
+from gr_ros2.cli.recording import bag_option, capture, output_bag, pcap_option
 from gr_ros2.cli.spectrum import LONGEST_S
 from gr_ros2.cli.status import LISTEN, MEASURE, OFFERS, PING, SET, STATUS, WANT, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted

@@ -19,7 +19,7 @@ from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import Number, set_option
-from gr_ros2.cli.pcap import capture, pcap_option
+from gr_ros2.cli.recording import capture, pcap_option
 from gr_ros2.codecs import CODECS
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.observe.observers import RunObserver

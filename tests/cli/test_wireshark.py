@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 
 from gr_ros2.cli.main import run
-from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.wireshark import DISSECTOR
 from gr_ros2.core.errors import ConfigError, WireError
 from gr_ros2.link.events import BoundPacket, PacketId, Received, SentPacket
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.observe.capture import PacketCapture
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import BOUND
 from gr_ros2.wire.mac_block import read_block

@@ -12,10 +12,10 @@ from typing import Any
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.observe.positions import humble_types
 from gr_ros2.state.keys import new_key_file
-from tests.cli.test_bag import lost_of
 from tests.e2e.links import LinkProcess, Links
 from tests.e2e.test_clocks import clock
 from tests.e2e.test_observers import disk, needs_root
+from tests.observe.test_bag import lost_of
 from tests.waiting import wait_for
 
 POINT = "geometry_msgs/msg/PointStamped"

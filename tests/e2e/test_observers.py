@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from gr_ros2.cli import main as command
-from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.core.errors import ConfigError, CrcError, RunError
 from gr_ros2.link.events import PacketId, ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.observe import observers as run_observers
+from gr_ros2.observe.capture import PacketCapture
 from gr_ros2.observe.observers import LiveRun
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording, read_recording
 from gr_ros2_lab.record.ledger import Ledger

@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.cli.bag import OutputBag
 from gr_ros2.cli.link import _live
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.observe.bag import OutputBag
 from gr_ros2.state.keys import new_key_file
-from tests.cli.test_bag import lost_of
 from tests.domains import domain
 from tests.middleware.calling import Adder, Caller, request, total
 from tests.middleware.support import CUSTOM, message
+from tests.observe.test_bag import lost_of
 from tests.radio.fibonacci import FibonacciClient, FibonacciServer
 from tests.radio.robots import QOS
 from tests.radio.team import FAST, SLOW, Team

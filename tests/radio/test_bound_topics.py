@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 
-from gr_ros2.cli.bag import OutputBag
 from gr_ros2.cli.link import _live
 from gr_ros2.cli.main import run
-from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.status import radio_words
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.gr.bound import BoundEnds
 from gr_ros2.link.events import AirPacket
 from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.observe.bag import OutputBag
+from gr_ros2.observe.capture import PacketCapture
 from gr_ros2.observe.positions import humble_types
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.live_settings import LiveSettings

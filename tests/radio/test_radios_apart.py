@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from gr_ros2.cli.capture import packets_in
-from gr_ros2.cli.pcap import PacketCapture
 from gr_ros2.cli.status import radio_words
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware.memory import MemoryMiddleware
+from gr_ros2.observe.capture import PacketCapture
 from gr_ros2.radio.config import link_from
 from gr_ros2.radio.findings import about, differences
 from gr_ros2.state.keys import new_key_file

@@ -1,4 +1,4 @@
-"""`--pcap FILE`: every packet that leaves or arrives, as a capture that Wireshark reads.
+"""Every packet that leaves or arrives, as a capture that Wireshark reads.
 
 A pcapng file of link type USER0 with two interfaces: `sent` (packets that our source composed) and `received` (packets
 that the PHY passed to the sink).
@@ -12,12 +12,10 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import click
 
 from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.core.closing import Closing
@@ -125,27 +123,6 @@ class PacketCapture(Closing):
         while left:
             left = left[self._file.write(left) :]
         self._size += len(data)
-
-
-pcap_option = click.option(
-    "--pcap",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Capture every packet for Wireshark (see `gr-ros2 wireshark`).",
-)
-
-
-@contextmanager
-def capture(path: Path | None) -> Iterator[list[PacketCapture]]:
-    """The captures of a command: one if a file is named, otherwise none.
-
-    :raises ConfigError: when the file cannot be written
-    """
-    if path is None:
-        yield []
-        return
-    with PacketCapture(path) as one:
-        yield [one]
 
 
 def _padded(data: bytes) -> bytes:

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 from gr_ros2.calls.backfill import Later, Missing, write_later
-from gr_ros2.cli.bag import OutputBag
 from gr_ros2.core.errors import BagError
 from gr_ros2.core.guard import Guard
 from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.link.events import Announced, Delivered, Lost
 from gr_ros2.link.key import Key
 from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.observe.bag import OutputBag
 from gr_ros2.radio.lost_messages import LOST_TYPE, _types
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import BACKFILL_TYPE, CALLS_TYPE, Topic

@@ -1,4 +1,4 @@
-"""`--bag FILE`: what comes out of a link, as a ROS 2 bag (MCAP).
+"""What comes out of a link, as a ROS 2 bag (MCAP).
 
 A message has two times in it: `log_time`, by which a bag is read and played, is when it was made, by this computer's
 clock, as far as the clock of its sender is known, else for how long it has been under way at least; `publish_time` is
@@ -15,12 +15,10 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Hashable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import click
 
 from gr_ros2.calls.backfill import Missing, read_later
 from gr_ros2.core.clocks import wall_ahead
@@ -215,21 +213,3 @@ class OutputBag(Closing):
 def _name(src_id: int, key: Hashable) -> _Name:
     assert isinstance(key, Key)
     return src_id, key.boot, key.number, key.place & 0xFF
-
-
-bag_option = click.option(
-    "--bag", type=click.Path(path_type=Path), metavar="FOLDER", help="Record what comes out as a ROS 2 bag (MCAP)."
-)
-
-
-@contextmanager
-def output_bag(path: Path | None) -> Iterator[list[OutputBag]]:
-    """The bags of a command: one if a folder is named, otherwise none.
-
-    :raises BagError: when it cannot be made
-    """
-    if path is None:
-        yield []
-        return
-    with OutputBag(path) as one:
-        yield [one]
