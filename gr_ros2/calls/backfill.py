@@ -36,6 +36,8 @@ _FIRST_S, _MOST_S = 0.5, 1.25
 """s from a packet to its report, until reports tell, and in their mean at most."""
 GONE_S = 8.0
 """s without a report, shorter than those after which robots take each other for gone."""
+UNKNOWN_PLACE = 0xFF
+"""Place of a message in its packet, where only the packet is known in which it began."""
 REPAIRED = 64
 """Newer packets that a report covers, after which one that was lost is not repaired any more in time."""
 
@@ -45,7 +47,8 @@ class Later(NamedTuple):
 
     :param serial: its number among all messages that its sender has submitted since it started
     :param made_us: when it was submitted, by its sender's clock, us since 1970
-    :param began: number of the packet in which it has begun to leave before, and its place there; None: it has not
+    :param began: see :func:`began_at`: number of the packet in which it has begun to leave before, and its place there;
+        None: it has not
     """
 
     topic_id: int
@@ -53,6 +56,14 @@ class Later(NamedTuple):
     made_us: int
     payload: bytes
     began: tuple[int, int] | None = None
+
+
+def began_at(number: int, place: int) -> tuple[int, int]:
+    """Where a message began, as :class:`Later` says it.
+
+    :param place: -1 is unknown
+    """
+    return number, place & UNKNOWN_PLACE
 
 
 class Missing(NamedTuple):
@@ -72,7 +83,7 @@ def write_later(messages: Iterable[Later | Missing]) -> bytes:
             number, place = (_NEVER, 0) if message.began is None else message.began
             size = len(message.payload)
             head = _HEAD.pack(
-                _MESSAGE, message.topic_id, message.serial & _SERIALS, message.made_us, number, place & 0xFF, size
+                _MESSAGE, message.topic_id, message.serial & _SERIALS, message.made_us, number, place, size
             )
             parts += [head, message.payload]
     return b"".join(parts)

@@ -17,7 +17,7 @@ from functools import partial
 from math import inf
 from typing import Any
 
-from gr_ros2.calls.backfill import Later, MessagesForLater, Missing, write_later
+from gr_ros2.calls.backfill import Later, MessagesForLater, Missing, began_at, write_later
 from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.gr.bulk_topic import add_bulk_topic
 from gr_ros2.gr.live_end import LiveEnd
@@ -78,7 +78,7 @@ class Backfill:
         elif isinstance(event, SentPacket):
             for entry in event.entries:
                 if not entry.repeat and isinstance(entry.key, Key):
-                    began = entry.key.number, entry.key.place
+                    began = began_at(entry.key.number, entry.key.place)
                     self.kept.left(entry.serial, began, event.number, event.now, last=entry.total > 0)
 
     def look(self, now: float) -> None:

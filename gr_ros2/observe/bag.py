@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gr_ros2.calls.backfill import Missing, read_later
+from gr_ros2.calls.backfill import UNKNOWN_PLACE, Missing, began_at, read_later
 from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import BagError, GrRos2Error, WireError
@@ -43,8 +43,6 @@ _LONGEST_S = 86400.0
 _REMEMBERED = 100_000
 _Name = tuple[int, ...]
 """Of a message: its robot, the start of that, and where it began, or its serial number there."""
-_UNKNOWN_PLACE = -1 & 0xFF
-"""Place of a message in a name, where only the packet is known in which it began."""
 
 
 class OutputBag(Closing):
@@ -152,7 +150,7 @@ class OutputBag(Closing):
             if each.began is not None:
                 name = (event.src_id, boot, *each.began)
                 if self._lost.pop(name, None) is None:  # of one whose first part is missing the place is not known
-                    self._lost.pop((*name[:3], _UNKNOWN_PLACE), None)
+                    self._lost.pop((*name[:3], UNKNOWN_PLACE), None)
                 known = self._is_known(name) or known
             if not known:
                 made = each.made_us * 1e-6 - (0.0 if clock is None else clock.ahead_s)
@@ -212,4 +210,4 @@ class OutputBag(Closing):
 
 def _name(src_id: int, key: Hashable) -> _Name:
     assert isinstance(key, Key)
-    return src_id, key.boot, key.number, key.place & 0xFF
+    return src_id, key.boot, *began_at(key.number, key.place)
