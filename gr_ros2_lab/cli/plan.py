@@ -23,6 +23,8 @@ from gr_ros2_lab.study.traffic import link_values, of_recording, recorded_graph
 
 _WIDTH = 110
 _ADVICE = 3
+_BEYOND = 10
+"""Times as far as the farthest place of a survey, up to which its fit is said to reach."""
 _MOST = 0.95
 """Share of the packets that arrive on a good link."""
 _GOOD = 0.9
@@ -106,12 +108,8 @@ def _tell(planner: Planner, advise: bool) -> None:
         )
     if (survey := planner.survey) is not None:
         console.print(f"The channel is that of {survey.name}: {survey.words()}.", soft_wrap=True)
-    if (half_m := planner.range_m(0.5)) is not None:
-        console.print(
-            f"The link ends at {half_m:.0f} m: half of the packets arrive there, and {_MOST:.0%} of them up to "
-            f"{planner.range_m(_MOST):.0f} m, without walls, shadowing and other robots that send.",
-            soft_wrap=True,
-        )
+    if words := range_words(planner):
+        console.print(words, soft_wrap=True)
     if not advise:
         return
     with console.status("cuts are tried"):
@@ -135,6 +133,21 @@ def _tell(planner: Planner, advise: bool) -> None:
 def _cut(cut: Cut) -> str:
     what = f"limit {cut.topic} to {cut.rate_hz:g} Hz" if cut.rate_hz else f"drop {cut.topic}"
     return f"{what}: new messages need {cut.load:.0%}"
+
+
+def range_words(planner: Planner) -> str:
+    """How far the link reaches; '' where levels do not follow from positions."""
+    half_m = planner.range_m(0.5)
+    if half_m is None:
+        return ""
+    if (survey := planner.survey) is not None and half_m > (known_m := _BEYOND * float(survey.apart.max())):
+        return (
+            f"The link ends beyond {known_m:.0f} m, {_BEYOND} times as far as the survey goes: it does not tell where."
+        )
+    return (
+        f"The link ends at {half_m:.0f} m: half of the packets arrive there, and {_MOST:.0%} of them up to "
+        f"{planner.range_m(_MOST):.0f} m, without walls, shadowing and other robots that send."
+    )
 
 
 def _table(forecast: Forecast) -> Table:

@@ -16,6 +16,7 @@ pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link import Received
+from gr_ros2_lab.cli.plan import range_words
 from gr_ros2_lab.medium.measured import SurveyedPlaces
 from gr_ros2_lab.run.load import make_phy
 from gr_ros2_lab.run.robots import surroundings
@@ -114,6 +115,12 @@ def test_a_plan_takes_the_survey_and_says_the_error_of_its_fit(rows: list[Survey
     half_m = planner.range_m(0.5)
     true_m = Planner(scenario(FAR, duration_s=30)).range_m(0.5)
     assert half_m == pytest.approx(true_m, rel=0.15)
+
+
+def test_a_survey_in_which_the_snr_does_not_fall_tells_no_range(tmp_path: Path) -> None:
+    write_table([row(float(x), snr_db=14.0) for x in range(2, 40)], tmp_path / "survey.csv")
+    planner = Planner(scenario({"trace": str(tmp_path / "survey.csv")}, duration_s=30))
+    assert range_words(planner).startswith("The link ends beyond 390 m, 10 times as far as the survey goes")
 
 
 def row(x: float, **values: Any) -> SurveyRow:
