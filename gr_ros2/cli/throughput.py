@@ -34,7 +34,8 @@ def throughput(*, robot: int, for_s: int, pid: int | None, as_json: bool) -> int
     """What the link to ROBOT carries each way beside the topics that run, and how old these are meanwhile.
 
     Both robots look at their topics for two seconds; then one fills what they leave of the air, then the other. What is
-    sent for it waits for every topic, and airtime limits hold.
+    sent for it waits for every topic, and airtime limits hold. A radio whose channel other robots share is measured by
+    itself.
     """
     chosen, console = find_link(pid), make_console()
     told: Mapping[str, Any] = ask_link(chosen, MEASURE, {"robot": robot, "for_s": for_s})
@@ -51,7 +52,9 @@ def throughput(*, robot: int, for_s: int, pid: int | None, as_json: bool) -> int
         click.echo(json.dumps(told))
     else:
         console.print(throughput_table(told), soft_wrap=True)
-    return 0 if told["there"] and told["there"]["messages"] and told["back"]["messages"] else FAILED
+        if told["words"]:
+            console.print(told["words"], soft_wrap=True)
+    return 0 if all(way is not None and way["messages"] for _, way in _ways(told)) else FAILED
 
 
 def throughput_table(told: Mapping[str, Any]) -> Table:
@@ -59,7 +62,7 @@ def throughput_table(told: Mapping[str, Any]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=None if told["state"] == "done" else told["state"])
     for column in ("", "carried", "lost", "topics beside", "their age", "at most", "before"):
         table.add_column(column, justify="right" if column else "left")
-    for name, way in ((f"to robot {told['robot']}", told["there"]), (f"from robot {told['robot']}", told["back"])):
+    for name, way in _ways(told):
         if way is not None:
             table.add_row(
                 name,
@@ -69,6 +72,18 @@ def throughput_table(told: Mapping[str, Any]) -> Table:
                 *(_in(way[age], 1e-3, "ms") for age in ("age_s", "worst_age_s", "quiet_age_s")),
             )
     return table
+
+
+def _ways(told: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any] | None]]:
+    """What was carried each way, by a name: over any radio, and over each that was measured by itself."""
+    over: dict[str, Mapping[str, Any]] = {f" over {name}": each for name, each in told["radios"].items()}
+    if not over or told["there"] is not None:
+        over = {"": told, **over}
+    return [
+        (f"{word} robot {told['robot']}{name}", each[way])
+        for name, each in over.items()
+        for word, way in (("to", "there"), ("from", "back"))
+    ]
 
 
 def _in(value: float | None, unit: float, name: str) -> str:

@@ -17,7 +17,7 @@ greater by ``APART`` times the number of the radio, counted from 1.
 
 *Services* that are bound are announced and called there, and what fills gaps (:mod:`gr_ros2.gr.backfill`) crosses
 there. What is offered and bound is asked for over all radios, and sent over its own; over a radio that shares its
-channel, it is asked for there.
+channel, it is asked for there, and what it carries is measured there (:mod:`gr_ros2.gr.throughput`).
 
 *Airtime.* The credits of the radio are for both endpoints, see :mod:`gr_ros2.link.shared_credits`.
 """
@@ -39,6 +39,7 @@ from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.radio_ports import RadioPorts
 from gr_ros2.gr.receiving import ReceivingBlock
 from gr_ros2.gr.starts import bound_state_file
+from gr_ros2.gr.throughput import LiveThroughput
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link import AirPacket, SentPacket
 from gr_ros2.link.air import Air
@@ -137,10 +138,12 @@ class BoundEnd:
     :ivar sends: whether it sends now
     :ivar calls: its services; None where it goes one way, or topics leave no room for calls
     :ivar wishes: what others ask for there
+    :ivar throughput: measurements of what it carries; None where it is measured with the other radios
     :ivar backfill: what crosses later; None where nothing does
     """
 
     wishes: LiveWishes | None = None
+    throughput: LiveThroughput | None = None
     calls: LiveCalls | None = None
     backfill: LiveBackfill | None = None
 
@@ -200,6 +203,15 @@ class BoundEnd:
                 self.calls = LiveCalls(self.end, self.source, self.sink, self.source.found)
                 if way.shares:
                     self.wishes = LiveWishes(own, self.calls, self.source, graph, clock=clock)
+                    self.throughput = LiveThroughput(
+                        own,
+                        self.end,
+                        self.calls,
+                        self.sink,
+                        share=way.air.airtime_share,
+                        sends=way.air.hears,
+                        clock=clock,
+                    )
                 if self.named and config.backfill.topics:
                     self.backfill = LiveBackfill(config, self.end, self.source, share=way.air.airtime_share)
         except GrRos2Error:
@@ -237,6 +249,7 @@ class BoundEnd:
         """Leave the ROS graph. Idempotent."""
         for part in (
             self.backfill,
+            self.throughput,
             self.wishes,
             self.calls,
             getattr(self, "source", None),

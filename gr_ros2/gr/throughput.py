@@ -171,23 +171,38 @@ class LiveThroughput:
         if thread is not None and thread is not threading.current_thread():
             thread.join()
 
-    def measure(self, robot: int, for_s: int) -> None:
-        """Measure the link to another robot.
+    def hears(self, robot: int) -> bool:
+        """Whether a robot can be asked."""
+        return robot in self._calls.heard()
 
-        :param for_s: s for each direction
-        :raises ConfigError: for a robot that is not heard, a wrong time, or while a measurement goes on
+    def check(self, robot: int, for_s: int) -> None:
+        """Check that the link to another robot can be measured now; see :meth:`measure`.
+
+        :raises ConfigError: if not
         """
         if not 1 <= for_s <= LONGEST_S:
             raise ConfigError(f"for = {for_s} s: write 1 to {LONGEST_S} s")
         if not self._sends:
             raise ConfigError("this robot does not transmit, so it cannot ask another one")
         self._calls.check_heard(robot)
+        with self._lock:
+            self._check_free(robot)
+
+    def _check_free(self, robot: int) -> None:
+        """Check that no measurement goes on; the caller holds the lock."""
+        if self._thread is not None:
+            raise ConfigError(f"a measurement of the link to robot {self._run.robot if self._run else robot} goes on")
+
+    def measure(self, robot: int, for_s: int) -> None:
+        """Measure the link to another robot.
+
+        :param for_s: s for each direction
+        :raises ConfigError: for a robot that is not heard, a wrong time, or while a measurement goes on
+        """
+        self.check(robot, for_s)
         number, now = secrets.randbits(32), self._clock()
         with self._lock:
-            if self._thread is not None:
-                raise ConfigError(
-                    f"a measurement of the link to robot {self._run.robot if self._run else robot} goes on"
-                )
+            self._check_free(robot)
             asked = _Run(robot, number, for_s, inf, inf, True, now)
             self._begin(asked)
         request = write_measure(MeasureRequest(MEASURE, number, for_s))

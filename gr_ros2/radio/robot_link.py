@@ -25,6 +25,7 @@ from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
 from gr_ros2.gr.throughput import LiveThroughput
+from gr_ros2.gr.throughput_ways import MAIN, ThroughputWays
 from gr_ros2.gr.wish_ways import WishWays, best_of
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.bond import Bond
@@ -135,6 +136,7 @@ class RobotLink(Flowgraph):
         self.node_name, graph = self._ros.node_name, self._ros.graph
         link = self._ros.link
         self.source, self.sink, self.end, self.calls = link.source, link.sink, link.end, link.calls
+        self._wishes, self._throughput = WishWays(self._wish_ways), ThroughputWays(self._throughput_ways)
         for number in range(len(radios)):
             self._connect_radio(number)
         if all(radio.phy.has_airtime for radio in radios):  # without, nothing sets a pace
@@ -426,7 +428,7 @@ class RobotLink(Flowgraph):
         """
         if not self._wish_ways():
             raise ConfigError(f"link {self.config.name}: nobody can be asked over it; that needs direction: both")
-        return WishWays(self._wish_ways)
+        return self._wishes
 
     def _wish_ways(self) -> list[LiveWishes]:
         """What is asked for over all radios, and over each that has one alone."""
@@ -435,16 +437,22 @@ class RobotLink(Flowgraph):
         return [wishes for wishes in ways if wishes is not None]
 
     @property
-    def throughput(self) -> LiveThroughput:
+    def throughput(self) -> ThroughputWays:
         """Measurements of what the link carries.
 
         :raises ConfigError: where nobody can be asked over this link
         """
-        if self._ros.link.throughput is None:
+        if not self._throughput_ways():
             raise ConfigError(
                 f"link {self.config.name}: goes one way, or has no room for calls, so nobody can be asked"
             )
-        return self._ros.link.throughput
+        return self._throughput
+
+    def _throughput_ways(self) -> dict[str, LiveThroughput]:
+        """What is measured over any radio, and over each whose channel others share, by its name."""
+        link = self._ros.link
+        ways = {MAIN: link.throughput, **{bound.way.name: bound.throughput for bound in link.bound or ()}}
+        return {name: measured for name, measured in ways.items() if measured is not None}
 
     def clocks(self) -> dict[int, ClockOffset]:
         """What is known of the clocks of the robots that are heard."""

@@ -85,6 +85,8 @@ class Links:
                 "front_end": {"name": "udp", "listen": f"127.0.0.1:{port}", "send_to": others},
                 **own,
             }
+            if "radios" in own:
+                del values["front_end"]
             file = folder / f"robot_{number}.yaml"
             file.write_text(json.dumps(values))
             self.files.append(file)

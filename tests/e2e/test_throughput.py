@@ -9,11 +9,13 @@ from typing import Any
 
 import pytest
 
+from tests.domains import free_ports
 from tests.e2e.links import LinkProcess, Links
 from tests.waiting import wait_for
 
 PEER = (sys.executable, "-m", "tests.e2e.clock_peer")
 BIT_RATE = 200_000
+FAR = 50_000
 TOPICS = {"topics": {"place": {}}}
 
 
@@ -73,6 +75,44 @@ def test_no_more_leaves_than_the_airtime_limit_allows(tmp_path: Path) -> None:
             account = link.status()["airtime"]
             assert account["spent_s"] <= account["allowed_s"]
         assert told["there"]["messages"] > 0
+
+
+@pytest.mark.slow
+def test_each_radio_is_measured_also_in_slots_and_within_its_own_limit(tmp_path: Path) -> None:
+    near, far = free_ports(2), free_ports(2)
+
+    def radio(ports: list[int], number: int, bit_rate: int, **more: Any) -> dict[str, Any]:
+        front_end = {
+            "name": "udp",
+            "listen": f"127.0.0.1:{ports[number]}",
+            "send_to": [f"127.0.0.1:{ports[1 - number]}"],
+        }
+        return {"phy": {"name": "modem", "options": {"bit_rate": bit_rate}}, "front_end": front_end, **more}
+
+    limited = {"duty_cycle": 0.3, "window_s": 10}
+    robots = [
+        {
+            **TOPICS,
+            "radios": [
+                radio(near, number, BIT_RATE, name="near"),
+                radio(far, number, FAR, name="far", medium="slots", airtime=limited),
+            ],
+        }
+        for number in (0, 1)
+    ]
+    with Links(tmp_path, *robots) as links:
+        one, two = started(links, 1, 2)
+        wait_for(lambda: [x.status()["radios"]["far"]["bound"]["heard"] for x in (one, two)] == [[2], [1]], "slots")
+        told = measured(one, "2", "--for", "5")
+        assert told["state"] == "done"
+        alone = told["radios"]["far"]
+        for way in ("there", "back"):
+            assert 0 < alone[way]["Bps"] < 0.3 * FAR / 8
+            assert FAR / 8 < told[way]["Bps"] < BIT_RATE / 8
+        for link in (one, two):
+            account = link.status()["radios"]["far"]["airtime"]
+            assert account["spent_s"] <= account["allowed_s"]
+        assert "from robot 2 over far" in one.ask("throughput", "2", "--for", "1")[1]
 
 
 @pytest.mark.slow
