@@ -34,17 +34,19 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """xdist's own for groups. Two errors of pytest-xdist 3.8 are corrected: waits without end after a worker's crash.
 
     What the worker had finished is given out again, as units of no test, and no answer to one ever comes. And a worker
-    begins a test when it knows the next one, but the successor gets one unit only.
+    begins a test when it knows the next one, but the successor gets one unit only. Units are forgotten as they are
+    finished, since each test that ends looks through all that its worker still has.
     """
     if config.getoption("dist") != "loadgroup":
         return None
     from xdist.scheduler import LoadGroupScheduling
 
     class Scheduler(LoadGroupScheduling):
-        def _reschedule(self, node: Any) -> None:
-            for scope in [scope for scope, unit in self.workqueue.items() if all(unit.values())]:
-                del self.workqueue[scope]
-            super()._reschedule(node)
+        def mark_test_complete(self, node: Any, item_index: int, duration: float = 0) -> None:
+            super().mark_test_complete(node, item_index, duration)
+            scope = self._split_scope(self.registered_collections[node][item_index])
+            if all(self.assigned_work[node][scope].values()):
+                del self.assigned_work[node][scope]
 
         def schedule(self) -> None:
             super().schedule()
