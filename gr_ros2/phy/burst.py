@@ -359,10 +359,10 @@ class BurstReceiver:
         """Take the next samples; returns the packets they complete."""
         packets: list[DemodulatedPacket] = []
         while len(samples):
-            space = self._make_space()
-            self._buffer[self._end : self._end + len(samples[:space])] = samples[:space]
-            self._end += len(samples[:space])
-            samples = samples[space:]
+            count = min(self._make_space(), len(samples))
+            end = self._end + count
+            self._buffer[self._end : end] = samples[:count]
+            self._end, samples = end, samples[count:]
             packets += self._take()
         return packets
 

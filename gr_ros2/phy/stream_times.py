@@ -81,5 +81,9 @@ class StreamTimes:
                 if place <= first + slack:
                     told = seconds + (first - place) / self._rate
                     return told + self.offset() if of_device and self.offset is not None else told
-            count, now = next((it for it in self._arrived if it[0] >= end), self._arrived[-1])
+            count, now = self._arrived[-1]
+            for earlier in reversed(self._arrived):
+                if earlier[0] < end:
+                    break
+                count, now = earlier
         return now - (count - first) / self._rate

@@ -44,15 +44,21 @@ class BurstTap:
 
     def __init__(self, size: int) -> None:
         self._size = size
-        self._newest: Samples = np.empty(0, np.complex64)
+        self._bursts: tuple[Samples, ...] = ()
+        """The newest, no more than hold so many samples."""
 
     def add(self, samples: Samples) -> None:
-        """A burst, or a part of one."""
-        self._newest = np.concatenate([self._newest, samples])[-self._size :]
+        """A burst, or a part of one, which nobody changes any more."""
+        bursts = (*self._bursts, samples)
+        more = sum(map(len, bursts)) - self._size
+        while more >= len(bursts[0]):
+            more -= len(bursts[0])
+            bursts = bursts[1:]
+        self._bursts = bursts
 
     def samples(self) -> Samples | None:
         """``size`` consecutive samples, None before that many have come."""
-        newest = self._newest
+        newest = np.concatenate(self._bursts or [np.empty(0, np.complex64)])[-self._size :]
         return newest if len(newest) == self._size else None
 
 

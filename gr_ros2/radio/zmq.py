@@ -24,6 +24,7 @@ import time
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cached_property
 from math import isfinite, nan
 from typing import Annotated, Any, ClassVar, Literal
@@ -316,18 +317,18 @@ class _Departures:
     def send(self, samples: NDArray[np.complex64], at: float | None) -> None:
         """Send a burst, which begins at a time of the link's clock, as far as that is known."""
         there = nan if at is None or self._medium_clock is None else self._medium_clock.there(at)
-        self._send(there, samples.astype(SAMPLE, copy=False).tobytes())
+        self._send(there, samples.astype(SAMPLE, copy=False).data)
         self._counters["bursts_out"] += 1
 
     def answer(self, at: float) -> None:
         """Tell the medium process that all has been sent that begins before ``at``."""
         self._send(at, b"")
 
-    def _send(self, at: float, samples: bytes) -> None:
+    def _send(self, at: float, samples: bytes | memoryview) -> None:
         header = HEADER.pack(MAGIC, self._sender, self._counters["bursts_out"], self._sample_rate, at)
         with self._sending:
             if not self._socket.closed:  # by close(), while arrivals were about to answer
-                self._socket.send(header + samples, zmq.NOBLOCK)
+                self._socket.send(b"".join((header, samples)), zmq.NOBLOCK)
 
     @property
     def closed(self) -> bool:
@@ -400,14 +401,13 @@ class _Arrivals:
         return True
 
     def _run(self) -> None:
-        with self._socket:
+        socket = self._socket
+        with socket, suppress(zmq.ContextTerminated):
             while True:
-                try:
-                    self.arrived(self._socket.recv(zmq.NOBLOCK if self.behind and self._listener else 0))
-                except zmq.Again:
+                if self.behind and self._listener and not socket.get(zmq.EVENTS) & zmq.POLLIN:
                     self._hand_over()
-                except zmq.ContextTerminated:
-                    return
+                else:
+                    self.arrived(socket.recv())
 
     def arrived(self, message: bytes) -> None:
         """Keep the samples of a message, unless it is refused or the queue is full."""

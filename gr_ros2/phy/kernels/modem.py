@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import weakref
+from array import array
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
@@ -112,7 +113,7 @@ class _Batch(ctypes.Structure):
         ("frames", ctypes.c_void_p),
         ("count", ctypes.c_int64),
         ("gap", ctypes.c_int64),
-        ("data", ctypes.c_void_p),
+        ("data", ctypes.c_char_p),
         ("lengths", ctypes.c_void_p),
         ("data_sizes", ctypes.c_void_p),
         ("sizes", ctypes.c_void_p),
@@ -195,12 +196,11 @@ class CompiledModem(BurstModem):
     def modulate_into(self, packets: Sequence[bytes], gap: int, out: Samples) -> None:
         frames = self.frames
         data = packets if frames.plain else [frames.of(len(one)).wrap(one).tobytes() for one in packets]
-        lengths = [len(packet) for packet in packets]
-        sizes = np.array([self._samples_of(length) + gap for length in lengths], np.int64)
-        numbers = np.array((lengths, [len(one) for one in data]), np.int32)
-        assert len(out) >= sizes.sum()
-        arrays = (np.frombuffer(b"".join(data), np.uint8), *numbers, sizes, out)
-        batch = _Batch(ctypes.addressof(self._form), len(packets), gap, *map(address, arrays))
+        lengths, data_sizes = array("i", map(len, packets)), array("i", map(len, data))
+        sizes = array("q", [self._samples_of(length) + gap for length in lengths])
+        assert len(out) >= sum(sizes)
+        arrays = (numbers.buffer_info()[0] for numbers in (lengths, data_sizes, sizes))
+        batch = _Batch(ctypes.addressof(self._form), len(packets), gap, b"".join(data), *arrays, address(out))
         checked(self._functions.modem_modulate(self._kernel, ctypes.addressof(batch)))
 
     def receiver(self) -> BurstReceiver:
@@ -246,10 +246,9 @@ class CompiledReceiver(BurstReceiver):
 
     def __init__(self, modem: CompiledModem) -> None:
         super().__init__(modem)
-        self._packets = np.empty(_ROOM * modem.frames.packet_len, np.uint8)
-        self._lengths = np.empty(_ROOM, np.int32)
-        self._newest_snrs = np.empty(_ROOM, np.float64)
-        self._ends = np.empty(_ROOM, np.int64)
+        self._packets = ctypes.create_string_buffer(_ROOM * modem.frames.packet_len)
+        self._lengths, self._newest_snrs = (ctypes.c_int32 * _ROOM)(), (ctypes.c_double * _ROOM)()
+        self._ends = (ctypes.c_int64 * _ROOM)()
         soft, points = modem.reading_size
         self._soft, self._points = np.empty(soft, np.float32), np.empty((2, points), np.complex64)
         self._stream = stream = _Stream()
@@ -257,14 +256,15 @@ class CompiledReceiver(BurstReceiver):
         stream.margin, stream.span = modem.margin, modem.span
         stream.peak, stream.burst, stream.stretch = modem.peak_samples, modem.burst_samples, self._stretch
         stream.room, stream.row_size = _ROOM, points
-        stream.packets, stream.lengths = address(self._packets), address(self._lengths)
-        stream.snrs, stream.ends = address(self._newest_snrs), address(self._ends)
+        stream.packets, stream.lengths = ctypes.addressof(self._packets), ctypes.addressof(self._lengths)
+        stream.snrs, stream.ends = ctypes.addressof(self._newest_snrs), ctypes.addressof(self._ends)
         stream.soft, stream.points = address(self._soft), address(self._points)
 
     def _take(self) -> list[DemodulatedPacket]:
         stream = self._stream
         stream.count, stream.cursor = self._end, self._cursor
-        stream.start, stream.last = (_NONE if at is None else at for at in (self._start, self._last))
+        stream.start = _NONE if self._start is None else self._start
+        stream.last = _NONE if self._last is None else self._last
         packets: list[DemodulatedPacket] = []
         reason = None
         while reason != _NEEDS_SAMPLES:
@@ -276,16 +276,17 @@ class CompiledReceiver(BurstReceiver):
             if reason == _NOT_PLAIN:
                 packets += self._unwrapped()
         self._cursor = stream.cursor
-        self._start, self._last = (None if at == _NONE else at for at in (stream.start, stream.last))
+        start, last = stream.start, stream.last
+        self._start, self._last = None if start == _NONE else start, None if last == _NONE else last
         return packets
 
     def _whole(self) -> list[DemodulatedPacket]:
         """The packets of the last call."""
-        stream, packets, begin = self._stream, [], 0
-        lengths, snrs = self._lengths[: stream.whole].tolist(), self._newest_snrs[: stream.whole].tolist()
-        joined = self._packets[: sum(lengths)].tobytes()
-        for length, snr, end in zip(lengths, snrs, self._ends[: stream.whole].tolist(), strict=True):
-            packets.append(DemodulatedPacket(joined[begin : begin + length], snr, self._counted(end)))
+        stream, packets = self._stream, []
+        begin, count = stream.packets, stream.whole
+        snrs = self._newest_snrs[:count]
+        for length, snr, end in zip(self._lengths[:count], snrs, self._ends[:count], strict=True):
+            packets.append(DemodulatedPacket(ctypes.string_at(begin, length), snr, self._counted(end)))
             begin += length
         self._measured(self._points[stream.row, : stream.row_points], snrs)
         return packets
