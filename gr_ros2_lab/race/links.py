@@ -141,59 +141,62 @@ class RaceRosLink(Closing):
         settings, self._logs = dict(contender.settings), (LinkLog(), LinkLog())
         registry = _registry(topics, settings.pop("queue", AUTO))
         paper = settings.pop("paper", None)
-        phy, block = radio.with_frames_of(packet_len), partial(RosLink, start=Start(), registry=registry)
+        self._phy, self._namespaces = radio.with_frames_of(packet_len), namespaces
+        self._block = partial(RosLink, start=Start(), registry=registry)
         ways: tuple[Direction, Direction] = ("both", "both")
         if paper is not None:
             ways = ("send", "receive")
-            block = partial(PaperLink, paper=PaperConfig(**paper), registry=registry, seed=radio.seed)
+            self._block = partial(PaperLink, paper=PaperConfig(**paper), registry=registry, seed=radio.seed)
+        publish = PublishConfig(depth=DEPTH)
+        self.outputs = [topic.republished(publish.as_, SOURCE_ID) for topic in registry]
+        """The topics on which the receiving end publishes the messages."""
+        self._links: dict[int, RobotLink] = {}
         with ExitStack() as stack:
             places = [f"ipc://{stack.enter_context(TemporaryDirectory(prefix='gr-ros2-'))}/air" for _ in DOMAINS]
-            self._links: list[RobotLink] = []
-            for end, (namespace, domain_id) in enumerate(zip(namespaces, DOMAINS, strict=True)):
-                loopback_up(namespace)
-                graph = stack.enter_context(inside(namespace, lambda domain=domain_id: _graph(domain)))  # type: ignore[misc]
-                config = LinkConfig(
+            self._configs = [
+                LinkConfig(
                     robot=SOURCE_ID + end,
                     direction=ways[end],
                     packet_len=packet_len,
                     graph=GraphConfig(namespace="", depth=DEPTH),
-                    publish=PublishConfig(depth=DEPTH),
+                    publish=publish,
                     phy=PhyConfig(name=PHY_NAME, sample_rate=radio.sample_rate),
                     front_end={"name": "zmq", "bind": places[end], "connect": [places[1 - end]]},
                     channel=radio.channel(1 - end),
                     diagnostics=DiagnosticsConfig(period_s=0),
                     **settings,
                 )
-                observer = _FrameLog(phy, self._logs[end])
-                self._links.append(RobotLink(config, middleware=graph, observer=observer, block=block))
-                stack.callback(self._links[-1].stop)
-            self._source, self._sink = self._links[0].source, self._links[1].sink
-            self._sink.outputs.announce(SOURCE_ID, [0])
-            self.outputs = [
-                self._sink.registry[number].republished(self._sink.config.publish.as_, SOURCE_ID)
-                for number in range(len(topics))
+                for end in range(len(DOMAINS))
             ]
-            """The topics on which the receiving end publishes the messages."""
+            for namespace in namespaces:
+                loopback_up(namespace)
             self._stack = stack.pop_all()
 
     def enter(self, end: int) -> None:
-        """Start the link of an end, 0 or 1."""
-        self._links[end].start()
+        """Make and start the link of an end, 0 or 1."""
+        graph = self._stack.enter_context(inside(self._namespaces[end], lambda: _graph(DOMAINS[end])))
+        observer = _FrameLog(self._phy, self._logs[end])
+        link = RobotLink(self._configs[end], middleware=graph, observer=observer, block=self._block)
+        self._stack.callback(link.stop)
+        self._links[end] = link
+        if end:
+            link.sink.outputs.announce(SOURCE_ID, [0])
+        link.start()
 
     def set_loss(self, probability: float) -> None:
         """Lose this share of all packets from now on, both ways."""
-        for link in self._links:
+        for link in self._links.values():
             link.radio.set_packet_loss(probability)
 
     def matched(self) -> bool:
         """Whether both blocks have found the programs at their ends: each side of a match is told of it by itself."""
-        return self._source.matched and self._sink.matched
+        return len(self._links) == len(DOMAINS) and self._links[0].source.matched and self._links[1].sink.matched
 
     def report(self) -> LinkReport:
         """The traffic on the air so far."""
-        topics = self._source.stats()["topics"].values()
+        topics = self._links[0].source.stats()["topics"].values()
         drops = {reason: count for topic in topics for reason, count in topic["refused"].items()}
-        on_air = sum(link.radio.counts().dropped for link in self._links)
+        on_air = sum(link.radio.counts().dropped for link in self._links.values())
         return LinkReport(*self._logs, {**drops, "on_air": on_air})
 
     def close(self) -> None:

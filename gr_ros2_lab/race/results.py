@@ -9,6 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -167,20 +168,25 @@ def race_figures(cells: Sequence[RaceCell]) -> dict[str, Figure]:
 
 
 def _figure(cells: Sequence[RaceCell], question: _Question) -> Figure | None:
-    """Bars of every contender, the shortest on top: one panel per load and loss. None: nobody has the number."""
+    """Bars of every contender, the best on top: one panel per load and loss. None: nobody has the number."""
     groups = [
-        [(cell.contender, value) for cell in group if (value := getattr(cell, question.number)) is not None]
-        for group in by_condition(cells).values()
+        [(cell.contender, getattr(cell, question.number)) for cell in group] for group in by_condition(cells).values()
     ]
-    if not any(groups):
+    if all(value is None for group in groups for _, value in group):
         return None
     names = [name for name in CONTENDERS if any(cell.contender == name for cell in cells)]
     column = COLUMNS[question.number]
     figure = Figure(figsize=(1.4 + 3.2 * len(groups), 1.2 + 0.24 * len(names)), layout="constrained")
     panels = figure.subplots(1, len(groups), squeeze=False, sharex=True)[0]
     for panel, group, (load, loss) in zip(panels, groups, by_condition(cells), strict=True):
-        order = sorted(group, key=lambda pair: pair[1], reverse=column.better == "least")
+        sign = -1 if column.better == "least" else 1
+        order = sorted(group, key=lambda pair: -inf if pair[1] is None else sign * pair[1])
         for place, (name, value) in enumerate(order):
+            if value is None:
+                panel.annotate(
+                    "never", (0, place), (3, 0), panel.get_yaxis_transform(), "offset points", va="center", size=7
+                )
+                continue
             height = 1000 * value if "[ms]" in column.heading else value
             panel.barh(place, height, color=OURS_COLOUR if name.startswith(OURS) else THEIRS_COLOUR)
             panel.annotate(
@@ -189,7 +195,7 @@ def _figure(cells: Sequence[RaceCell], question: _Question) -> Figure | None:
         panel.set_yticks(range(len(order)), [name for name, _ in order], fontsize=7)
         panel.set_title(f"load {load:.0%}, loss {loss:.0%}", fontsize=8)
         panel.margins(x=0.15)
-        if question.logarithmic and all(value > 0 for _, value in group):
+        if question.logarithmic and all(value is None or value > 0 for _, value in group):
             panel.set_xscale("log")
     figure.suptitle(question.text, fontsize=9)
     figure.supxlabel(column.heading, fontsize=8)
