@@ -40,7 +40,7 @@ _ROWS = ("steady", "outage-5", "outage-30", "late", "map", "camera")
 def race(
     short: bool, out: Path | None, loss: str | None, load: str | None, peers: str | None, **options: object
 ) -> None:
-    """Carry one recording by gr-ros2, Cyclone DDS and Zenoh over the same radio, and compare. Needs root."""
+    """Carry one recording by gr-ros2, DDS and Zenoh over the same radio, and compare. Needs root."""
     # A race loads figures, tables of files and ROS's types, for which its help does not wait.
     from gr_ros2.settings.config import build
     from gr_ros2_lab.race.race_settings import RaceSettings
