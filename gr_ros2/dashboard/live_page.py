@@ -57,6 +57,9 @@ from gr_ros2.settings.config import ChannelConfig
 
 AHEAD = 3
 """When a viewer is this number of pictures behind, it gets no new one."""
+CURVES_EVERY = 2
+"""Pictures of which one has new curves: they show minutes, and to draw them is most of what an open page costs a
+browser."""
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _SENT, _RECEIVED = "#3b82d6", "#d62728"
@@ -158,10 +161,14 @@ class LivePage:
     def offer(self, snapshot: Snapshot, radio: RadioView, always: bool = False) -> None:
         """Draw it when the document is free. Skip it while there is no viewer, or when the viewer is too far behind."""
         if self._ready and not self._pause.active and (always or self.behind < AHEAD):
-            self.document.add_next_tick_callback(partial(self.draw, snapshot, radio))
+            curves = always or not self._counter.drawn % CURVES_EVERY
+            self.document.add_next_tick_callback(partial(self.draw, snapshot, radio, curves=curves))
 
-    def draw(self, snapshot: Snapshot, radio: RadioView) -> None:
-        """Show a snapshot. The caller holds the lock of the document."""
+    def draw(self, snapshot: Snapshot, radio: RadioView, *, curves: bool = True) -> None:
+        """Show a snapshot. The caller holds the lock of the document.
+
+        :param curves: whether the curves are new, too
+        """
         self._html["tiles"].text = tiles_html(snapshot)
         self._html["counters"].text = counters_html(snapshot, radio.backlog, radio.snr_db)
         self._html["alarms"].text = alarms_html(snapshot)
@@ -170,13 +177,14 @@ class LivePage:
         self._html["team"].text = team_html(snapshot)
         self._html["paths"].text = paths_html(snapshot)
         self._html["packets"].text = packets_html(snapshot)
-        self._draw_series(snapshot)
+        if curves:
+            self._draw_curves(snapshot)
+            self._draw_radio(radio)
         self._draw_paths(snapshot)
         self._draw_pictures(snapshot)
         if snapshot.team is not None:
             own = {topic.src_id: colour(topic.colour) for topic in reversed(snapshot.topics)}
             self._draw_team(snapshot.team, own)
-        self._draw_radio(radio)
         self._show_channel(radio)
         self._asked.draw(self._monitor.asked)
         empty = set(_empty_cards(snapshot, radio)) | ({"asked"} if self._monitor.asked is None else set())
@@ -187,7 +195,7 @@ class LivePage:
         self._counter.said = ". ".join((state_text(snapshot), *snapshot.alarms))
         self._counter.drawn += 1
 
-    def _draw_series(self, snapshot: Snapshot) -> None:
+    def _draw_curves(self, snapshot: Snapshot) -> None:
         series = snapshot.series
         self._sources["series"].data = {
             "name": [line.name for line in series],
@@ -197,6 +205,12 @@ class LivePage:
             "goodput": [_small(line.goodput_Bps / 1000) for line in series],
             "age": [_small(line.age_s) for line in series],
             "queued": [_small(line.queued) for line in series],
+        }
+        self._sources["error"].data = {
+            "name": [path.name for path in snapshot.paths],
+            "colour": [colour(path.colour) for path in snapshot.paths],
+            "t": [_small(path.error_t) for path in snapshot.paths],
+            "m": [_small(path.errors_m) for path in snapshot.paths],
         }
         air = snapshot.air
         if air is not None:
@@ -238,12 +252,6 @@ class LivePage:
             "x": [end[0] for end in known],
             "y": [end[1] for end in known],
             "colour": [end[2] for end in known],
-        }
-        self._sources["error"].data = {
-            "name": names,
-            "colour": [colour(path.colour) for path in paths],
-            "t": [_small(path.error_t) for path in paths],
-            "m": [_small(path.errors_m) for path in paths],
         }
 
     def _draw_pictures(self, snapshot: Snapshot) -> None:

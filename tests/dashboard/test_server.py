@@ -127,6 +127,22 @@ def test_a_page_grows_no_larger_with_time() -> None:
     assert len(list(document.models)) < 600
 
 
+def test_every_other_picture_has_new_curves_and_the_last_one_too() -> None:
+    document, dashboard = Document(), Dashboard()
+    page = LivePage(document, dashboard, "test")
+    page.ready()
+    curves: list[object] = []
+    for last in (False, False, False, True):
+        page.offer(dashboard.snapshot, dashboard.radio, last)
+        (drawing,) = document.session_callbacks
+        document.remove_next_tick_callback(drawing)
+        page._sources["error"].data = {"name": ["old"]}
+        drawing.callback()
+        curves.append(page._sources["error"].data["name"] == [])
+        page._counter.seen = page._counter.drawn
+    assert curves == [True, False, True, True]
+
+
 def test_a_viewer_that_cannot_keep_up_gets_fewer_pictures() -> None:
     document = Document()
     dashboard = Dashboard()
