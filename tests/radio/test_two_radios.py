@@ -23,6 +23,7 @@ def closing() -> Iterator[ExitStack]:
         yield stack
 
 
+@pytest.mark.real_time  # of what is said faster than a slow computer takes it, some is dropped
 def test_two_like_radios_share_the_load_and_every_message_comes_once(tmp_path: Path, closing: ExitStack) -> None:
     team = Team(tmp_path, (FAST, FAST), closing)
     team.talk(0, 100)
