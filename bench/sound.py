@@ -18,12 +18,12 @@ from scipy import signal
 
 from bench.rows import Row
 from bench.sound_channels import Wave, faster, loudspeaker, narrow_fm, room, single_sideband, through, with_noise
-from bench.sound_peers import Peer, peers
+from bench.sound_peers import TEXT_LEN, Peer, peers
 from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS, PRESETS
 from gr_ros2.radio.audio_bursts import CARD_RATE, Upconverter
 
-CHANNELS, PACKETS, PACKET_LEN = 20, 5, 64
+CHANNELS, PACKETS, PACKET_LEN = 20, 5, TEXT_LEN
 SNR_DB = 20.0
 CLOCK_PPM, DRIVING_PPM = 300.0, 2900.0
 _PPM = 50.0
@@ -100,7 +100,7 @@ def _peer_row(cell: _Cell, peer: Peer) -> Row:
     arrived, seconds, band = 0, 0.0, preset_phy(cell.preset).sample_rate
     for seed in range(CHANNELS):
         draw = random.Random(seed)
-        texts = ["".join(draw.choices(_LETTERS, k=PACKET_LEN)) for _ in range(PACKETS)]
+        texts = ["".join(draw.choices(_LETTERS, k=TEXT_LEN)) for _ in range(PACKETS)]
         parts = []
         for text in texts:
             said = peer.spoken(text)
@@ -110,7 +110,7 @@ def _peer_row(cell: _Cell, peer: Peer) -> Row:
         came = peer.heard(cell.channel(played, band, seed))
         arrived += sum(text in came for text in texts)
     count = CHANNELS * PACKETS
-    note = f"{8 * PACKET_LEN * count / seconds:.0f} bit/s"
+    note = f"{8 * TEXT_LEN * count / seconds:.0f} bit/s"
     return Row(f"{peer.name} where {cell.preset} is: {cell.what}: packets", arrived / count, form="{:.2f}", note=note)
 
 
