@@ -66,7 +66,7 @@ class RosSource(SendingBlock):
         """
         with self._lock:
             self._end.reconfigure(dst_id=dst_id)
-            self.live.rouse()
+            self._work.notify_all()
 
 
 class RosSink(ReceivingBlock):

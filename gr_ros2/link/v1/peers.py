@@ -99,9 +99,7 @@ class Peer:
     def delay(self) -> float:
         """Shortest time in s from a packet's departure to the report that covers it. While it is known of packets only
         that were sent again, as losses make it longer, each repair that no report follows halves it."""
-        if self.delays:
-            return min(self.delays)
-        return 0.0 if self.rough == inf else ldexp(self.rough, -self.repairs)
+        return min(self.delays, default=0.0 if self.rough == inf else ldexp(self.rough, -self.repairs))
 
     @property
     def answer(self) -> float:
