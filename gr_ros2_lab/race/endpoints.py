@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from gr_ros2.core.closing import Closing
-from gr_ros2.middleware import Publisher, Qos, Subscription, join_graph
+from gr_ros2.middleware import Middleware, Publisher, Qos, Subscription, join_graph
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.middleware.base import MessageCallback, Reliability
 from gr_ros2_lab.race.contenders import ADDRESSES, QUEUE, Contender, cyclone_uri, fast_profiles, zenoh_config
@@ -130,36 +130,14 @@ class Network(ABC):
         """Leave the network with all publishers and subscriptions."""
 
 
-class DdsNetwork(Network):
-    """A ROS 2 node on Cyclone DDS.
+class RosNetwork(Network):
+    """A ROS 2 node.
 
     :param qos: QoS of the publisher; a subscription has a larger depth, so that it loses no message on a busy computer
     """
 
-    def __init__(self, domain_id: int, localhost_only: bool, qos: Qos) -> None:
-        self._graph = join_graph("dds", domain_id=domain_id, node_name="race", localhost_only=localhost_only)
-        self._qos = qos
-
-    def advertise(self, topic: RaceTopic) -> Publisher:
-        return self._graph.advertise(topic.name, topic.type_name, topic.qos or self._qos)
-
-    def subscribe(self, topic: RaceTopic, callback: MessageCallback) -> Subscription:
-        qos = topic.qos or replace(self._qos, depth=DEPTH)
-        return self._graph.subscribe(topic.name, topic.type_name, qos, callback)
-
-    def close(self) -> None:
-        self._graph.close()
-
-
-class FastNetwork(Network):
-    """A ROS 2 node on Fast DDS.
-
-    :param profiles: as :func:`fast_profiles` makes them
-    :param qos: see :class:`DdsNetwork`
-    """
-
-    def __init__(self, profiles: str, qos: Qos) -> None:
-        self._graph, self._qos = FastDds(_DOMAIN, profiles), qos
+    def __init__(self, graph: Middleware | FastDds, qos: Qos) -> None:
+        self._graph, self._qos = graph, qos
 
     def advertise(self, topic: RaceTopic) -> Publisher:
         return self._graph.advertise(topic.name, topic.type_name, topic.qos or self._qos)
@@ -285,16 +263,20 @@ def join(contender: Contender, seat: Seat, topics: Sequence[RaceTopic]) -> Netwo
         changes = {**changes, "timestamping/enabled": stamped}
         return ZenohNetwork(config, changes, reliable=contender.reliable, **how)
     if contender.stack == "gr-ros2":  # the local graphs lose nothing; the radio is between them
-        return DdsNetwork(DOMAINS[seat.number], True, Qos("reliable", "volatile", DEPTH))
+        return RosNetwork(_cyclone(DOMAINS[seat.number], localhost_only=True), Qos("reliable", "volatile", DEPTH))
     reliability: Reliability = "reliable" if contender.reliable else "best_effort"
     qos, peer = (
         Qos(reliability, "volatile", settings.pop("depth", _ROS_DEPTH)),
         "" if seat.shared else ADDRESSES[1 - seat.number],
     )
     if contender.stack == "fast":
-        return FastNetwork(fast_profiles(ADDRESSES[seat.number], peer, settings), qos)
+        return RosNetwork(FastDds(_DOMAIN, fast_profiles(ADDRESSES[seat.number], peer, settings)), qos)
     os.environ["CYCLONEDDS_URI"] = cyclone_uri(INTERFACE, peer, settings)
-    return DdsNetwork(_DOMAIN, False, qos)
+    return RosNetwork(_cyclone(_DOMAIN, localhost_only=False), qos)
+
+
+def _cyclone(domain_id: int, *, localhost_only: bool) -> Middleware:
+    return join_graph("dds", domain_id=domain_id, node_name="race", localhost_only=localhost_only)
 
 
 class RaceProgram(Closing):
