@@ -25,7 +25,7 @@ from gr_ros2.cli.dashboard import audience, dashboard_option, foxglove_option, f
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import BackendName, Number, set_option
 from gr_ros2.cli.ping import check
-from gr_ros2.cli.recording import bag_option, capture, output_bag, pcap_option
+from gr_ros2.cli.recording import bag_option, pcap_option, recording
 from gr_ros2.cli.spectrum import LONGEST_S
 from gr_ros2.cli.status import LISTEN, MEASURE, OFFERS, PING, SET, STATUS, WANT, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted
@@ -34,6 +34,8 @@ from gr_ros2.core.guard import Guard
 from gr_ros2.core.systemd import notify
 from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.middleware import MIDDLEWARE
+from gr_ros2.observe.bag import OutputBag
+from gr_ros2.observe.capture import PacketCapture
 from gr_ros2.radio import FRONT_ENDS, PRESETS
 from gr_ros2.radio.config import LinkConfig, link_from, load_link
 from gr_ros2.radio.one_line import FLAGS, one_line
@@ -146,8 +148,8 @@ def link(
     answers: dict[str, Callable[[Any], Any]] = {}
     with ExitStack() as stack:
         clients = stack.enter_context(audience(dashboard, console, settings.name, answers=answers))
-        captures = stack.enter_context(capture(pcap))
-        bags = stack.enter_context(output_bag(bag))
+        captures = stack.enter_context(recording(PacketCapture, pcap))
+        bags = stack.enter_context(recording(OutputBag, bag))
         viewers = stack.enter_context(foxglove_server(foxglove, console))
         run_observers = RunObservers([clients, *captures, *bags, *viewers], threaded=True)
         stack.callback(run_observers.run_ended, None)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import click
 
-from gr_ros2.observe.bag import OutputBag
-from gr_ros2.observe.capture import PacketCapture
+from gr_ros2.core.closing import Closing
+
+_Recorder = TypeVar("_Recorder", bound=Closing)
 
 bag_option = click.option(
     "--bag", type=click.Path(path_type=Path), metavar="FOLDER", help="Record what comes out as a ROS 2 bag (MCAP)."
@@ -23,26 +25,13 @@ pcap_option = click.option(
 
 
 @contextmanager
-def output_bag(path: Path | None) -> Iterator[list[OutputBag]]:
-    """The bags of a command: one if a folder is named, otherwise none.
+def recording(kind: Callable[[Path], _Recorder], path: Path | None) -> Iterator[list[_Recorder]]:
+    """The recorders of one kind that a command has: one if a file is named, otherwise none.
 
-    :raises BagError: when it cannot be made
+    :raises BagError, ConfigError: when it cannot be made
     """
     if path is None:
         yield []
         return
-    with OutputBag(path) as one:
-        yield [one]
-
-
-@contextmanager
-def capture(path: Path | None) -> Iterator[list[PacketCapture]]:
-    """The captures of a command: one if a file is named, otherwise none.
-
-    :raises ConfigError: when the file cannot be written
-    """
-    if path is None:
-        yield []
-        return
-    with PacketCapture(path) as one:
+    with kind(path) as one:
         yield [one]

@@ -19,9 +19,10 @@ from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.dashboard import audience, dashboard_option
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import Number, set_option
-from gr_ros2.cli.recording import capture, pcap_option
+from gr_ros2.cli.recording import pcap_option, recording
 from gr_ros2.codecs import CODECS
 from gr_ros2.core.backends import uninterrupted
+from gr_ros2.observe.capture import PacketCapture
 from gr_ros2.observe.observers import RunObserver
 from gr_ros2.settings.fields import AUTO
 from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, pictures_option
@@ -128,7 +129,7 @@ def _run(
     out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     console = make_console()
     looked_at = audience(dashboard, console, scenario.name)
-    with looked_at as run_observers, capture(pcap) as captures, _bar(console) as bar:
+    with looked_at as run_observers, recording(PacketCapture, pcap) as captures, _bar(console) as bar:
         seen: list[RunObserver] = [run_observers, *captures]
         if scenario.repetitions == 1:
             outcome = runner.run_scenario(scenario, out, _advance(bar, scenario, scenario.name), seen)
