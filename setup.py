@@ -128,6 +128,7 @@ setup(
             "losses/*",
             "losses/*/*",
             "race/*.cpp",
+            "race/*.hpp",
             "report/templates/*",
         ],
     },

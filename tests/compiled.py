@@ -12,13 +12,17 @@ from pathlib import Path
 import pytest
 
 
-def compiled(config: pytest.Config, source: Path, name: str, options: Sequence[str]) -> Path:
-    """A file that ``g++`` makes of one source, alone in a folder of its own; kept until source or options change.
+def compiled(
+    config: pytest.Config, source: Path, name: str, options: Sequence[str], headers: Sequence[Path] = ()
+) -> Path:
+    """A file that ``g++`` makes of one source, alone in a folder of its own; kept until sources or options change.
 
     :param name: of the file
+    :param headers: which the source includes from other folders
     :param options: of ``g++``; those behind the source are libraries (``-l…``)
     """
-    number = hashlib.sha256(source.read_bytes() + repr(options).encode()).hexdigest()[:16]
+    texts = b"".join(each.read_bytes() for each in (source, *headers))
+    number = hashlib.sha256(texts + repr(options).encode()).hexdigest()[:16]
     folder = config.rootpath / ".pytest_cache" / "compiled" / f"{source.stem}-{number}"
     folder.parent.mkdir(parents=True, exist_ok=True)
     with folder.with_suffix(".lock").open("w") as lock:
@@ -29,6 +33,7 @@ def compiled(config: pytest.Config, source: Path, name: str, options: Sequence[s
                 made.mkdir()
                 libraries = [option for option in options if option.startswith("-l")]
                 others = [option for option in options if option not in libraries]
+                others += [f"-I{header.parent}" for header in headers]
                 command = ["g++", *others, "-O1", "-o", str(made / name), str(source), *libraries]
                 done = subprocess.run(command, capture_output=True, text=True)
                 assert done.returncode == 0, done.stderr

@@ -20,7 +20,7 @@ from gr_ros2.core.errors import BackendMissingError, MiddlewareError
 from gr_ros2.middleware import Publisher, Qos, Subscription, ros_graph
 from gr_ros2.middleware.base import MessageCallback
 
-_SOURCE = Path(__file__).with_name("fastdds.cpp")
+_SOURCE, _HEADER = (Path(__file__).with_name(name) for name in ("fastdds.cpp", "fastdds_opaque.hpp"))
 _HEADERS = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
 _THIRD = Path("/usr/include/fastdds/config.hpp")
 """Fast DDS 3 has it; before, its library was called fastrtps."""
@@ -42,7 +42,7 @@ def library() -> Path:
         raise BackendMissingError(f"Fast DDS is not installed: {_REMEDY}")
     options = ("-std=c++17", "-O1", "-shared", "-fPIC")
     linked = ("-lfastdds" if _THIRD.exists() else "-lfastrtps", "-lfastcdr")
-    text = _SOURCE.read_bytes() + repr((options, linked, sysconfig.get_platform())).encode()
+    text = _SOURCE.read_bytes() + _HEADER.read_bytes() + repr((options, linked, sysconfig.get_platform())).encode()
     cache = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache") / "gr-ros2"
     cache.mkdir(parents=True, exist_ok=True)
     made = cache / f"fastdds-{hashlib.sha256(text).hexdigest()[:16]}.so"

@@ -20,6 +20,7 @@ from tests.middleware.support import ADAPT, BEST_EFFORT, CUSTOM, LATCHED, Peer, 
 from tests.waiting import wait_for
 
 SOURCE = Path(__file__).parents[1] / "peers" / "fastdds_peer.cpp"
+OPAQUE = Path(__file__).parents[2] / "gr_ros2_lab" / "race" / "fastdds_opaque.hpp"
 HEADER = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
 THIRD = Path("/usr/include/fastdds/rtps/transport/UDPv4TransportDescriptor.hpp")
 """Fast DDS 3 has it; before, it was called `….h` and half of all names were `fastrtps`."""
@@ -45,7 +46,7 @@ def program(pytestconfig: pytest.Config) -> Path:
     if installed() < OLDEST:
         pytest.skip(f"Fast DDS is {installed()}: from {OLDEST} on it hears Cyclone DDS 11")
     library = "-lfastdds" if THIRD.exists() else "-lfastrtps"
-    return compiled(pytestconfig, SOURCE, "peer", ("-std=c++17", library, "-lfastcdr", "-lpthread"))
+    return compiled(pytestconfig, SOURCE, "peer", ("-std=c++17", library, "-lfastcdr", "-lpthread"), [OPAQUE])
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@
 // (encapsulation header included). In, for pub: one message per line, in hex. End of input ends it.
 
 #include <cstdlib>
-#include <cstring>
 #include <iostream>
 #include <memory>
 #include <mutex>
@@ -25,104 +24,18 @@
 #include <fastdds/dds/subscriber/DataReaderListener.hpp>
 #include <fastdds/dds/subscriber/SampleInfo.hpp>
 #include <fastdds/dds/subscriber/Subscriber.hpp>
-#include <fastdds/dds/topic/TopicDataType.hpp>
-#if __has_include(<fastdds/config.hpp>)
-#define FAST_DDS_3 1
+
+#include "fastdds_opaque.hpp"
+
+#if FAST_DDS_3
 #include <fastdds/rtps/transport/UDPv4TransportDescriptor.hpp>
-namespace fast = eprosima::fastdds;
 using Duration_t = eprosima::fastdds::dds::Duration_t;
 #else
-#define FAST_DDS_3 0
 #include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
-namespace fast = eprosima::fastrtps;
 using eprosima::fastrtps::Duration_t;
 #endif
 
-using namespace eprosima::fastdds::dds;
-using fast::rtps::InstanceHandle_t;
-using fast::rtps::SerializedPayload_t;
-using Bytes = std::vector<unsigned char>;
-
 namespace {
-
-// A type about which nothing is known but its name: the message is the payload, as it came or as it goes.
-class OpaqueType : public TopicDataType {
-public:
-    explicit OpaqueType(const std::string& name)
-    {
-        // The size to begin with: payloads are reallocated, as rmw_fastrtps has it.
-#if FAST_DDS_3
-        set_name(name);
-        max_serialized_type_size = 64;
-        is_compute_key_provided = false;
-#else
-        setName(name.c_str());
-        m_typeSize = 64;
-        m_isGetKeyDefined = false;
-        auto_fill_type_object(false);
-        auto_fill_type_information(false);
-#endif
-    }
-
-#if FAST_DDS_3
-    bool serialize(const void* const data, SerializedPayload_t& payload, DataRepresentationId_t) override
-    {
-        return to_payload(data, &payload);
-    }
-
-    bool deserialize(SerializedPayload_t& payload, void* data) override { return from_payload(&payload, data); }
-
-    uint32_t calculate_serialized_size(const void* const data, DataRepresentationId_t) override
-    {
-        return static_cast<uint32_t>(static_cast<const Bytes*>(data)->size());
-    }
-
-    void* create_data() override { return new Bytes(); }
-    void delete_data(void* data) override { delete static_cast<Bytes*>(data); }
-    bool compute_key(SerializedPayload_t&, InstanceHandle_t&, bool) override { return false; }
-    bool compute_key(const void* const, InstanceHandle_t&, bool) override { return false; }
-#else
-    bool serialize(void* data, SerializedPayload_t* payload) override { return to_payload(data, payload); }
-
-    bool deserialize(SerializedPayload_t* payload, void* data) override { return from_payload(payload, data); }
-
-    std::function<uint32_t()> getSerializedSizeProvider(void* data) override
-    {
-        return [data] { return static_cast<uint32_t>(static_cast<Bytes*>(data)->size()); };
-    }
-
-    void* createData() override { return new Bytes(); }
-    void deleteData(void* data) override { delete static_cast<Bytes*>(data); }
-    bool getKey(void*, InstanceHandle_t*, bool) override { return false; }
-#endif
-
-private:
-    static bool to_payload(const void* data, SerializedPayload_t* payload)
-    {
-        const auto& bytes = *static_cast<const Bytes*>(data);
-        if (bytes.size() > payload->max_size) {
-            return false;
-        }
-        payload->encapsulation = CDR_LE;
-        payload->length = static_cast<uint32_t>(bytes.size());
-        std::memcpy(payload->data, bytes.data(), bytes.size());
-        return true;
-    }
-
-    static bool from_payload(const SerializedPayload_t* payload, void* data)
-    {
-        static_cast<Bytes*>(data)->assign(payload->data, payload->data + payload->length);
-        return true;
-    }
-};
-
-#if FAST_DDS_3
-constexpr auto OK = RETCODE_OK;
-bool written(DataWriter* writer, Bytes* bytes) { return writer->write(bytes) == OK; }
-#else
-const auto OK = ReturnCode_t::RETCODE_OK;
-bool written(DataWriter* writer, Bytes* bytes) { return writer->write(bytes); }
-#endif
 
 std::mutex output;
 
@@ -226,7 +139,7 @@ int main(int argc, char** argv)
     if (participant == nullptr) {
         return fail("no participant");
     }
-    TypeSupport type(new OpaqueType(type_name));
+    TypeSupport type(new OpaqueType(type_name.c_str()));
     type.register_type(participant);
     auto* topic = participant->create_topic(topic_name, type_name, TOPIC_QOS_DEFAULT);
     if (topic == nullptr) {
