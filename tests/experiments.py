@@ -41,7 +41,7 @@ from gr_ros2.settings.robot import RobotConfig, robot_from
 from gr_ros2_lab.cli.run import run
 from gr_ros2_lab.race.contenders import CONTENDERS
 from gr_ros2_lab.race.measure import Identity, RaceSender
-from gr_ros2_lab.race.race_settings import RaceSettings, conditions, read_recordings
+from gr_ros2_lab.race.race_settings import RaceSettings, beside, conditions, read_recordings
 from gr_ros2_lab.race.slots import run_slots
 from gr_ros2_lab.run.robots import surroundings
 from gr_ros2_lab.run.scenario import load_scenario
@@ -198,7 +198,8 @@ def prepared(**changes: Any) -> list[Any]:
     settings = build(RaceSettings, {"duration_s": 0.2, **changes})
     with TemporaryDirectory() as folder:
         recordings = read_recordings(settings, Path(folder))
-    return [conditions(settings, recordings), [(one.topic, one.due, one.payloads) for one in recordings]]
+        others = beside(settings, Path(folder), "gr-ros2")
+    return [conditions(settings, recordings), [(one.topic, one.due, one.payloads) for one in [*recordings, *others]]]
 
 
 @functools.cache

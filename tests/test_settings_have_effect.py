@@ -554,6 +554,7 @@ effects(
     peers=lambda: (list(chosen((), "two")), list(chosen(("gr-ros2",), "two"))),
     loss=differs(prepared, loss=(0.5,)),
     load=differs(prepared, load=(0.8,)),
+    row=differs(prepared, row="map"),
     seed=differs(prepared, seed=3),
 )
 
