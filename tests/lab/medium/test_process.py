@@ -317,6 +317,7 @@ def test_what_is_no_burst_is_refused_and_counted(tmp_path: Path) -> None:
             b"x" * 40,
             HEADER.pack(MAGIC, 1, 0, RATE, 0.0) + b"odd",
             HEADER.pack(MAGIC, 1, 0, RATE, 0.0) + np.full(3, np.nan, "<c8").tobytes(),
+            HEADER.pack(MAGIC, 1, 0, RATE, 0.0) + np.full(3, 1e38, "<c8").tobytes(),
             HEADER.pack(MAGIC, 1, 0, 2 * RATE, 0.0) + samples,
             HEADER.pack(MAGIC, 1, 0, RATE, nan) + samples,
             HEADER.pack(MAGIC, 1, 0, RATE, 1e300) + samples,
@@ -324,7 +325,7 @@ def test_what_is_no_burst_is_refused_and_counted(tmp_path: Path) -> None:
             HEADER.pack(MAGIC, 1, 0, RATE, nan),
         ):
             process._arrived(0, message)
-        assert process.counted == {"malformed": 4, "wrong_rate": 1, "bursts": 3, "overlapping": 0}
+        assert process.counted == {"malformed": 5, "wrong_rate": 1, "bursts": 3, "overlapping": 0}
         assert process.robots == 1
     finally:
         process.close()
