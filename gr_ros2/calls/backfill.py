@@ -10,7 +10,7 @@ more the oldest goes and is counted; a message is kept once; none that nobody ha
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from heapq import heappop, heappush
 from math import inf
@@ -19,12 +19,11 @@ from typing import NamedTuple, Protocol
 
 from gr_ros2.core.errors import EntryBoundsError, EntryKindError
 
-_MESSAGE, _MISSING = 1, 2
+_MESSAGE, _ACCOUNT = 1, 3
 _HEAD = Struct(">BBIQQBI")
-_COUNT = Struct(">BBQ")
+_COUNT = Struct(">BBQQ")
 _LATEST_US = ((1 << 63) - 1) // 1000
 """The last time that a bag can hold."""
-_NEVER = (1 << 64) - 1
 _SERIALS = (1 << 32) - 1
 _OVERHEAD = 400
 """bytes of memory counted for each message, in addition to its payload."""
@@ -36,8 +35,8 @@ _FIRST_S, _MOST_S = 0.5, 1.25
 """s from a packet to its report, until reports tell, and in their mean at most."""
 GONE_S = 8.0
 """s without a report, shorter than those after which robots take each other for gone."""
-UNKNOWN_PLACE = 0xFF
-"""Place of a message in its packet, where only the packet is known in which it began."""
+UNKNOWN_PLACE, NO_PLACE = 0xFF, 0xFE
+"""Place of a message in its packet, where only the packet is known in which it began; and of one that never began."""
 REPAIRED = 64
 """Newer packets that a report covers, after which one that was lost is not repaired any more in time."""
 
@@ -47,15 +46,20 @@ class Later(NamedTuple):
 
     :param serial: its number among all messages that its sender has submitted since it started
     :param made_us: when it was submitted, by its sender's clock, us since 1970
-    :param began: see :func:`began_at`: number of the packet in which it has begun to leave before, and its place there;
-        None: it has not
+    :param at: see :func:`began_at`: number of the packet in which it has begun to leave before, and its place there;
+        of one that never began the number of the packet that followed when it was dropped, and ``NO_PLACE``
     """
 
     topic_id: int
     serial: int
     made_us: int
     payload: bytes
-    began: tuple[int, int] | None = None
+    at: tuple[int, int]
+
+    @property
+    def began(self) -> tuple[int, int] | None:
+        """``at`` of a message that has begun to leave before; None of another one."""
+        return None if self.at[1] == NO_PLACE else self.at
 
 
 def began_at(number: int, place: int) -> tuple[int, int]:
@@ -66,38 +70,37 @@ def began_at(number: int, place: int) -> tuple[int, int]:
     return number, place & UNKNOWN_PLACE
 
 
-class Missing(NamedTuple):
-    """How many more messages of a topic its sender has given up."""
+class Account(NamedTuple):
+    """How many messages of a topic have begun to leave, or were dropped before, in front of a packet, since the start
+    of their sender. Who has an earlier account too and counts what came knows what is missing."""
 
     topic_id: int
+    number: int
     count: int  # type: ignore[assignment]
 
 
-def write_later(messages: Iterable[Later | Missing]) -> bytes:
+def write_later(messages: Iterable[Later | Account]) -> bytes:
     """The bytes of a message that fills gaps."""
     parts = []
     for message in messages:
-        if isinstance(message, Missing):
-            parts.append(_COUNT.pack(_MISSING, message.topic_id, message.count))
+        if isinstance(message, Account):
+            parts.append(_COUNT.pack(_ACCOUNT, *message))
         else:
-            number, place = (_NEVER, 0) if message.began is None else message.began
-            size = len(message.payload)
-            head = _HEAD.pack(
-                _MESSAGE, message.topic_id, message.serial & _SERIALS, message.made_us, number, place, size
-            )
-            parts += [head, message.payload]
+            topic_id, serial, made_us, payload, (number, place) = message
+            head = _HEAD.pack(_MESSAGE, topic_id, serial & _SERIALS, made_us, number, place, len(payload))
+            parts += [head, payload]
     return b"".join(parts)
 
 
-def read_later(data: bytes) -> list[Later | Missing]:
+def read_later(data: bytes) -> list[Later | Account]:
     """The messages of these bytes.
 
     :raises WireError: EntryBoundsError (cut off) or EntryKindError (of another kind)
     """
-    found: list[Later | Missing] = []
+    found: list[Later | Account] = []
     at = 0
     while at < len(data):
-        head = {_MESSAGE: _HEAD, _MISSING: _COUNT}.get(data[at])
+        head = {_MESSAGE: _HEAD, _ACCOUNT: _COUNT}.get(data[at])
         if head is None:
             raise EntryKindError(f"kind {data[at]} in what fills a gap")
         if at + head.size > len(data):
@@ -105,22 +108,21 @@ def read_later(data: bytes) -> list[Later | Missing]:
         _, topic_id, *values = head.unpack_from(data, at)
         at += head.size
         if head is _COUNT:
-            found.append(Missing(topic_id, values[0]))
+            found.append(Account(topic_id, *values))
             continue
         serial, made_us, number, place, size = values
         if made_us > _LATEST_US:
             raise EntryBoundsError(f"a message that fills a gap and was made {made_us} us after 1970")
         if at + size > len(data):
             raise EntryBoundsError(f"a message of {size} bytes that fills a gap ends at byte {len(data)}")
-        began = None if number == _NEVER else (number, place)
-        found.append(Later(topic_id, serial, made_us, data[at : at + size], began))
+        found.append(Later(topic_id, serial, made_us, data[at : at + size], (number, place)))
         at += size
     return found
 
 
 class _Kept(NamedTuple):
     """A message that may have to cross later: when it was submitted, s, and see :class:`Later`. There is no ``payload``
-    where memory was short."""
+    where memory was short; ``began`` is its ``at``, None while it has neither begun nor been dropped."""
 
     at: float
     topic_id: int
@@ -156,7 +158,6 @@ class MessagesForLater:
 
     :param for_s: s for which one is kept
     :param most_bytes: of them all
-    :ivar given_up: messages that were kept in vain and that nobody has been told of, by topic id
     :ivar lost: how many were kept in vain so far
     :ivar filled: how many have filled gaps
     :ivar unheard: whether nobody seems to hear this robot
@@ -181,7 +182,13 @@ class MessagesForLater:
         self._told = self._doubted = -1
         self._mean_s, self._since = _FIRST_S, inf
         """The mean time from a packet to its report, and since when none has come of what has left, s."""
-        self.given_up: Counter[int] = Counter()
+        self._newest = -1
+        """The newest packet with messages."""
+        self._decided: dict[int, tuple[int, int, int]] = {}
+        """By topic: the newest packet at which one of its messages began, or was dropped; how many did before it, and
+        how many there."""
+        self._heard: dict[int, Account] = {}
+        """The accounts when the newest report came."""
         self.lost = self.filled = 0
         self.unheard = False
 
@@ -199,7 +206,8 @@ class MessagesForLater:
 
         :param ever: whether it may be sent later
         """
-        kept = self._take_back(serial)
+        next_packet = self._newest + 1, NO_PLACE
+        kept = [each if each.began else self._decide(each, next_packet) for each in self._take_back(serial)]
         if ever:
             self._gap(kept)
         else:
@@ -213,9 +221,10 @@ class MessagesForLater:
         :param number: of the packet
         :param last: whether it is the last part
         """
+        self._newest = number
         kept = self._waiting.get(serial, ())
-        if kept and serial not in self._filling and kept[0].began is None:
-            kept = self._waiting[serial] = [kept[0]._replace(began=began)]
+        if kept and kept[0].began is None:
+            kept = self._waiting[serial] = [self._decide(kept[0], began)]
         if kept and last:
             del self._waiting[serial]
             # What fills gaps comes in order: it is repaired until it is there, if its last packet was for somebody.
@@ -248,6 +257,7 @@ class MessagesForLater:
             if self._since < inf:
                 self._mean_s += (min(now - self._since, _MOST_S) - self._mean_s) / 8
             self._told, self.unheard = newest, False
+            self._heard = self.accounts()
             self._since = next((left.at for left in self._left.values() if left.last > newest), inf)
         elif now - self._since > self.patience_s:
             self.unheard = True
@@ -279,6 +289,7 @@ class MessagesForLater:
         found: list[Later] = []
         while self._gaps:
             at, topic_id, serial, payload, began = self._gaps[0]
+            assert began is not None
             size += _HEAD.size + len(payload or b"")
             if taken and size > most:
                 break
@@ -294,11 +305,25 @@ class MessagesForLater:
             self._waiting[serial], self._taken = self._taken, ()
             self._whole[serial] = None
 
-    def tell(self) -> list[Missing]:
-        """What has been given up since the last call."""
-        told = [Missing(topic_id, count) for topic_id, count in self.given_up.items()]
-        self.given_up.clear()
-        return told
+    def accounts(self) -> dict[int, Account]:
+        """Of each topic, how many messages there were."""
+        number = self._newest + 1
+        return {
+            topic_id: Account(topic_id, number, before + there * (newest < number))
+            for topic_id, (newest, before, there) in self._decided.items()
+        }
+
+    def accounts_heard(self) -> dict[int, Account]:
+        """The same when somebody was heard to hear for the last time."""
+        return self._heard
+
+    def _decide(self, kept: _Kept, began: tuple[int, int]) -> _Kept:
+        """A message begins to leave, or never will: from then on it counts."""
+        newest, before, there = self._decided.get(kept.topic_id, (began[0], 0, 0))
+        if began[0] > newest:
+            newest, before, there = began[0], before + there, 0
+        self._decided[kept.topic_id] = newest, before, there + 1
+        return kept._replace(began=began)
 
     def __len__(self) -> int:
         return len(self._gaps) + sum(self._filling.values()) + self._missing
@@ -346,5 +371,4 @@ class MessagesForLater:
 
     def _give_up(self, kept: _Kept) -> None:
         self._bytes -= kept.size
-        self.given_up[kept.topic_id] += 1
         self.lost += 1

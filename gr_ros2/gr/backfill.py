@@ -12,12 +12,12 @@ is kept on.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from math import inf
 from typing import Any
 
-from gr_ros2.calls.backfill import Later, MessagesForLater, Missing, began_at, write_later
+from gr_ros2.calls.backfill import PIECE, Account, Later, MessagesForLater, began_at, write_later
 from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.gr.bulk_topic import add_bulk_topic
 from gr_ros2.gr.live_end import LiveEnd
@@ -64,6 +64,13 @@ class Backfill:
         self._tried, self._pause_s = -inf, 0.0
         self._starts: dict[int, int] = {}
         """The newest start of each robot that was heard."""
+        self._from: dict[int, Account] = {}
+        """Accounts from which robots count that have started in a silence."""
+        self._told: set[int] = set()
+        """Topics of which an account was told."""
+        self._untold, self._lost = 0, 0
+        """Bytes of messages since the last account, at least ``PIECE`` where one is due at once; and ``kept.lost``
+        then."""
         self._topic_id = add_bulk_topic(endpoint, "_backfill", BACKFILL_TYPE, waiting=WAITING, reliability="reliable")
 
     def note(self, event: SenderEvent) -> None:
@@ -73,6 +80,7 @@ class Backfill:
                 self.kept.taken(event.serial)
             elif self._chosen(event.topic_id):
                 self.kept.accepted(event.topic_id, event.serial, event.payload, event.now)
+                self._untold += len(event.payload)
         elif isinstance(event, Refused):
             self.kept.refused(event.serial, ever=event.reason != Fate.TOO_LARGE)
         elif isinstance(event, SentPacket):
@@ -90,6 +98,10 @@ class Backfill:
         }
         if any(self._starts.get(robot, start) != start for robot, start in here.items()):
             self.kept.doubt()
+        if not self._starts.items() >= here.items():
+            self._untold += PIECE
+            if self.kept.unheard:
+                self._from = self.kept.accounts_heard()
         self._starts |= here
         self.kept.heard(self._receipts, now)
         if here:
@@ -104,8 +116,9 @@ class Backfill:
             self._pause_s = 0.0
             while self._may_submit and (found := self.kept.take(self._wall_ahead())):
                 self._submit(found, now)
-            if self._may_submit and not len(self.kept) and (missing := self.kept.tell()):
-                self._submit(missing, now)
+            told = self._untold < PIECE and (len(self.kept) or self.kept.lost == self._lost)
+            if self._may_submit and not told:
+                self._submit([], now)
         elif self.kept.tries or now < self._tried + self._pause_s or not self._may_submit:
             return
         elif found := self.kept.take(self._wall_ahead(), most=0):
@@ -117,10 +130,22 @@ class Backfill:
     def _may_submit(self) -> bool:
         return self._endpoint.messages.has_space(self._topic_id) and (self._share >= 1 or self._allowed > 0)
 
-    def _submit(self, messages: Sequence[Later | Missing], now: float) -> None:
-        payload = write_later(messages)
+    def _submit(self, messages: Sequence[Later], now: float) -> None:
+        payload = write_later([*messages, *self._accounts()])
         self._allowed -= len(payload)
         self._endpoint.messages.submit(self._topic_id, payload, now)
+
+    def _accounts(self) -> Iterator[Account]:
+        """What is told beside messages that fill gaps, and as often as messages are made that would fill a piece: so
+        it takes a few thousandths of their bytes."""
+        for topic_id, account in self.kept.accounts().items():
+            if topic_id not in self._told:
+                yield Account(topic_id, 0, 0)
+            elif topic_id in self._from:
+                yield self._from[topic_id]
+            yield account
+            self._told.add(topic_id)
+        self._from, self._untold, self._lost = {}, 0, self.kept.lost
 
 
 class LiveBackfill:

@@ -175,6 +175,10 @@ class BagRecorder:
         except queue.Full:
             self._count(f"not_recorded:{channel.topic}", f"the disk is {BACKLOG} messages behind")
 
+    def note(self, name: str, text: str) -> None:
+        """Say something in ``metadata.yaml`` (``custom_data``), which is written at the end."""
+        self._writer.set_custom_data(name, text)
+
     def close(self) -> None:
         """Write what is queued and the index; the second call does nothing.
 

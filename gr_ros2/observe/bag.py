@@ -5,8 +5,9 @@ clock, as far as the clock of its sender is known, else for how long it has been
 when it came out here.
 
 What fills gaps of an outage (:mod:`gr_ros2.gr.backfill`) stands among the rest, once. What is missing at the end is
-said in the bag, in the way of rosbag2 on `events/messages_lost` of the link's node: messages of which a part has come,
-and those that their sender has given up.
+said in the bag, in the way of rosbag2 on `events/messages_lost` of the link's node: of topics whose gaps are filled
+every message that their sender made between the first and the last account that came of it, of others only those of
+which a part has come. `metadata.yaml` says which are which.
 
 Invariants: the link never waits for the disk; what the disk cannot take is counted and said.
 """
@@ -14,13 +15,14 @@ Invariants: the link never waits for the disk; what the disk cannot take is coun
 from __future__ import annotations
 
 import time
+from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gr_ros2.calls.backfill import UNKNOWN_PLACE, Missing, began_at, read_later
+from gr_ros2.calls.backfill import UNKNOWN_PLACE, Account, began_at, read_later
 from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.core.closing import Closing
 from gr_ros2.core.errors import BagError, GrRos2Error, WireError
@@ -45,6 +47,53 @@ _Name = tuple[int, ...]
 """Of a message: its robot, the start of that, and where it began, or its serial number there."""
 
 
+class _Counted:
+    """Of a topic of one start of a robot: how many of its messages are missing, by accounts of the robot.
+
+    :param topic: its name in the bag
+    :ivar last: the newest account; None until there is one
+    """
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        self._first: Account | None = None
+        self.last: Account | None = None
+        self._came = 0
+        """Messages that came and are of packets between both accounts."""
+        self._numbers: list[int] = []
+        """Packets of those that came and are newer, in order."""
+
+    def came(self, number: int) -> None:
+        """A message came.
+
+        :param number: of the packet in which it began
+        """
+        if self.last is None or number >= self.last.number:
+            insort(self._numbers, number)
+            del self._numbers[:-_REMEMBERED]
+        elif self._first is not None and number >= self._first.number:
+            self._came += 1
+
+    def told(self, account: Account) -> None:
+        """Its sender tells how many there were."""
+        if self.last is not None and account.number <= self.last.number:
+            return
+        older = bisect_left(self._numbers, account.number)
+        if self._first is None:
+            self._first = account
+        else:
+            self._came += older
+        del self._numbers[:older]
+        self.last = account
+
+    @property
+    def missing(self) -> int:
+        """How many have not come."""
+        if self._first is None or self.last is None:
+            return 0
+        return max(self.last.count - self._first.count - self._came, 0)
+
+
 class OutputBag(Closing):
     """A bag being written: a :class:`gr_ros2.observe.observers.RunObserver`.
 
@@ -62,13 +111,16 @@ class OutputBag(Closing):
         self.name = f"bag {path}"
         self.missed: Counter[str] = Counter()
         self._run: LiveRun | None = None
-        self._given_up: Counter[str] = Counter()
-        """Messages of each topic that nobody has any more."""
-        self._lost: dict[_Name, str] = {}
-        """Topics of messages of which only a part has come."""
+        self._nameless: Counter[str] = Counter()
+        """Messages of each topic that were lost, of which nothing else is known."""
+        self._lost: dict[_Name, tuple[int, str]] = {}
+        """Topics of messages of which only a part has come: id and name."""
+        self._counted: dict[tuple[int, int, int], _Counted] = {}
+        """By robot, its start and the id of a topic whose gaps are filled."""
         self._fillers: dict[tuple[int, int], int] | None = None
         self._known: dict[_Name, None] = {}
-        """The newest messages of robots that fill gaps, as one may come twice: where it was not known to be heard."""
+        """The newest messages that came. Of robots that fill gaps one may come twice: where it was not known to be
+        heard."""
         self._channels: dict[tuple[int, int], BagChannel | None] = {}
         make_folder(path.parent)
         self._recorder = BagRecorder(path, "mcap", {LOST_TYPE: lost_definition()}, self._count, lossless=False)
@@ -94,16 +146,21 @@ class OutputBag(Closing):
         elif self._run is None:
             return
         elif isinstance(event, Lost):
-            self._note_lost(self._run, event.src_id, event.topic_id, key=event.key)
+            self._note_lost(self._run, event)
         elif isinstance(event, Delivered) and not event.again:
             came = now + wall_ahead(self._run.clock)
             fillers = self._filling(self._run)
             if (event.src_id, event.topic_id) in fillers:
                 self._fill(self._run, event, came)
                 return
-            fills = event.src_id in fillers.values() and isinstance(event.key, Key)
-            if fills and self._is_known(_name(event.src_id, event.key)):
-                return
+            if isinstance(event.key, Key):
+                name = _name(event.src_id, event.key)
+                self._lost.pop(name, None)
+                known = self._is_known(name)
+                if event.src_id in fillers.values():
+                    if known:
+                        return
+                    self._count_of(self._run, event.src_id, event.key.boot, event.topic_id).came(event.key.number)
             took = event.latency_s
             if took is None or not 0 <= took <= _LONGEST_S:  # a stamp of simulated time, or of a bag that is played
                 # One that was repaired may have been under way for any time up to its age.
@@ -113,8 +170,8 @@ class OutputBag(Closing):
     def close(self) -> None:
         """Finish the file; :meth:`incomplete` says what could not be written. Idempotent."""
         with suppress(GrRos2Error):
-            if not self._recorder.closed:
-                self._tell_lost()
+            if not self._recorder.closed and self._run is not None:
+                self._tell_lost(self._run)
         with suppress(BagError):
             self._recorder.close()
 
@@ -133,7 +190,7 @@ class OutputBag(Closing):
         return self._fillers
 
     def _fill(self, run: LiveRun, event: Delivered, came: float) -> None:
-        """Write messages that fill gaps, and note what their sender has given up."""
+        """Write messages that fill gaps, and note how many there were."""
         try:
             found = read_later(event.message)
         except WireError as error:
@@ -143,8 +200,9 @@ class OutputBag(Closing):
         apart = event.topic_id // APART * APART
         clock = run.clocks().get(event.src_id)
         for each in found:
-            if isinstance(each, Missing):
-                self._note_lost(run, event.src_id, each.topic_id + apart, each.count)
+            counted = self._count_of(run, event.src_id, boot, each.topic_id + apart)
+            if isinstance(each, Account):
+                counted.told(each)
                 continue
             known = self._is_known((event.src_id, boot, each.serial))
             if each.began is not None:
@@ -153,6 +211,7 @@ class OutputBag(Closing):
                     self._lost.pop((*name[:3], UNKNOWN_PLACE), None)
                 known = self._is_known(name) or known
             if not known:
+                counted.came(each.at[0])
                 made = each.made_us * 1e-6 - (0.0 if clock is None else clock.ahead_s)
                 self._write(run, (event.src_id, each.topic_id + apart), made, came, each.payload)
 
@@ -165,22 +224,43 @@ class OutputBag(Closing):
             del self._known[next(iter(self._known))]
         return False
 
-    def _note_lost(self, run: LiveRun, src_id: int, topic_id: int, count: int = 1, key: Hashable = None) -> None:
-        """Messages are missing in the bag, unless they come later."""
-        channel = self._channel(run, (src_id, topic_id))
-        name = _name(src_id, key) if isinstance(key, Key) else None
+    def _count_of(self, run: LiveRun, src_id: int, boot: int, topic_id: int) -> _Counted:
+        found = self._counted.get((src_id, boot, topic_id))
+        if found is None:
+            channel = self._channel(run, (src_id, topic_id))
+            if channel is None:
+                return _Counted("")
+            found = self._counted[src_id, boot, topic_id] = _Counted(channel.topic)
+        return found
+
+    def _note_lost(self, run: LiveRun, event: Lost) -> None:
+        """A message is missing in the bag, unless it comes later."""
+        channel = self._channel(run, (event.src_id, event.topic_id))
+        name = _name(event.src_id, event.key) if isinstance(event.key, Key) else None
         if channel is None or name in self._known:  # it filled a gap before it was given up
             return
         if name is not None and len(self._lost) < _REMEMBERED:
-            self._lost[name] = channel.topic
+            self._lost[name] = event.topic_id, channel.topic
         else:
-            self._given_up[channel.topic] += count
+            self._nameless[channel.topic] += 1
 
-    def _tell_lost(self) -> None:
-        """Say in the bag what is missing in it, as rosbag2 does."""
-        lost = self._given_up + Counter(self._lost.values())
-        if lost and self._run is not None:
-            node = link_node(next(iter(self._run.sources)))
+    def _tell_lost(self, run: LiveRun) -> None:
+        """Say in the bag what is missing in it, as rosbag2 does, and which topics that counts."""
+        lost, whole = Counter[str](), set[str]()
+        for counted in self._counted.values():
+            if counted.last is not None:
+                whole.add(counted.topic)
+                lost[counted.topic] += counted.missing
+        for (src_id, boot, number, _), (topic_id, topic) in self._lost.items():
+            found = self._counted.get((src_id, boot, topic_id))
+            lost[topic] += found is None or found.last is None or number >= found.last.number
+        lost += Counter({topic: count for topic, count in self._nameless.items() if topic not in whole})
+        self._recorder.note(
+            "messages_lost",
+            f"all that were made, of {', '.join(sorted(whole)) or 'no topic'}; of others, those of which a part came",
+        )
+        if lost:
+            node = link_node(next(iter(run.sources)))
             where = self._recorder.channel(f"/{node}/events/messages_lost", LOST_TYPE, Qos(depth=_DEPTH))
             self._recorder.write(where, time.time_ns(), lost_event(node, lost))
 

@@ -6,14 +6,23 @@ import random
 
 import pytest
 
-from gr_ros2.calls.backfill import PIECE, REPAIRED, Later, MessagesForLater, Missing, read_later, write_later
+from gr_ros2.calls.backfill import (
+    NO_PLACE,
+    PIECE,
+    REPAIRED,
+    Account,
+    Later,
+    MessagesForLater,
+    read_later,
+    write_later,
+)
 from gr_ros2.core.errors import WireError
 
 HEARS_S = 0.1
 
 
-def later(serial: int, size: int = 100, began: tuple[int, int] | None = None) -> Later:
-    return Later(3, serial, 0, bytes(size), began)
+def later(serial: int, size: int = 100, at: tuple[int, int] = (0, NO_PLACE)) -> Later:
+    return Later(3, serial, 0, bytes(size), at)
 
 
 def accept(kept: MessagesForLater, serial: int, now: float, size: int = 100) -> None:
@@ -111,7 +120,9 @@ def test_what_was_superseded_is_filled_and_what_is_too_large_is_given_up() -> No
     kept.refused(1)
     kept.refused(3, ever=False)
     assert take(kept) == [later(1)]
-    assert (kept.tell(), kept.tell()) == ([Missing(3, 1)], [])
+    assert (kept.lost, kept.accounts()) == (1, {3: Account(3, 0, 0)})
+    kept.left(9, (0, 0), 0, 0.2, last=True)
+    assert kept.accounts() == {3: Account(3, 1, 2)}, "those that were dropped, and not the one that waits"
 
 
 def test_a_message_of_which_a_part_has_left_says_where_it_began() -> None:
@@ -121,7 +132,7 @@ def test_a_message_of_which_a_part_has_left_says_where_it_began() -> None:
     kept.heard(Heard().report(7), 0.15)
     kept.left(1, (7, 2), 8, 0.2, last=False)
     kept.refused(1)
-    assert take(kept) == [later(1, began=(7, 2))]
+    assert take(kept) == [later(1, at=(7, 2))]
 
 
 @pytest.mark.parametrize("away", [False, True])
@@ -135,7 +146,7 @@ def test_of_more_than_fits_the_oldest_are_given_up_and_counted(away: bool) -> No
     sent.look(hears=False)
     left = len(sent.kept)
     assert 50 < left < 300
-    assert sent.kept.tell() == [Missing(3, count - left)]
+    assert sent.kept.lost == count - left
     assert take(sent.kept)[0].serial == count - left
 
 
@@ -147,7 +158,7 @@ def test_what_waits_longer_than_there_is_memory_and_is_heard_was_not_lost() -> N
     for serial in range(50):
         kept.left(serial, (serial, 0), serial, 1.0, last=True)
     kept.heard(receipts.report(49 + REPAIRED, 7), 1.0)
-    assert kept.tell() == [Missing(3, 2)], "one that was refused, and one that was lost"
+    assert kept.lost == 2, "one that was refused, and one that was lost"
     assert len(kept._waiting) == 49
     assert take(kept) == []
 
@@ -210,7 +221,7 @@ def test_a_single_message_that_is_lost_and_not_repaired_is_filled() -> None:
             assert len(kept) == 2
             assert take(kept) == []
             receipts.add(6)  # repaired
-    assert take(kept) == [later(5, began=(5, 0))]
+    assert take(kept) == [later(5, at=(5, 0))]
 
 
 def test_of_a_message_of_several_packets_every_one_counts() -> None:
@@ -219,7 +230,7 @@ def test_of_a_message_of_several_packets_every_one_counts() -> None:
     for number in range(3):
         kept.left(0, (0, 0), number, 0.0, last=number == 2)
     kept.heard(receipts.report(2 + REPAIRED, 1), 1.0)
-    assert take(kept) == [later(0, began=(0, 0))]
+    assert take(kept) == [later(0, at=(0, 0))]
 
 
 def test_a_robot_that_comes_back_after_long_tells_nothing_of_what_left_before() -> None:
@@ -251,14 +262,14 @@ def test_memory_is_counted_down_to_nothing() -> None:
 
 
 def test_what_is_written_is_read() -> None:
-    messages = [later(1, 0), Missing(2, 1 << 40), later((1 << 32) - 1, 3000, (1 << 50, 255))]
+    messages = [later(1, 0), Account(2, 1 << 50, 1 << 40), later((1 << 32) - 1, 3000, (1 << 50, 255))]
     assert read_later(write_later(messages)) == messages
     assert read_later(b"") == []
 
 
 def test_bytes_of_strangers_raise_a_wire_error_or_mean_something() -> None:
     rng = random.Random(2)
-    whole = write_later([later(1, 20), Missing(2, 3), later(9, 5, (4, 1))])
+    whole = write_later([later(1, 20), Account(2, 9, 3), later(9, 5, (4, 1))])
     for _ in range(3000):
         data = bytearray(whole[: rng.randrange(len(whole) + 1)])
         for _ in range(rng.randrange(4)):

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import random
+from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 
 from gr_ros2.calls.backfill import Later, read_later
 from gr_ros2.gr.backfill import Backfill
-from gr_ros2.link.events import Delivered, ReceiverEvent, SenderEvent
+from gr_ros2.link.events import Delivered, Received, ReceiverEvent, Rejected, SenderEvent
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.mac import Slots
+from gr_ros2.middleware.bag_files import read_bag
+from gr_ros2.observe.bag import OutputBag
 from gr_ros2.settings.config import SendOptions
-from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.settings.registry import BACKFILL_TYPE, Registry, Topic
 from gr_ros2.settings.robot import BackfillConfig
 from tests.link.v1.air import SLOT_S, Air, Robot, registry
 from tests.link.v1.test_relaying import Line
+from tests.observe.test_bag import OneEnd, lost_of
 
 ODOM, SCAN = range(2)
 TOPICS = Registry(
@@ -232,3 +236,39 @@ def test_what_one_who_records_has_not_heard_crosses_later_whoever_else_has(
     missing = set(range(first, last)) - {*pair.later(), *pair.live()}
     assert bool(missing) != bool(records)
     assert not len(pair.backfill.kept)
+
+
+@pytest.mark.parametrize(("mode", "loss"), [("none", 0.0), ("encrypt", 0.3)])
+def test_a_bag_lacks_as_many_messages_as_it_says(tmp_path: Path, mode: SealMode, loss: float) -> None:
+    pair = Pair(mode, loss=loss)
+    end = OneEnd()
+    end.announced = lambda: [
+        (1, "/x/odom", Topic(ODOM, "odom", "std_msgs/msg/String")),
+        (1, "/x/_backfill", Topic(2, "_backfill", BACKFILL_TYPE)),
+    ]
+    bag = OutputBag(tmp_path / "bag")
+    bag.run_started(end)  # type: ignore[arg-type]
+
+    def record() -> None:
+        for event in pair.two.events:
+            if not isinstance(event, Received | Rejected):
+                bag.receiver_event(event, pair.air.now)
+        pair.two.events.clear()
+
+    for start in range(2):
+        pair.slots(300, odom=3)
+        pair.backfill.kept._most = 20_000
+        pair.outage(800)  # of which the memory holds a part
+        record()
+        pair.slots(300, odom=3)
+        if start:
+            pair.two.start()  # and goes on with its bag
+        pair.slots(1200, odom=20)
+        record()
+        assert pair.backfill.kept.lost > 100
+        if not start:
+            pair.one.start()
+    bag.close()
+    came = [each.payload[:4] for each in read_bag(tmp_path / "bag") if each.topic == "/x/odom"]
+    assert len(came) == len(set(came))
+    assert lost_of(tmp_path / "bag") == {"/x/odom": pair.made - len(came)}

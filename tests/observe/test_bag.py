@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from gr_ros2.calls.backfill import Later, Missing, write_later
+from gr_ros2.calls.backfill import NO_PLACE, Account, Later, write_later
 from gr_ros2.core.errors import BagError
 from gr_ros2.core.guard import Guard
 from gr_ros2.link.clocks import ClockOffset
@@ -73,7 +74,7 @@ def test_a_stamp_that_is_not_of_the_clock_does_not_move_a_message(tmp_path: Path
     assert found.stamp_ns / 1e9 == pytest.approx(wall - 2.0, abs=0.1)
 
 
-def fills(*messages: Later | Missing, boot: int = 7) -> Delivered:
+def fills(*messages: Later | Account, boot: int = 7) -> Delivered:
     return Delivered(2, 2, write_later(messages), 0, Key(boot, 100, 0))
 
 
@@ -90,7 +91,10 @@ def test_what_fills_a_gap_stands_where_it_was_made_and_once(tmp_path: Path) -> N
     with opened(tmp_path / "bag") as bag:
         bag._run.clocks = lambda: {2: ClockOffset(5.0, 0.001, 0, 0.0, 1, 5.0, 0.001, 0.0)}  # type: ignore[union-attr]
         bag.receiver_event(Delivered(2, 0, message(3, 50), 0, Key(7, 40, 1), age_s=1.0), now)
-        oldest, old = Later(0, 0, made[0], message(1, 50)), Later(0, 1, made[1], message(2, 50), (30, 0))
+        oldest, old = (
+            Later(0, 0, made[0], message(1, 50), (29, NO_PLACE)),
+            Later(0, 1, made[1], message(2, 50), (30, 0)),
+        )
         came = Later(0, 2, made[2], message(3, 50), (40, 1))
         bag.receiver_event(fills(old, came), now)
         bag.receiver_event(fills(oldest, old), now + 1)
@@ -110,8 +114,48 @@ def test_the_bag_says_what_is_missing_at_the_end(tmp_path: Path) -> None:
             bag.receiver_event(Lost(2, 0, "given_up", Key(7, 30, place)), 0.0)
         bag.receiver_event(Lost(2, 0, "expired"), 0.0)
         bag.receiver_event(Lost(2, 1, "expired", Key(7, 31, 0)), 0.0)
-        bag.receiver_event(fills(Later(0, 5, 0, message(1, 50), (30, 1)), Missing(0, 10), Missing(9, 3)), 0.0)
-    assert lost_of(tmp_path / "bag") == {"/rx_robot_2/chat": 2 + 1 + 10}
+        bag.receiver_event(fills(Later(0, 5, 0, message(1, 50), (30, 1))), 0.0)
+    assert lost_of(tmp_path / "bag") == {"/rx_robot_2/chat": 2 + 1}
+    assert custom_data(tmp_path / "bag").endswith("of no topic; of others, those of which a part came")
+
+
+def custom_data(path: Path) -> str:
+    """What a bag says of how it counts lost messages."""
+    found = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]["custom_data"]
+    return str(found["messages_lost"])
+
+
+def test_of_a_topic_whose_gaps_are_filled_every_message_is_counted_whatever_came_of_it(tmp_path: Path) -> None:
+    with opened(tmp_path / "bag") as bag:
+
+        def came(number: int, boot: int = 7) -> None:
+            bag.receiver_event(Delivered(2, 0, message(1, 50), 0, Key(boot, number, 0)), 0.0)
+
+        for number in range(90, 110):
+            came(number)
+        bag.receiver_event(fills(Account(0, 100, 500)), 0.0)  # 10 of what came are of later packets
+        for number in range(120, 130):
+            came(number)
+        bag.receiver_event(Lost(2, 0, "given_up", Key(7, 110, 0)), 0.0)
+        bag.receiver_event(Lost(2, 0, "given_up", Key(7, 141, 0)), 0.0)  # behind the last account
+        unbegun = Later(0, 5, 0, message(1, 50), (111, NO_PLACE))
+        bag.receiver_event(fills(unbegun, Later(0, 6, 0, message(1, 50), (30, 0)), Account(0, 125, 525)), 0.0)
+        bag.receiver_event(fills(Account(0, 110, 510), unbegun), 0.0)  # came late, and again
+        bag.receiver_event(fills(Later(0, 7, 0, message(1, 50), (112, 3)), Account(0, 140, 540)), 0.0)
+        bag.receiver_event(fills(Account(0, 0, 0), Account(0, 50, 50), boot=8), 0.0)  # its next start, of which 2 came
+        came(3, boot=8)
+        came(4, boot=8)
+    assert lost_of(tmp_path / "bag") == {"/rx_robot_2/chat": 40 - (10 + 10 + 2) + 1 + 48}
+    assert custom_data(tmp_path / "bag").startswith("all that were made, of /rx_robot_2/chat; ")
+
+
+def test_a_message_that_came_another_way_is_not_missing(tmp_path: Path) -> None:
+    with opened(tmp_path / "bag") as bag:
+        for key in (Key(7, 1, 0), Key(7, 2, 0)):
+            bag.receiver_event(Lost(2, 0, "expired", key), 0.0)
+            bag.receiver_event(Delivered(2, 0, message(1, 50), 0, key), 0.0)
+        bag.receiver_event(Lost(2, 0, "expired", Key(7, 2, 0)), 0.0)
+    assert lost_of(tmp_path / "bag") == {}
 
 
 def test_what_filled_a_gap_before_the_receiver_gave_it_up_is_not_missing(tmp_path: Path) -> None:
@@ -132,9 +176,9 @@ def test_a_message_of_which_the_first_part_was_missed_is_not_missing_once_it_has
 def test_what_cannot_be_read_is_counted(tmp_path: Path) -> None:
     with opened(tmp_path / "bag") as bag:
         bag.receiver_event(Delivered(2, 2, b"\xffjunk", 0), 0.0)
-        bag.receiver_event(Delivered(2, 2, write_later([Later(0, 1, 2, bytes(9))])[:-1], 0), 0.0)
-        bag.receiver_event(fills(Later(77, 1, 2, bytes(9))), 0.0)
-        bag.receiver_event(fills(Later(0, 1, (1 << 64) - 1, message(1, 50))), 0.0)
+        bag.receiver_event(Delivered(2, 2, write_later([Later(0, 1, 2, bytes(9), (1, 0))])[:-1], 0), 0.0)
+        bag.receiver_event(fills(Later(77, 1, 2, bytes(9), (1, 0)), Account(77, 1, 1)), 0.0)
+        bag.receiver_event(fills(Later(0, 1, (1 << 64) - 1, message(1, 50), (1, 0))), 0.0)
         bag.receiver_event(Delivered(2, 0, message(2, 50), 0, age_s=3e9), 0.0)  # made before 1970
     assert [each.payload for each in read_bag(tmp_path / "bag")] == [message(2, 50)]
     assert bag.incomplete() == [f"bag {tmp_path / 'bag'}: robot 2 lacks 3 messages"]
