@@ -196,7 +196,8 @@ class CloudEncoder:
         if not keep:
             return None, said
         if keep == "intensity":
-            values = _column(cloud, fields[keep]).ravel()[inside].astype(np.float64)
+            with np.errstate(invalid="ignore"):
+                values = _column(cloud, fields[keep]).ravel()[inside].astype(np.float64)
             return np.nan_to_num(values, posinf=0, neginf=0)[:, None], said
         field = fields[keep]
         if field.datatype not in (_FLOAT32, _UINT32, 5):
@@ -378,7 +379,8 @@ def _points(cloud: Any, reach: float) -> tuple[Whole, Whole]:
         raise UnfitError("cloud: no fields x, y and z of floating-point numbers")
     if not cloud.width * cloud.height:
         return np.zeros((3, 0)), np.zeros(0, bool)
-    points = np.stack([_column(cloud, fields[axis]).ravel() for axis in "xyz"]).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # there are floats of which only computing with them tells that they are none
+        points = np.stack([_column(cloud, fields[axis]).ravel() for axis in "xyz"]).astype(np.float64)
     x, y, z = points
     if reach < math.inf:
         with np.errstate(over="ignore", invalid="ignore"):

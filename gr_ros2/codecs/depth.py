@@ -316,7 +316,9 @@ def _read(type_name: str, image: Any) -> _Depth:
     size = np.dtype(kind).itemsize
     rows = rows_of(image, size)[:, : image.width * size]
     values = np.ascontiguousarray(rows).view((">" if image.is_bigendian else "<") + kind)
-    return _Depth(Origin(image.header), _valid(values.astype(np.float32) * UNITS[image.encoding]), str(image.encoding))
+    with np.errstate(all="ignore"):  # a float may be any number, also one that only computing with it tells of
+        metres = values.astype(np.float32) * UNITS[image.encoding]
+    return _Depth(Origin(image.header), _valid(metres), str(image.encoding))
 
 
 def _read_compressed(image: Any) -> _Depth:

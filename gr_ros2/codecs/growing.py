@@ -14,12 +14,14 @@ from gr_ros2.codecs.messages import CLOUD
 from gr_ros2.codecs.pack import Packer
 from gr_ros2.compression import bounds
 from gr_ros2.compression.zstd_frames import Zstd
-from gr_ros2.core.errors import CodecError
+from gr_ros2.core.errors import CodecError, DamagedError
 
 _CLOUD = CHANGES + 1
 """Form of a cloud that is sent whole."""
 _LEVEL = 6
 """Of zstd: 1 MB takes some 20 ms."""
+_SHORTEST = 8
+"""Bytes of the shortest message, and of the shortest that zstd refers to."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class GrowingEncoder(ChangesEncoder[bytes]):
         self._cloud = CloudCodec(CLOUD).encoder() if type_name == CLOUD else None
 
     def _read(self, message: bytes) -> bytes:
-        return message
+        return _begun(message)
 
     def _changes(self, base: bytes, read: bytes) -> bytes:
         return Zstd(base, _LEVEL).compress(read, least=bounds.least(len(read)))
@@ -72,7 +74,7 @@ class GrowingDecoder(ChangesDecoder[bytes]):
         self._cloud = CloudCodec(CLOUD).decoder(max_size)
 
     def _read(self, message: bytes) -> bytes:
-        return message
+        return _begun(message)
 
     def _size(self, read: bytes) -> int:
         return len(read)
@@ -82,3 +84,13 @@ class GrowingDecoder(ChangesDecoder[bytes]):
 
     def _changed(self, body: bytes, base: bytes) -> bytes:
         return Zstd(base).decompress(body, min(self._max_size, bounds.largest(len(body))))
+
+
+def _begun(message: bytes) -> bytes:
+    """The message, which begins as DDS writes one: later ones refer to it.
+
+    :raises DamagedError: for other bytes, some of which zstd would take for a dictionary with tables of its own
+    """
+    if len(message) < _SHORTEST or message[0]:
+        raise DamagedError(f"damaged message: {len(message)} bytes that do not begin as a message")
+    return message

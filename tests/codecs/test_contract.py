@@ -7,9 +7,10 @@ from contextlib import suppress
 
 import pytest
 
-from gr_ros2.codecs import CODECS, Coded
+from gr_ros2.codecs import CODECS, Coded, base
 from gr_ros2.codecs.base import KEY_TIMES
 from gr_ros2.codecs.messages import VIDEO, read
+from gr_ros2.codecs.pack import Packer
 from gr_ros2.core.errors import CodecError, DamagedError, MissingFrameError
 from tests.codecs.samples import SAMPLES, Sample
 
@@ -167,3 +168,20 @@ def test_random_bytes_are_no_frame(sample: Sample) -> None:
         sample.topic().decoder().decode(b"")
     with pytest.raises(DamagedError, match="no codec 200"):
         sample.topic().decoder().decode(b"\xc8")
+
+
+@samples
+def test_bytes_that_are_no_message_end_in_an_error_and_nothing_refers_to_them(sample: Sample) -> None:
+    """Neither at the encoder, whose next message passes, nor where somebody sends a frame that changes them."""
+    topic, message = sample.topic(), sample.messages()[-1]
+    for bad in (b"", b"\0\1\0\0", b"\x37\xa4\x30\xec" + bytes(range(200))):
+        encoder, decoder = topic.encoder(), topic.decoder()
+        with suppress(CodecError):
+            coded = encoder.encode(bad, sample.budget)
+            encoder.confirmed(coded.name)
+            decoder.decode(coded.data)
+        whole = base.frame(0, Packer().pack(bad))
+        for forged in (whole, base.frame(1, b"\x0a12345", whole.name)):
+            with suppress(CodecError):
+                decoder.decode(bytes([CODECS[sample.codec].number]) + forged.data)
+        assert decoder.decode(encoder.encode(message, sample.budget).data)
