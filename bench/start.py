@@ -30,7 +30,7 @@ def start() -> list[Row]:
     resident_mb, threads, started_s = (sorted(values)[REPEATS // 2] for values in zip(*links, strict=True))
     return [
         Row("link (psk, zmq, dds): resident", resident_mb, "MB", "≤", 90, "{:.0f}"),
-        Row("link: threads", threads, "", "≤", 23 + _processors(), note="one for each processor is of OpenBLAS"),
+        Row("link: threads", threads, "", "≤", 22 + _processors(), note="one for each processor is of OpenBLAS"),
         Row("link: processor until it runs", started_s, "s", "≤", 0.8, "{:.2f}"),
         _answers(("scenarios",), 0.5),
         _answers(("race", "--help"), 0.5),

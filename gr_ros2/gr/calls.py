@@ -67,7 +67,7 @@ class LiveCalls:
         self, end: LiveEnd[OpenEndpoint], source: SendingBlock, sink: ReceivingBlock, found: FoundTopics
     ) -> None:
         self._end, self._messages = end.endpoint, end.endpoint.messages
-        self._lock, self._work = end.lock, end.work
+        self._lock, self._rouse = end.lock, end.rouse
         self._engine = Calls(source.src_id, self._end.boot)
         self._topic_id = len(source.subscriptions.registry)
         self._source, self._sink = source, sink
@@ -189,7 +189,7 @@ class LiveCalls:
             else:
                 self._offered.pop(topic_id, None)
             self._messages.offer(topic_id, offered=there)
-            self._work.notify()
+            self._rouse()
         _log.info("service %s: %s", self._own[topic_id].name, "offered to other robots" if there else "no server")
 
     def _reply(self, ticket: int, payload: bytes) -> None:
@@ -357,7 +357,7 @@ class LiveCalls:
         """Send a frame. Called with the lock held."""
         if frame is not None:
             self._messages.submit(self._topic_id, frame.data, now, frame.lifespan_s, frame.robot)
-            self._work.notify()
+            self._rouse()
 
     def _tell_first(self, counter: str, error: Exception) -> None:
         with self._lock:

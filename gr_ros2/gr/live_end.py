@@ -30,6 +30,10 @@ class LiveEnd(Generic[_E_co]):
         self.lock = threading.Lock()
         self.work = threading.Condition(self.lock)
         self.sleeps_until = self.looked = -inf
+        self.changed = True
+        """Whether something has happened since the endpoint last had no packet."""
+        self._departs = inf
+        """When a packet may leave if nothing happens, s; a credit for it provided."""
         self.look: Callable[[], None] = lambda: None
         """Called when packets have left or come, with the lock held: a picture may have to be encoded."""
         self._foreseen = False
@@ -44,6 +48,7 @@ class LiveEnd(Generic[_E_co]):
 
         :param credited: whether nothing has come but a credit
         """
+        self.changed |= not credited or self._departs == inf
         if self.sleeps_until == -inf or (credited and self._foreseen):
             return
         at = self.endpoint.next_departure()
@@ -52,19 +57,38 @@ class LiveEnd(Generic[_E_co]):
         elif at < self.sleeps_until or self.endpoint.urgent:
             self.work.notify()
 
-    def sleep(self, clock: Callable[[], float]) -> None:
+    def rouse(self) -> None:
+        """Have the sending thread look, whatever there is; the caller holds the lock."""
+        self.changed = True
+        self.work.notify()
+
+    def due(self, now: float) -> bool:
+        """Whether the endpoint is to be asked for a packet; the caller, the sending thread, holds the lock.
+
+        It is asked after each event and after each packet, since some of what it may send it looks for only then; and
+        when one is due.
+        """
+        return self.changed or (self._departs <= now and not self.endpoint.pace.out_of_credit)
+
+    def nothing(self) -> None:
+        """The endpoint had no packet; the caller, the sending thread, holds the lock."""
+        self.changed = False
+        at = self.endpoint.next_departure(credited=True)
+        self._departs = inf if at is None else at
+
+    def sleep(self, clock: Callable[[], float], until: float = inf) -> None:
         """Wait, as the sending thread, until a packet may leave; the caller holds the lock.
 
         :param clock: gives the time in s
+        :param until: when it wakes up at the latest, s
         """
-        now = clock()
+        now, at = clock(), self._departs
         # What is due later is waited for also without a credit, so that one that comes before need not wake the thread.
-        at = self.endpoint.next_departure(credited=True)
-        self._foreseen = at is not None and at > now
-        if not self._foreseen:
-            at = self.endpoint.next_departure()
-        self.sleeps_until = inf if at is None else at
-        self.work.wait(wait_until_s(at, now, SHORTEST_WAIT_S))
+        self._foreseen = now < at < inf
+        if at <= now and self.endpoint.pace.out_of_credit:
+            at = inf
+        self.sleeps_until = until = min(at, until)
+        self.work.wait(wait_until_s(until, now, SHORTEST_WAIT_S))
         self.looked = clock()  # before it counts as awake: `stalled_s` takes no lock
         self.sleeps_until = -inf
 

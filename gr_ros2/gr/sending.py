@@ -3,13 +3,14 @@
 With several radios, each has ports of its own, and a :class:`Bond` says over which of them a packet leaves.
 
 Invariants: this block is a thin shell. All behaviour is in the link's engine, which one lock protects. One pump thread
-composes each packet just before it leaves. A callback of the middleware blocks only with ``backpressure``. Every
-dropped message is counted by name.
+composes each packet just before it leaves; where it drives the gate of its only radio, it also lets packets pass there.
+A callback of the middleware blocks only with ``backpressure``. Every dropped message is counted by name.
 """
 
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -36,7 +37,8 @@ from gr_ros2.settings.robot import RobotConfig
 
 _COUNTED = ("unread", "held_back_at_close", "pump_failed", "tf_damaged", "tf_static_full")
 _BATCH = 32
-"""Number of packets composed before the lock is released, so that callbacks do not wait long."""
+"""Number of packets composed before the lock is released, so that callbacks do not wait long. Where the sending thread
+drives a gate, each is handed over at once: another one may leave only later."""
 
 
 class Keeper(Protocol):
@@ -54,6 +56,16 @@ class Ports(Protocol):
 
     def send(self, packets: list[SentPacket], *, adaptive: bool) -> None:
         """As :meth:`RadioPorts.send`."""
+
+
+class Gate(Protocol):
+    """What sets the pace of packets, see :class:`gr_ros2.phy.airtime.AirtimeGate`."""
+
+    looks_at: float
+    looks: Callable[[], None] | None
+
+    def step(self) -> None:
+        """Do what is due."""
 
 
 class Sharing(Protocol):
@@ -124,6 +136,10 @@ class SendingBlock(HalfBlock):
         """Keeps messages for later, where something does."""
         self.sharing: Sharing | None = None
         """What else sends over its radios."""
+        self.gate: Gate | None = None
+        """What sets the pace of its only radio, if its thread does that too."""
+        self._pumping = 0
+        """Number of that thread."""
         if ports is None:
             ports = RadioPorts(self, self.radios, bond, self._lock, lambda: self.subscriptions.registry)
         self.ports = ports
@@ -177,7 +193,10 @@ class SendingBlock(HalfBlock):
         """Whether a packet has to be composed by now. For an end that knows when its packets leave."""
         with self._lock:
             at = self._end.next_departure()
-            return at is not None and at <= now
+            due = at is not None and at <= now
+            if due:  # the clock of a medium has gone faster than the computer's, by which the sending thread sleeps
+                self._work.notify()
+            return due
 
     def rate(self) -> dict[str, str]:
         """With an adaptive rate, the name of the mcs of the newest packet as ``mcs``; otherwise nothing."""
@@ -188,6 +207,11 @@ class SendingBlock(HalfBlock):
         """Let no packet leave before the first `credit` message."""
         with self._lock:
             self._end.pace.use_credit()
+
+    def drive(self, gate: Gate) -> None:
+        """Let what has passed this gate leave in the thread that composes packets. Call this before the flowgraph
+        starts."""
+        self.gate, gate.looks = gate, self._look
 
     def start(self) -> bool:
         self._unread = not self.ports.find_readers()
@@ -254,7 +278,7 @@ class SendingBlock(HalfBlock):
             config = replaced(self.config, **changes)
             self._end.reconfigure(**{name: getattr(config, name) for name in changes})  # as validated
             self.config = config
-            self._work.notify_all()
+            self.live.rouse()
             self._space.notify_all()
 
     def _credit(self, message: Any, radio: int = 0) -> None:
@@ -272,6 +296,12 @@ class SendingBlock(HalfBlock):
                 packets = self._bond.ask(radio, packets)
             self._end.pace.credit(packets, since)
             self.live.wake(credited=True)
+
+    def _look(self) -> None:
+        """Wake the sending thread, where it is not that which has changed something at the gate."""
+        if threading.get_ident() != self._pumping:
+            with self._lock:
+                self._work.notify()
 
     def wants(self, radio: int) -> bool:
         """Whether there is something to send over a radio."""
@@ -297,9 +327,12 @@ class SendingBlock(HalfBlock):
                 self._bond.spend(radio)
 
     def _pump(self) -> None:
+        gate, self._pumping = self.gate, threading.get_ident()
         while self._running:
-            self.live.looked = self.clock()
+            self.live.looked = now = self.clock()
             try:
+                if gate is not None and gate.looks_at <= now:
+                    gate.step()
                 if packets := self._compose():
                     self._emit(packets)
             except Exception as error:  # noqa: BLE001 - an exception would end all transmission
@@ -313,15 +346,20 @@ class SendingBlock(HalfBlock):
         """The packets that may leave now. If there are none, wait for a reason to look again and return none."""
         with self._lock:
             packets: list[SentPacket] = []
-            while self._running and len(packets) < _BATCH and (sent := self._end.next_packet(self.clock())) is not None:
-                packets.append(sent)
+            most = _BATCH if self.gate is None else 1
+            if self.live.due(self.clock()):
+                while len(packets) < most and (sent := self._end.next_packet(self.clock())) is not None:
+                    packets.append(sent)
+                if not packets:
+                    self.live.nothing()
             if packets:
+                self.live.changed = True
                 self.live.look()
                 self.composed += len(packets)
                 self._mcs = packets[-1].mcs
                 self._space.notify_all()
             elif self._running:
-                self.live.sleep(self.clock)
+                self.live.sleep(self.clock, inf if self.gate is None else self.gate.looks_at)
         return packets
 
     def _emit(self, packets: list[SentPacket]) -> None:

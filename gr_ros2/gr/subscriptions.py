@@ -270,7 +270,7 @@ class OpenSubscriptions(Subscriptions):
         """Code messages of a type by the definition that a node has given."""
         with self._live.lock:
             self._messages.learn(described.type_name, described.types)
-            self._live.work.notify()
+            self._live.rouse()
 
     def change(self, options: Mapping[str, SendOptions]) -> None:
         """Use other options of single topics from now on, all or none. Called with the lock held.
@@ -338,7 +338,7 @@ class OpenSubscriptions(Subscriptions):
             if topic.type_name == TF_TYPE and all(offer.durability == "transient_local" for offer in info.publishers):
                 self._static[topic.topic_id] = StaticTransforms(self._counters)
             self.subscribed = {**self.subscribed, info.topic: topic}
-            self._live.work.notify()
+            self._live.rouse()
         self._guard_loops()
         if before is None:
             self._log.info("topic %s (%s) of the ROS graph is sent", info.topic, topic.type_name)
@@ -351,7 +351,7 @@ class OpenSubscriptions(Subscriptions):
         """Use other options of a topic that is sent, by its name on the ROS graph."""
         with self._live.lock:
             self._change(self.subscribed[name].topic_id, options)
-            self._live.work.notify()
+            self._live.rouse()
 
     def remove(self, names: Iterable[str]) -> None:
         """Send these no more, by their names on the ROS graph; their topic ids stay theirs."""

@@ -66,7 +66,7 @@ class RosSource(SendingBlock):
         """
         with self._lock:
             self._end.reconfigure(dst_id=dst_id)
-            self._work.notify_all()
+            self.live.rouse()
 
 
 class RosSink(ReceivingBlock):

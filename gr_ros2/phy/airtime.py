@@ -1,5 +1,8 @@
 """The gate in front of a simulated transmitter: packets pass one per airtime, and credits flow back.
 
+A thread of its own looks when packets pass, or the one that composes them (``looks``), which saves a hop for each
+packet and for each credit.
+
 Invariants: no packet passes before its airtime is over, or before it is about to begin where a device spends the
 time (`throttle` would let bursts through); the queue is unbounded and counted; samples are never touched.
 """
@@ -8,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from math import inf
 from typing import Any
 
@@ -32,6 +36,9 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
     :param admits: whether a packet with these bytes may be sent at all; others count as refused, `not_sealed`
     :param clock: s, monotonic
     :ivar lateness: delays of packets after the time at which they should pass
+    :ivar looks_at: when somebody has to call :meth:`step` next, s; infinite until something changes
+    :ivar looks: wakes the thread that does so, once ``looks_at`` has changed. It is set before the flowgraph starts;
+        None: the gate has a thread of its own
     :raises ConfigError: for a value out of range
     """
 
@@ -49,7 +56,7 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__("gr-ros2-airtime", "gr_ros2_airtime_gate", None, None)
-        self._airtime_of = airtime_of
+        self._airtime_of = None if airtime_of is None else lru_cache(maxsize=None)(airtime_of)
         self._clock: AirtimeClock[Any] = AirtimeClock(
             airtime, LEAD_S, ahead, limit, measured=True, timed=timed, listens=listens, ready=ready
         )
@@ -59,8 +66,8 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         """Packets that have passed or are about to."""
         self.passed = 0
         self.lateness = Lateness()
-        self._looks_at = inf
-        """When its thread began with what it does, or looks again at the latest, s."""
+        self.looks_at = inf
+        self.looks: Callable[[], None] | None = None
         self.arrived = 0
         """Packets that have come."""
         self._port, self._credits = PduPort(self), CreditPort(self)
@@ -74,7 +81,7 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
 
     def at_rest(self) -> int | None:
         """How many packets have passed; None while one is due."""
-        with self._changed:
+        with self._lock:
             due = self._clock.first_due
             return None if due is not None and due <= self._now() else self._left
 
@@ -85,14 +92,14 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
 
     def transmit(self, *, on: bool) -> None:
         """Switch sending off, at once for all packets that have not reached the device, or on again."""
-        with self._changed:
+        with self._lock:
             self._clock.switch(on=on)
-            self._changed.notify_all()
+        self._look_now()
 
     def account(self) -> dict[str, Any]:
         """Whether it sends, s of airtime sent since the start, packets refused by reason; with a limit also the s sent
         in its window, the s allowed, the window, how often the account could not be stored, and whether it is now."""
-        with self._changed:
+        with self._lock:
             clock, limit = self._clock, self._clock.limit
             told = {"transmits": clock.transmits, "sent_s": clock.used, "refused": dict(clock.refused)}
             told["deferred"] = clock.deferred
@@ -110,16 +117,20 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
 
     def stalled_s(self) -> float:
         """s for which its thread has been at one thing, or asleep beyond the time at which it meant to look again;
-        infinite if it has ended. Takes no lock."""
-        if not self._running:
+        infinite if it has ended, 0 where it has none. Takes no lock."""
+        if not self._running or self.looks is not None:
             return 0.0
-        return max(0.0, self._now() - self._looks_at) if self._thread.alive else inf
+        return max(0.0, self._now() - self.looks_at) if self._thread.alive else inf
 
     def start(self) -> bool:
         self._port.find_readers()
         self._credits.find_readers()
-        self._looks_at = self._now()
-        return super().start()
+        self.looks_at = self._now()
+        if self.looks is None:
+            return super().start()
+        self._running = True
+        self.looks()
+        return True
 
     def take(self, packets: Sequence[AirPacket]) -> None:
         """Packets have come."""
@@ -138,7 +149,7 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
     def _offer(self, packet: AirPacket, passed_on: Any) -> None:
         airtime = None if self._airtime_of is None else self._airtime_of(len(packet.data), packet.mcs or 0)
         admitted = self._admits is None or self._admits(packet.data)
-        with self._changed:
+        with self._lock:
             if admitted:
                 self._clock.offer(passed_on, self._now(), airtime, packet.leave_at)
             else:
@@ -147,13 +158,21 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
 
     def _look(self) -> None:
         """Packets have come: those that take no time pass at once, of others its thread looks when."""
-        passed = []
-        with self._changed:
-            if self._at_once:
+        if self._at_once:
+            with self._lock:
                 passed = self._clock.due(self._now())
                 self._left += len(passed)
-            self._changed.notify_all()
-        self._pass(passed)
+            self._pass(passed)
+        self._look_now()
+
+    def _look_now(self) -> None:
+        """Something has changed: have the thread look again."""
+        with self._lock:
+            self.looks_at = min(self.looks_at, self._now())
+            if self.looks is None:
+                self._changed.notify_all()
+        if self.looks is not None:
+            self.looks()
 
     def _pass(self, passed: list[tuple[float, Any]]) -> None:
         if self._port.direct:
@@ -165,27 +184,28 @@ class AirtimeGate(WaitingBlock, gr.basic_block):  # type: ignore[misc]
         self.passed += len(passed)
 
     def run(self) -> None:
-        while True:
-            with self._changed:
-                if not self._running:
-                    return
-                pdus, credits = self._step()
-                free = inf if self._clock.held else self._clock.free
-            self._pass(pdus)
-            if credits:
-                self._credits.grant(credits, free)
+        while self._running:
+            self.step()
+            with self._lock:
+                now, at = self._now(), self.looks_at
+                if self._running and at > now:
+                    self._changed.wait(wait_until_s(at, now))
 
-    def _step(self) -> tuple[list[tuple[float, Any]], int]:
-        """What is due; waits until something is due."""
-        now = self._now()
-        due = self._clock.first_due
-        pdus, credits = self._clock.due(now), self._clock.grants(now)
-        self._left += len(pdus)
-        if pdus and due is not None:
-            self.lateness.happened(due, now)
-        if not pdus and not credits:
-            at = self._clock.next_timeout(now)
-            self._looks_at = inf if at is None else max(at, now)
-            self._changed.wait(wait_until_s(at, now))
-            self._looks_at = self._now()
-        return pdus, credits
+    def step(self) -> None:
+        """Let the packets pass and give the credits that are due, and set ``looks_at``. One thread calls this."""
+        with self._lock:
+            if not self._running:
+                self.looks_at = inf
+                return
+            clock, now = self._clock, self._now()
+            due = clock.first_due
+            passed, credits = clock.due(now), clock.grants(now)
+            self._left += len(passed)
+            if passed and due is not None:
+                self.lateness.happened(due, now)
+            free = inf if clock.held else clock.free
+            at = clock.next_timeout(now)
+            self.looks_at = inf if at is None else max(at, now)
+        self._pass(passed)
+        if credits:
+            self._credits.grant(credits, free)

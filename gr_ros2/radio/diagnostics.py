@@ -1,8 +1,8 @@
 """Publishes the state of a link on the ROS graph: ``/diagnostics`` for common tools, the messages that were lost in
 rosbag2's form, and all counters as JSON.
 
-Invariants: one thread publishes, and this thread leaves the graph. It counts every failure and continues. Nothing is
-published after ``stop`` has returned. ``gr.health`` makes all judgements.
+Invariants: one thread publishes what somebody reads, and this thread leaves the graph. It counts every failure and
+continues. Nothing is published after ``stop`` has returned. ``gr.health`` makes all judgements.
 """
 
 from __future__ import annotations
@@ -108,14 +108,16 @@ class Diagnostics:
             if not self._stop.is_set():
                 status = _status(state, self._node_name)
                 self._link(src_id).publish(bytes(typestore().serialize_cdr(status, STATUS_TYPE)))
-        array = diagnostic_array(statuses, self._node_name, time.time_ns())
-        messages: list[tuple[Publisher, bytes]] = [(self._array, array), (self._counters, statistics(stats))]
+        messages: list[tuple[Publisher, Callable[[], bytes]]] = [
+            (self._array, lambda: diagnostic_array(statuses, self._node_name, time.time_ns())),
+            (self._counters, lambda: statistics(stats)),
+        ]
         if self._events is not None and (lost := self._lost.event(stats)) is not None:
-            messages.append((self._events, lost))
+            messages.append((self._events, lambda: lost))
         for publisher, message in messages:
             # The step before may have taken longer than ``stop`` waits.
-            if not self._stop.is_set():
-                publisher.publish(message)
+            if publisher.matched() and not self._stop.is_set():
+                publisher.publish(message())
 
     def _link(self, src_id: int) -> Publisher:
         """Says how the link to a robot is, to programs that start later too."""

@@ -120,7 +120,7 @@ def ping(live: LiveEnd[OpenEndpoint], robot: int, now: float, *, anew: bool = Fa
         questions = live.endpoint.questions
         told = questions.put(robot, now, anew=anew)
         snrs = {peer.robot: peer.snr_db for peer in live.endpoint.peers(now)}
-        live.work.notify()
+        live.rouse()
     only = questions.snr_db() if list(snrs) == [robot] else None  # where no other robot's packet may be the newest
     return {**told, "robot": robot, "snr_here_db": only if snrs.get(robot) is None else snrs[robot]}
 

@@ -231,8 +231,9 @@ class RobotLink(Flowgraph):
             self.msg_connect(link, pdus, one.radio, "pdus")
             if one.phy.has_airtime:
                 self.msg_connect(one.radio, "credit", link, credit)
-            if self.bond is None:
+            if self.bond is None:  # of several, none waits for another
                 one.front_end.follow(self._at_rest)
+                self.source.drive(one.radio.gate)
         if self.config.receives:
             self.msg_connect(one.radio, "pdus", link, pdus)
 

@@ -58,6 +58,7 @@ _HEARTBEAT_MS, _DEAD_MS = 250, 1000
 """Interval and limit of heartbeats. The connection to a peer that is silent up to the limit is closed, with all bursts
 that wait for it. Then a new connection is tried."""
 _RECONNECT_MS, _RECONNECT_MAX_MS = 50, 500
+_READABLE = int(zmq.POLLIN)  # as a number: to combine flags takes longer than to ask for them
 _WAIT_S = 0.1
 _LOOK_S = 2e-4
 """s between two looks whether all has been sent that begins before the time of the medium process."""
@@ -404,7 +405,7 @@ class _Arrivals:
         socket = self._socket
         with socket, suppress(zmq.ContextTerminated):
             while True:
-                if self.behind and self._listener and not socket.get(zmq.EVENTS) & zmq.POLLIN:
+                if self.behind and self._listener and not socket.get(zmq.EVENTS) & _READABLE:
                     self._hand_over()
                 else:
                     self.arrived(socket.recv())

@@ -91,6 +91,30 @@ def test_on_a_clock_that_stands_still_its_thread_does_not_count_as_stuck(top: Fl
     assert gate.stalled_s() == 0.0
 
 
+def test_whoever_drives_it_lets_packets_pass_and_learns_when_to_look_again(top: Flowgraph) -> None:
+    now, woken = 0.0, list[float]()
+    gate = AirtimeGate(0.02, clock=lambda: now)
+    gate.looks = lambda: woken.append(gate.looks_at)
+    probe = wire(top, gate)
+    wait_for(lambda: woken == [0.0], "its start")
+    gate.step()
+    assert gate.looks_at == inf  # until a packet comes for the credit
+    probe.post(b"x")
+    wait_for(lambda: woken == [0.0, 0.0], "the packet")
+    gate.step()
+    assert gate.passed == 0
+    assert 0.0 < gate.looks_at < 0.02, "the next credit comes before the air is free"
+    now = gate.looks_at
+    gate.step()
+    assert (gate.passed, gate.looks_at, gate.stalled_s()) == (0, 0.02, 0.0)
+    now = 0.02
+    gate.step()
+    assert gate.passed == 1
+    wait_for(lambda: (probe.packets, probe.credits) == ([b"x"], 2), "the packet, and both credits")
+    gate.transmit(on=False)
+    assert woken == [0.0, 0.0, 0.02]
+
+
 def test_it_stops_with_packets_on_the_air(top: Flowgraph) -> None:
     gate = AirtimeGate(3600.0)
     probe = wire(top, gate)

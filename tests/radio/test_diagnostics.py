@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
 from gr_ros2.middleware.memory import MemoryMiddleware
@@ -206,9 +207,12 @@ def test_nothing_is_published_after_the_end_however_long_a_snapshot_takes(monkey
         assert diagnostics.failed == 0
 
 
-def test_a_closed_graph_is_counted_and_survived() -> None:
+def test_a_graph_that_fails_is_counted_and_survived() -> None:
+    def closed() -> Mapping[str, Any]:
+        raise MiddlewareError("the graph is closed")
+
     graph = MemoryMiddleware(domain_id=domain())
-    diagnostics = Diagnostics(QUICK, graph, "link", lambda: STATS)
+    diagnostics = Diagnostics(QUICK, graph, "link", closed)
     graph.close()
     diagnostics.start()
     wait_for(lambda: diagnostics.failed >= 2, "two failures")

@@ -99,7 +99,9 @@ class Peer:
     def delay(self) -> float:
         """Shortest time in s from a packet's departure to the report that covers it. While it is known of packets only
         that were sent again, as losses make it longer, each repair that no report follows halves it."""
-        return min(self.delays, default=0.0 if self.rough == inf else ldexp(self.rough, -self.repairs))
+        if self.delays:
+            return min(self.delays)
+        return 0.0 if self.rough == inf else ldexp(self.rough, -self.repairs)
 
     @property
     def answer(self) -> float:
