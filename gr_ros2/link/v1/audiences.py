@@ -14,7 +14,7 @@ is only one, nothing is chosen here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from gr_ros2.link.rate import RateController
@@ -194,6 +194,11 @@ class Audiences:
         younger = sum(min(late.submitted - topic.behind[robot], NEVER_S) ** 2 for robot in lacking)
         size = sum(len(record.body) for record in missing)
         return topic.weight * younger / size, missing[0]
+
+    def airtime_s(self, robots: Iterable[int], now: float) -> float:
+        """s that the longest packet takes as these robots hear it."""
+        chosen = self._rate.chosen(now)
+        return self._rate.mcs_table[min((chosen.get(robot, 0) for robot in robots), default=0)].airtime_s
 
     def skipped(self, robots: frozenset[int] | None) -> int:
         """The bits of those who do not hear a packet for some."""

@@ -110,7 +110,12 @@ class Hold:
         :param waiting: whether others have to wait still; this one did not because its packet is known to be lost
         """
         self._owed = max(self._owed - 1, 0.0)
-        if self._would_end < inf and not waiting:
+        if not waiting:
+            self.left_instead()
+
+    def left_instead(self) -> None:
+        """Something leaves for which others do not wait any more."""
+        if self._would_end < inf:
             self._ended(0.0)
 
     def until(self, now: float, end: float, airtime: float, *, repairs: bool = True) -> float:

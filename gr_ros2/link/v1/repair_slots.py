@@ -138,11 +138,14 @@ class RepairSlots:
     def _late(self, audiences: Audiences, slot: SendSlot) -> SentPacket | None:
         """What was sent too fast for some, sent as they hear it."""
         record = audiences.due(slot.now)
-        if record is None or self.held(slot.now):
+        if record is None:
             return None
         peers = self._window.peers
         robots = [src_id for src_id, peer in peers.all.items() if record.skipped & peer.bit]
-        self._hold.repaired(waiting=False)
+        # It takes longer than what others wait for, and is owed to no loss.
+        if self.held(slot.now, repairs=False, airtime=audiences.airtime_s(robots, slot.now)):
+            return None
+        self._hold.left_instead()
         again = self._window.complete(record, slot.now)
         return None if again is None else self._writer.repair(again, slot, robots)
 
@@ -170,8 +173,12 @@ class RepairSlots:
             return now
         return min(now + _POLL_S, window.thrift.next_doubt(since))
 
-    def held(self, now: float, *, repairs: bool = True) -> bool:
-        """Whether what could leave now, a repair or something else, waits for a new message."""
-        airtime = self._pace.interval
-        self._waits_until = self._hold.until(now, self._pace.free(now) + airtime, airtime, repairs=repairs)
+    def held(self, now: float, *, repairs: bool = True, airtime: float = 0.0) -> bool:
+        """Whether what could leave now, a repair or something else, waits for a new message.
+
+        :param airtime: that it takes, s; 0 = as much as other packets lately
+        """
+        usual = self._pace.interval
+        end = self._pace.free(now) + (airtime or usual)
+        self._waits_until = self._hold.until(now, end, usual, repairs=repairs)
         return self._waits_until > now
