@@ -22,7 +22,7 @@ from gr_ros2.link.v1.delivery import DeliveryRules
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.order import Order, Ready, nobody
 from gr_ros2.link.v1.outcomes import Outcomes
-from gr_ros2.link.v1.overtaking import Overtaking
+from gr_ros2.link.v1.overtaking import Overtaken, Overtaking
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.reports import Reporter, SharedReporter
 from gr_ros2.wire.control import MAP, Control, LeftOut
@@ -80,6 +80,7 @@ class Inbox:
         many as its depth
     :param outcomes: takes what comes of its packets, shared with other inboxes
     :param control: called with entries that are not messages
+    :param learned: of the packets of its earlier starts over several radios
     :param relaying: is told of messages that came, where they are relayed
     :param give_up_s: s of silence after which the robot is regarded as gone
     :param quiet_s: s of silence after which others are believed about its messages
@@ -104,6 +105,7 @@ class Inbox:
         marks: dict[int, tuple[int, ...]],
         outcomes: Outcomes,
         control: Callable[[Control], None],
+        learned: Overtaken | None = None,
         relaying: Passing | None = None,
         give_up_s: float = inf,
         quiet_s: float = inf,
@@ -134,7 +136,7 @@ class Inbox:
             brings=brings,
         )
         several = settings.radios > 1
-        self._overtaking = Overtaking(self.decoder, self.order.contents) if several else None
+        self._overtaking = Overtaking(self.decoder, self.order.contents, learned or Overtaken()) if several else None
         of = src_id, boot
         self.reports: Reporter = (
             SharedReporter(of, self.decoder, self.order, self._reassembly, settings)

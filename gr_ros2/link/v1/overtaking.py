@@ -28,26 +28,49 @@ _TIMES = 4
 """How much longer than the mean of these is waited: 95 % have come then."""
 
 
-class Overtaking:
-    """The messages of one sender that wait for packets that may have been overtaken.
+class Overtaken:
+    """How many packets of a robot are overtaken, and how late these are. It is kept when the robot restarts: else about
+    ten messages of the new start were overtaken before any waited."""
 
-    :param decoder: knows which packets are here
-    :param contents: knows which topics missing ones can have carried
-    """
-
-    def __init__(self, decoder: RepairDecoder, contents: GapContents) -> None:
-        self._decoder, self._contents = decoder, contents
-        self._gaps: deque[tuple[float, int, int]] = deque()
-        """Packets that were missed no longer than ``MOST_S`` ago: when (s), the first and the last of them."""
-        self._untold: deque[tuple[float, int, int]] = deque()
-        """Those of them of which it is not told yet whether they are lost."""
+    def __init__(self) -> None:
         self._share, self._late_s = 0.0, MOST_S / _TIMES
-        self._waiting: list[Ready] = []
 
     @property
     def wait_s(self) -> float:
         """s for which a missing packet is waited for now."""
         return min(_TIMES * self._late_s, MOST_S) if self._share >= SOME else 0.0
+
+    def came(self, late_s: float) -> None:
+        """A packet has come.
+
+        :param late_s: s since later ones have; infinite where it is the newest
+        """
+        overtaken = late_s <= MOST_S
+        self._share += (overtaken - self._share) * _SHARE_WEIGHT
+        if overtaken:
+            self._late_s += (late_s - self._late_s) * _TIME_WEIGHT
+
+
+class Overtaking:
+    """The messages of one sender that wait for packets that may have been overtaken.
+
+    :param decoder: knows which packets are here
+    :param contents: knows which topics missing ones can have carried
+    :param learned: of this robot's packets so far
+    """
+
+    def __init__(self, decoder: RepairDecoder, contents: GapContents, learned: Overtaken) -> None:
+        self._decoder, self._contents, self._learned = decoder, contents, learned
+        self._gaps: deque[tuple[float, int, int]] = deque()
+        """Packets that were missed no longer than ``MOST_S`` ago: when (s), the first and the last of them."""
+        self._untold: deque[tuple[float, int, int]] = deque()
+        """Those of them of which it is not told yet whether they are lost."""
+        self._waiting: list[Ready] = []
+
+    @property
+    def wait_s(self) -> float:
+        """s for which a missing packet is waited for now."""
+        return self._learned.wait_s
 
     def missing(self, now: float, first: int, last: int) -> None:
         """These packets had not come when a later one did."""
@@ -62,10 +85,7 @@ class Overtaking:
         :param late: after a later one
         """
         since = next((since for since, first, last in self._gaps if first <= number <= last), -inf) if late else -inf
-        overtaken = now - since <= MOST_S
-        self._share += (overtaken - self._share) * _SHARE_WEIGHT
-        if overtaken:
-            self._late_s += (now - since - self._late_s) * _TIME_WEIGHT
+        self._learned.came(now - since)
 
     def lost(self, now: float) -> int:
         """How many packets have become too late to have been overtaken; each is counted once."""

@@ -40,6 +40,7 @@ from gr_ros2.link.v1.facts import (
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
 from gr_ros2.link.v1.outcomes import Outcomes
+from gr_ros2.link.v1.overtaking import Overtaken
 from gr_ros2.link.v1.peers import REACH
 from gr_ros2.link.v1.relaying import FORGET_S, Relaying
 from gr_ros2.link.v1.replays import Save
@@ -108,6 +109,8 @@ class ReceivingSide:
         self._decoder_for = decoder_for
         self._marks: dict[int, dict[int, tuple[int, ...]]] = {}
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
+        self._learned: dict[int, Overtaken] = {}
+        """Of the packets of every robot."""
         own = settings.src_id, boot
         self.neighbours = Neighbours(
             own, settings, keys, heard=heard, save=save, inbox=self._inbox, dropped=self.stats.dropped
@@ -374,6 +377,7 @@ class ReceivingSide:
             self._settings,
             decoder_for=self._decoder_for,
             marks=self._marks.setdefault(src_id, {}),
+            learned=self._learned.setdefault(src_id, Overtaken()),
             outcomes=self._outcomes,
             control=self._entry,
             relaying=self.relaying,

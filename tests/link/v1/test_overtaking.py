@@ -13,7 +13,7 @@ from gr_ros2.link.events import Delivered
 from gr_ros2.link.v1.decoder import RepairDecoder
 from gr_ros2.link.v1.gap_contents import GapContents
 from gr_ros2.link.v1.order import Ready
-from gr_ros2.link.v1.overtaking import MOST_S, Overtaking
+from gr_ros2.link.v1.overtaking import MOST_S, Overtaken, Overtaking
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import registry
@@ -135,6 +135,10 @@ def test_what_waits_when_its_sender_starts_anew_comes_out() -> None:
     filled.air.run(0.5)
     came = filled.receiver.payloads(BULK)
     assert all(ready.payload in came for ready in waiting)
+    started = filled.receiver.end.neighbours.all[1].inbox._overtaking
+    assert started is not overtaking
+    assert started is not None
+    assert started.wait_s > 0, "what was learned of the start before"
 
 
 @given(
@@ -146,7 +150,7 @@ def test_what_waits_when_its_sender_starts_anew_comes_out() -> None:
 def test_messages_come_out_once_in_order_and_soon(packets: list[tuple[float, float, bool]]) -> None:
     """Each packet, with one message, leaves some s after the one before, comes so many ms late, or does not come."""
     decoder = RepairDecoder(100, lambda _: True, 1000)
-    overtaking = Overtaking(decoder, GapContents(decoder, 100))
+    overtaking = Overtaking(decoder, GapContents(decoder, 100), Overtaken())
     left, arrivals = 0.0, []
     for number, (pause_s, late_ms, lost) in enumerate(packets):
         left += pause_s
