@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import click
 
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import Number, set_option
-from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, written_line
+from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, new_results, written_line
 from gr_ros2_lab.report.compare import write_comparison
 from gr_ros2_lab.report.table import as_table
 from gr_ros2_lab.run.scenario import Scenario
@@ -26,7 +25,7 @@ def ablate(
     scenario: str, out: Path | None, seed: int | None, duration: float | None, overrides: tuple[str, ...]
 ) -> None:
     """Run SCENARIO as is, then without compression, pull, repair, reports, queue latest: one at a time"""
-    out = out or Path("results") / f"ablate-{Path(scenario).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    out = out or new_results(f"ablate-{Path(scenario).stem}")
     console = make_console()
 
     def announce(variant: Variant) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import click
 
 from gr_ros2.cli.console import console
 from gr_ros2.core.errors import ConfigError
-from gr_ros2_lab.cli.params import OUT_FOLDER, pictures_option, written_line
+from gr_ros2_lab.cli.params import OUT_FOLDER, new_results, pictures_option, written_line
 from gr_ros2_lab.report.compare import compare_grid, lateness_of, write_comparison
 from gr_ros2_lab.report.page import read_runs
 from gr_ros2_lab.report.table import as_table
@@ -24,9 +23,7 @@ def compare(directories: tuple[Path, ...], out: Path | None, pictures: bool) -> 
     runs = read_runs(directories)
     if len(runs) < 2:
         raise ConfigError(f"{directories[0]}: nothing to compare it with; give two folders or more")
-    written = write_comparison(
-        runs, out or Path("results") / f"compare-{time.strftime('%Y%m%d-%H%M%S')}", pictures=pictures
-    )
+    written = write_comparison(runs, out or new_results("compare"), pictures=pictures)
     for line in lateness_of(runs):
         console().print(line, style="bold red", soft_wrap=True)
     console().print(as_table(compare_grid(runs)))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterable, Sequence
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from gr_ros2.cli.params import Completed
-from gr_ros2.core.files import check_folder
+from gr_ros2.core.files import check_folder, make_folder
 from gr_ros2_lab.run.builtin import builtin_scenarios
 
 
@@ -40,6 +42,28 @@ class OutFolder(click.Path):
 
 
 OUT_FOLDER = OutFolder(path_type=Path)
+
+
+def new_results(what: str) -> Path:
+    """A new folder for what a command writes: `results/WHAT-TIME`, with a number behind it where there is one already,
+    as runs may begin in the same second.
+
+    :raises ConfigError: when it cannot be made
+    """
+    first = Path("results") / f"{what}-{time.strftime('%Y%m%d-%H%M%S')}"
+    names = chain([first.name], (f"{first.name}-{number}" for number in count(2)))
+    make_folder(first.parent)
+    check_folder(first.parent)
+    return next(folder for folder in map(first.with_name, names) if _made(folder))
+
+
+def _made(folder: Path) -> bool:
+    """Make a folder; whether there was none before."""
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        return False
+    return True
 
 
 pictures_option = click.option(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import click
@@ -11,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from gr_ros2.cli.console import console as make_console
 from gr_ros2.cli.params import Number, OrAuto
 from gr_ros2.core.errors import ConfigError
-from gr_ros2_lab.cli.params import OUT_FOLDER
+from gr_ros2_lab.cli.params import OUT_FOLDER, new_results
 from gr_ros2_lab.report.table import as_table
 
 _SHORT = {"duration_s": 5.0, "loss": (0.05,), "load": (2.0,)}
@@ -64,7 +63,7 @@ def race(
         },
         "race",
     )
-    out = out or Path("results") / f"race-{time.strftime('%Y%m%d-%H%M%S')}"
+    out = out or new_results("race")
     console = make_console()
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=not console.is_terminal) as bar:

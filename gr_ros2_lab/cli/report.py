@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import click
 
-from gr_ros2_lab.cli.params import OUT_FOLDER, pictures_option, written_line
+from gr_ros2_lab.cli.params import OUT_FOLDER, new_results, pictures_option, written_line
 from gr_ros2_lab.report.page import read_runs, write_report
 
 
@@ -22,5 +21,5 @@ def report(directories: tuple[Path, ...], out: Path | None, pictures: bool) -> N
     latencies in one figure.
     """
     runs = read_runs(directories)
-    default = directories[0] if len(directories) == 1 else Path("results") / f"report-{time.strftime('%Y%m%d-%H%M%S')}"
+    default = directories[0] if len(directories) == 1 else new_results("report")
     print(written_line(write_report(runs, out or default, pictures=pictures)))

@@ -25,7 +25,7 @@ from gr_ros2.core.backends import uninterrupted
 from gr_ros2.observe.capture import PacketCapture
 from gr_ros2.observe.observers import RunObserver
 from gr_ros2.settings.fields import AUTO
-from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, pictures_option
+from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, new_results, pictures_option
 from gr_ros2_lab.cli.terminal import path_text
 from gr_ros2_lab.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2_lab.record.result import Result
@@ -126,7 +126,7 @@ def _run(
     pcap: Path | None,
 ) -> int:
     scenario = load_scenario(name, overrides, seed=seed, repetitions=repetitions, duration_s=duration)
-    out = out or Path("results") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    out = out or new_results(scenario.name)
     console = make_console()
     looked_at = audience(dashboard, console, scenario.name)
     with looked_at as run_observers, recording(PacketCapture, pcap) as captures, _bar(console) as bar:

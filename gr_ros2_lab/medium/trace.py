@@ -17,7 +17,7 @@ import numpy as np
 from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.medium.base import Hearers, Measured, RadioPath
-from gr_ros2_lab.survey.numbers import read_numbers, text_of
+from gr_ros2_lab.survey.numbers import line_of, read_numbers, text_of
 from gr_ros2_lab.survey.table import NEEDED
 
 TIME = "t_s"
@@ -138,7 +138,9 @@ def read_trace(path: Path) -> ChannelTrace:
     for name in found:
         low, high = _RANGES[name]
         for row in np.flatnonzero((columns[name] < low) | (columns[name] > high))[:1]:
-            raise ConfigError(f"{path}: row {row + 1}: {name} = {columns[name][row]:g}: not within {low:g}..{high:g}")
+            raise ConfigError(
+                f"{path}: line {line_of(path, row)}: {name} = {columns[name][row]:g}: not within {low:g}..{high:g}"
+            )
     times = times - times[0]
     usual = float(np.median(np.diff(times)))
     period_s = float(times[-1]) + usual
@@ -154,14 +156,15 @@ def _check_times(path: Path, times: Floats) -> None:
     steps = np.diff(times)
     usual = float(np.median(steps))
     for row in np.flatnonzero(steps <= 0)[:1]:
+        where = f"{path}: line {line_of(path, row + 1)}"
         raise ConfigError(
-            f"{path}: row {row + 2}: {TIME} = {times[row + 1]:g} after {times[row]:g}: time goes back or stands; sort "
-            "the rows"
+            f"{where}: {TIME} = {times[row + 1]:g} after {times[row]:g}: time goes back or stands; sort the rows"
         )
     for row in np.flatnonzero(steps > GAP * usual)[:1]:
+        where = f"{path}: line {line_of(path, row + 1)}"
         raise ConfigError(
-            f"{path}: row {row + 2}: a gap of {steps[row]:g} s after {TIME} = {times[row]:g}, where rows are "
-            f"{usual:g} s apart; fill it, or cut the trace there"
+            f"{where}: a gap of {steps[row]:g} s after {TIME} = {times[row]:g}, where rows are {usual:g} s apart; "
+            "fill it, or cut the trace there"
         )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Collection, Mapping
 from io import StringIO
+from itertools import islice
 from math import isfinite, nan
 from pathlib import Path
 
@@ -53,6 +54,18 @@ def read_numbers(path: Path, wanted: Collection[str], may_lack: Collection[str] 
     except csv.Error as error:
         raise ConfigError(f"{path}: line {rows.line_num}: {error}") from error
     return {name: np.array(column) for name, column in found.items()}
+
+
+def line_of(path: Path, row: int) -> int:
+    """The line of a file at which a row of :func:`read_numbers` ends.
+
+    :param row: from 0
+    """
+    rows = csv.reader(StringIO(text_of(path), newline=""))
+    next(rows)
+    for _ in islice(filter(None, rows), row + 1):
+        pass
+    return rows.line_num
 
 
 def _number(cell: str, where: str, *, empty: bool) -> float:

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
 
 from gr_ros2.cli import main as command
+from gr_ros2_lab.cli.params import new_results
 from gr_ros2_lab.sim.sensors import TYPES
 
 LOSSY = ["--duration", "1", "--set", "channel.packet_loss=0.02", "--set", "time=packets"]
@@ -84,3 +85,13 @@ def test_a_demonstration_with_a_camera_shows_what_a_robot_sees(
     assert topics["/robot_1/camera"]["delivered"] > 10
     assert command.run(["demo", "--camera", "--robots", "3"]) != 0
     assert "--camera: leave --wire and --robots out" in capsys.readouterr().err
+
+
+def test_runs_of_one_second_have_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gr_ros2_lab.cli.params.time.strftime", lambda _: "20260101-120000")
+    found = [new_results(what) for what in ("a.b", "a.b", "a.b", "other")]
+    assert [path.name for path in found] == [f"a.b-20260101-120000{end}" for end in ("", "-2", "-3")] + [
+        "other-20260101-120000"
+    ]
+    assert all(path.is_dir() for path in found)
