@@ -40,6 +40,8 @@ class WishOutcome(IntEnum):
     """It is sent to another robot alone."""
     FAILED = 5
     """It cannot be sent, for instance because a link carries no more topics."""
+    SENT_ANYWAY = 6
+    """It is sent whether somebody asks or not."""
 
 
 @dataclass(frozen=True, slots=True)

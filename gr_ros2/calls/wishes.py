@@ -165,7 +165,7 @@ class OwnWishes:
             wish.ask_at = now + again_s
 
     def answered(self, robot: int, request: WishRequest, answer: WishAnswer, now: float) -> None:
-        """An answer has come. A wish that was refused is over."""
+        """An answer has come. A wish that was refused is over, and one for what is sent anyway."""
         wish = self._wishes.get((robot, request.name))
         if wish is None or wish.ended < inf or wish.rate != request.rate:
             return

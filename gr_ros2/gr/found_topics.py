@@ -21,6 +21,7 @@ from gr_ros2.middleware.graph_search import GraphSearch
 from gr_ros2.middleware.services import OTHER_RMW, ServiceGraph
 from gr_ros2.middleware.type_search import TypeSearch
 from gr_ros2.settings.config import SendOptions
+from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import DEFAULT_OPTIONS, MAX_TOPICS, NewTopic, Topic, normalize_type, options_of
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2.settings.service_rows import ServiceRow, is_service, parts, rows_of
@@ -125,6 +126,15 @@ class FoundTopics:
         if any(map(self._takes, choice.patterns)) and not subscribed and not unseen:
             return [choice.everything]
         return unseen + self._subscriptions.unmatched()
+
+    def sends(self, name: str, robot: int) -> bool:
+        """Whether something is sent to a robot, or may be called by it, that nobody need ask for.
+
+        :param name: without leading slash
+        """
+        to = [topic.options.to for _, topic in self._subscriptions.named() if topic.name.lstrip("/") == name]
+        called = [self.choice.row_name(service) or "" for service in self.offered.copy()]
+        return AUTO in to or robot in to or name in [service.lstrip("/") for service in called]
 
     def begin(self, offered: OpenTopic, rate: float, options: Mapping[str, SendOptions]) -> None:
         """Send something that is offered, or send it with another rate.

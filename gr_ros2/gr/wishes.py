@@ -227,8 +227,9 @@ class LiveWishes:
             return told
         left_s = max(wish.until - self._clock(), 0.0)
         answer, over = wish.answer, wish.ended < inf
-        refused = answer is not None and answer.outcome != WishOutcome.SENT
-        state = "refused" if refused else "over" if over else "asked" if answer is None else "sent"
+        anyway = answer is not None and answer.outcome == WishOutcome.SENT_ANYWAY
+        refused = answer is not None and answer.outcome != WishOutcome.SENT and not anyway
+        state = "refused" if refused else "over" if over and not anyway else "asked" if answer is None else "sent"
         told |= {"state": state, "rate": wish.rate, "left_s": 0.0 if over else left_s}
         if answer is not None:
             told |= {"cost_Bps": answer.cost, "free_Bps": None if answer.free == inf else answer.free}
@@ -310,7 +311,8 @@ class LiveWishes:
         """Take a wish, or refuse it."""
         offered = self._found.offers.get(wish.name)
         if offered is None:
-            return WishAnswer(WishOutcome.NOT_OFFERED)
+            sent = self._found.sends(wish.name, robot)
+            return WishAnswer(WishOutcome.SENT_ANYWAY if sent else WishOutcome.NOT_OFFERED)
         if offered.options.to not in (AUTO, robot):
             return WishAnswer(WishOutcome.NOT_FOR_YOU)
         renewed = self._held.holds(robot, boot, wish, self._clock())
@@ -462,6 +464,8 @@ def _words(robot: int, name: str, state: str, left_s: float, answer: WishAnswer 
             return f"robot {robot} sends {name}{rate}, for {left_s:.0f} s" + (
                 f"; it takes {cost}" if answer.cost else ""
             )
+        case WishOutcome.SENT_ANYWAY:
+            return f"robot {robot} sends {name} whether somebody asks or not"
         case WishOutcome.NOT_OFFERED:
             return f"robot {robot} does not offer {name}; what it offers: gr-ros2 topics {robot}"
         case WishOutcome.NO_ROOM:

@@ -147,7 +147,9 @@ def test_what_is_not_offered_is_refused_in_a_line(robots: Robots) -> None:
     with talking(robots, SCAN, ODOM, "/robot_2/secret"):
         meet(robots)
         offered(robots, "scan")
-        for name in ("odom", "secret", "nothing"):
+        wait_for(lambda: ODOM in sent(robots), "odom to be sent")
+        assert want(robots, "odom")["words"] == "robot 2 sends odom whether somebody asks or not"
+        for name in ("secret", "nothing"):
             told = want(robots, name)
             assert told["state"] == "refused"
             assert told["words"] == f"robot 2 does not offer {name}; what it offers: gr-ros2 topics 2"
