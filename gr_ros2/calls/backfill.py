@@ -11,7 +11,7 @@ more the oldest goes and is counted; a message is kept once; none that nobody ha
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from heapq import heappop, heappush
 from math import inf
 from struct import Struct
@@ -143,6 +143,10 @@ class _Left(NamedTuple):
     last: int
     kept: Sequence[_Kept]
 
+    @property
+    def topic_id(self) -> int:
+        return self.kept[0].topic_id
+
 
 class HeardPackets(Protocol):
     """Which packets others have: see :class:`gr_ros2.link.endpoint.PacketReceipts`."""
@@ -158,13 +162,15 @@ class MessagesForLater:
 
     :param for_s: s for which one is kept
     :param most_bytes: of them all
+    :param overtakes: whether messages of a topic come out that overtake earlier ones, which do not come out any more
+        when they are repaired
     :ivar lost: how many were kept in vain so far
     :ivar filled: how many have filled gaps
     :ivar unheard: whether nobody seems to hear this robot
     """
 
-    def __init__(self, for_s: float, most_bytes: int) -> None:
-        self._for_s, self._most, self._bytes = for_s, most_bytes, 0
+    def __init__(self, for_s: float, most_bytes: int, overtakes: Callable[[int], bool] = lambda _: False) -> None:
+        self._for_s, self._most, self._bytes, self._overtakes = for_s, most_bytes, 0, overtakes
         self._waiting: OrderedDict[int, Sequence[_Kept]] = OrderedDict()
         """Messages that have not left whole, by serial."""
         self._left: OrderedDict[int, _Left] = OrderedDict()
@@ -241,18 +247,24 @@ class MessagesForLater:
         newest, told, gone = receipts.newest, self._told, now - self._since > GONE_S
         before = now - self.patience_s if gone else -inf
         self._missing = 0
+        lacking: dict[int, list[int]] = {}
+        """By topic: messages that have not come, and do not come out any more once a later one has."""
         for serial, left in list(self._left.items()):
             if left.last > newest and left.at > before:
                 break
             if serial <= self._doubted or (gone and (newest > told or left.at <= before)):
                 self._fill_later(serial)
             elif receipts.have(left.first, left.last):
+                for overtaken in lacking.pop(left.topic_id, ()):
+                    self._fill_later(overtaken)
                 self.filled += self._filling.get(serial, 0)
                 self._bytes -= sum(kept.size for kept in self._take_back(serial))
             elif left.last <= newest - REPAIRED or now - left.at > GONE_S:
                 self._fill_later(serial)
             else:
                 self._missing += serial not in self._filling
+                if serial not in self._filling and self._overtakes(left.topic_id):
+                    lacking.setdefault(left.topic_id, []).append(serial)
         if newest > told:
             if self._since < inf:
                 self._mean_s += (min(now - self._since, _MOST_S) - self._mean_s) / 8

@@ -59,7 +59,7 @@ class Backfill:
     ) -> None:
         self._receipts, self._robots = endpoint.receipts_of(config.robots), config.robots
         self._endpoint, self._share, self._chosen, self._wall_ahead = endpoint, share, chosen, wall_ahead
-        self.kept = MessagesForLater(config.for_s, round(config.memory_mb * 1e6))
+        self.kept = MessagesForLater(config.for_s, round(config.memory_mb * 1e6), endpoint.messages.overtakes)
         self._allowed, self._looked = 0.0, inf
         self._tried, self._pause_s = -inf, 0.0
         self._starts: dict[int, int] = {}

@@ -132,6 +132,9 @@ class MessageSide(Protocol):
 class OpenMessages(MessageSide, Protocol):
     """The messages of an end that announces its topics, so that these may change while it runs."""
 
+    def overtakes(self, topic_id: int) -> bool:
+        """Whether messages of a topic overtake earlier ones, which may be repaired then and do not come out."""
+
     def add(self, topics: Sequence[NewTopic]) -> Registry:
         """Send further topics from now on, all or none. Services among them are announced when they are offered.
 

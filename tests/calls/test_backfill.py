@@ -289,3 +289,13 @@ def test_a_piece_is_no_longer_than_it_says() -> None:
         kept.refused(serial)
     while found := take(kept):
         assert len(write_later(found)) <= PIECE
+
+
+@pytest.mark.parametrize("overtakes", [True, False])
+def test_what_is_missing_once_a_later_one_has_come_is_filled_if_that_overtook_it(*, overtakes: bool) -> None:
+    kept, receipts = MessagesForLater(600.0, 1_000_000, lambda _: overtakes), Heard()
+    for serial in range(4):
+        kept.accepted(serial // 3, serial, bytes(9), 0.0)
+        kept.left(serial, (serial, 0), serial, 0.0, last=True)
+    kept.heard(receipts.report(3, 1), 0.1)  # serial 3 is of another topic
+    assert [each.serial for each in take(kept)] == ([1] if overtakes else [])

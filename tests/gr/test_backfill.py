@@ -272,3 +272,23 @@ def test_a_bag_lacks_as_many_messages_as_it_says(tmp_path: Path, mode: SealMode,
     came = [each.payload[:4] for each in read_bag(tmp_path / "bag") if each.topic == "/x/odom"]
     assert len(came) == len(set(came))
     assert lost_of(tmp_path / "bag") == {"/x/odom": pair.made - len(came)}
+
+
+def test_what_would_be_repaired_when_later_ones_are_out_crosses_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        f"{__name__}.TOPICS",
+        registry(
+            odom=SendOptions(queue="fifo", reliability="best_effort"),
+            scan=SendOptions(queue="fifo", reliability="best_effort"),
+        ),
+    )
+    pair = Pair()
+    pair.slots(200, odom=4)
+    first = pair.made
+    for _ in range(3):  # too short for anybody to seem gone
+        pair.outage(100)
+        pair.slots(300, odom=4)
+    last = pair.made
+    pair.slots(200, odom=20)
+    assert len(set(pair.later())) > 60
+    assert set(range(first, last)) <= {*pair.later(), *pair.live()}

@@ -257,6 +257,10 @@ class Outbox:
         queue = self.sent[topic_id].queue
         return queue.policy, queue.deadline_s
 
+    def overtakes(self, topic_id: int) -> bool:
+        topic = self.sent[topic_id]
+        return not topic.in_order and topic.queue.policy != "latest"  # which ends repairs of earlier ones
+
     def depth(self, topic_id: int) -> int:
         depth = self.sent[topic_id].topic.options.queue_depth
         return self._settings.queue_depth if depth == AUTO else depth
