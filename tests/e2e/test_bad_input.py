@@ -133,7 +133,8 @@ def test_a_message_of_more_than_255_entries_is_counted_and_the_others_pass(tmp_p
     check_books(result)
     books = {topic.topic: topic.ledger for topic in result.topics}
     assert books["/robot_1/map"] == {"too_large": 1}
-    assert set(books["/robot_1/odom"]) == {"delivered"}
+    assert books["/robot_1/odom"]["delivered"] > 20
+    assert set(books["/robot_1/odom"]) <= {"delivered", "in_flight"}, "where the computer is late as the run ends"
 
 
 def garbage(seed: int, good: bytes) -> Iterator[object]:

@@ -99,12 +99,22 @@ def test_ping_tells_a_clock_that_nobody_watches(tmp_path: Path) -> None:
         one, _ = links.start(1, "1", "0", command=PEER), links.start(2, "2", "-7", command=PEER)
         links.meet()
         assert clock(one) is None
-        status, said = one.ask("ping", "2", "--count", "5", "--interval", "0.2", "--json")
-        told = json.loads(said)
-        assert (status, told["clock_s"]) == (0, pytest.approx(-7, abs=told["clock_error_s"] + ADJUSTED_S))
+
+        answers: list[Any] = []
+
+        def answered() -> bool:
+            """A busy computer may be late for all questions."""
+            status, said = one.ask("ping", "2", "--count", "5", "--interval", "0.2", "--json")
+            answers.append(json.loads(said))
+            return status == 0 and answers[-1]["clock_s"] is not None
+
+        wait_for(answered, "answers")
+        answer = answers[-1]
+        assert answer["clock_s"] == pytest.approx(-7, abs=answer["clock_error_s"] + ADJUSTED_S)
         assert close_to(clock(one), -7)
 
 
+@pytest.mark.real_time
 def test_a_bag_of_what_came_out_has_the_times_of_this_computers_clock(tmp_path: Path) -> None:
     settings = {"topics": {"place": {}}}
     bag = tmp_path / "recorded"
