@@ -12,7 +12,7 @@ is kept on.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from functools import partial
 from math import inf
 from typing import Any
@@ -64,6 +64,8 @@ class Backfill:
         self._tried, self._pause_s = -inf, 0.0
         self._starts: dict[int, int] = {}
         """The newest start of each robot that was heard."""
+        self._here: Set[tuple[int, int]] = frozenset()
+        """Those that are, each with its start."""
         self._from: dict[int, Account] = {}
         """Accounts from which robots count that have started in a silence."""
         self._told: set[int] = set()
@@ -98,12 +100,14 @@ class Backfill:
         }
         if any(self._starts.get(robot, start) != start for robot, start in here.items()):
             self.kept.doubt()
-        if not self._starts.items() >= here.items():
-            self._untold += PIECE
-            if self.kept.unheard:
-                self._from = self.kept.accounts_heard()
+        unheard = self.kept.unheard
+        if unheard and not self._starts.items() >= here.items():
+            self._from = self.kept.accounts_heard()
         self._starts |= here
         self.kept.heard(self._receipts, now)
+        if here.items() - self._here or unheard > self.kept.unheard:
+            self._untold += PIECE
+        self._here = here.items()
         if here:
             self._fill(now)
         self._looked = now
@@ -114,11 +118,11 @@ class Backfill:
             self._allowed = min(self._allowed + free, 1e9)
         if not self.kept.unheard:
             self._pause_s = 0.0
+            told = self._untold < PIECE and (len(self.kept) or self.kept.lost == self._lost)
+            if self._may_submit and not told and self.kept.accounts():  # before what takes longer to cross
+                self._submit([], now)
             while self._may_submit and (found := self.kept.take(self._wall_ahead())):
                 self._submit(found, now)
-            told = self._untold < PIECE and (len(self.kept) or self.kept.lost == self._lost)
-            if self._may_submit and not told:
-                self._submit([], now)
         elif self.kept.tries or now < self._tried + self._pause_s or not self._may_submit:
             return
         elif found := self.kept.take(self._wall_ahead(), most=0):

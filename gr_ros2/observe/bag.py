@@ -119,8 +119,7 @@ class OutputBag(Closing):
         """By robot, its start and the id of a topic whose gaps are filled."""
         self._fillers: dict[tuple[int, int], int] | None = None
         self._known: dict[_Name, None] = {}
-        """The newest messages that came. Of robots that fill gaps one may come twice: where it was not known to be
-        heard."""
+        """The newest messages of robots that fill gaps, as one may come twice: where it was not known to be heard."""
         self._channels: dict[tuple[int, int], BagChannel | None] = {}
         make_folder(path.parent)
         self._recorder = BagRecorder(path, "mcap", {LOST_TYPE: lost_definition()}, self._count, lossless=False)
@@ -156,9 +155,8 @@ class OutputBag(Closing):
             if isinstance(event.key, Key):
                 name = _name(event.src_id, event.key)
                 self._lost.pop(name, None)
-                known = self._is_known(name)
                 if event.src_id in fillers.values():
-                    if known:
+                    if self._is_known(name):
                         return
                     self._count_of(self._run, event.src_id, event.key.boot, event.topic_id).came(event.key.number)
             took = event.latency_s
