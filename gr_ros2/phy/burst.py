@@ -93,6 +93,7 @@ class Frames:
     :param mcs: with an adaptive rate the number of its MCS. The CRC-32 then covers MCS and packet length too, so
         that no frame is taken for one of another MCS or length
     :param decoders: what decodes the code
+    :param carriers: see :class:`gr_ros2.phy.fec.Codes`
     """
 
     def __init__(
@@ -106,8 +107,10 @@ class Frames:
         mask: Octets | None = None,
         mcs: int | None = None,
         decoders: Decoders = GNU_RADIO,
+        carriers: tuple[int, int] = (0, 1),
     ) -> None:
         form: dict[str, Any] = {"fixed": fixed, "order": order, "multiple": multiple, "mask": mask, "mcs": mcs}
+        form["carriers"] = carriers
         self._again = partial(Frames, packet_len, fec, **form, decoders=decoders)
         self._mcs = mcs
         self.packet_len, self.fixed, self.coded = packet_len, fixed, fec != "none"
@@ -116,7 +119,7 @@ class Frames:
         self.order, self.multiple = order, multiple
         self.mask = whitening(self.length(packet_len)) if mask is None else mask
         self.decoders = decoders
-        self._codes = Codes(fec, decoders)
+        self._codes = Codes(fec, decoders, carriers)
         self.of = lru_cache(maxsize=_KEPT)(self._make)
         """The frame by the bytes of its packet."""
 

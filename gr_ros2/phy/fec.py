@@ -47,6 +47,10 @@ _POLAR_RATE = 0.625
 _POLAR_ROOM = int(_POLAR_MOST * _POLAR_RATE)
 _POLAR_DESIGN_DB = 1.0
 _GOLDEN = 0.618
+_NEAR = 24
+"""Coded bits that may decide together in the Viterbi decoder: those of 12 data bits."""
+_TRIED = 200
+"""Steps of the interleaver that are tried."""
 
 
 def _fec() -> Any:
@@ -128,13 +132,21 @@ class Uncoded(Code):
 
 
 class Spread(Code):
-    """Interleaver around another code: it moves neighbouring bits far apart."""
+    """Interleaver around another code: it moves neighbouring bits far apart.
 
-    def __init__(self, inner: Code) -> None:
+    :param symbol_bits: bits of an OFDM symbol, or 0. Neighbouring bits are then on different carriers, too: a carrier
+        that fades does so in each symbol
+    :param carrier_bits: bits of one of its carriers
+    """
+
+    def __init__(self, inner: Code, symbol_bits: int = 0, carrier_bits: int = 1) -> None:
         super().__init__(inner.bits)
         self._inner = inner
         self.coded_bits = count = inner.coded_bits
-        step = next(step for step in range(int(_GOLDEN * count), count + 1) if gcd(step, count) == 1)
+        first = int(_GOLDEN * count)
+        steps = [step for step in range(first, first + max(_TRIED, count - first + 1)) if gcd(step, count) == 1]
+        apart = (s for s in steps[:_TRIED] if symbol_bits and _apart(s, count, symbol_bits, carrier_bits))
+        step = next(apart, steps[0])
         self._order = np.arange(count) * step % count
 
     def encode(self, bits: Bits) -> Bits:
@@ -145,6 +157,13 @@ class Spread(Code):
         ordered = np.empty_like(soft)
         ordered[self._order] = soft
         return self._inner.decode(ordered)
+
+
+def _apart(step: int, count: int, symbol_bits: int, carrier_bits: int) -> bool:
+    """Whether each of ``count`` coded bits is on another carrier than the next ``_NEAR``, with such an interleaver."""
+    ahead = np.arange(1, _NEAR) * pow(step, -1, count) % count
+    off = np.concatenate((ahead, count - ahead)) % symbol_bits
+    return bool(np.all((carrier_bits <= off) & (off <= symbol_bits - carrier_bits)))
 
 
 class Convolutional(Code):
@@ -314,10 +333,12 @@ class Codes:
     One thread may encode while another decodes.
 
     :param decoders: what decodes
+    :param carriers: bits of an OFDM symbol, and of one of its carriers; (0, 1) for other PHYs
     """
 
-    def __init__(self, name: CodeName, decoders: Decoders = GNU_RADIO) -> None:
+    def __init__(self, name: CodeName, decoders: Decoders = GNU_RADIO, carriers: tuple[int, int] = (0, 1)) -> None:
         self.name = name
+        self._spread = partial(Spread, symbol_bits=carriers[0], carrier_bits=carriers[1])
         self._decoders = decoders
         self._matrix = lru_cache(maxsize=len(_LDPC))(partial(Matrix, decoders))
 
@@ -333,8 +354,8 @@ class Codes:
         if self.name == "none":
             return Uncoded(bits)
         if self.name == "ldpc":
-            return Spread(Ldpc(bits, self._matrix(*Ldpc.shape(bits))))
-        return Spread((Convolutional if self.name == "cc" else Polar)(bits, self._decoders))
+            return self._spread(Ldpc(bits, self._matrix(*Ldpc.shape(bits))))
+        return self._spread((Convolutional if self.name == "cc" else Polar)(bits, self._decoders))
 
 
 _CODES: dict[str, type[Convolutional | Ldpc | Polar]] = {"cc": Convolutional, "ldpc": Ldpc, "polar": Polar}

@@ -107,7 +107,9 @@ class OfdmPhy(BurstPhy):
         """
         layout, threshold = self.layout, self.options.detection_threshold
         mask = layout.mask(self.packet_len + layout.fill(self.packet_len) + CRC_LEN)
-        frames = self.frames(order="little", multiple=layout.multiple, mask=mask, mcs=mcs)
+        bits = layout.bits_per_carrier
+        carriers = bits * len(layout.data[0]), bits
+        frames = self.frames(order="little", multiple=layout.multiple, mask=mask, mcs=mcs, carriers=carriers)
         return OfdmModem(frames, layout, None if threshold == AUTO else threshold, mcs)
 
     def _adaptive(self, options: dict[str, Any]) -> tuple[OfdmPhy, ...]:

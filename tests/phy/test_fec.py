@@ -46,6 +46,19 @@ def test_a_burst_of_errors_is_corrected(name: str) -> None:
     assert np.array_equal(code.decode(received), data)
 
 
+@pytest.mark.parametrize("packet_len", [50, 67, 84, 101, 118])
+def test_carriers_that_fade_in_each_symbol_are_corrected_at_any_length(packet_len: int) -> None:
+    """At these lengths many a bit was on the carrier of one that follows soon."""
+    carriers = 204
+    code = Codes("cc", carriers=(carriers, 1)).of(8 * (packet_len + 4))
+    data = bits(code.bits)
+    for seed in range(10):
+        faded = np.random.default_rng(seed).permutation(carriers)[: carriers // 4]
+        received = soft(code.encode(data))
+        received[np.isin(np.arange(len(received)) % carriers, faded)] = 0
+        assert np.array_equal(code.decode(received), data)
+
+
 @pytest.mark.parametrize("name", CODES)
 def test_certainty_beyond_measure_does_no_harm(name: str) -> None:
     code = Codes(name).of(544)
