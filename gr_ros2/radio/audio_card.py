@@ -66,6 +66,8 @@ _WAIT_S = 0.05
 _FULL = 0.99
 """A sample beyond this share of full scale counts as clipped."""
 _REMEMBERED = 64
+_ANSWER_S = 20.0
+"""s that PortAudio may take to look for devices."""
 _opening = threading.Lock()
 _streams: set[Any] = set()
 """Those of this process that are open."""
@@ -114,9 +116,36 @@ def look_again() -> None:
     """
     with _opening:
         if not _streams:
-            with suppress(PortAudioError):  # the last time may have failed
-                sounddevice._terminate()
-            sounddevice._initialize()
+            _within(_ANSWER_S, _list_anew)
+
+
+def _list_anew() -> None:
+    with suppress(PortAudioError):  # the last time may have failed
+        sounddevice._terminate()
+    sounddevice._initialize()
+
+
+def _within(seconds: float, work: Callable[[], None]) -> None:
+    """Do what may hang, as libjack does now and then when no JACK server runs (``pthread_cond_destroy`` waits for ever
+    in ``jack_client_open``): in a thread of its own, so that a signal still ends the program.
+
+    :raises PortAudioError: when it takes longer, or from the work
+    """
+    failed: list[Exception] = []
+
+    def run() -> None:
+        try:
+            work()
+        except PortAudioError as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run, name="portaudio", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if thread.is_alive():
+        raise PortAudioError("PortAudio hangs while it looks for devices: start this program again")
+    if failed:
+        raise failed[0]
 
 
 @_signals_kept()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -17,7 +18,7 @@ pytest.importorskip("gr_ros2.radio.audio_card", reason="needs sounddevice and li
 
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.phy.psk import PskPhy
-from gr_ros2.radio import PRESETS
+from gr_ros2.radio import PRESETS, audio_card
 from gr_ros2.radio.audio import AudioFrontEnd
 from gr_ros2.radio.audio_card import look_again
 from gr_ros2.radio.permission import permitted
@@ -194,6 +195,17 @@ def test_no_signal_stays_blocked() -> None:
 
 
 @pytest.mark.usefixtures("server")
+def test_a_sound_system_that_hangs_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C would not end a program whose main thread waits in PortAudio."""
+    answers = threading.Event()
+    monkeypatch.setattr(audio_card, "_ANSWER_S", 0.05)
+    monkeypatch.setattr(audio_card.sounddevice, "_terminate", lambda: None)
+    monkeypatch.setattr(audio_card.sounddevice, "_initialize", answers.wait)
+    with pytest.raises(audio_card.PortAudioError, match="hangs"):
+        audio_card.look_again()
+    answers.set()
+
+
 def test_a_device_that_is_not_there_is_one_line_with_those_that_are() -> None:
     with pytest.raises(RadioError, match=r"device = 'nowhere'.*devices found: .*pulse") as raised:
         AudioFrontEnd(PskPhy(64, 24_000), device="nowhere")
