@@ -64,6 +64,8 @@ BENCHMARKS = {
     "carried": "bench.relay",
     "reliable": "bench.reliable",
     "sound": "bench.sound",
+    "sound_beside": "bench.sound",
+    "sound_recorded": "bench.sound_recorded",
     "sound_live": "bench.sound_live",
     "backfill": "bench.backfill",
     "race_profiles": "bench.race_profiles",
@@ -72,7 +74,7 @@ BENCHMARKS = {
 LONG = (
     *("half_points", "rate", "drive", "sweep", "hostile", "live_image", "constants", "mac", "relay", "reliable"),
     *("gate", "rate_rules", "cells", "first", "hidden", "changes", "scale", "crowd", "energy", "cameras", "clouds"),
-    *("sound", "sound_live", "backfill", "race_profiles"),
+    *("sound", "sound_beside", "sound_recorded", "sound_live", "backfill", "race_profiles"),
 )
 """Many minutes, or parts of ``mac``: only when named."""
 

@@ -1,8 +1,9 @@
 """The presets of the front end `audio` in simulated channels, and other programs' modems in the same.
 
-Premise: every cell carries the same packets of 64 random bytes, each after .3 to .6 s of silence, in 20 channels drawn
-at random; clocks are 50 ppm apart where nothing else is said, and loudspeaker and microphone pass 200 to 8000 Hz. A
-rate is that of 64 B over the airtime of its burst, silence and key not counted.
+Premise: every cell carries packets of random bytes, as long as the preset's longest, each after .3 to .6 s of silence,
+in 20 channels drawn at random; clocks are 50 ppm apart where nothing else is said, and loudspeaker and microphone pass
+200 to 8000 Hz. A rate is that of a packet's bytes over the airtime of its burst, silence and key not counted. Others'
+modems pass the same channels, each with a text of 64 letters: some of theirs take seven seconds.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from gr_ros2.phy import PHY
 from gr_ros2.radio import FRONT_ENDS, PRESETS
 from gr_ros2.radio.audio_bursts import CARD_RATE, Upconverter
 
-CHANNELS, PACKETS, PACKET_LEN = 20, 5, TEXT_LEN
+CHANNELS, PACKETS = 20, 5
 SNR_DB = 20.0
 CLOCK_PPM, DRIVING_PPM = 300.0, 2900.0
 _PPM = 50.0
@@ -58,7 +59,7 @@ def _moderate(sound: Wave, band_hz: float, seed: int, snr_db: float) -> Wave:
 
 
 @dataclass(frozen=True)
-class _Cell:
+class Cell:
     """A preset in a channel, and what has to arrive at which rate; 0: a figure."""
 
     preset: str
@@ -69,61 +70,60 @@ class _Cell:
 
 
 BESIDE = [
-    _Cell("sound", "room, RT60 .4 s, DRR 0 dB", partial(_in_room, echo_s=0.4, direct_db=0.0), 0.98),
-    _Cell("hall", "room, RT60 .4 s, DRR -6 dB", partial(_in_room, echo_s=0.4, direct_db=-6.0), 0.9, 300),
-    _Cell("hall", "room, RT60 .6 s, DRR -6 dB", partial(_in_room, echo_s=0.6, direct_db=-6.0), 0.9, 300),
-    _Cell("voice", "narrow FM, CNR 10 dB", partial(_fm, cnr_db=10.0), 0.98, 1000),
-    _Cell("voice", "SSB 50 Hz off, 10 dB", partial(_ssb, snr_db=10.0), 0.98, 1000),
-    _Cell("voice", "the same, Watterson moderate", partial(_moderate, snr_db=10.0)),
+    Cell("sound", "room, RT60 .4 s, DRR 0 dB", partial(_in_room, echo_s=0.4, direct_db=0.0), 0.98),
+    Cell("hall", "room, RT60 .4 s, DRR -6 dB", partial(_in_room, echo_s=0.4, direct_db=-6.0), 0.9, 300),
+    Cell("hall", "room, RT60 .6 s, DRR -6 dB", partial(_in_room, echo_s=0.6, direct_db=-6.0), 0.9, 300),
+    Cell("voice", "narrow FM, CNR 10 dB", partial(_fm, cnr_db=10.0), 0.98, 1000),
+    Cell("voice", "SSB 50 Hz off, 10 dB", partial(_ssb, snr_db=10.0), 0.98, 1000),
+    Cell("voice", "the same, Watterson moderate", partial(_moderate, snr_db=10.0)),
 ]
 """Where others' modems are tried, too."""
 _PACES = [(name, CLOCK_PPM) for name in ("sound", "hall", "voice", "cable")]
 _PACES += [(name, DRIVING_PPM) for name in ("sound", "hall")]  # what comes by radio or cable does not drive through air
 CELLS = [
     *BESIDE,
-    *(_Cell(name, f"{ppm:g} ppm faster or slower", partial(_alone, ppm=ppm), 0.98) for name, ppm in _PACES),
+    *(Cell(name, f"{ppm:g} ppm faster or slower", partial(_alone, ppm=ppm), 0.98) for name, ppm in _PACES),
     *(
-        _Cell("sound", f"that room, {ppm:g} ppm faster", partial(_in_room, echo_s=0.4, direct_db=0.0, ppm=ppm), 0.95)
+        Cell("sound", f"that room, {ppm:g} ppm faster", partial(_in_room, echo_s=0.4, direct_db=0.0, ppm=ppm), 0.95)
         for ppm in (CLOCK_PPM, DRIVING_PPM)
     ),
 ]
 
 
 def sound() -> list[Row]:
-    """Packets that arrive, by preset and channel, and beside them what others' modems carry."""
-    rows = [_row(cell) for cell in CELLS]
-    return [*rows, *(_peer_row(cell, peer) for cell in BESIDE for peer in peers())]
+    """Packets that arrive, by preset and channel."""
+    return [cell_row(cell) for cell in CELLS]
 
 
-def _peer_row(cell: _Cell, peer: Peer) -> Row:
-    """Of as many texts of as many letters."""
+def sound_beside() -> list[Row]:
+    """What others' modems carry in the same channels."""
+    return [peer_row(cell, peer) for cell in BESIDE for peer in peers()]
+
+
+def peer_row(cell: Cell, peer: Peer) -> Row:
     arrived, seconds, band = 0, 0.0, preset_phy(cell.preset).sample_rate
     for seed in range(CHANNELS):
         draw = random.Random(seed)
-        texts = ["".join(draw.choices(_LETTERS, k=TEXT_LEN)) for _ in range(PACKETS)]
-        parts = []
-        for text in texts:
-            said = peer.spoken(text)
-            seconds += len(said) / CARD_RATE
-            parts += [np.zeros(int(draw.uniform(0.3, 0.6) * CARD_RATE)), said]
-        played = np.concatenate([*parts, np.zeros(CARD_RATE)])
-        came = peer.heard(cell.channel(played, band, seed))
-        arrived += sum(text in came for text in texts)
-    count = CHANNELS * PACKETS
-    note = f"{8 * TEXT_LEN * count / seconds:.0f} bit/s"
-    return Row(f"{peer.name} where {cell.preset} is: {cell.what}: packets", arrived / count, form="{:.2f}", note=note)
+        text = "".join(draw.choices(_LETTERS, k=TEXT_LEN))
+        said = peer.spoken(text)
+        seconds += len(said) / CARD_RATE
+        played = np.concatenate([np.zeros(int(draw.uniform(0.3, 0.6) * CARD_RATE)), said, np.zeros(CARD_RATE)])
+        arrived += text in peer.heard(cell.channel(played, band, seed))
+    what, note = f"{peer.name} where {cell.preset} is: {cell.what}", f"{8 * TEXT_LEN * CHANNELS / seconds:.0f} bit/s"
+    return Row(f"{what}: messages", arrived / CHANNELS, form="{:.2f}", note=note)
 
 
 def preset_phy(name: str) -> Any:
     """The PHY of a preset, as a link has it."""
     preset = PRESETS[name]
     row = FRONT_ENDS[preset.front_end]
-    return PHY.load(preset.phy or row.phy)(PACKET_LEN, preset.sample_rate or row.sample_rate, **preset.phy_options)
+    rate = preset.sample_rate or row.sample_rate
+    return PHY.load(preset.phy or row.phy)(preset.packet_len, rate, **preset.phy_options)
 
 
-def _row(cell: _Cell) -> Row:
+def cell_row(cell: Cell) -> Row:
     phy, centre = preset_phy(cell.preset), float(PRESETS[cell.preset].settings.get("centre_hz", 4500.0))
-    rate, arrived = 8 * PACKET_LEN / phy.airtime(), 0
+    rate, arrived = 8 * phy.packet_len / phy.airtime(), 0
     for seed in range(CHANNELS):
         played, packets = spoken(phy, centre, seed)
         arrived += len(heard(phy, cell.channel(played, phy.sample_rate, seed), centre) & set(packets))
@@ -138,7 +138,7 @@ def spoken(phy: Any, centre_hz: float, seed: int) -> tuple[Wave, list[bytes]]:
     """Sound of bursts, each after some silence, and their packets."""
     draw, parts, packets = random.Random(seed), [], []
     for _ in range(PACKETS):
-        packets.append(draw.randbytes(PACKET_LEN))
+        packets.append(draw.randbytes(phy.packet_len))
         parts += [np.zeros(phy.gap + int(draw.uniform(0.3, 0.6) * phy.sample_rate)), phy.modem.modulate(packets[-1])]
     whole = np.concatenate([*parts, np.zeros(int(0.7 * phy.sample_rate))]).astype(np.complex64)
     return Upconverter(phy.sample_rate, centre_hz)(whole), packets

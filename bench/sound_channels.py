@@ -92,7 +92,8 @@ def faster(sound: Wave, ppm: float) -> Wave:
     return np.asarray(b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a))))
 
 
-def _voice(low: float, high: float) -> Wave:
+def voice_band(low: float, high: float) -> Wave:
+    """The filter of a voice radio, as sections of second order."""
     return np.asarray(signal.butter(6, [low, high], "band", fs=CARD_RATE, output="sos"))
 
 
@@ -101,7 +102,7 @@ def narrow_fm(sound: Wave, cnr_db: float, seed: int, deviation_hz: float = 2500.
 
     :param use: root mean square of the deviation over its limit, before the limiter
     """
-    tilt = np.diff(signal.sosfilt(_voice(300, 3000), sound), prepend=0.0)
+    tilt = np.diff(signal.sosfilt(voice_band(300, 3000), sound), prepend=0.0)
     tilt *= use / power(tilt) ** 0.5
     carrier = np.exp(2j * np.pi * deviation_hz / CARD_RATE * np.cumsum(np.clip(tilt, -1, 1)))
     draw = np.random.default_rng(seed)
@@ -109,7 +110,7 @@ def narrow_fm(sound: Wave, cnr_db: float, seed: int, deviation_hz: float = 2500.
     heard = carrier + sigma * (draw.standard_normal(len(sound)) + 1j * draw.standard_normal(len(sound)))
     heard = signal.sosfilt(signal.butter(4, _FM_BAND_HZ / 2, fs=CARD_RATE, output="sos"), heard)
     turn = np.angle(heard[1:] * heard[:-1].conj())
-    return np.asarray(signal.sosfilt(_voice(300, 3000), signal.lfilter([1], [1, -0.97], turn)))
+    return np.asarray(signal.sosfilt(voice_band(300, 3000), signal.lfilter([1], [1, -0.97], turn)))
 
 
 def single_sideband(
@@ -137,7 +138,7 @@ def single_sideband(
             heard[late:] += (gain * near)[: len(near) - late]
         near = heard
     shifted = (near * np.exp(2j * np.pi * off_hz / CARD_RATE * np.arange(len(sound)))).real
-    return np.asarray(signal.sosfilt(_voice(300, 2700), with_noise(shifted, snr_db, band_hz, seed)))
+    return np.asarray(signal.sosfilt(voice_band(300, 2700), with_noise(shifted, snr_db, band_hz, seed)))
 
 
 def _fading(count: int, spread_hz: float, draw: np.random.Generator) -> NDArray[np.complex128]:

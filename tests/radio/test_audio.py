@@ -194,7 +194,6 @@ def test_no_signal_stays_blocked() -> None:
     assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before == set()
 
 
-@pytest.mark.usefixtures("server")
 def test_a_sound_system_that_hangs_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C would not end a program whose main thread waits in PortAudio."""
     answers = threading.Event()
@@ -206,6 +205,7 @@ def test_a_sound_system_that_hangs_is_an_error(monkeypatch: pytest.MonkeyPatch) 
     answers.set()
 
 
+@pytest.mark.usefixtures("server")
 def test_a_device_that_is_not_there_is_one_line_with_those_that_are() -> None:
     with pytest.raises(RadioError, match=r"device = 'nowhere'.*devices found: .*pulse") as raised:
         AudioFrontEnd(PskPhy(64, 24_000), device="nowhere")
