@@ -65,6 +65,7 @@ def foxglove_server(where: str | None, console: Console) -> Iterator[list[Foxglo
     from gr_ros2.dashboard.foxglove import FoxgloveServer
 
     address, port = parse_place(where, "foxglove")
+    logging.getLogger("foxglove.websocket").setLevel(logging.CRITICAL)  # it prints invalid messages of clients
     with FoxgloveServer(address, port) as server:
         url = f"ws://{in_url(address)}:{server.port}"
         console.print(f"Foxglove: {url}", soft_wrap=True)

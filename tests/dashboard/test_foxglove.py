@@ -62,9 +62,12 @@ def server() -> Any:
 
 class Client:
     """A client that subscribes to every topic, and again to those of which nothing comes: the SDK tells of a channel
-    slightly before it takes subscriptions of it."""
+    slightly before it takes subscriptions of it.
 
-    def __init__(self, port: int) -> None:
+    :param first: messages that it sends at first
+    """
+
+    def __init__(self, port: int, first: tuple[str | bytes, ...] = ()) -> None:
         self.channels: dict[int, Any] = {}
         self.services: dict[str, Any] = {}
         self.replies: list[bytes | str] = []
@@ -72,7 +75,7 @@ class Client:
         self.calls: list[tuple[str, bytes]] = []
         """Still to be made."""
         self.seen: list[tuple[str, bytes]] = []
-        self._port, self._asked = port, 0
+        self._port, self._asked, self._first = port, 0, first
         self._of: dict[int, int] = {}
         """The channel of each subscription."""
 
@@ -83,6 +86,8 @@ class Client:
     async def _run(self, until: Callable[[], bool], work: Callable[[], None]) -> None:
         request = HTTPRequest(f"ws://127.0.0.1:{self._port}")
         connection = await websocket_connect(request, subprotocols=["foxglove.sdk.v1"])
+        for message in self._first:
+            await connection.write_message(message, binary=isinstance(message, bytes))
         waiting = asyncio.ensure_future(_read(connection))
         while not until():
             work()
@@ -314,6 +319,16 @@ def test_who_serves_the_network_is_told_the_address_that_others_use(caplog: pyte
     with foxglove_server("0.0.0.0:0", Console(file=said, width=200)) as (served,):
         assert said.getvalue() == f"Foxglove: ws://{own_addresses()[0]}:{served.port}\n"
         assert "everybody on the network" in caplog.text
+
+
+def test_a_client_that_sends_nonsense_is_served_and_fills_no_log(caplog: pytest.LogCaptureFixture) -> None:
+    nonsense = ("{", "null", b"\xff", b"\x02", '{"op": "subscribe", "subscriptions": [{"id": 7, "channelId": 9999}]}')
+    with foxglove_server("127.0.0.1:0", Console(file=StringIO())) as (served,):
+        served.run_started(_run())
+        client, sent = Client(served.port, nonsense), transforms("odom")
+        client.watch(lambda: bool(client.seen), lambda: served.sender_event(1, Accepted(0, 0, sent, 0.0)))
+    assert client.seen[0] == ("/robot_1/tf", sent)
+    assert caplog.text == ""
 
 
 def test_a_port_that_is_taken_is_named(server: FoxgloveServer) -> None:
