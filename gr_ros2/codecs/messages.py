@@ -38,7 +38,7 @@ def store() -> Typestore:
 
 
 def read(type_name: str, message: bytes) -> Any:
-    """The message as a value; its arrays refer to the bytes.
+    """The message as a value.
 
     :raises DamagedError: when the bytes are not such a message
     """
