@@ -17,7 +17,7 @@ import numpy as np
 from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.medium.base import Hearers, Measured, RadioPath
-from gr_ros2_lab.survey.numbers import line_of, read_numbers, text_of
+from gr_ros2_lab.survey.numbers import check_ranges, line_of, read_numbers, text_of
 from gr_ros2_lab.survey.table import NEEDED
 
 TIME = "t_s"
@@ -28,7 +28,7 @@ QUEUE_S = 2.0
 """s for which a packet may wait for capacity, or there is no room for it."""
 _MTU = 1500
 """Bytes that one line of Mahimahi's format lets pass."""
-_RANGES = {"snr_db": (-100.0, 100.0), "loss": (0.0, 1.0), "capacity_bps": (0.0, 1e12)}
+_RANGES = {TIME: (-1e13, 1e13), "snr_db": (-100.0, 100.0), "loss": (0.0, 1.0), "capacity_bps": (0.0, 1e12)}
 
 
 class Capacity:
@@ -134,13 +134,8 @@ def read_trace(path: Path) -> ChannelTrace:
     times = columns[TIME]
     if len(times) < 2:
         raise ConfigError(f"{path}: {len(times)} rows say nothing over time; a trace has two or more")
+    check_ranges(path, columns, _RANGES)
     _check_times(path, times)
-    for name in found:
-        low, high = _RANGES[name]
-        for row in np.flatnonzero((columns[name] < low) | (columns[name] > high))[:1]:
-            raise ConfigError(
-                f"{path}: line {line_of(path, row)}: {name} = {columns[name][row]:g}: not within {low:g}..{high:g}"
-            )
     times = times - times[0]
     usual = float(np.median(np.diff(times)))
     period_s = float(times[-1]) + usual

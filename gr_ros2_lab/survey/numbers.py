@@ -56,6 +56,18 @@ def read_numbers(path: Path, wanted: Collection[str], may_lack: Collection[str] 
     return {name: np.array(column) for name, column in found.items()}
 
 
+def check_ranges(path: Path, columns: Mapping[str, Floats], ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Check each column that has a range; empty cells pass.
+
+    :raises ConfigError: for a value outside; names line, column and value
+    """
+    for name in ranges.keys() & columns.keys():
+        low, high = ranges[name]
+        for row in np.flatnonzero((columns[name] < low) | (columns[name] > high))[:1]:
+            value = columns[name][row]
+            raise ConfigError(f"{path}: line {line_of(path, row)}: {name} = {value:g}: not within {low:g}..{high:g}")
+
+
 def line_of(path: Path, row: int) -> int:
     """The line of a file at which a row of :func:`read_numbers` ends.
 

@@ -19,7 +19,7 @@ import numpy as np
 from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import ConfigError
 from gr_ros2_lab.survey.fit import DistanceFit, fit_odds, fit_over_distance
-from gr_ros2_lab.survey.numbers import read_numbers
+from gr_ros2_lab.survey.numbers import check_ranges, read_numbers
 
 CELL_M = 1.0
 """Edge of the cells in which rows become one point, m."""
@@ -72,6 +72,12 @@ class SurveyRow:
 
 COLUMNS = tuple(item.name for item in fields(SurveyRow))
 NEEDED = ("x_m", "y_m", "their_x_m", "their_y_m", "packets", "lost")
+_RANGES = {
+    **dict.fromkeys(("x_m", "y_m", "their_x_m", "their_y_m"), (-1e9, 1e9)),
+    **dict.fromkeys(("packets", "lost"), (0.0, 1e15)),
+    "robot": (0.0, 255.0),
+    "snr_db": (-100.0, 100.0),
+}
 _MAY_LACK = ("latitude", "longitude", "snr_db", "age_s")
 
 
@@ -91,14 +97,13 @@ def _cell(value: float) -> str:
 def read_table(path: Path) -> list[SurveyRow]:
     """The rows of a table.
 
-    :raises ConfigError: when it cannot be read, lacks a column, or has a cell that is no finite number
+    :raises ConfigError: when it cannot be read, lacks a column, or has a cell that is no finite number that can be
     """
     columns = read_numbers(path, COLUMNS, _MAY_LACK)
     if lacking := [name for name in NEEDED if name not in columns]:
         raise ConfigError(f"{path}: a survey needs the columns {', '.join(NEEDED)}; {lacking[0]} is missing")
     count = len(columns["x_m"])
-    if (columns["packets"] < 0).any() or (columns["lost"] < 0).any():
-        raise ConfigError(f"{path}: packets and lost are counts; one is below 0")
+    check_ranges(path, columns, _RANGES)
     whole = [columns.get(name, np.full(count, nan if name in _MAY_LACK else 0.0)).tolist() for name in COLUMNS]
     return [SurveyRow(t, int(robot), *rest) for t, robot, *rest in zip(*whole, strict=True)]
 

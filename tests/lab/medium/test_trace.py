@@ -60,6 +60,7 @@ def test_a_row_holds_until_the_next_and_the_trace_begins_again(tmp_path: Path) -
         ("t_s,loss\n0,0\n1,0\n\n1,0\n", "line 5: t_s = 1 after 1: time goes back or stands"),
         ("t_s,loss\n0,0\n2,0\n1,0\n", "line 4: t_s = 1 after 2: time goes back"),
         ("t_s,loss\n0,0\n1,0\n2,0\n30,0\n", "line 5: a gap of 28 s after t_s = 2, where rows are 1 s apart"),
+        ("t_s,loss\n-1e308,0\n1e308,1\n", "line 2: t_s = -1e+308: not within"),
         ("t_s,loss\n0,0\n1,1.5\n", "line 3: loss = 1.5: not within 0..1"),
         ("t_s,capacity_bps\n0,0\n1,0\n", "not one packet"),
         ("t_s,loss\n0,0\n", "1 rows say nothing over time"),

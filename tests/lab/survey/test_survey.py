@@ -182,7 +182,9 @@ def test_a_place_where_nothing_arrived_stays_dead() -> None:
     ("text", "said"),
     [
         ("x_m,y_m,their_x_m,their_y_m,packets,lost\n1,2,0,0,5,nan\n", "line 2: lost = 'nan'"),
-        ("x_m,y_m,their_x_m,their_y_m,packets,lost\n1,2,0,0,-5,0\n", "one is below 0"),
+        ("x_m,y_m,their_x_m,their_y_m,packets,lost\n1,2,0,0,-5,0\n", "line 2: packets = -5: not within 0"),
+        ("robot,x_m,y_m,their_x_m,their_y_m,packets,lost\n1e30,1,2,0,0,5,0\n", "line 2: robot = .* not within 0"),
+        ("x_m,y_m,their_x_m,their_y_m,packets,lost\n1,-1e200,0,0,5,0\n", "line 2: y_m = .* not within"),
         ("x_m,y_m,their_x_m,their_y_m,packets,lost\n1,2,0,0,0,0\n", "counts no packet"),
         ("x_m,y_m,their_x_m,their_y_m,packets,lost\n1,2,0,0,9,0\n", "1 places from 2.2 to 2.2 m say no path loss"),
     ],
