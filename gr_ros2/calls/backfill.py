@@ -22,6 +22,8 @@ from gr_ros2.core.errors import EntryBoundsError, EntryKindError
 _MESSAGE, _ACCOUNT = 1, 3
 _HEAD = Struct(">BBIQQBI")
 _COUNT = Struct(">BBQQ")
+ACCOUNT_LEN = _COUNT.size
+"""Bytes of an account."""
 _LATEST_US = ((1 << 63) - 1) // 1000
 """The last time that a bag can hold."""
 _SERIALS = (1 << 32) - 1

@@ -12,12 +12,12 @@ is kept on.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from functools import partial
 from math import inf
 from typing import Any
 
-from gr_ros2.calls.backfill import PIECE, Account, Later, MessagesForLater, began_at, write_later
+from gr_ros2.calls.backfill import ACCOUNT_LEN, PIECE, Account, Later, MessagesForLater, began_at, write_later
 from gr_ros2.core.clocks import wall_ahead
 from gr_ros2.gr.bulk_topic import add_bulk_topic
 from gr_ros2.gr.live_end import LiveEnd
@@ -32,6 +32,8 @@ from gr_ros2.settings.robot import BackfillConfig, RobotConfig
 from gr_ros2.settings.topic_choice import TopicChoice
 
 WAITING = 2
+ACCOUNTS_PART = 64
+"""Accounts take one byte at most for so many of the messages of which they tell."""
 SELDOM_S = 60.0
 """s from one try to the next at most, while nobody hears."""
 _LOOK_S, _BUSY_S = 0.2, 0.02
@@ -70,9 +72,10 @@ class Backfill:
         """Accounts from which robots count that have started in a silence."""
         self._told: set[int] = set()
         """Topics of which an account was told."""
+        self._due = False
+        """Whether somebody lacks an account."""
         self._untold, self._lost = 0, 0
-        """Bytes of messages since the last account, at least ``PIECE`` where one is due at once; and ``kept.lost``
-        then."""
+        """Bytes of messages since the last account, and ``kept.lost`` then."""
         self._topic_id = add_bulk_topic(endpoint, "_backfill", BACKFILL_TYPE, waiting=WAITING, reliability="reliable")
 
     def note(self, event: SenderEvent) -> None:
@@ -106,7 +109,7 @@ class Backfill:
         self._starts |= here
         self.kept.heard(self._receipts, now)
         if here.items() - self._here or unheard > self.kept.unheard:
-            self._untold += PIECE
+            self._due = True
         self._here = here.items()
         if here:
             self._fill(now)
@@ -118,9 +121,8 @@ class Backfill:
             self._allowed = min(self._allowed + free, 1e9)
         if not self.kept.unheard:
             self._pause_s = 0.0
-            told = self._untold < PIECE and (len(self.kept) or self.kept.lost == self._lost)
-            if self._may_submit and not told and self.kept.accounts():  # before what takes longer to cross
-                self._submit([], now)
+            if self._may_submit and self._owes and (accounts := self._accounts()):
+                self._submit(accounts, now)  # before what takes longer to cross
             while self._may_submit and (found := self.kept.take(self._wall_ahead())):
                 self._submit(found, now)
         elif self.kept.tries or now < self._tried + self._pause_s or not self._may_submit:
@@ -128,28 +130,37 @@ class Backfill:
         elif found := self.kept.take(self._wall_ahead(), most=0):
             # One message tells whether somebody hears again, where nothing else leaves that would.
             self._tried, self._pause_s = now, min(max(1.0, 2 * self._pause_s), SELDOM_S)
-            self._submit(found, now)
+            self._submit([*found, *(self._accounts() if self._owes else ())], now)
+
+    @property
+    def _owes(self) -> bool:
+        """Whether accounts are told: to who is there anew, when something was given up, and beside so many bytes of
+        messages that they take a small part of them."""
+        least = max(PIECE, ACCOUNTS_PART * ACCOUNT_LEN * len(self._told))
+        return self._due or self._untold >= least or (not len(self.kept) and self.kept.lost != self._lost)
 
     @property
     def _may_submit(self) -> bool:
         return self._endpoint.messages.has_space(self._topic_id) and (self._share >= 1 or self._allowed > 0)
 
-    def _submit(self, messages: Sequence[Later], now: float) -> None:
-        payload = write_later([*messages, *self._accounts()])
+    def _submit(self, messages: Sequence[Later | Account], now: float) -> None:
+        payload = write_later(messages)
         self._allowed -= len(payload)
         self._endpoint.messages.submit(self._topic_id, payload, now)
 
-    def _accounts(self) -> Iterator[Account]:
-        """What is told beside messages that fill gaps, and as often as messages are made that would fill a piece: so
-        it takes a few thousandths of their bytes."""
+    def _accounts(self) -> list[Account]:
+        """What is told of how many messages there were."""
+        found: list[Account] = []
         for topic_id, account in self.kept.accounts().items():
             if topic_id not in self._told:
-                yield Account(topic_id, 0, 0)
+                found.append(Account(topic_id, 0, 0))
             elif topic_id in self._from:
-                yield self._from[topic_id]
-            yield account
+                found.append(self._from[topic_id])
+            found.append(account)
             self._told.add(topic_id)
-        self._from, self._untold, self._lost = {}, 0, self.kept.lost
+        if found:
+            self._due, self._from, self._untold, self._lost = False, {}, 0, self.kept.lost
+        return found
 
 
 class LiveBackfill:
