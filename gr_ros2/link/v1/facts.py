@@ -87,6 +87,7 @@ class Has(NamedTuple):
 class Asked(NamedTuple):
     """A robot lacks messages that are kept for such robots."""
 
+    robot: int
     topic_ids: tuple[int, ...]
 
 

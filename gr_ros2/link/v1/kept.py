@@ -1,7 +1,7 @@
 """The messages that a robot keeps for others that join late, and its table of topics, one message per row.
 
 A robot that lacks one asks for it; hellos name them. While no robot reports, they are repeated. Fragments of a repeat
-complete those that came before.
+complete those that came before: a robot that came while a message was under way gets its beginning alone.
 
 Invariants: a message is named in hellos only after the receivers had time to get it when it was first sent; however
 many ask, and whoever they are, each message takes a bounded share of the time.
@@ -10,7 +10,7 @@ many ask, and whoever they are, each message takes a bounded share of the time.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from zlib import crc32
 
@@ -58,6 +58,8 @@ class _Kept:
     """When it was submitted, s."""
     begin: int = 0
     """The packet in which its first fragment left for the first time; 0 if it left whole."""
+    missed: dict[int, int] = field(default_factory=dict)
+    """How many of its bytes had left when a robot came, by the robot, until it asks."""
 
 
 class KeptMessages:
@@ -133,10 +135,21 @@ class KeptMessages:
         """Keep none of the messages of a topic so far."""
         self._kept.pop(topic_id, None)
 
-    def asked(self, topic_id: int, now: float, interval_s: float = 0.0, *, anew: bool = False) -> bool:
+    def meet(self, robot: int) -> None:
+        """A robot comes; of what is under way it hears the rest."""
+        for topic_id, messages in self._kept.items():
+            queue = self._topics[topic_id].queue
+            head = next(iter(queue), None)
+            for kept in messages:
+                kept.missed.pop(robot, None)
+                if head is not None and head.started and head.serial == kept.serial and not head.begins:
+                    kept.missed[robot] = head.offset
+
+    def asked(self, topic_id: int, now: float, interval_s: float = 0.0, *, robot: int = -1, anew: bool = False) -> bool:
         """A robot asks for the kept message of a topic; returns whether that is not too often.
 
         :param interval_s: s from one packet of this robot to the next; 0 = not known
+        :param robot: which robot asks; -1 = not known
         :param anew: it has nothing of it. Otherwise rows of the table that wait may be those that it lacks
         """
         slow = self._settings.shares and self._settings.slower > 1
@@ -148,7 +161,7 @@ class KeptMessages:
         left, at = self._answers.get(topic_id, (ANSWERS, now))
         left = min(left + (now - at) / pause, ANSWERS)
         if left >= 1:
-            left -= self._tell_anew(now) if topic_id == TABLE_TOPIC else self.ask(topic_id, now)
+            left -= self._tell_anew(now) if topic_id == TABLE_TOPIC else self.ask(topic_id, now, robot)
             self._answers[topic_id] = left, now
             return True
         return False
@@ -176,10 +189,11 @@ class KeptMessages:
         self._send_rows([row for row in rows if row.payload not in leaving], self._table_qos, now)
         return bool(rows)
 
-    def ask(self, topic_id: int, now: float, *, fills: bool = False) -> bool:
+    def ask(self, topic_id: int, now: float, robot: int = -1, *, fills: bool = False) -> bool:
         """Send the kept message of a topic again because a robot lacks it, unless it is waiting already; returns
         whether it is sent.
 
+        :param robot: which robot; what it missed of messages that were under way when it came is enough at first
         :param fills: the table takes only room that nothing else needs
         """
         self._starting_until = min(self._starting_until, now + STARTING_S * self._settings.slower)
@@ -191,21 +205,34 @@ class KeptMessages:
         if topic_id == TABLE_TOPIC and not fills:
             for message in topic.queue:
                 message.qos = self._table_qos
+        messages = self._kept.get(topic_id, ())
+        missed = {kept.serial: kept.missed.pop(robot) for kept in messages if robot in kept.missed}
         if any(message.repeat for message in topic.queue):
+            self._lengthen(topic, missed)
             return False
         if topic_id == TABLE_TOPIC:
             self._send_rows(self._rows.values(), QOS_BULK if fills else self._table_qos, now)
             return True
         qos = QOS_BULK if topic.latched else topic.qos
-        for kept in self._kept.get(topic_id, ()):
-            if now > kept.until:
+        waiting = {message.serial for message in topic.queue}
+        for kept in messages:
+            if now > kept.until or kept.serial in waiting or (missed and kept.serial not in missed):
                 continue
-            again = Message(kept.serial, topic_id, kept.payload, qos, now, topic.weight, kept.until - now)
+            payload = kept.payload[: missed[kept.serial]] if missed else kept.payload
+            again = Message(kept.serial, topic_id, payload, qos, now, topic.weight, kept.until - now)
+            again.begins = len(payload) < len(kept.payload)
             again.repeat, again.coded, again.published = True, kept.coded, kept.made
             again.begin, again.dst_id, again.keys = kept.begin, topic.dst_id, kept.keys
             self._admit(topic, again)
             self._stats.repeats += 1
         return True
+
+    def _lengthen(self, topic: SentTopic, missed: dict[int, int]) -> None:
+        """Another robot has missed more of a message whose beginning is sent again."""
+        for kept in self._kept.get(topic.topic.topic_id, ()):
+            for message in topic.queue:
+                if message.begins and message.serial == kept.serial:
+                    message.payload = kept.payload[: max(len(message.payload), missed.get(kept.serial, 0))]
 
     @property
     def _table_qos(self) -> int:
@@ -248,7 +275,8 @@ class KeptMessages:
             return
         for kept in of:
             if kept.payload is message.payload:
-                kept.named = min(kept.named, now + SETTLING_S * self._settings.slower)
+                settling_s = 0.0 if kept.missed else SETTLING_S * self._settings.slower
+                kept.named = min(kept.named, now + settling_s)
                 kept.begin = message.begin if message.index > 1 else kept.begin
         if not reported:
             # Later the table is sent again, and is small; at the start, nothing can be delivered without it.

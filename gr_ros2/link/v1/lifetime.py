@@ -84,6 +84,10 @@ class Lifetimes:
         while len(earlier) > most:
             earlier.popleft().end()
 
+    def beside(self, lifetime: Lifetime) -> None:
+        """The beginning of a message has left again, which is of use only with the rest."""
+        self._left.append(lifetime)
+
     def restart(self, keys: Keys) -> None:
         """The newest message of these instances needs no earlier one, and whoever has it needs none."""
         for old in [lifetime for lifetime in self._left if lifetime.keys == keys][:-1]:

@@ -22,6 +22,7 @@ class Message(Outgoing):
     :param published: when it was submitted, s, where it is sent again for robots that join late
     :param robots: those for which its packets are sent fast enough; None for all
     :param key: it needs no earlier message of its topic, and these are of no more use when it has left
+    :param begins: it is only the beginning of a message, for who has heard the rest
     :param plain: the message before it was coded, where later ones may be merged with it
     :param carried: its topic and key at the robot that made it, while it is carried over others
     """
@@ -38,6 +39,7 @@ class Message(Outgoing):
     left_at: float = inf
     published: float = inf
     key: bool = False
+    begins: bool = False
 
     @property
     def made(self) -> float:

@@ -337,6 +337,9 @@ class Outbox:
         """A message has left whole."""
         topic = self.sent[message.topic_id]
         reported = bool(self._peers.all) or self._peers.confirm(in_order=topic.in_order)
+        if message.begins:
+            topic.lifetimes.beside(message.lifetime)
+            return
         topic.lifetimes.left(
             message.lifetime,
             policy=topic.queue.policy,

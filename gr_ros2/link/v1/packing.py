@@ -288,10 +288,11 @@ class Packing:
                 message.numbers.append(number)
             payload = message.take(taken)
             last = message.offset == len(message.payload)
-            parts.append(Part(ON_AIR.get(topic_id, topic_id), payload, back, offset, last, message.coded))
+            whole = last and not message.begins
+            parts.append(Part(ON_AIR.get(topic_id, topic_id), payload, back, offset, whole, message.coded))
             named = (number, place) if message.place < 0 else (message.begin, message.place)
             of, key = message.carried or (topic_id, Key(self._boot, *named))
-            total = message.index if last else 0
+            total = message.index if whole else 0
             sent.append(SentEntry(message.serial, of, key, message.index - 1, total, message.repeat))
             lifetimes.append(lifetime)
             if RANK[message.qos] < RANK[qos]:

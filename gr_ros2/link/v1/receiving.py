@@ -346,7 +346,7 @@ class ReceivingSide:
             elif self.relaying is not None:
                 self.relaying.newest(self._sender.src_id, entry, self._now)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
-            self._facts.append(Asked(tuple(dict.fromkeys(entry.topic_ids))))
+            self._facts.append(Asked(self._sender.src_id, tuple(dict.fromkeys(entry.topic_ids))))
 
     def _reported(self, sender: int, report: Report) -> None:
         """A robot says which packets it has."""

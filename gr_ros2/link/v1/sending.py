@@ -230,6 +230,7 @@ class SendingSide:
             case Appeared(knows):
                 self._appeared(now, knows=knows)
             case PeerMet(robot, proven, wanted):
+                self._come(robot)
                 self._window.peers.meet(robot, now)
                 if proven is not None:
                     self._window.peers.prove(robot, proven, wanted=wanted)
@@ -237,9 +238,9 @@ class SendingSide:
                     self._rate.meet(robot)
             case PeerLeft(robot, ended):
                 self._left(robot, now, ended=ended)
-            case Asked(topic_ids):
+            case Asked(robot, topic_ids):
                 for topic_id in topic_ids:
-                    if self._messages.kept.asked(topic_id, now, self._interval):
+                    if self._messages.kept.asked(topic_id, now, self._interval, robot=robot):
                         self._messages.asks[topic_id] += 1
                     else:
                         self._neighbours.dropped["asked_too_often"] += 1
@@ -248,12 +249,18 @@ class SendingSide:
             case ProofWanted():
                 self.hellos.answer(now)
 
+    def _come(self, robot: int) -> None:
+        """A robot reports: if it has just come, it has missed what has left of the messages under way."""
+        if robot not in self._window.peers.all:
+            self._messages.kept.meet(robot)
+
     def _reported(self, robot: int, number: int, report: Report, now: float) -> None:
         loss = report.loss / 128
         not_for = 0.0
         if self._audiences is not None:
             not_for = self._audiences.not_for(robot, number)
             loss = max(loss - not_for, 0.0) / (1 - not_for)
+        self._come(robot)
         self._window.peers.report(robot, number, report.arrived, settled=report.settled, loss=loss, now=now)
         self.repairs.reported()
         if self._relaying is not None:

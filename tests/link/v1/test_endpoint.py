@@ -194,6 +194,35 @@ def test_a_robot_that_joins_late_has_what_is_kept_within_two_round_trips(delay: 
     assert two.delivered() == [text(1, 700)]
 
 
+@pytest.mark.parametrize(("mode", "restarts"), [("none", False), ("encrypt", True)])
+def test_who_joins_while_a_message_is_under_way_gets_no_more_than_its_beginning_again(
+    mode: SealMode, restarts: bool
+) -> None:
+    """Two join one after the other, and the first of them may start again after that."""
+    one, first = Robot(1, registry(odom=SendOptions(), map=LATCHED), mode=mode), Robot(2, mode=mode)
+    joiners = [Robot(3, mode=mode), Robot(4, mode=mode)]
+    air, size = Air(one, first, loss=0.2), 12_000
+    air.run(1.0)
+    one.end.messages.submit(1, text(1, size), air.now)
+
+    def left(share: float) -> bool:
+        return one.end.sent.payload_bytes >= share * size
+
+    air.run(60.0, lambda: left(0.2))
+    air.robots.append(joiners[0])
+    air.run(60.0, lambda: left(0.4))
+    air.robots.append(joiners[1])
+    air.run(60.0, lambda: left(0.6))
+    if restarts:
+        joiners[0].start()
+    robots = [first, *joiners]
+    air.run(60.0, lambda: all(robot.delivered() for robot in robots))
+    air.run(10.0)
+    assert [robot.delivered() for robot in robots] == [[text(1, size)]] * 3
+    begun = 0.6 if restarts else 0.4  # when the last of them came
+    assert one.end.sent.payload_bytes < (1 + begun + 0.1) * size
+
+
 @pytest.mark.parametrize("hears", [True, False])
 def test_several_messages_are_kept_of_a_topic_whose_depth_is_set(hears: bool) -> None:
     topics = registry(odom=SendOptions(), map=replace(LATCHED, depth=10))
