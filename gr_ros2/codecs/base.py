@@ -19,7 +19,7 @@ from gr_ros2.core.errors import DamagedError
 MAX_SIZE = 1 << 24
 """Bytes of the largest message that a decoder makes unless it is told otherwise."""
 KEY_TIMES = 4
-"""Budgets that a key frame of video has. With one, what is seen is coarse for a second."""
+"""Budgets that a key frame of video has at most. With one, what is seen is coarse for a second."""
 OF_CHAIN = 127
 """First byte of a frame of another chain than the first; the number of the chain and the frame follow. It is the
 number of no codec."""

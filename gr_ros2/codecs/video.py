@@ -96,6 +96,9 @@ class VideoEncoder:
         self._fixed = b""
         self._video: H264Encoder | None = None
         self._last: int | None = None
+        self._since = KEY_TIMES
+        """Frames since the last key frame, and so the budgets that the next may have: two cameras that publish as one
+        would take four times what is free."""
 
     def encode(self, picture: av.VideoFrame, head: bytes, side: bytes, budget: int, key: bool) -> Coded:
         """A frame.
@@ -113,7 +116,9 @@ class VideoEncoder:
         try:
             if self._video is None:
                 self._fixed, self._video = fixed, H264Encoder(picture.width, picture.height)
-                budget *= KEY_TIMES
+                budget *= min(self._since, KEY_TIMES)
+                self._since = 0
+            self._since += 1
             data = self._video.encode(picture, max(0, budget - len(body) - _OUTER))
         except (av.error.FFmpegError, ValueError) as error:
             self._video = None

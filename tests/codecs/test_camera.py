@@ -210,6 +210,17 @@ def test_another_size_encoding_or_frame_is_a_key_frame() -> None:
     assert [(out.width, out.encoding) for out in shown[::2]] == [(64, "rgb8"), (64, "bgr8"), (96, "bgr8")]
 
 
+def test_key_frames_one_after_the_other_take_no_more_than_the_budget() -> None:
+    """As of two cameras that publish as one topic."""
+    encoder = CodedTopic(IMAGE, {"camera": {"size": "full"}}).encoder()
+    frames = [
+        encoder.encode(image(view(number, 160, 120), ("rgb8", "bgr8")[number % 2], number), 900) for number in range(6)
+    ]
+    assert {frame.before for frame in frames} == {None}
+    assert len(frames[0].data) > 2 * 900
+    assert all(len(frame.data) <= 1.1 * 900 for frame in frames[1:])
+
+
 def test_the_size_follows_the_budget_and_stays_when_it_wavers() -> None:
     topic = CodedTopic(IMAGE)
     encoder = topic.encoder()
