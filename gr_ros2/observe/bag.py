@@ -6,8 +6,8 @@ when it came out here.
 
 What fills gaps of an outage (:mod:`gr_ros2.gr.backfill`) stands among the rest, once. What is missing at the end is
 said in the bag, in the way of rosbag2 on `events/messages_lost` of the link's node: of topics whose gaps are filled
-every message that their sender made between the first and the last account that came of it, of others only those of
-which a part has come. `metadata.yaml` says which are which.
+every message that their sender made between the first and the last account that came of it, of others only those that
+came in part or too late. `metadata.yaml` says which are which.
 
 Invariants: the link never waits for the disk; what the disk cannot take is counted and said.
 """
@@ -253,9 +253,9 @@ class OutputBag(Closing):
             found = self._counted.get((src_id, boot, topic_id))
             lost[topic] += found is None or found.last is None or number >= found.last.number
         lost += Counter({topic: count for topic, count in self._nameless.items() if topic not in whole})
+        counted_whole = ", ".join(sorted(whole)) or "no topic"
         self._recorder.note(
-            "messages_lost",
-            f"all that were made, of {', '.join(sorted(whole)) or 'no topic'}; of others, those of which a part came",
+            "messages_lost", f"all that were made, of {counted_whole}; of others, those that came in part or too late"
         )
         if lost:
             node = link_node(next(iter(run.sources)))
