@@ -152,11 +152,15 @@ def _links(server: SoundServer, folder: Path, sinks: Sinks, preset: str, run: _R
     finally:
         took = time.monotonic() - begin
         used = []
-        for process in processes:
+        runs = [process for process in processes if process.poll() is None]
+        for process in runs:
             process.terminate()
             _, _, usage = os.wait4(process.pid, 0)
             process.returncode = 0
             used.append(usage.ru_utime + usage.ru_stime)
-        run.cores = max(used) / took
+        run.cores = max(used, default=0.0) / took
+        said = [(folder / f"link-{number}.txt").read_text()[-2000:] for number in range(1, len(sinks) + 1)]
+        if len(runs) < len(processes):
+            raise RuntimeError("\n".join(["a link ended by itself:", *said]))
         if not run.came:
-            print(*((folder / f"link-{n}.txt").read_text()[-2000:] for n in range(1, len(sinks) + 1)), sep="\n")
+            print(*said, sep="\n")
