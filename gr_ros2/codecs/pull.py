@@ -29,9 +29,10 @@ _EAGER = 2
 _OFTEN_S = 0.1
 """Where the free rate has no room for one in so many s, they take no more than that: odometry that fills 3.5 kbit/s
 would be 2.4 times as old as alone."""
-_AHEAD = 4 * LEAST_BYTES
-"""Bytes that may wait there when the next is coded: all leave in one packet, and the newest is shown. With half of it,
-a picture in a hundred is left out at 32 kbit/s and 5 % loss while a repair waits, and one in ten at 20 %."""
+_AHEAD = 2 * LEAST_BYTES
+"""Bytes that may wait there when the next is coded: both leave in one packet, and the newer one is shown. Where less
+than that is free until the next, twice as many may: otherwise a picture in a hundred is left out at 32 kbit/s and 5 %
+loss while a repair waits, and one in ten at 20 %."""
 PART = 0.85
 """Of what is free, so that a frame that came out long, or a repair, does not delay the next. With .9, pictures at 64
 kbit/s are 107 ms old, with .8 101."""
@@ -158,7 +159,8 @@ class FramePull:
         """
         rate, waiting = progress.rate * share, progress.waiting
         often = LEAST_BYTES / _OFTEN_S < rate < inf
-        soon = max(rate * self._coding_s if rate < inf else 0, _AHEAD if often else 0)
+        ahead = _AHEAD * (1 + (PART * rate * self._period < _AHEAD)) if often else 0
+        soon = max(rate * self._coding_s if rate < inf else 0, ahead)
         if self._newest is None or not self.waits(now) or waiting > soon:
             return None
         if progress.lacked > PATIENCE_S and (progress.silent or now - self._keyed < KEY_S):

@@ -72,11 +72,11 @@ def test_a_newer_message_takes_the_place_of_one_that_was_not_coded() -> None:
 
 
 def test_it_waits_until_the_frame_before_will_have_left_when_coding_is_done() -> None:
-    pull, now = running(coding_s=0.02)
-    assert pull.pull(now, FREE._replace(waiting=201)) is None
-    request = pull.pull(now, FREE._replace(waiting=200))
+    pull, now = running(coding_s=0.008)
+    assert pull.pull(now, FREE._replace(waiting=81)) is None
+    request = pull.pull(now, FREE._replace(waiting=80))
     assert request is not None
-    assert request.budget == pytest.approx(PART * RATE * PERIOD - 200, abs=1)
+    assert request.budget == pytest.approx(PART * RATE * PERIOD - 80, abs=1)
 
 
 def test_on_a_slow_link_the_next_is_coded_while_a_small_one_waits() -> None:
