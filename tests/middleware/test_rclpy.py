@@ -448,7 +448,7 @@ def test_a_service_is_called_from_another_node_and_replies_later(start: Start) -
     server = one.serve("/list", kind, lambda client, payload: asked.append((client, payload)))
     client = two.client("/list", kind, lambda number, payload: answers.append((number, payload)), there.append)
     wait_for(lambda: there, "the server to be found")
-    request = bytes(serialize_message(ListParameters.Request(prefixes=["a"], depth=3)))
+    request = bytes(serialize_message(ListParameters.Request(prefixes=["planner"], depth=3)))
     client.call(1, request)
     client.call(2, request)
     wait_for(lambda: len(asked) == 2, "the requests")
