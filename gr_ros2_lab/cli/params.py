@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -46,7 +48,7 @@ OUT_FOLDER = OutFolder(path_type=Path)
 
 def new_results(what: str) -> Path:
     """A new folder for what a command writes: `results/WHAT-TIME`, with a number behind it where there is one already,
-    as runs may begin in the same second.
+    as runs may begin in the same second. It goes if it is empty when the command ends, as after a typing error.
 
     :raises ConfigError: when it cannot be made
     """
@@ -54,7 +56,10 @@ def new_results(what: str) -> Path:
     names = chain([first.name], (f"{first.name}-{number}" for number in count(2)))
     make_folder(first.parent)
     check_folder(first.parent)
-    return next(folder for folder in map(first.with_name, names) if _made(folder))
+    folder = next(folder for folder in map(first.with_name, names) if _made(folder))
+    if (context := click.get_current_context(silent=True)) is not None:
+        context.call_on_close(partial(_remove_empty, folder))
+    return folder
 
 
 def _made(folder: Path) -> bool:
@@ -64,6 +69,11 @@ def _made(folder: Path) -> bool:
     except FileExistsError:
         return False
     return True
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # there is something in it
+        folder.rmdir()
 
 
 pictures_option = click.option(

@@ -21,5 +21,5 @@ def report(directories: tuple[Path, ...], out: Path | None, pictures: bool) -> N
     latencies in one figure.
     """
     runs = read_runs(directories)
-    default = directories[0] if len(directories) == 1 else new_results("report")
-    print(written_line(write_report(runs, out or default, pictures=pictures)))
+    folder = out or (directories[0] if len(directories) == 1 else new_results("report"))
+    print(written_line(write_report(runs, folder, pictures=pictures)))

@@ -95,3 +95,23 @@ def test_runs_of_one_second_have_folders_of_their_own(tmp_path: Path, monkeypatc
         "other-20260101-120000"
     ]
     assert all(path.is_dir() for path in found)
+
+
+@pytest.mark.parametrize("words", [["ablate", "nosuch"], ["race", "--peers", "nosuch"]], ids=" ".join)
+def test_a_typing_error_leaves_no_folder(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert command.run(words) == command.BAD_INPUT
+    assert "nosuch" in capsys.readouterr().err
+    assert not list(tmp_path.glob("results/*"))
+
+
+def test_a_report_that_is_written_elsewhere_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        words = ["run", "paper-direct", "--duration", "0.5", "--set", "time=packets", "--no-report", "--out", name]
+        assert command.run(words) == 0
+    assert command.run(["report", "a", "b", "--out", "both"]) == 0
+    assert list(tmp_path.glob("both/*.html"))
+    assert not (tmp_path / "results").exists()
