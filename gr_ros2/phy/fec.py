@@ -14,6 +14,7 @@ import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import lru_cache, partial
+from itertools import chain, islice
 from math import gcd
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -143,10 +144,11 @@ class Spread(Code):
         super().__init__(inner.bits)
         self._inner = inner
         self.coded_bits = count = inner.coded_bits
-        first = int(_GOLDEN * count)
-        steps = [step for step in range(first, first + max(_TRIED, count - first + 1)) if gcd(step, count) == 1]
-        apart = (s for s in steps[:_TRIED] if symbol_bits and _apart(s, count, symbol_bits, carrier_bits))
-        step = next(apart, steps[0])
+        golden = int(_GOLDEN * count)
+        steps = (step for step in range(golden, golden + max(_TRIED, count - golden + 1)) if gcd(step, count) == 1)
+        first = next(steps)
+        tried = chain([first], islice(steps, _TRIED - 1)) if symbol_bits else ()
+        step = next((step for step in tried if _apart(step, count, symbol_bits, carrier_bits)), first)
         self._order = np.arange(count) * step % count
 
     def encode(self, bits: Bits) -> Bits:
