@@ -228,7 +228,7 @@ class LiveWishes:
         left_s = max(wish.until - self._clock(), 0.0)
         answer, over = wish.answer, wish.ended < inf
         anyway = answer is not None and answer.outcome == WishOutcome.SENT_ANYWAY
-        refused = answer is not None and answer.outcome != WishOutcome.SENT and not anyway
+        refused = answer is not None and answer.outcome not in (WishOutcome.SENT, WishOutcome.SENT_ANYWAY)
         state = "refused" if refused else "over" if over and not anyway else "asked" if answer is None else "sent"
         told |= {"state": state, "rate": wish.rate, "left_s": 0.0 if over else left_s}
         if answer is not None:
