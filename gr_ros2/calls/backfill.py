@@ -151,7 +151,7 @@ class _Left(NamedTuple):
 
 
 class HeardPackets(Protocol):
-    """Which packets others have: see :class:`gr_ros2.link.endpoint.PacketReceipts`."""
+    """Which packets others have: see :class:`gr_ros2.link.v1.receipts.Receipts`."""
 
     newest: int
 

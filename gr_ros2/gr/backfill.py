@@ -40,6 +40,55 @@ _LOOK_S, _BUSY_S = 0.2, 0.02
 """s between two looks at what has become of messages, and while some wait for room and somebody hears."""
 
 
+class _Accounts:
+    """When the robots that hear this one are told how many messages there were.
+
+    :param kept: counts them
+    """
+
+    def __init__(self, kept: MessagesForLater) -> None:
+        self._kept = kept
+        self._from: dict[int, Account] = {}
+        """Accounts from which robots count that have started in a silence."""
+        self._told: set[int] = set()
+        """Topics of which an account was told."""
+        self._due = False
+        """Whether somebody lacks an account."""
+        self._untold, self._lost = 0, 0
+        """Bytes of messages since the last account, and ``kept.lost`` then."""
+
+    def accepted(self, size: int) -> None:
+        """There is a further message of so many bytes."""
+        self._untold += size
+
+    def begin_anew(self) -> None:
+        """Robots have started in a silence: they count from what was heard before it."""
+        self._from = self._kept.accounts_heard()
+
+    def lacked(self) -> None:
+        """Somebody is there who lacks an account."""
+        self._due = True
+
+    def owed(self) -> list[Account]:
+        """What is to be told now: to who is there anew, when something was given up, and beside so many bytes of
+        messages that accounts take a small part of them."""
+        least = max(PIECE, ACCOUNTS_PART * ACCOUNT_LEN * len(self._told))
+        over = not len(self._kept) and self._kept.lost != self._lost
+        if not (self._due or self._untold >= least or over):
+            return []
+        found: list[Account] = []
+        for topic_id, account in self._kept.accounts().items():
+            if topic_id not in self._told:
+                found.append(Account(topic_id, 0, 0))
+            elif topic_id in self._from:
+                found.append(self._from[topic_id])
+            found.append(account)
+            self._told.add(topic_id)
+        if found:
+            self._due, self._from, self._untold, self._lost = False, {}, 0, self._kept.lost
+        return found
+
+
 class Backfill:
     """What one endpoint keeps and fills later.
 
@@ -68,14 +117,7 @@ class Backfill:
         """The newest start of each robot that was heard."""
         self._here: Set[tuple[int, int]] = frozenset()
         """Those that are, each with its start."""
-        self._from: dict[int, Account] = {}
-        """Accounts from which robots count that have started in a silence."""
-        self._told: set[int] = set()
-        """Topics of which an account was told."""
-        self._due = False
-        """Whether somebody lacks an account."""
-        self._untold, self._lost = 0, 0
-        """Bytes of messages since the last account, and ``kept.lost`` then."""
+        self._accounts = _Accounts(self.kept)
         self._topic_id = add_bulk_topic(endpoint, "_backfill", BACKFILL_TYPE, waiting=WAITING, reliability="reliable")
 
     def note(self, event: SenderEvent) -> None:
@@ -85,7 +127,7 @@ class Backfill:
                 self.kept.taken(event.serial)
             elif self._chosen(event.topic_id):
                 self.kept.accepted(event.topic_id, event.serial, event.payload, event.now)
-                self._untold += len(event.payload)
+                self._accounts.accepted(len(event.payload))
         elif isinstance(event, Refused):
             self.kept.refused(event.serial, ever=event.reason != Fate.TOO_LARGE)
         elif isinstance(event, SentPacket):
@@ -105,11 +147,11 @@ class Backfill:
             self.kept.doubt()
         unheard = self.kept.unheard
         if unheard and not self._starts.items() >= here.items():
-            self._from = self.kept.accounts_heard()
+            self._accounts.begin_anew()
         self._starts |= here
         self.kept.heard(self._receipts, now)
         if here.items() - self._here or unheard > self.kept.unheard:
-            self._due = True
+            self._accounts.lacked()
         self._here = here.items()
         if here:
             self._fill(now)
@@ -121,7 +163,7 @@ class Backfill:
             self._allowed = min(self._allowed + free, 1e9)
         if not self.kept.unheard:
             self._pause_s = 0.0
-            if self._may_submit and self._owes and (accounts := self._accounts()):
+            if self._may_submit and (accounts := self._accounts.owed()):
                 self._submit(accounts, now)  # before what takes longer to cross
             while self._may_submit and (found := self.kept.take(self._wall_ahead())):
                 self._submit(found, now)
@@ -130,14 +172,7 @@ class Backfill:
         elif found := self.kept.take(self._wall_ahead(), most=0):
             # One message tells whether somebody hears again, where nothing else leaves that would.
             self._tried, self._pause_s = now, min(max(1.0, 2 * self._pause_s), SELDOM_S)
-            self._submit([*found, *(self._accounts() if self._owes else ())], now)
-
-    @property
-    def _owes(self) -> bool:
-        """Whether accounts are told: to who is there anew, when something was given up, and beside so many bytes of
-        messages that they take a small part of them."""
-        least = max(PIECE, ACCOUNTS_PART * ACCOUNT_LEN * len(self._told))
-        return self._due or self._untold >= least or (not len(self.kept) and self.kept.lost != self._lost)
+            self._submit([*found, *self._accounts.owed()], now)
 
     @property
     def _may_submit(self) -> bool:
@@ -147,20 +182,6 @@ class Backfill:
         payload = write_later(messages)
         self._allowed -= len(payload)
         self._endpoint.messages.submit(self._topic_id, payload, now)
-
-    def _accounts(self) -> list[Account]:
-        """What is told of how many messages there were."""
-        found: list[Account] = []
-        for topic_id, account in self.kept.accounts().items():
-            if topic_id not in self._told:
-                found.append(Account(topic_id, 0, 0))
-            elif topic_id in self._from:
-                found.append(self._from[topic_id])
-            found.append(account)
-            self._told.add(topic_id)
-        if found:
-            self._due, self._from, self._untold, self._lost = False, {}, 0, self.kept.lost
-        return found
 
 
 class LiveBackfill:

@@ -25,6 +25,7 @@ from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.stats import ReceiverStats, SenderStats
+from gr_ros2.link.v1.receipts import Receipts
 from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
@@ -352,16 +353,6 @@ class Endpoint(PacketSide, Protocol):
         """The robots that are known, if the version tells."""
 
 
-class PacketReceipts(Protocol):
-    """Which packets of a robot others have, as they report."""
-
-    newest: int
-    """Number of the newest packet that any report covers, -1 for none."""
-
-    def have(self, first: int, last: int) -> bool:
-        """Whether somebody has each packet from one to another."""
-
-
 class OpenEndpoint(Endpoint, Protocol):
     """An end that announces its topics, asks other robots and may carry services."""
 
@@ -384,7 +375,7 @@ class OpenEndpoint(Endpoint, Protocol):
     def used_air(self) -> AirMeter:
         """How much of the air it uses."""
 
-    def receipts_of(self, robots: Collection[int]) -> PacketReceipts:
+    def receipts_of(self, robots: Collection[int]) -> Receipts:
         """Which of its packets one of some robots has, or any robot where none is named, as they report from now on."""
 
     @property

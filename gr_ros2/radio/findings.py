@@ -154,23 +154,20 @@ def _radios_differ(own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str
     """What does not match between the PHYs and packets of two ends. Of several radios those of one name are compared;
     one that only one of the ends has is not missed. One alone may be any of several."""
     here, there = _radios(own), _radios(other)
-    if here is not None and there is not None:
-        shared = sorted(here.keys() & there.keys())
-        found = [f"phy of radio {name} {_SET}" for name in shared if here[name][0] != there[name][0]]
-        found += _packets_differ("", other["packet_len"], own["packet_len"])
+    differ = _packets_differ("", other["packet_len"], own["packet_len"])
+    if (here is None) == (there is None):
+        ours, theirs = here or {}, there or {}
+        shared = sorted(ours.keys() & theirs.keys())
+        found = [f"phy of radio {name} {_SET}" for name in shared if ours[name][0] != theirs[name][0]]
+        found += differ
         for name in shared:
-            found += _packets_differ(f"radio {name}: ", there[name][1], here[name][1])
-        return found
+            found += _packets_differ(f"radio {name}: ", theirs[name][1], ours[name][1])
+        return found + [f"phy {_SET}"] * (here is None and other["phy"] != own["phy"])
     one, several = (own, there) if here is None else (other, here)
-    if several is None:
-        differ = _packets_differ("", other["packet_len"], own["packet_len"])
-        return differ + [f"phy {_SET}"] * (other["phy"] != own["phy"])
-    like = {packet_len for phy, packet_len in several.values() if phy == one["phy"]}
+    like = {packet_len for phy, packet_len in (several or {}).values() if phy == one["phy"]}
     if several and not like:
         return [f"no radio has the phy of the other end: phy {_SET}"]
-    if own["packet_len"] == other["packet_len"] or one["packet_len"] in like or not several:
-        return []
-    return _packets_differ("", other["packet_len"], own["packet_len"])
+    return differ if several and one["packet_len"] not in like else []
 
 
 def _packets_differ(where: str, there: int, here: int) -> list[str]:

@@ -248,15 +248,7 @@ class ArrivingMessages:
         for ready in due:
             if ready.topic_id == CARRIED_TOPIC:
                 self._of_another(ready)
-            else:
-                self._deliver(ready, self.announced.topics[ready.topic_id])
-
-    def follow(self, waited: Iterable[Ready], now: float) -> None:
-        """Messages need not wait any more for those that were overtaken."""
-        self._now = now
-        for ready in waited:
-            topic = self.announced.topic_of(ready)
-            if topic is None:
+            elif (topic := self.announced.topic_of(ready)) is None:
                 self._await_table(ready)
             else:
                 self._deliver(ready, topic)

@@ -289,7 +289,7 @@ class Inbox:
         self._now = now
         self.messages.release(self.order.without(()), now)
         if self._overtaking is not None:
-            self.messages.follow(self._overtaking.clear(), now)
+            self.messages.release(self._overtaking.clear(), now)
         self.close(Fate.SENDER_RESTARTED)
 
     def close(self, reason: Fate) -> None:
@@ -317,7 +317,7 @@ class Inbox:
         if self._overtaking is not None:
             if lost := self._overtaking.lost(self._now):
                 self._missed(lost, counts=True)
-            self.messages.follow(self._overtaking.due(self._now), self._now)
+            self.messages.release(self._overtaking.due(self._now), self._now)
 
     def _plausible(self, body: bytes) -> bool:
         try:

@@ -67,11 +67,6 @@ class Overtaking:
         """Those of them of which it is not told yet whether they are lost."""
         self._waiting: list[Ready] = []
 
-    @property
-    def wait_s(self) -> float:
-        """s for which a missing packet is waited for now."""
-        return self._learned.wait_s
-
     def missing(self, now: float, first: int, last: int) -> None:
         """These packets had not come when a later one did."""
         while self._gaps and self._gaps[0][0] + MOST_S < now:
@@ -89,7 +84,7 @@ class Overtaking:
 
     def lost(self, now: float) -> int:
         """How many packets have become too late to have been overtaken; each is counted once."""
-        lost, wait_s, here = 0, self.wait_s, self._decoder.bodies
+        lost, wait_s, here = 0, self._learned.wait_s, self._decoder.bodies
         while self._untold and self._untold[0][0] + wait_s <= now:
             _, first, last = self._untold.popleft()
             lost += sum(number not in here for number in range(first, last + 1))
@@ -122,7 +117,7 @@ class Overtaking:
     def next_timeout(self) -> float | None:
         """When :meth:`lost` or :meth:`due` has something to return at the latest, s; None where nothing waits."""
         times = [self._until(ready, -inf) for ready in self._waiting]
-        times += [since + self.wait_s for since, _, _ in self._untold]
+        times += [since + self._learned.wait_s for since, _, _ in self._untold]
         return min(times, default=None)
 
     def clear(self) -> list[Ready]:
@@ -132,7 +127,7 @@ class Overtaking:
 
     def _until(self, ready: Ready, now: float) -> float:
         """Until when packets before a message may come, s; -inf where none is missing."""
-        wait_s, here, may_carry = self.wait_s, self._decoder.bodies, self._contents.may_carry
+        wait_s, here, may_carry = self._learned.wait_s, self._decoder.bodies, self._contents.may_carry
         for since, first, last in reversed(self._gaps):
             if since + wait_s <= now:
                 break

@@ -44,6 +44,10 @@ class _Sequence(Generic[T]):
         self.newest, self.came = (-1, -1), -inf
         self.waiting: dict[int, tuple[Relayed, T]] = {}
 
+    def passed(self, message: Relayed) -> bool:
+        """Whether a message is no later one than the last that was given out."""
+        return (message.number, message.place) <= self.newest
+
     def take_out(self) -> tuple[Relayed, T] | None:
         """The next message; None if it is not here."""
         first = min(self.waiting, default=None)
@@ -72,20 +76,19 @@ class Sequences(Generic[T]):
         :param known: it can be delivered as soon as it is the next of its topic
         :return: whether it is new; None if there is no room for it
         """
-        stream, false = Stream(message.origin, message.start, message.topic_id), self.refutes(message, made)
-        sequence = self._all.get(stream)
-        passed = sequence is not None and (message.number, message.place) <= sequence.newest
-        if sequence is None and self._share.full and not known:
-            return None
-        if sequence is None or false:
+        stream = Stream(message.origin, message.start, message.topic_id)
+        if self.refutes(message, made):
             self._drop(stream)
+        sequence = self._all.pop(stream, None)
+        if sequence is None:
+            if self._share.full and not known:
+                return None
             self._share.held += _STREAM_COST
-            sequence, passed = _Sequence(message.place - message.waits), False
-        self._all.pop(stream, None)
+            sequence = _Sequence(message.place - message.waits)
         self._all[stream] = sequence
         if len(self._all) > MOST_STREAMS:
             self._drop(next(iter(self._all)))
-        if passed:
+        if sequence.passed(message):
             return False
         place = sequence.next + (message.place - sequence.next) % PLACES
         sequence.floor = max(sequence.floor, place - message.waits)
@@ -101,8 +104,7 @@ class Sequences(Generic[T]):
     def refutes(self, message: Relayed, made: float) -> bool:
         """Whether a message shows that the last one of its topic that was given out was false."""
         sequence = self._all.get(Stream(message.origin, message.start, message.topic_id))
-        passed = sequence is not None and (message.number, message.place) <= sequence.newest
-        return sequence is not None and passed and made > sequence.came + EXPIRES_S
+        return sequence is not None and sequence.passed(message) and made > sequence.came + EXPIRES_S
 
     def due(self, origin: int, start: int, known: Container[int] = range(TABLE_TOPIC)) -> list[T]:
         """The messages of a start of a robot whose turn has come.
