@@ -12,6 +12,7 @@ from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sent_topics import SentTopics
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.memory import Memory
+from gr_ros2.relay.robots import Robots
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Receipt, Relayed, read_carried, read_relayed, write_carried, write_relayed
@@ -24,7 +25,7 @@ _STEP = 20
 
 def relay(data: bytes) -> None:
     """Take the bytes as packets heard, and choose in between."""
-    gains = Gains(1)
+    gains = Gains(1, Robots())
     now = 0.0
     topics, window = SentTopics(None, ()), RepairWindow("off", 200)
     topics.relay()
@@ -34,7 +35,7 @@ def relay(data: bytes) -> None:
         window.packets,
         window.peers,
         gains=gains,
-        routes=Routes(),
+        routes=Routes(gains.robots),
         room=200,
         most=10_000,
         share=Memory(10_000).share(),

@@ -24,12 +24,11 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import NamedTuple
 
+from gr_ros2.relay.robots import Robots
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
 from gr_ros2.wire.v1 import TABLE_TOPIC
 
-HEARD_S = 3.0
-"""s for which a robot that was heard counts as a neighbour."""
 OWN, OTHERS = 0.7, 0.9
 """Share of the way from what a neighbour was taken to have to a message that it should have heard just now."""
 LIKELY = 0.5
@@ -84,31 +83,18 @@ class _State:
         """The neighbours that had any, as they have shown."""
 
 
-class _Heard:
-    """A robot that is heard."""
-
-    __slots__ = ("at", "named", "packets")
-
-    def __init__(self) -> None:
-        self.at = 0.0
-        self.packets = 0
-        self.named: dict[int, int] = {}
-        """The robots that it hears -> the count of its packets when it last named each."""
-
-
 class Gains:
     """The gain of sending each message that this robot has, for those who hear it.
 
     :param src_id: of this robot
-    :param slower: by how much longer than written robots are waited for, where they send seldom
+    :param robots: those that it hears
     """
 
-    def __init__(self, src_id: int, slower: Callable[[], float] = lambda: 1.0) -> None:
-        self.src_id, self.slower = src_id, slower
+    def __init__(self, src_id: int, robots: Robots) -> None:
+        self.src_id, self.robots = src_id, robots
         self._streams: dict[Stream, _State] = {}
         self._told: dict[tuple[int, int, int], _State] = {}
         """The same by what an entry ``Newest`` names."""
-        self._heard: dict[int, _Heard] = {}
         self._turn = 0
         self._worth = 1.0
         self._chosen_at = 0.0
@@ -121,47 +107,19 @@ class Gains:
     # ---- what is heard
 
     def neighbour(self, src_id: int, now: float, names: Iterable[int] = (), heard: int = 0) -> None:
-        """A packet of a robot was heard.
-
-        :param names: robots that it says it hears
-        :param heard: how many it hears in all: a name counts for as many packets as it takes to name all twice
-        """
-        robot = self._heard.get(src_id)
-        if robot is None:
-            robot = self._heard[src_id] = _Heard()
-        if not self.near(robot.at, now):  # it may have forgotten others since
+        """A packet of a robot was heard; see :meth:`Robots.hear`."""
+        if not self.robots.hear(src_id, now, names, heard):  # it may have forgotten others since
             for state in self._streams.values():
                 state.known.discard(src_id)
-        robot.at = now
-        robot.packets += 1
-        for name in names:
-            robot.named[name] = robot.packets
-        if len(robot.named) > heard:
-            robot.named = {name: at for name, at in robot.named.items() if robot.packets - at <= heard + 2}
-
-    def near(self, at: float, now: float) -> bool:
-        """Whether a robot that was heard at a time counts as a neighbour."""
-        return now - at < self._near_s
 
     def hears(self, src_id: int, now: float) -> bool:
-        """Whether a robot is heard and says that it hears this one."""
-        robot = self._heard.get(src_id)
-        return robot is not None and self.near(robot.at, now) and self.src_id in robot.named
+        """Whether a robot is a neighbour and says that it hears this one."""
+        return self.robots.is_near(src_id, now) and self.src_id in self.robots.all[src_id].hears
 
     def knows(self, src_id: int, stream: Stream) -> bool:
         """Whether a robot has shown that it knows the table of another one that has a stream."""
         table = self._streams.get(stream._replace(topic_id=TABLE_TOPIC))
         return table is not None and src_id in table.known
-
-    def heard_by(self, src_id: int) -> list[int]:
-        """The robots that are heard here and that a robot says it hears."""
-        robot = self._heard.get(src_id)
-        return [] if robot is None else [name for name in robot.named if name in self._heard]
-
-    def apart(self, origin: int, now: float) -> list[int]:
-        """The robots that are heard and do not say that they hear another one."""
-        near = self._neighbours(now)
-        return [src_id for src_id in near if src_id != origin and origin not in self._heard[src_id].named]
 
     def message(self, via: int, stream: Stream, number: int, now: float, made: float | None = None) -> bool:
         """A message was heard.
@@ -174,9 +132,8 @@ class Gains:
         new = stream.origin != self.src_id and self._arrived(state, number, now, now if made is None else made)
         state.has[via] = max(number, state.has.get(via, number))
         state.known.add(via)
-        robot = self._heard.get(via)
-        for name in () if robot is None else robot.named:
-            if name in self._heard and name != self.src_id:
+        for name in self.robots.heard_by(via):
+            if name != self.src_id:
                 self._count_as_heard(state, name, number, OTHERS)
         return new
 
@@ -197,7 +154,7 @@ class Gains:
     def gain(self, stream: Stream, now: float) -> float:
         """By how many s sending its newest message makes the neighbours younger, all together."""
         state = self._streams[stream]
-        return self._gain(stream, state, self._neighbours(now))
+        return self._gain(stream, state, self.robots.near(now))
 
     def lacks(self, stream: Stream, now: float) -> bool:
         """Whether a neighbour is likely to lack its newest message."""
@@ -219,7 +176,7 @@ class Gains:
         :param may_leave: whether a stream's message may leave now
         :param room: how much of the cost fits a packet: a table that takes several counts as so many for the weight
         """
-        neighbours = self._neighbours(now)
+        neighbours = self.robots.near(now)
         best: Stream | None = None
         most = worth = found = found_worth = 0.0
         largest, total = max(others, default=0.0), sum(gain * gain for gain in others)
@@ -245,17 +202,13 @@ class Gains:
         """Packets to send while others send one."""
         return min(max(int(1 + self._worth - EVEN), 1), MOST_WEIGHT)
 
-    def neighbours(self, now: float) -> int:
-        """Robots that are heard."""
-        return len(self._neighbours(now))
-
     def sent(self, stream: Stream, number: int, now: float, share: float = OWN) -> None:
         """A message of a stream leaves.
 
         :param share: of the way to it by which the neighbours are taken to have come
         """
         state = self._streams[stream]
-        for robot in self._neighbours(now):
+        for robot in self.robots.near(now):
             if robot != stream.origin:
                 self._count_as_heard(state, robot, number, share)
 
@@ -319,14 +272,6 @@ class Gains:
         if number > before:
             state.has[robot] = before + share * (number - before)
 
-    def _neighbours(self, now: float) -> list[int]:
-        near_s = self._near_s
-        return [src_id for src_id, robot in self._heard.items() if now - robot.at < near_s]
-
-    @property
-    def _near_s(self) -> float:
-        return HEARD_S * self.slower()
-
     def _gain(self, stream: Stream, state: _State, neighbours: Iterable[int]) -> float:
         newest, origin, has = state.newest, stream.origin, state.has
         table = stream.topic_id == TABLE_TOPIC  # who hears a robot has its table from it
@@ -334,7 +279,7 @@ class Gains:
             return 0.0
         behind = 0.0
         for robot in neighbours:
-            if robot != origin and not (table and origin in self._heard[robot].named):
+            if robot != origin and not (table and origin in self.robots.all[robot].hears):
                 before = has.get(robot)
                 if before is None or (table and before <= newest - 1 and robot not in state.known):
                     behind += UNKNOWN_S / state.period

@@ -178,7 +178,7 @@ class InOrder:
         place = 0 if row is None else bisect_left(row.orders, name.order)
         if row is not None and row.orders[place : place + 1] == [name.order]:
             kept = row.kept[place]
-            for robot in self._gains.heard_by(via):
+            for robot in self._gains.robots.heard_by(via):
                 kept.sent[robot] = now, kept.sent.get(robot, (0.0, 0))[1]
 
     def started(self, robot: int) -> None:
@@ -204,7 +204,7 @@ class InOrder:
             if not row.orders:
                 continue
             if stream.origin not in apart:
-                apart[stream.origin] = self._gains.apart(stream.origin, now)
+                apart[stream.origin] = self._gains.robots.apart(stream.origin, now)
             wanted: dict[Order, int] = {}
             for robot in apart[stream.origin]:
                 for order, kept in self._next(stream, row, robot, now):
@@ -232,7 +232,7 @@ class InOrder:
         if name in self:
             row, kept = self._rows[name.stream], self[name]
             row.served, kept.repaired = now, repaired
-            for robot in self._gains.apart(name.stream.origin, now):
+            for robot in self._gains.robots.apart(name.stream.origin, now):
                 if row.has.get(robot, (-1, 0)) < name.order:
                     kept.sent[robot] = now, min(kept.sent.get(robot, (0.0, 0))[1] + 1, DOUBLED)
 
@@ -244,7 +244,7 @@ class InOrder:
         if has is None and not self._gains.knows(robot, stream):
             return []
         begin = len(row.orders) - row.late if has is None else bisect_right(row.orders, has)
-        again = AGAIN_S * self._gains.slower()
+        again = AGAIN_S * self._gains.robots.slower()
         found = []
         if has is None and row.orders:
             row.kept_for[robot] = row.orders[-1]

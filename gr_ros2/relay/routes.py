@@ -12,8 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
-STALE_S = 15.0
-"""s for which a distance counts: tables are relayed every 5 s at least, and two may be lost."""
+from gr_ros2.relay.robots import Robots
 
 DOUBT_S = 300.0
 """s for which a robot over which messages did not arrive comes after all others."""
@@ -22,11 +21,11 @@ DOUBT_S = 300.0
 class Routes:
     """The distances of the robots that are heard from all others.
 
-    :param slower: by how much longer than written a distance counts, where robots send seldom
+    :param robots: says for how long a distance counts
     """
 
-    def __init__(self, slower: Callable[[], float] = lambda: 1.0) -> None:
-        self._slower = slower
+    def __init__(self, robots: Robots) -> None:
+        self._robots = robots
         self._ways: dict[int, dict[int, tuple[int, float]]] = {}
         """By robot, and by the one that is heard: how many stand between them, this one included, and when that was
         last so, s."""
@@ -41,15 +40,10 @@ class Routes:
         """
         ways = self._ways.setdefault(robot, {})
         before, at = ways.get(via, (hops, now))
-        if hops < before or now > at + self.stale_s:
+        if hops < before or now > at + self._robots.stale_s:
             ways[via] = hops, now
         elif hops == before:  # a detour says nothing about the shortest way
             ways[via] = hops, max(at, now)
-
-    @property
-    def stale_s(self) -> float:
-        """s for which a distance counts."""
-        return STALE_S * self._slower()
 
     def known(self, robot: int) -> bool:
         """Whether a way to a robot was ever known."""
@@ -69,7 +63,7 @@ class Routes:
 
         :param usable: whether a robot may be taken
         """
-        since = now - self.stale_s
+        since = now - self._robots.stale_s
         open_ways = [
             (until if now < (until := self._doubted.get((robot, via), -inf)) else -inf, hops, via)
             for via, (hops, at) in self._ways.get(robot, {}).items()
@@ -79,5 +73,5 @@ class Routes:
 
     def hops(self, robot: int, now: float) -> int | None:
         """Robots between this one and another; 0 if it is heard, None if nothing is known."""
-        since = now - self.stale_s
+        since = now - self._robots.stale_s
         return min((hops for hops, at in self._ways.get(robot, {}).values() if since <= at), default=None)

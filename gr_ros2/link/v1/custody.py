@@ -335,7 +335,7 @@ class Custody:
 
         def usable(via: int) -> bool:
             reports = via in self._peers.all and self._peers.all[via].newest >= 0
-            return reports and self._gains.hears(via, now) and (via != came or now > at + self.routes.stale_s)
+            return reports and self._gains.hears(via, now) and (via != came or now > at + self._gains.robots.stale_s)
 
         return self.routes.over(robot, now, usable)
 

@@ -42,11 +42,11 @@ from gr_ros2.link.v1.neighbours import Neighbour, Neighbours, Opened
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.overtaking import Overtaken
 from gr_ros2.link.v1.peers import REACH
-from gr_ros2.link.v1.relaying import FORGET_S, Relaying
+from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys
 from gr_ros2.link.v1.sent_packets import SentPackets
-from gr_ros2.relay.gain import HEARD_S
+from gr_ros2.relay.robots import GONE_S, NEAR_S, QUIET_S, Robots
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.wire.control import (
     CAN_HEAR,
@@ -65,9 +65,6 @@ from gr_ros2.wire.control import (
 from gr_ros2.wire.mac_block import read_block
 from gr_ros2.wire.table import AnnouncedTopic
 from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC, EntryV1, Header, PacketV1, RepairHeader, read_body, read_header
-
-GIVE_UP_S = 10.0
-"""s of silence after which a robot is regarded as gone."""
 
 
 class ReceivingSide:
@@ -119,13 +116,13 @@ class ReceivingSide:
         if settings.relay:
             self.relaying = Relaying(
                 settings.src_id,
+                Robots(lambda: settings.slower),
                 self.neighbours,
                 self._outcomes,
                 lambda src_id, boot, first: self._inbox(src_id, boot, first, settings.packet_len, far=True),
                 packet_len=settings.packet_len,
                 repairs=settings.repair != "off",
                 most=settings.max_source_bytes,
-                slower=lambda: settings.slower,
             )
         self._now = -inf
         self._sender: Neighbour | None = None
@@ -176,7 +173,7 @@ class ReceivingSide:
 
     @property
     def _give_up_s(self) -> float:
-        return GIVE_UP_S * self._settings.slower
+        return GONE_S * self._settings.slower
 
     def _timeout(self, neighbour: Neighbour) -> float:
         waits = neighbour.inbox.next_timeout()
@@ -382,8 +379,8 @@ class ReceivingSide:
             control=self._entry,
             relaying=self.relaying,
             give_up_s=self._give_up_s,
-            quiet_s=HEARD_S * self._settings.slower,
-            patience_s=FORGET_S * self._settings.slower if far else inf,
+            quiet_s=NEAR_S * self._settings.slower,
+            patience_s=QUIET_S * self._settings.slower if far else inf,
             brings=self._brings,
         )
         inbox.reports.tells_snr = self._tells_snr

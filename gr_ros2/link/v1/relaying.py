@@ -9,7 +9,7 @@ messages are relayed to those who do not hear their origin, in their order, once
 (``relay.in_order``); of all others the newest of each topic.
 
 A message has an age, which grows at every robot. Where its table is known, a robot sends nothing on that is older than
-its topic allows. All that a start of a robot has said is forgotten ``FORGET_S`` after it was last there.
+its topic allows. For how long what a robot has said counts says ``relay.robots``.
 
 What is known of far robots holds ``far``, and what is sent on ``sent_on``. Repairs tell nothing of how far a robot is,
 since they may be sent long after what is in them.
@@ -39,6 +39,7 @@ from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.relay.gain import TOLD, Gains, Stream
 from gr_ros2.relay.in_order import Kept, Name
 from gr_ros2.relay.memory import Memory
+from gr_ros2.relay.robots import QUIET_S, Robots
 from gr_ros2.relay.routes import Routes
 from gr_ros2.settings.registry import CALLS_TYPE
 from gr_ros2.wire.ages import age_of
@@ -61,8 +62,6 @@ LATER, MOST_TABLE_S = 2, REPAIRED_S
 """A table of several packets is worth it so many times later for each of them, and not later than so many s. With
 packets of 64 bytes, sealed, one of four topics takes 14: every 5 s, tables of robots that are known left no time for
 that of another one over a line of four."""
-FORGET_S = 60.0
-"""s after which nothing of a robot is sent on any more: its table comes every ``TABLE_S`` from who hears it."""
 _BOOT_LEN = 8
 
 
@@ -70,12 +69,12 @@ class Relaying:
     """What one robot does with messages of other robots.
 
     :param src_id: of this robot
-    :param neighbours: the robots that are heard
+    :param robots: the others
+    :param neighbours: those that are heard
     :param outcomes: takes what comes of it
     :param packet_len: bytes of a packet
     :param repairs: whether lost packets are repaired
     :param most: bytes of all that is kept of messages of other robots
-    :param slower: see :class:`gr_ros2.relay.gain.Gains`
     :param make_inbox: see :class:`FarRobots`
     :ivar gains: who lacks what
     :ivar routes: over whom robots are reached
@@ -87,6 +86,7 @@ class Relaying:
     def __init__(
         self,
         src_id: int,
+        robots: Robots,
         neighbours: Neighbours,
         outcomes: Outcomes,
         make_inbox: Callable[[int, int, int], Inbox],
@@ -94,13 +94,12 @@ class Relaying:
         packet_len: int,
         repairs: bool,
         most: int,
-        slower: Callable[[], float],
     ) -> None:
-        self.src_id, self._packet_len = src_id, packet_len
+        self.src_id, self._robots, self._packet_len = src_id, robots, packet_len
         self._neighbours, self._dropped = neighbours, outcomes.stats.dropped
-        self.gains, self.routes = Gains(src_id, slower), Routes(slower)
+        self.gains, self.routes = Gains(src_id, robots), Routes(robots)
         self.memory = Memory(most, kinds=5)
-        self.far = FarRobots(neighbours, outcomes, self.routes, make_inbox, share=self.memory.share())
+        self.far = FarRobots(robots, neighbours, outcomes, self.routes, make_inbox, share=self.memory.share())
         self.sent_on = SentOn(self.gains, self._dropped, self.memory, repairs=repairs)
         self.custody: Custody
         self._telling = deque[Stream | None]()
@@ -126,8 +125,7 @@ class Relaying:
         boot, table, at = self._tables.get(src_id, (0, b"", now))
         if neighbour is not None and not neighbour.hello.digest and boot != neighbour.boot:
             boot, table, at = neighbour.boot, write_table(()), -inf  # others learn that it is there, and where
-        self.far.there[src_id] = now
-        every = min(TABLE_S * max(LATER * len(table) / self._packet_len, 1), MOST_TABLE_S) * self.gains.slower()
+        every = min(TABLE_S * max(LATER * len(table) / self._packet_len, 1), MOST_TABLE_S) * self._robots.slower()
         if table and neighbour is not None and now - at > every:
             self._table(src_id, boot, table, neighbour.inbox.newest, now)
         if now > self._swept + TABLE_S:
@@ -155,7 +153,7 @@ class Relaying:
     def direct(self, src_id: int, boot: int, ready: Ready, now: float) -> None:
         """A message has come from the robot that made it."""
         number, place = ready.order
-        self.far.hops[src_id] = 0
+        self._robots.of(src_id).hops = 0
         if ready.topic_id == TABLE_TOPIC:
             if (inbox := self.far.inbox(src_id, boot & 0xFFFF)) is not None:
                 self._due(inbox, now, receipts=True)
@@ -224,7 +222,7 @@ class Relaying:
         of.made, of.sealed, of.limit_s = made, ready.sealed - age_s if ready.sealed < inf else inf, limit_s
         if table and not carried and not self._starts(message, via, now, min(made, of.sealed), heard=heard is not None):
             return
-        near = heard is not None and self.gains.near(heard.heard, now)
+        near = heard is not None and self._robots.is_near(origin, now)
         if heard is not None and near and message.number > heard.inbox.newest:
             self._dropped["ahead"] += 1  # its next packet tells whether it has come so far
             return
@@ -243,7 +241,7 @@ class Relaying:
         elif not self.sent_on.take(via, kept, now):
             self._dropped["relayed_before"] += 1
             return
-        self.far.hops[origin] = message.hops
+        self._robots.of(origin).hops = message.hops
         if message.dst_id in (BROADCAST, self.src_id):
             self._delivered(inbox, of, now)
             if table:
@@ -268,7 +266,7 @@ class Relaying:
             except WireError as error:
                 self._dropped[error.kind] += 1
             return
-        self.far.hops[message.origin] = message.hops
+        self._robots.of(message.origin).hops = message.hops
         inbox = self.far.inbox(message.origin, message.start)
         known = inbox is not None and message.topic_id in inbox.announced.topics
         if inbox is not None and self._carried_here.refutes(message, kept.made):
@@ -322,10 +320,10 @@ class Relaying:
     def _sweep(self, now: float) -> None:
         """Forget what is too long ago."""
         self._swept = now
-        for origin, at in self.far.there.items():
-            if now > at + FORGET_S * self.gains.slower():
-                self.sent_on.drop_of(origin)
-        for origin in self.far.forget_old(now):
+        for origin in self._robots.quiet(now):
+            self.sent_on.drop_of(origin)
+        for origin in self._robots.forget(now):
+            self.far.drop(origin)
             self.sent_on.in_order.drop_of(origin, lambda _: True)
         for src_id in [src_id for src_id in self._tables if src_id not in self._neighbours.all]:
             del self._tables[src_id]
@@ -347,7 +345,7 @@ class Relaying:
             self._dropped["relayed_before"] += 1
             return False
         if self.far.inbox(origin, message.start) is None:
-            if now > made + FORGET_S * self.gains.slower():
+            if now > made + QUIET_S * self._robots.slower():
                 self._dropped["too_old"] += 1
                 return False
             known = self.far.present(origin)
@@ -396,7 +394,7 @@ class Relaying:
         for src_id in {*self._neighbours.all, *self.far.inboxes}:
             inbox, neighbour = self.far.present(src_id), self._neighbours.all.get(src_id)
             if inbox is not None:
-                heard = neighbour is not None and self.gains.near(neighbour.heard, now)
+                heard = neighbour is not None and self._robots.is_near(src_id, now)
                 topics = [topic.topic_id for topic in inbox.announced.topics.values() if for_all_in_order(topic)]
                 told = [topic_id for topic_id in topics if not heard or inbox.order.ahead(topic_id)]
                 found += [Stream(src_id, inbox.boot & 0xFFFF, topic_id) for topic_id in told]

@@ -162,7 +162,7 @@ class SentOn:
             self.relayed[self._next.stream.origin, self._next.stream.topic_id] += 1
         table = message.topic_id == RELAYED_TABLES
         if table:
-            message.lifetime.expires = now + REPAIRED_S * self._gains.slower()
+            message.lifetime.expires = now + REPAIRED_S * self._gains.robots.slower()
         if message.topic_id in self._offered:
             stream, to_pass = self._offered.pop(message.topic_id)
             self._gains.sent(stream, to_pass.message.number, now, 1.0 if table else OWN)
@@ -179,7 +179,7 @@ class SentOn:
         message = to_pass.message
         hops = min(message.hops + 1, MOST_HOPS)
         payload = write_relayed(message._replace(hops=hops, age=age_code(leaves - to_pass.made)))
-        topic.newest = now - gain / max(self._gains.neighbours(now), 1)
+        topic.newest = now - gain / max(len(self._gains.robots.near(now)), 1)
         queued = Message(-1, topic.topic.topic_id, payload, QOS_DEFAULT, now, expires=to_pass.until, repeat=True)
         topic.queue.append(queued)
 

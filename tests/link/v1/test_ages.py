@@ -12,8 +12,9 @@ from gr_ros2.link.events import Delivered, ReceiverEvent
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.packing import TOLD
-from gr_ros2.link.v1.relaying import FORGET_S, Relaying
+from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.relay.robots import QUIET_S
 from gr_ros2.settings.commands import COMMAND_DEADLINE_S
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import CALLS_TYPE, Registry, Topic
@@ -160,7 +161,7 @@ def test_nothing_of_a_robot_is_sent_on_long_after_it_was_there() -> None:
     line.run(10)
     assert any(stream.origin == 1 for stream in relaying_of(line.robots[1]).sent_on._newest)
     absent(line, 1)
-    line.run(FORGET_S + 20)
+    line.run(QUIET_S + 20)
     assert not any(stream.origin == 1 for one in line.robots[1:] for stream in relaying_of(one).sent_on._newest)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from bench.repair_backlog import CASES, LOSSES, OLDER, run
 from gr_ros2.link.events import SentPacket
-from gr_ros2.link.v1.receiving import GIVE_UP_S
+from gr_ros2.relay.robots import GONE_S
 from gr_ros2.settings.config import SendOptions
 from tests.link.v1.air import Air, Robot, registry
 
@@ -98,7 +98,7 @@ def test_a_receiver_waits_for_a_sender_that_is_out_of_range() -> None:
     one.end.messages.submit(0, b"second", air.now)
     air.step()
     air.lost = lambda *_: True
-    air.run(3 * GIVE_UP_S)
+    air.run(3 * GONE_S)
     assert two.delivered() == []
     air.lost = lambda *_: False
     air.run(3.0)

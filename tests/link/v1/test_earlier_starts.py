@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gr_ros2.link.events import Delivered
-from gr_ros2.link.v1.far import FAR_S
 from gr_ros2.link.v1.order import Ready
-from gr_ros2.link.v1.relaying import FORGET_S
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.relay.robots import KNOWN_S, QUIET_S
 from gr_ros2.wire.ages import age_code
 from gr_ros2.wire.relayed import (
     Relayed,
@@ -35,7 +34,7 @@ def odom(origin: int, boot: int, number: int, payload: bytes) -> Relayed:
 
 @pytest.mark.parametrize(
     ("silent_s", "mode"),
-    [(16.0, "none"), (FORGET_S + 1, "encrypt"), (FAR_S - 5, "none"), (FAR_S + 10, "encrypt")],
+    [(16.0, "none"), (QUIET_S + 1, "encrypt"), (KNOWN_S - 5, "none"), (KNOWN_S + 10, "encrypt")],
 )
 def test_a_late_table_of_an_earlier_start_takes_no_place(mode: SealMode, silent_s: float) -> None:
     line = Line(robot(2, mode), robot(3, mode))

@@ -11,8 +11,8 @@ from gr_ros2.link import AirPacket
 from gr_ros2.link.events import Announced, Delivered, Lost, Met, Refused, SentPacket
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.receiving import GIVE_UP_S
 from gr_ros2.link.v1.sealing import SealMode
+from gr_ros2.relay.robots import GONE_S
 from gr_ros2.settings.config import NOBODY, SendOptions
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire.v1 import MAX_MESSAGE, MAX_TOPICS, Part, body_room, read_header
@@ -486,7 +486,7 @@ def test_more_repairs_than_repair_ids_move_on_to_the_next_number() -> None:
     air.run(0.5)
     air.lost = lambda *_: True
     one.end.messages.submit(ODOM, text(1), air.now)
-    air.run(GIVE_UP_S - 1)
+    air.run(GONE_S - 1)
     air.lost = lambda *_: False
     air.run(1.5)
     assert two.delivered() == [text(1)]

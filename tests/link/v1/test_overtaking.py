@@ -138,7 +138,7 @@ def test_what_waits_when_its_sender_starts_anew_comes_out() -> None:
     started = filled.receiver.end.neighbours.all[1].inbox._overtaking
     assert started is not overtaking
     assert started is not None
-    assert started.wait_s > 0, "what was learned of the start before"
+    assert started._learned.wait_s > 0, "what was learned of the start before"
 
 
 @given(

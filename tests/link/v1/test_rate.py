@@ -7,7 +7,7 @@ from gr_ros2.link.events import SenderEvent, SentPacket
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.v1.endpoint import EndpointV1
 from gr_ros2.link.v1.endpoint_settings import Settings
-from gr_ros2.link.v1.receiving import GIVE_UP_S
+from gr_ros2.relay.robots import GONE_S
 from gr_ros2.settings.registry import Registry
 from gr_ros2.wire import BROADCAST
 from gr_ros2.wire.control import Report
@@ -75,7 +75,7 @@ def test_a_receiver_that_falls_silent_is_served_at_the_most_robust_rate_until_it
     fleet.snrs[3] = None
     assert fleet.run(200)[-1] == 0
     fleet.sender.handle_timeout(fleet.now)
-    fleet.now += GIVE_UP_S
+    fleet.now += GONE_S
     fleet.run(1)
     fleet.sender.handle_timeout(fleet.now)
     assert fleet.run(200)[-1] == 2
