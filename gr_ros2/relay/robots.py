@@ -30,6 +30,9 @@ KNOWN_S = 600.0
 class Robot:
     """Another robot.
 
+    :ivar met: when its present start was heard first, s
+    :ivar met_over: when its present start was first known over others, where it is not heard itself, s
+    :ivar doubled: when a start of it sent something although another one had begun, s
     :ivar heard: when it was heard last, s
     :ivar there: when it was there last, as it or others show, s
     :ivar came: when something of its present start came over others, s
@@ -38,9 +41,10 @@ class Robot:
     :ivar packets: those of it that were heard
     """
 
-    __slots__ = ("came", "heard", "hears", "hops", "packets", "there")
+    __slots__ = ("came", "doubled", "heard", "hears", "hops", "met", "met_over", "packets", "there")
 
     def __init__(self) -> None:
+        self.met = self.met_over = self.doubled = -inf
         self.heard = self.there = self.came = -inf
         self.hears: dict[int, int] = {}
         self.packets = self.hops = 0
@@ -115,8 +119,8 @@ class Robots:
         return [src_id for src_id, robot in self.all.items() if -inf < robot.there < since]
 
     def forget(self, now: float) -> list[int]:
-        """Forget the robots that were there too long ago; returns them."""
+        """The robots that were there too long ago, which are forgotten; each is returned once."""
         old = [src_id for src_id, robot in self.all.items() if -inf < max(robot.there, robot.came) < now - KNOWN_S]
         for src_id in old:
-            del self.all[src_id]
+            self.all[src_id].there = self.all[src_id].came = -inf
         return old

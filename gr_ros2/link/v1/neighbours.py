@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from math import inf
 
 from gr_ros2.core.errors import (
     CrcError,
@@ -40,6 +39,7 @@ from gr_ros2.link.v1.peers import START
 from gr_ros2.link.v1.proofs import OwnHellos, Proofs
 from gr_ros2.link.v1.replays import Floor, Floors, Save
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Trailer
+from gr_ros2.relay.robots import Robots
 from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, READS_LEFT_OUT, WANTS_PROOF, Heard, Hello
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
@@ -168,6 +168,7 @@ class Neighbours:
     """All robots that are heard.
 
     :param own: id and boot number of this robot
+    :param robots: all others
     :param heard: what ``save`` has stored, by robot id: boot number and packet number
     :param dropped: counts packets that are kept (``early``), packets that may have been sealed before this robot
         started (``unproven``), and failures of ``save`` (``state_not_written``)
@@ -180,6 +181,7 @@ class Neighbours:
     def __init__(
         self,
         own: tuple[int, int],
+        robots: Robots,
         settings: Settings,
         keys: Keys,
         *,
@@ -189,7 +191,7 @@ class Neighbours:
         dropped: Counter[str],
     ) -> None:
         self.dropped = dropped
-        self._own = own
+        self._own, self._robots = own, robots
         self._settings = settings
         self._keys = keys
         self._trailer_len = keys.trailer_len
@@ -202,16 +204,10 @@ class Neighbours:
         self._early: dict[int, deque[tuple[float, bytes]]] = {}
         self._packets = self._met_first = 0
         """Packets that were opened; so many of them when a robot was met and no other one was heard."""
-        self._met_at: dict[int, float] = {}
-        """When the present start of each robot was heard for the first time."""
         self._ended: dict[tuple[int, int], int] = {}
         """By id and boot number of a start that was replaced: the first packet of it that was not heard."""
-        self._far_at: dict[int, float] = {}
-        """The same of robots that are reached over others."""
         self._again: dict[tuple[int, int], float] = {}
         """By id and low 16 bits of the boot number of another start: when it sent something first, s."""
-        self._doubled: dict[int, float] = {}
-        """When a start of a robot sent something although another one had begun, s."""
 
     def early(self, src_id: int, now: float) -> list[tuple[float, bytes]]:
         """Packets of a robot that could not be opened before, and when they came, s; they are returned once."""
@@ -315,21 +311,18 @@ class Neighbours:
         :param boot: number of that start, or its low 16 bits
         :param at: when, s. What was sent before the present start was met says nothing
         """
-        if at > max(self._met_at.get(src_id, -inf), self._far_at.get(src_id, -inf)):
+        robot = self._robots.of(src_id)
+        if at > max(robot.met, robot.met_over):
             first = self._again.setdefault((src_id, boot & 0xFFFF), at)
             if at > first + _CHANGE_S * self._settings.slower:  # later than all that was under way
-                self._doubled[src_id] = now
+                robot.doubled = now
             if len(self._again) > _STARTS:
                 del self._again[next(iter(self._again))]
-
-    def met_over_others(self, src_id: int, now: float) -> None:
-        """Note that the present start of a robot was met, which is not heard itself."""
-        self._far_at[src_id] = now
 
     def doubled(self, src_id: int, now: float) -> bool:
         """Whether two robots send under this number: both were there lately, in turns. A robot that restarts never
         comes back as it was before."""
-        return now < self._doubled.get(src_id, -inf) + _DOUBLED_S
+        return now < self._robots.of(src_id).doubled + _DOUBLED_S
 
     def reads_left_out(self, src_id: int) -> bool:
         """Whether a robot says that it reads which packets are left out."""
@@ -338,7 +331,7 @@ class Neighbours:
 
     def lacks_table(self, neighbour: Neighbour, now: float) -> bool:
         """Whether a robot has topics, and nothing of its table has come although it has been heard for long."""
-        waits = now - self._met_at[neighbour.src_id] > _TABLE_S * self._settings.slower
+        waits = now - self._robots.of(neighbour.src_id).met > _TABLE_S * self._settings.slower
         return waits and neighbour.hello.digest != 0 and not neighbour.inbox.announced.digest
 
     def heard(self, newest: int) -> list[Heard]:
@@ -409,7 +402,8 @@ class Neighbours:
                     neighbour.proves = self._proves(hello)
                 return self._opened(Opened(neighbour, header, number, repair, b"", entries), now)
         boot, floor = self.floors.of(src_id)
-        before = self._met_at.get(src_id, -inf)
+        robot = self._robots.of(src_id)
+        before = robot.met
         proven = sealed and self.own_hellos.proofs(number, entries, before)
         refused = hello.boot < boot and not proven
         if not sealed:
@@ -453,7 +447,7 @@ class Neighbours:
         )
         if met.proves:
             inbox.deliveries.sealed_after = proofs.sealed_after
-        self._met_at[src_id] = now
+        robot.met = now
         met.new(number, repair.repair_id)
         self.all[src_id] = met
         self.floors.store(met.floor, max(first, number + 1) if stores else 0, now)

@@ -108,15 +108,15 @@ class ReceivingSide:
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
         self._learned: dict[int, Overtaken] = {}
         """Of the packets of every robot."""
-        own = settings.src_id, boot
+        own, robots = (settings.src_id, boot), Robots(lambda: settings.slower)
         self.neighbours = Neighbours(
-            own, settings, keys, heard=heard, save=save, inbox=self._inbox, dropped=self.stats.dropped
+            own, robots, settings, keys, heard=heard, save=save, inbox=self._inbox, dropped=self.stats.dropped
         )
         self.relaying: Relaying | None = None
         if settings.relay:
             self.relaying = Relaying(
                 settings.src_id,
-                Robots(lambda: settings.slower),
+                robots,
                 self.neighbours,
                 self._outcomes,
                 lambda src_id, boot, first: self._inbox(src_id, boot, first, settings.packet_len, far=True),

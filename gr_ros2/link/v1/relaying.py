@@ -358,7 +358,7 @@ class Relaying:
             self.far.start(origin, boot, message.number + 1, made)
             self.sent_on.drop_of(origin)
             self.sent_on.drop_other_starts(origin, message.start)
-            self._neighbours.met_over_others(origin, now)
+            self._robots.of(origin).met_over = now
             self.found(origin, now)
         if lost := self.far.hold(origin, via, len(message.payload)):
             self._dropped["max_sources"] += lost
