@@ -9,7 +9,7 @@ from struct import Struct
 from typing import Protocol
 
 from gr_ros2.relay.gain import Gains, Stream
-from gr_ros2.relay.robots import Robots
+from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.wire.control import Newest, read_control, write_control
 from gr_ros2.wire.mac_block import NOBODY, Block
 from gr_ros2.wire.relayed import RELAYED_LEN, Relayed, read_relayed, write_relayed
@@ -60,7 +60,7 @@ class ByGain:
     def __init__(self, src_id: int) -> None:
         self.relays = False
         self._src_id = src_id
-        self._gains = Gains(src_id, Robots())
+        self._gains = Gains(src_id, OtherRobots())
         self._newest: dict[int, Relayed] = {}
 
     @property

@@ -12,7 +12,7 @@ from gr_ros2.link.v1.repair import RepairWindow
 from gr_ros2.link.v1.sent_topics import SentTopics
 from gr_ros2.relay.gain import Gains, Stream
 from gr_ros2.relay.memory import Memory
-from gr_ros2.relay.robots import Robots
+from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Receipt, Relayed, read_carried, read_relayed, write_carried, write_relayed
@@ -25,7 +25,7 @@ _STEP = 20
 
 def relay(data: bytes) -> None:
     """Take the bytes as packets heard, and choose in between."""
-    gains = Gains(1, Robots())
+    gains = Gains(1, OtherRobots())
     now = 0.0
     topics, window = SentTopics(None, ()), RepairWindow("off", 200)
     topics.relay()
@@ -80,7 +80,7 @@ def carry(custody: Custody, data: bytes, src_id: int, now: float) -> None:
 
 
 def corpus() -> list[bytes]:
-    """Robots of which each sends on what the one before has said."""
+    """OtherRobots of which each sends on what the one before has said."""
     heard = b""
     for n in range(40):
         message = write_relayed(Relayed(n % 7, 1, n, 0, 0, n % 4, b"odom"))

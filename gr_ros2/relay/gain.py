@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import NamedTuple
 
-from gr_ros2.relay.robots import Robots
+from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
 from gr_ros2.wire.v1 import TABLE_TOPIC
@@ -90,7 +90,7 @@ class Gains:
     :param robots: those that it hears
     """
 
-    def __init__(self, src_id: int, robots: Robots) -> None:
+    def __init__(self, src_id: int, robots: OtherRobots) -> None:
         self.src_id, self.robots = src_id, robots
         self._streams: dict[Stream, _State] = {}
         self._told: dict[tuple[int, int, int], _State] = {}
@@ -107,7 +107,7 @@ class Gains:
     # ---- what is heard
 
     def neighbour(self, src_id: int, now: float, names: Iterable[int] = (), heard: int = 0) -> None:
-        """A packet of a robot was heard; see :meth:`Robots.hear`."""
+        """A packet of a robot was heard; see :meth:`OtherRobots.hear`."""
         if not self.robots.hear(src_id, now, names, heard):  # it may have forgotten others since
             for state in self._streams.values():
                 state.known.discard(src_id)

@@ -27,7 +27,7 @@ KNOWN_S = 600.0
 """s after which a robot that is known over others only is forgotten, and with it what has come of it."""
 
 
-class Robot:
+class OtherRobot:
     """Another robot.
 
     :ivar met: when its present start was heard first, s
@@ -50,7 +50,7 @@ class Robot:
         self.packets = self.hops = 0
 
 
-class Robots:
+class OtherRobots:
     """The robots that one robot hears, or reaches over others.
 
     :param slower: by how much longer than written they are waited for, where they send seldom
@@ -59,13 +59,13 @@ class Robots:
 
     def __init__(self, slower: Callable[[], float] = lambda: 1.0) -> None:
         self.slower = slower
-        self.all: dict[int, Robot] = {}
+        self.all: dict[int, OtherRobot] = {}
 
-    def of(self, src_id: int) -> Robot:
+    def of(self, src_id: int) -> OtherRobot:
         """The record of a robot."""
         robot = self.all.get(src_id)
         if robot is None:
-            robot = self.all[src_id] = Robot()
+            robot = self.all[src_id] = OtherRobot()
         return robot
 
     def hear(self, src_id: int, now: float, names: Iterable[int] = (), heard: int = 0) -> bool:

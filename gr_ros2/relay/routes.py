@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
-from gr_ros2.relay.robots import Robots
+from gr_ros2.relay.robots import OtherRobots
 
 DOUBT_S = 300.0
 """s for which a robot over which messages did not arrive comes after all others."""
@@ -24,7 +24,7 @@ class Routes:
     :param robots: says for how long a distance counts
     """
 
-    def __init__(self, robots: Robots) -> None:
+    def __init__(self, robots: OtherRobots) -> None:
         self._robots = robots
         self._ways: dict[int, dict[int, tuple[int, float]]] = {}
         """By robot, and by the one that is heard: how many stand between them, this one included, and when that was
@@ -72,6 +72,6 @@ class Routes:
         return min(open_ways)[2] if open_ways else None
 
     def hops(self, robot: int, now: float) -> int | None:
-        """Robots between this one and another; 0 if it is heard, None if nothing is known."""
+        """OtherRobots between this one and another; 0 if it is heard, None if nothing is known."""
         since = now - self._robots.stale_s
         return min((hops for hops, at in self._ways.get(robot, {}).values() if since <= at), default=None)

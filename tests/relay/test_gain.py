@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gr_ros2.relay.gain import EVEN, EXPIRES_S, KNOWN_S, OWN, UNKNOWN_S, Gains, Stream
-from gr_ros2.relay.robots import NEAR_S, Robots
+from gr_ros2.relay.robots import NEAR_S, OtherRobots
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.mac_block import MOST_WEIGHT
 from gr_ros2.wire.v1 import TABLE_TOPIC
@@ -17,7 +17,7 @@ ODOM = Stream(7, 0xCAFE, 0)
 
 def hearing(*neighbours: int, period_s: float = 0.1) -> Gains:
     """Robot 1, which hears these, and has heard robot 7 ten times a second."""
-    gains = Gains(1, Robots())
+    gains = Gains(1, OtherRobots())
     for number in range(11):
         for neighbour in neighbours:
             gains.neighbour(neighbour, number * period_s)
@@ -159,7 +159,7 @@ def test_every_stream_is_told_in_turn() -> None:
 
 @given(st.lists(st.tuples(st.integers(2, 5), st.integers(0, 9), st.integers(0, 70_000), st.integers(0, 40))))
 def test_the_choice_is_something_that_is_here(packets: list[tuple[int, int, int, int]]) -> None:
-    gains = Gains(1, Robots())
+    gains = Gains(1, OtherRobots())
     newest: dict[Stream, int] = {}
     made: dict[Stream, float] = {}
     now = 0.0
@@ -180,7 +180,7 @@ def test_the_choice_is_something_that_is_here(packets: list[tuple[int, int, int,
 
 
 def test_a_robot_that_has_started_again_has_nothing_of_what_it_told() -> None:
-    gains = Gains(1, Robots())
+    gains = Gains(1, OtherRobots())
     gains.neighbour(2, 1.0)
     gains.neighbour(3, 1.0)
     gains.message(2, ODOM, 10, 1.0)
@@ -191,7 +191,7 @@ def test_a_robot_that_has_started_again_has_nothing_of_what_it_told() -> None:
 
 
 def test_a_robot_that_sends_seldom_counts_as_a_neighbour_for_longer() -> None:
-    gains = Gains(1, Robots(lambda: 4.0))
+    gains = Gains(1, OtherRobots(lambda: 4.0))
     gains.neighbour(2, 0.0, [1], 1)
     assert gains.hears(2, 3.9 * NEAR_S)
     assert gains.robots.near(3.9 * NEAR_S) == [2]

@@ -8,7 +8,7 @@ from gr_ros2.relay.gain import EXPIRES_S, Gains, Stream
 from gr_ros2.relay.in_order import AGAIN_S, COST, InOrder, Kept, Name
 from gr_ros2.relay.memory import Memory
 from gr_ros2.relay.quotas import Quotas
-from gr_ros2.relay.robots import Robots
+from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.wire.control import Newest
 from gr_ros2.wire.relayed import Relayed
 from gr_ros2.wire.v1 import TABLE_TOPIC
@@ -18,7 +18,7 @@ GOAL = Stream(1, 7, 3)
 
 def at_robot_2(*, most: int = 100) -> tuple[Gains, InOrder]:
     """Robot 2 hears 1, and 3 and 4, which do not hear 1."""
-    gains = Gains(2, Robots())
+    gains = Gains(2, OtherRobots())
     gains.neighbour(1, 0.0, [2], 1)
     gains.neighbour(3, 0.0, [2, 4], 2)
     gains.neighbour(4, 0.0, [2, 3], 2)

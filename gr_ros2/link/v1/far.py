@@ -4,7 +4,7 @@
 heard, a number or a start that came over others counts until the robot itself says less, or until something with a
 lower one was made ``EXPIRES_S`` after it came.
 
-Invariant: everything here is forgotten: at once where the robot is met, and in any case when ``Robots`` forgets it.
+Invariant: everything here is forgotten: at once where the robot is met, in any case when ``relay.robots`` forgets it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.relay.gain import EXPIRES_S
 from gr_ros2.relay.memory import Share
 from gr_ros2.relay.quotas import Quotas
-from gr_ros2.relay.robots import Robots
+from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.v1 import BROADCAST
 
@@ -58,7 +58,7 @@ class FarRobots:
 
     def __init__(
         self,
-        robots: Robots,
+        robots: OtherRobots,
         neighbours: Neighbours,
         outcomes: Outcomes,
         routes: Routes,

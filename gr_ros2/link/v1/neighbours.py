@@ -39,7 +39,7 @@ from gr_ros2.link.v1.peers import START
 from gr_ros2.link.v1.proofs import OwnHellos, Proofs
 from gr_ros2.link.v1.replays import Floor, Floors, Save
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Trailer
-from gr_ros2.relay.robots import Robots
+from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.wire.control import CAN_HEAR, ENCRYPTS, READS_LEFT_OUT, WANTS_PROOF, Heard, Hello
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
@@ -181,7 +181,7 @@ class Neighbours:
     def __init__(
         self,
         own: tuple[int, int],
-        robots: Robots,
+        robots: OtherRobots,
         settings: Settings,
         keys: Keys,
         *,
@@ -214,7 +214,7 @@ class Neighbours:
         return [(at, data) for at, data in self._early.pop(src_id, ()) if now <= at + _EARLY_S * self._settings.slower]
 
     def silent(self, now: float, after: float) -> list[Neighbour]:
-        """Robots that do not count as heard any more after so many s of silence. Their state is kept until another
+        """OtherRobots that do not count as heard any more after so many s of silence. Their state is kept until another
         robot needs the room."""
         silent = [n for n in self.all.values() if n.heard + after <= now and not n.silent]
         heard = [neighbour for neighbour in silent if neighbour.proven]

@@ -46,7 +46,7 @@ from gr_ros2.link.v1.relaying import Relaying
 from gr_ros2.link.v1.replays import Save
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys
 from gr_ros2.link.v1.sent_packets import SentPackets
-from gr_ros2.relay.robots import GONE_S, NEAR_S, QUIET_S, Robots
+from gr_ros2.relay.robots import GONE_S, NEAR_S, QUIET_S, OtherRobots
 from gr_ros2.settings.config import NOBODY
 from gr_ros2.wire.control import (
     CAN_HEAR,
@@ -108,7 +108,7 @@ class ReceivingSide:
         """CRC-32 of the latched messages of every robot; kept when the robot restarts."""
         self._learned: dict[int, Overtaken] = {}
         """Of the packets of every robot."""
-        own, robots = (settings.src_id, boot), Robots(lambda: settings.slower)
+        own, robots = (settings.src_id, boot), OtherRobots(lambda: settings.slower)
         self.neighbours = Neighbours(
             own, robots, settings, keys, heard=heard, save=save, inbox=self._inbox, dropped=self.stats.dropped
         )

@@ -39,7 +39,7 @@ from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.relay.gain import TOLD, Gains, Stream
 from gr_ros2.relay.in_order import Kept, Name
 from gr_ros2.relay.memory import Memory
-from gr_ros2.relay.robots import QUIET_S, Robots
+from gr_ros2.relay.robots import QUIET_S, OtherRobots
 from gr_ros2.relay.routes import Routes
 from gr_ros2.settings.registry import CALLS_TYPE
 from gr_ros2.wire.ages import age_of
@@ -86,7 +86,7 @@ class Relaying:
     def __init__(
         self,
         src_id: int,
-        robots: Robots,
+        robots: OtherRobots,
         neighbours: Neighbours,
         outcomes: Outcomes,
         make_inbox: Callable[[int, int, int], Inbox],
@@ -106,7 +106,7 @@ class Relaying:
         """What is told next: a reliable topic for all, or None for the newest message of the next of the others."""
         self._swept = 0.0
         self._tables: dict[int, tuple[int, bytes, float]] = {}
-        """Robots that are heard: boot number, table, and when it was last worth sending on."""
+        """OtherRobots that are heard: boot number, table, and when it was last worth sending on."""
         self._carried_here = Sequences[Ready](self.memory.share())
         self.found: Callable[[int, float], None] = lambda _, __: None
         """Called with a robot that is reached over others for the first time."""

@@ -11,7 +11,7 @@ from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.link.v1.writer import SendSlot
 from gr_ros2.relay.gain import EXPIRES_S
-from gr_ros2.relay.robots import STALE_S, Robots
+from gr_ros2.relay.robots import STALE_S, OtherRobots
 from gr_ros2.relay.routes import Routes
 from gr_ros2.wire.relayed import Relayed, write_relayed
 from gr_ros2.wire.v1 import RELAYED_TOPIC
@@ -88,7 +88,7 @@ def test_what_is_repaired_is_younger_than_the_last_hello_before_it() -> None:
 
 
 def test_a_late_message_tells_no_way() -> None:
-    routes = Routes(Robots())
+    routes = Routes(OtherRobots())
     routes.note(1, 2, 0, 100.0)
     routes.note(1, 2, 0, 90.0)
     assert routes.over(1, 100.0 + STALE_S, lambda _: True) == 2

@@ -18,7 +18,7 @@ from gr_ros2.link.v1.sent_topics import RELAYED_TABLES, SentTopics
 from gr_ros2.mac import Slots
 from gr_ros2.relay.gain import Gains
 from gr_ros2.relay.memory import Memory
-from gr_ros2.relay.robots import Robots
+from gr_ros2.relay.robots import OtherRobots
 from gr_ros2.settings.config import SendOptions
 from gr_ros2.settings.registry import Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
@@ -39,7 +39,7 @@ def robot(src_id: int, mode: SealMode = "none", topics: Registry = ODOM, **setti
 
 
 class Line:
-    """Robots in a row of which each hears the next on both sides; packets that overlap destroy each other."""
+    """OtherRobots in a row of which each hears the next on both sides; packets that overlap destroy each other."""
 
     def __init__(self, *robots: Robot, loss: float = 0.0) -> None:
         self.robots = list(robots)
@@ -182,7 +182,7 @@ def test_tables_of_many_packets_cross_a_line(loss: float, seed: int) -> None:
 
 
 def test_a_table_that_comes_while_another_one_leaves_is_sent_on() -> None:
-    gains = Gains(2, Robots())
+    gains = Gains(2, OtherRobots())
     for robot_id in (1, 3):
         gains.neighbour(robot_id, 0.0)
     sent_on, topics = SentOn(gains, Counter(), Memory(10_000, 2), repairs=True), SentTopics(None, ())
