@@ -80,7 +80,7 @@ def carry(custody: Custody, data: bytes, src_id: int, now: float) -> None:
 
 
 def corpus() -> list[bytes]:
-    """OtherRobots of which each sends on what the one before has said."""
+    """Robots of which each sends on what the one before has said."""
     heard = b""
     for n in range(40):
         message = write_relayed(Relayed(n % 7, 1, n, 0, 0, n % 4, b"odom"))

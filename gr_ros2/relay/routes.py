@@ -72,6 +72,6 @@ class Routes:
         return min(open_ways)[2] if open_ways else None
 
     def hops(self, robot: int, now: float) -> int | None:
-        """OtherRobots between this one and another; 0 if it is heard, None if nothing is known."""
+        """Robots between this one and another; 0 if it is heard, None if nothing is known."""
         since = now - self._robots.stale_s
         return min((hops for hops, at in self._ways.get(robot, {}).values() if since <= at), default=None)

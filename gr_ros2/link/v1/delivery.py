@@ -75,13 +75,17 @@ class DeliveryRules:
 
     :param marks: CRC-32 of the newest messages of each latched topic, in the form in which they were transmitted: as
         many as its depth, or where that is more than 1, ``_MARKS`` more; what a hello has named counts as new again
-    :ivar sealed_after: tells the time in s after which a packet was sealed; None where this cannot be proven
+    :param sealed_after: tells the time in s after which a packet was sealed; None where this cannot be proven
     :ivar newest: the newest message that was delivered, by topic
     """
 
-    def __init__(self, settings: Settings, marks: dict[int, tuple[int, ...]]) -> None:
-        self.marks = marks
-        self.sealed_after: Callable[[int], float] | None = None
+    def __init__(
+        self,
+        settings: Settings,
+        marks: dict[int, tuple[int, ...]],
+        sealed_after: Callable[[int], float] | None = None,
+    ) -> None:
+        self.marks, self.sealed_after = marks, sealed_after
         self.newest: dict[int, tuple[int, int]] = {}
         self._own, self._settings = settings.src_id, settings
         self._silent_before = 0

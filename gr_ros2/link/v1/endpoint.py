@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -127,6 +128,17 @@ class EndpointV1:
             keys,
             window.packets,
             decoder_for=decoder_for,
+            custody=partial(
+                Custody,
+                (settings.src_id, boot),
+                messages.sent,
+                window.packets,
+                window.peers,
+                room=room,
+                most=settings.max_source_bytes,
+                drop=messages.drop,
+                ended=messages.ledger.ended,
+            ),
             access=access,
             tells_snr=rate is not None,
             heard=heard or {},
@@ -158,23 +170,6 @@ class EndpointV1:
             rate=rate,
             relaying=self._receiving.relaying,
         )
-        relaying = self._receiving.relaying
-        if relaying is not None:
-            relaying.custody = messages.custody = Custody(
-                (settings.src_id, boot),
-                messages.sent,
-                window.packets,
-                window.peers,
-                gains=relaying.gains,
-                routes=relaying.routes,
-                room=room,
-                most=settings.max_source_bytes,
-                share=relaying.memory.share(),
-                dropped=self.received.dropped,
-                drop=messages.drop,
-                ended=messages.ledger.ended,
-            )
-            messages.relayed_left, relaying.found = relaying.left, messages.found
         self.pings = self._sending.pings
         self.used_air = UsedAir(
             pace,

@@ -98,8 +98,14 @@ class Questioned(NamedTuple):
     entry: Ping | About
 
 
+class Reached(NamedTuple):
+    """A robot is reached over others for the first time."""
+
+    robot: int
+
+
 class ProofWanted(NamedTuple):
     """A robot lacks the proof that this one hears it."""
 
 
-Fact = Taken | Early | Appeared | PeerMet | PeerLeft | Reported | Has | Asked | Questioned | ProofWanted
+Fact = Taken | Early | Appeared | PeerMet | PeerLeft | Reported | Has | Asked | Questioned | Reached | ProofWanted

@@ -139,7 +139,7 @@ class FarRobots:
         for inbox in self.inboxes.values():
             inbox.order.wait_anew(now)
 
-    def overruled(self, neighbour: Neighbour, number: int) -> bool:
+    def overruled(self, neighbour: Neighbour, number: int, began: float) -> bool:
         """A robot itself has reached this number: whoever has said more was wrong, unless it may have made that after
         this packet. Returns whether somebody may have been wrong."""
         far, sealed_after = self._all.get(neighbour.src_id), neighbour.inbox.deliveries.sealed_after
@@ -147,7 +147,7 @@ class FarRobots:
             return False
         if sealed_after is not None and sealed_after(number) < far.ahead:
             return False
-        if neighbour.inbox.overrule(number):
+        if neighbour.inbox.overrule(number, began):
             far.ahead = inf
         return True
 

@@ -85,12 +85,13 @@ class Inbox:
     :param give_up_s: s of silence after which the robot is regarded as gone
     :param quiet_s: s of silence after which others are believed about its messages
     :param patience_s, brings: see :class:`gr_ros2.link.v1.order.Order`
+    :param tells_snr: see :class:`gr_ros2.link.v1.reports.Reporter`
+    :param sealed_after: see :class:`gr_ros2.link.v1.delivery.DeliveryRules`
     :ivar first: see above
     :ivar reports: what the robot is told of its packets
     :ivar messages: what becomes of its messages
     :ivar order: which of its messages wait for an earlier one
     :ivar deliveries: which of them are delivered
-    :ivar began: when the packet that is processed began to arrive, s
     """
 
     def __init__(
@@ -111,9 +112,11 @@ class Inbox:
         quiet_s: float = inf,
         patience_s: float = inf,
         brings: Callable[[float], bool] = nobody,
+        tells_snr: bool = True,
+        sealed_after: Callable[[int], float] | None = None,
     ) -> None:
         self.src_id, self.boot = src_id, boot
-        self.deliveries = DeliveryRules(settings, marks)
+        self.deliveries = DeliveryRules(settings, marks, sealed_after)
         self._room, self._settings = room, settings
         self._stats = outcomes.stats
         bounds = Bounds.of(settings.max_source_bytes, room)
@@ -139,9 +142,9 @@ class Inbox:
         self._overtaking = Overtaking(self.decoder, self.order.contents, learned or Overtaken()) if several else None
         of = src_id, boot
         self.reports: Reporter = (
-            SharedReporter(of, self.decoder, self.order, self._reassembly, settings)
+            SharedReporter(of, self.decoder, self.order, settings, self._reassembly, tells_snr=tells_snr)
             if settings.shares
-            else Reporter(of, self.decoder, self.order, settings)
+            else Reporter(of, self.decoder, self.order, settings, tells_snr=tells_snr)
         )
         self.messages = ArrivingMessages(
             of,
@@ -162,7 +165,8 @@ class Inbox:
         self._takes = False
         """Whether packets are taken that are known at once. The decoder has all of them from the first one on: whoever
         settled before the last one, as for a message of this robot that it hands on, would pass over the others'."""
-        self.began = inf
+        self._began = inf
+        """When the packet that is processed began to arrive, s."""
 
     @property
     def announced(self) -> AnnouncedTopics:
@@ -185,13 +189,16 @@ class Inbox:
         coded = packets * (self._room + _PACKET_COST) + equations * (self._room + _EQUATION_COST)
         return coded + self._reassembly.held + self.announced.held
 
-    def source(self, number: int, body: bytes, entries: Sequence[EntryV1], qos: int, now: float) -> None:
+    def source(
+        self, number: int, body: bytes, entries: Sequence[EntryV1], qos: int, now: float, *, began: float = inf
+    ) -> None:
         """Take a source packet.
 
         :param body: as it stood in the packet, padding included
         :param entries: the entries of the packet
+        :param began: when it began to arrive, s
         """
-        decoder = self.decoder
+        decoder, self._began = self.decoder, began
         if number in decoder.bodies:
             self._stats.dropped["duplicate"] += 1
             return
@@ -207,7 +214,7 @@ class Inbox:
         try:
             for found in decoder.source(number, body[: self._room]):
                 if found[0] == number:
-                    self.messages.take(number, entries, qos, now, self.began, repaired=late)
+                    self.messages.take(number, entries, qos, now, began, repaired=late)
                 else:
                     self._recovered(found)
         finally:
@@ -215,7 +222,16 @@ class Inbox:
         self._settle()
 
     def repair(
-        self, number: int, mask: int, repair_id: int, combined: bytes, *, oldest: bool, now: float, new: bool = True
+        self,
+        number: int,
+        mask: int,
+        repair_id: int,
+        combined: bytes,
+        *,
+        oldest: bool,
+        now: float,
+        began: float = inf,
+        new: bool = True,
     ) -> None:
         """Take a repair; only one that was not here before calls for a report.
 
@@ -223,6 +239,7 @@ class Inbox:
         """
         if len(combined) > self._room and combined.count(0, self._room) < len(combined) - self._room:
             raise PadError(f"a combination of {len(combined)} bytes, where bodies have {self._room}")
+        self._began = began
         self.reports.unreported += new
         self.reports.confirms = True
         self._advance(number, now, here=False, late=True)
@@ -249,14 +266,16 @@ class Inbox:
         not. Where a mask does not fit beside the bodies, a repair has all packets of its span, however old."""
         return any(newest >= number and mask >> newest - number & 1 for newest, mask in self._named)
 
-    def heard(self, number: int, now: float, *, over: bool = False) -> None:
+    def heard(self, number: int, now: float, began: float = inf, *, over: bool = False) -> None:
         """Note the number at which a packet stands that is neither a source packet nor a repair.
 
+        :param began: when it began to arrive, s
         :param over: the sender repairs no packet up to that number
         """
+        self._began = began
         self._advance(number, now, here=False)
         if number >= self.decoder.newest:
-            self.deliveries.stands(number, self.began)
+            self.deliveries.stands(number, began)
         self.decoder.advance(number)
         if over:
             self.order.repaired_from(number + 1)
@@ -341,7 +360,7 @@ class Inbox:
                 self.deliveries.silent_before(number + (not here))
         if number <= newest:
             return
-        self.deliveries.reached(number, self.began, late=late)
+        self.deliveries.reached(number, self._began, late=late)
         gone = number - newest - here
         if gone:
             met = newest >= self.first  # what came before the first packet that was heard is not lost
@@ -362,7 +381,7 @@ class Inbox:
     def _recovered(self, found: tuple[int, bytes]) -> None:
         number, body = found
         entries = read_body(body, self._room)
-        self.messages.take(number, entries, -1, self._now, self.began, repaired=True, of_use=self._of_use(number))
+        self.messages.take(number, entries, -1, self._now, self._began, repaired=True, of_use=self._of_use(number))
 
     def relayed(self, ready: Ready, now: float) -> None:
         """Take a message of this robot that has come over another one."""
@@ -379,13 +398,14 @@ class Inbox:
                 return newest
         return self.order.up_to(topic.topic_id)
 
-    def overrule(self, number: int) -> bool:
-        """The robot itself has reached this number: what came over others before with a greater one was false.
+    def overrule(self, number: int, began: float) -> bool:
+        """The robot itself has reached this number, in a packet that began to arrive at a time, s: what came over
+        others before with a greater one was false.
 
         :return: whether none of that is left
         """
         self.messages.give_up(self.order.beyond(number), Fate.DAMAGED)
-        return self.deliveries.overrule(number, self.began)
+        return self.deliveries.overrule(number, began)
 
     def adopt(self, far: Inbox) -> None:
         """Go on from what has come of this start over other robots."""

@@ -175,7 +175,7 @@ class Neighbours:
     :ivar all: the robots, by id
     :ivar own_hellos: what others can prove to have heard
     :param inbox: makes the inbox of a start of a robot: (src_id, boot, first packet that may be needed, bytes of its
-        longest body)
+        longest body, what tells when a packet was sealed)
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class Neighbours:
         *,
         heard: Mapping[int, tuple[int, int]],
         save: Save | None,
-        inbox: Callable[[int, int, int, int], Inbox],
+        inbox: Callable[..., Inbox],
         dropped: Counter[str],
     ) -> None:
         self.dropped = dropped
@@ -214,7 +214,7 @@ class Neighbours:
         return [(at, data) for at, data in self._early.pop(src_id, ()) if now <= at + _EARLY_S * self._settings.slower]
 
     def silent(self, now: float, after: float) -> list[Neighbour]:
-        """OtherRobots that do not count as heard any more after so many s of silence. Their state is kept until another
+        """Robots that do not count as heard any more after so many s of silence. Their state is kept until another
         robot needs the room."""
         silent = [n for n in self.all.values() if n.heard + after <= now and not n.silent]
         heard = [neighbour for neighbour in silent if neighbour.proven]
@@ -432,7 +432,8 @@ class Neighbours:
             first = max(first, ended)
             self.sent_by_another_start(src_id, hello.boot, now, now)
         room = header.room(self._settings.packet_len)
-        inbox, proofs = self._make_inbox(src_id, hello.boot, first, room), Proofs(before)
+        proofs, proves = Proofs(before), self._proves(hello)
+        inbox = self._make_inbox(src_id, hello.boot, first, room, proofs.sealed_after if proves else None)
         met = Neighbour(
             src_id,
             hello.boot,
@@ -443,10 +444,8 @@ class Neighbours:
             now,
             Floor(src_id, hello.boot),
             proofs,
-            self._proves(hello),
+            proves,
         )
-        if met.proves:
-            inbox.deliveries.sealed_after = proofs.sealed_after
         robot.met = now
         met.new(number, repair.repair_id)
         self.all[src_id] = met

@@ -10,7 +10,7 @@ start lasts, so that no older table of a receiver lets it deliver what is for an
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from typing import Any, Protocol
@@ -24,18 +24,17 @@ from gr_ros2.link.ledger import MessageObserver, SenderLedger
 from gr_ros2.link.message_codec import FRAME, MessageCodec
 from gr_ros2.link.queues import OVERLOAD_S, OVERLOADED, Dropped, PublisherQos
 from gr_ros2.link.stats import SenderStats
-from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.kept import KeptMessages
 from gr_ros2.link.v1.lifetime import WORTH
 from gr_ros2.link.v1.message import Message
 from gr_ros2.link.v1.packing import ENTRY, Packing
 from gr_ros2.link.v1.peers import Peers
-from gr_ros2.link.v1.sent_topics import LONG_CARRIED, RELAYED, SentTopic, SentTopics
+from gr_ros2.link.v1.sent_topics import RELAYED, SentTopic, SentTopics
 from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
-from gr_ros2.wire.v1 import CARRIED_TOPIC, MAX_MESSAGE, TABLE_TOPIC
+from gr_ros2.wire.v1 import MAX_MESSAGE, TABLE_TOPIC
 
 LARGE = 4096
 """Bytes from which on a message is coded before it is submitted. Coding 4 kB takes some .1 ms, 5 MB a fourth of a
@@ -118,10 +117,6 @@ class Outbox:
             slow=lambda: settings.shares and settings.slower > 1,
         )
         self.packing.turns.join(TABLE_TOPIC)
-        self.relayed_left: Callable[[Message, float], None] = lambda _, __: None
-        """Called when a message of another robot has left whole."""
-        self.custody: Custody | None = None
-        """Carries messages over other robots, where they are relayed."""
         if settings.relay:
             self.sent.relay()
             for topic_id in self.sent:
@@ -351,10 +346,6 @@ class Outbox:
             topic.lifetimes.restart(message.keys)
         if topic.kept or message.topic_id == TABLE_TOPIC:
             self.kept.left(message, now, reported=reported)
-        if message.topic_id in RELAYED:
-            self.relayed_left(message, now)
-        elif self.custody is not None and message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):
-            self.custody.left(message, now)
 
     def found(self, robot: int, now: float) -> None:
         """A robot is reached over others for the first time: what is kept for it is sent. It cannot ask."""

@@ -66,6 +66,8 @@ class Filling:
     """When the first of its messages that no ``max_rate`` holds back was submitted, s; infinite if there is none."""
     robots: frozenset[int] | None
     """Those for whom it is; None for all."""
+    left: list[Message]
+    """The messages that leave whole with it."""
 
 
 class Packing:
@@ -78,7 +80,6 @@ class Packing:
         that others leave in every packet
     :param slow: tells whether turns come so seldom that messages do not wait for rows of other topics
     :ivar turns: whose turn it is
-    :ivar audiences: chooses for whom a packet is, where robots hear at different rates; None where nobody does
     """
 
     def __init__(
@@ -93,7 +94,6 @@ class Packing:
         slow: Callable[[], bool] = lambda: False,
     ) -> None:
         self.turns = Turns()
-        self.audiences: Audiences | None = None
         self._audience: Audience | None = None
         """For whom the packet is that is being filled; None for all."""
         self._topics, self._stats, self._left = topics, stats, left
@@ -105,12 +105,15 @@ class Packing:
         """Messages that may continue or start now, by topic."""
         self._holder = -1
 
-    def fill(self, number: int, room: int, now: float, *, spare: bool = False) -> Filling | None:
+    def fill(
+        self, number: int, room: int, now: float, *, spare: bool = False, audiences: Audiences | None = None
+    ) -> Filling | None:
         """Take what goes into the next source packet.
 
         :param number: number of that packet
         :param room: bytes that its body may have
         :param spare: nothing else needs the packet
+        :param audiences: chooses for whom the packet is, where robots hear at different rates; None where nobody does
         :return: None if nothing may be sent
         """
         self._open = {}
@@ -121,8 +124,8 @@ class Packing:
                 self._open[topic_id] = ready
         if not self._open:
             return None
-        levels = () if self.audiences is None else self.audiences.of(now)
-        heap = self._chosen(self.audiences, levels) if self.audiences is not None and levels else self._heap()
+        levels = () if audiences is None else audiences.of(now)
+        heap = self._chosen(audiences, levels) if audiences is not None and levels else self._heap()
         if len(heap) == 1 and not spare and heap[0][2] == TABLE_TOPIC and self.fills:
             return None
         picks: list[tuple[Message, int, int]] = []
@@ -144,16 +147,16 @@ class Packing:
             if taken == remaining and position + 1 < len(queue):
                 following, topic = queue[position + 1], self._topics[topic_id]
                 before = topic.newest if following.repeat else message.submitted
-                if self.audiences is None or self._audience is None:
+                if audiences is None or self._audience is None:
                     worth = value(following, before, ENTRY)
-                elif self.audiences.may_begin(topic, following, self._audience):
-                    worth = self.audiences.value(topic, following, self._audience, ENTRY, before)
+                elif audiences.may_begin(topic, following, self._audience):
+                    worth = audiences.value(topic, following, self._audience, ENTRY, before)
                 else:
                     continue
                 heappush(heap, (self._rank(following), -worth, topic_id, position + 1))
         if not picks:
             return None
-        return self._take(picks, number, used, ages, now)
+        return self._take(picks, number, used, ages, now, audiences=audiences)
 
     def _age(self, message: Message, now: float) -> int:
         """The code of the age that is told of a message which may begin in this packet; 0 where it is not told."""
@@ -263,10 +266,20 @@ class Packing:
         self._open = {topic_id: waiting[topic_id] for _, _, topic_id, _ in chosen}
         return chosen
 
-    def _take(self, picks: list[tuple[Message, int, int]], number: int, used: int, ages: bytes, now: float) -> Filling:
+    def _take(
+        self,
+        picks: list[tuple[Message, int, int]],
+        number: int,
+        used: int,
+        ages: bytes,
+        now: float,
+        *,
+        audiences: Audiences | None,
+    ) -> Filling:
         parts: list[EntryV1] = []
         sent: list[SentEntry] = []
         lifetimes: list[Lifetime] = []
+        left: list[Message] = []
         stats, qos, since = self._stats, picks[0][0].qos, inf
         robots = None if self._audience is None else self._audience.robots
         for place, (message, taken, back) in enumerate(picks):
@@ -301,19 +314,20 @@ class Packing:
             if last:
                 lifetime.left, message.left_at = True, now
                 queue.popleft()
-                if self.audiences is not None and (topic.behind or message.robots is not None):
-                    self.audiences.left(topic, message)
+                if audiences is not None and (topic.behind or message.robots is not None):
+                    audiences.left(topic, message)
                 if message.submitted > topic.newest and not (queue and queue[0].repeat):
                     topic.newest = message.submitted  # what is repeated together is worth the same
                 stats.sent[of] += not message.repeat
                 self._left(message, now)
+                left.append(message)
         # On a shared channel a topic that goes along in a packet has had a turn: fresh messages are in every packet.
         self.turns.sent([message.topic_id for message, _, _ in picks] if self._shares else [self._holder])
         stats.entries += len(picks)
         if ages:
             parts.append(Waited(ages))
             used += WAITED_LEN + len(ages)
-        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, since, robots)
+        return Filling(parts, tuple(sent), tuple(lifetimes), qos, used, since, robots, left)
 
 
 def _size(ages: bytes) -> int:

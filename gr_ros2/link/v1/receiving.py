@@ -23,6 +23,7 @@ from gr_ros2.link.events import (
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.message_codec import MessageCodec
 from gr_ros2.link.v1.announced import ARRIVING_S
+from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.endpoint_settings import Settings
 from gr_ros2.link.v1.facts import (
     TAKEN,
@@ -73,6 +74,7 @@ class ReceivingSide:
     :param decoder_for: makes the decoder for a robot's messages from its table of topics
     :param heard: what ``save`` stored before this start
     :param sent: what has left, of which reports speak
+    :param custody: makes what keeps messages for single robots, where messages of others are sent on
     :param access: is told what is heard on a channel that others share
     :param tells_snr: whether reports say how strong packets are
     :ivar stats: what arrived and what did not
@@ -88,6 +90,7 @@ class ReceivingSide:
         sent: SentPackets,
         *,
         decoder_for: Callable[[tuple[AnnouncedTopic, ...]], MessageCodec] | None,
+        custody: Callable[..., Custody],
         access: Access | None = None,
         tells_snr: bool = False,
         heard: Mapping[int, tuple[int, int]],
@@ -98,7 +101,6 @@ class ReceivingSide:
         """The destinations of packets that are for this robot."""
         self._sent, self._tells_snr = sent, tells_snr
         self._outcomes = Outcomes()
-        self._facts: list[Fact] = []
         self.stats = self._outcomes.stats
         self._settings = settings
         self._boot = boot
@@ -120,6 +122,7 @@ class ReceivingSide:
                 self.neighbours,
                 self._outcomes,
                 lambda src_id, boot, first: self._inbox(src_id, boot, first, settings.packet_len, far=True),
+                custody=custody,
                 packet_len=settings.packet_len,
                 repairs=settings.repair != "off",
                 most=settings.max_source_bytes,
@@ -142,8 +145,7 @@ class ReceivingSide:
         except WireError as error:
             self.stats.rejected[error.kind] += 1
             self._outcomes.events.append(Rejected(arrival.data, error.alone()))
-        facts, self._facts = self._facts, []
-        return self._outcomes.take(), facts
+        return self._outcomes.take(), self._outcomes.take_facts()
 
     def handle_timeout(self, now: float) -> tuple[list[ReceiverEvent], list[Fact]]:
         """Give up missing packets, and forget robots that are silent; returns as ``receive`` does."""
@@ -152,15 +154,14 @@ class ReceivingSide:
             neighbour.inbox.handle_timeout(now)
         self.neighbours.settle(now)
         for gone in self.neighbours.silent(now, self._give_up_s):
-            self._facts.append(PeerLeft(gone.src_id, ended=False))
+            self._outcomes.facts.append(PeerLeft(gone.src_id, ended=False))
             if self.relaying is None or not self.relaying.far.reaches(gone.src_id, gone.boot, now):
                 self._outcomes.events.append(Gone(gone.src_id, gone.boot))
         if self.relaying is not None:
             self.relaying.far.handle_timeout(now)
         for neighbour in self.neighbours.all.values():
             neighbour.timeout = None
-        facts, self._facts = self._facts, []
-        return self._outcomes.take(), facts
+        return self._outcomes.take(), self._outcomes.take_facts()
 
     def next_timeout(self) -> float | None:
         """When ``handle_timeout`` has something to do, if no other method is called before."""
@@ -203,10 +204,9 @@ class ReceivingSide:
             return
         if arrival.snr_db is not None and opened.new and opened.trusted:
             opened.neighbour.inbox.reports.snr.measured(arrival.snr_db)
-        opened.neighbour.inbox.began = began
-        self._use(arrival, opened, now)
+        self._use(arrival, opened, now, began)
         if opened.met and (early := self.neighbours.early(opened.neighbour.src_id, now)):
-            self._facts.append(Early(early))
+            self._outcomes.facts.append(Early(early))
 
     def _note_slot(self, access: Access, header: Header, arrival: AirPacket, now: float, opened: Opened | None) -> None:
         """Tell medium access what was heard, and when its burst began; and relaying whom the sender hears."""
@@ -237,12 +237,12 @@ class ReceivingSide:
             raise NotSealedError(f"a packet of robot {header.src_id} that is not sealed, where a key is configured")
         return self.neighbours.open(data, header, now)
 
-    def _use(self, arrival: AirPacket, opened: Opened, now: float) -> None:
-        """Take an opened packet."""
+    def _use(self, arrival: AirPacket, opened: Opened, now: float, began: float) -> None:
+        """Take an opened packet that began to arrive at a time, s."""
         self.stats.packets += 1
         neighbour, header, number, repair = opened.neighbour, opened.header, opened.number, opened.repair
         urgent = repair is not None and not repair.mask
-        self._facts.append(TAKEN[opened.trusted or opened.appeared, urgent])
+        self._outcomes.facts.append(TAKEN[opened.trusted or opened.appeared, urgent])
         if opened.appeared:
             self._appear(opened, now)
         if opened.met:
@@ -254,7 +254,7 @@ class ReceivingSide:
         entries: Sequence[EntryV1] = ()
         if not mask:
             if self.relaying is not None and opened.new and opened.trusted:
-                self.relaying.reached(neighbour, number)
+                self.relaying.reached(neighbour, number, began)
             entries = opened.entries or read_body(opened.body, header.room(self._settings.packet_len))
         encrypted = neighbour.trailer.encrypts and not clear
         packet = PacketV1(header, tuple(entries), repair, opened.body if mask else b"", encrypted)
@@ -263,22 +263,31 @@ class ReceivingSide:
         )
         self._outcomes.events.append(received)
         if repair is None:
-            inbox.source(number, opened.body, entries, header.qos, now)
+            inbox.source(number, opened.body, entries, header.qos, now, began=began)
         elif mask:
-            inbox.repair(number, mask, repair_id, opened.body, oldest=repair.oldest, now=now, new=opened.new)
+            inbox.repair(
+                number, mask, repair_id, opened.body, oldest=repair.oldest, now=now, began=began, new=opened.new
+            )
         else:
-            self._control(arrival, opened, repair, entries, now)
+            self._control(arrival, opened, repair, entries, now, began=began)
 
     def _control(
-        self, arrival: AirPacket, opened: Opened, repair: RepairHeader, entries: Sequence[EntryV1], now: float
+        self,
+        arrival: AirPacket,
+        opened: Opened,
+        repair: RepairHeader,
+        entries: Sequence[EntryV1],
+        now: float,
+        *,
+        began: float,
     ) -> None:
         """Take a packet of entries that are not messages. One that is not trusted moves nothing but the proofs."""
         neighbour, number = opened.neighbour, opened.number
         inbox = neighbour.inbox
         if repair.clear:
             neighbour.echo = arrival.data[-ECHO_LEN:], self._sent.newest
-            if neighbour.hello.capabilities & WANTS_PROOF and not self._answered(neighbour, entries, now):
-                self._facts.append(ProofWanted())
+            if neighbour.hello.capabilities & WANTS_PROOF and not self._answered(neighbour, entries, now, began):
+                self._outcomes.facts.append(ProofWanted())
         if not opened.trusted:
             if not repair.clear:
                 self.stats.dropped["unproven"] += 1
@@ -289,24 +298,23 @@ class ReceivingSide:
             elif isinstance(entry, (Ask, Report, Newest, LeftOut)):
                 self._entry(entry)
             elif isinstance(entry, (Ping, About)):
-                self._facts.append(Questioned(neighbour.src_id, entry))
-        inbox.heard(number, now, over=repair.oldest)
+                self._outcomes.facts.append(Questioned(neighbour.src_id, entry))
+        inbox.heard(number, now, began, over=repair.oldest)
 
     def _appear(self, opened: Opened, now: float) -> None:
         """Something of a robot comes for the first time, or again: it is answered, so that it can prove that it hears
         this start."""
         if opened.replaced is not None:
             opened.replaced.inbox.ended(now)
-            self._facts.append(PeerLeft(opened.replaced.src_id, ended=True))
+            self._outcomes.facts.append(PeerLeft(opened.replaced.src_id, ended=True))
             if self.relaying is not None:
                 self.relaying.started(opened.replaced, now)
-        self._facts.append(Appeared(opened.neighbour.knows))
+        self._outcomes.facts.append(Appeared(opened.neighbour.knows))
 
-    def _answered(self, neighbour: Neighbour, entries: Sequence[EntryV1], now: float) -> bool:
+    def _answered(self, neighbour: Neighbour, entries: Sequence[EntryV1], now: float, began: float) -> bool:
         """Whether a robot whose hello says that it lacks a proof means other robots, or an answer is under way."""
         if self._access is None or self._settings.slower <= 1:
             return False
-        began = neighbour.inbox.began
         since = 2 * began - now - self._access.lead_s  # another packet took as long, and this one was written before
         return self.neighbours.own_hellos.knows((neighbour.src_id, neighbour.boot), entries, since)
 
@@ -315,7 +323,7 @@ class ReceivingSide:
         hears = neighbour.hello.capabilities & CAN_HEAR != 0
         if hears and self._settings.dst_id in (BROADCAST, neighbour.src_id):
             proof = self.neighbours.since(neighbour.src_id) if neighbour.proves else ()
-            self._facts.append(PeerMet(neighbour.src_id, *proof))
+            self._outcomes.facts.append(PeerMet(neighbour.src_id, *proof))
         self._outcomes.events.append(Met(neighbour.src_id, neighbour.boot, hears))
         if self.relaying is not None:
             self.relaying.far.met(neighbour, now)
@@ -343,7 +351,7 @@ class ReceivingSide:
             elif self.relaying is not None:
                 self.relaying.newest(self._sender.src_id, entry, self._now)
         elif isinstance(entry, Ask) and entry.src_id == self._settings.src_id:
-            self._facts.append(Asked(self._sender.src_id, tuple(dict.fromkeys(entry.topic_ids))))
+            self._outcomes.facts.append(Asked(self._sender.src_id, tuple(dict.fromkeys(entry.topic_ids))))
 
     def _reported(self, sender: int, report: Report) -> None:
         """A robot says which packets it has."""
@@ -353,20 +361,29 @@ class ReceivingSide:
         number = newest - ((newest - report.number) & 0xFFFF)
         if number < 0:
             raise EntryKindError(f"a report of packet {report.number}, which was never sent")
-        self._facts.append(Reported(sender, number, report))
+        self._outcomes.facts.append(Reported(sender, number, report))
 
     def _has(self, sender: int, newest: Newest) -> None:
         """A robot says which messages of this one it has."""
         if newest.place is not None and newest.start == self._boot & 0xFF and newest.number <= self._sent.newest:
-            self._facts.append(Has(sender, newest.topic_id, (newest.number, newest.place)))
+            self._outcomes.facts.append(Has(sender, newest.topic_id, (newest.number, newest.place)))
 
     def _brings(self, since: float) -> bool:
         """Whether a robot that is heard still repairs something that was missing at this time, s."""
         heard = [neighbour for neighbour in self.neighbours.all.values() if not neighbour.silent]
         return any(neighbour.inbox.order.missing_since() <= since for neighbour in heard)
 
-    def _inbox(self, src_id: int, boot: int, first: int, room: int, *, far: bool = False) -> Inbox:
-        inbox = Inbox(
+    def _inbox(
+        self,
+        src_id: int,
+        boot: int,
+        first: int,
+        room: int,
+        sealed_after: Callable[[int], float] | None = None,
+        *,
+        far: bool = False,
+    ) -> Inbox:
+        return Inbox(
             src_id,
             boot,
             first,
@@ -382,6 +399,6 @@ class ReceivingSide:
             quiet_s=NEAR_S * self._settings.slower,
             patience_s=QUIET_S * self._settings.slower if far else inf,
             brings=self._brings,
+            tells_snr=self._tells_snr,
+            sealed_after=sealed_after,
         )
-        inbox.reports.tells_snr = self._tells_snr
-        return inbox

@@ -28,6 +28,7 @@ from gr_ros2.link.message_codec import FRAME
 from gr_ros2.link.v1.arriving import ArrivingMessages
 from gr_ros2.link.v1.custody import Custody
 from gr_ros2.link.v1.delivery import UNKNOWN_S, for_all_in_order
+from gr_ros2.link.v1.facts import Reached
 from gr_ros2.link.v1.far import FarRobots
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.message import Message
@@ -35,6 +36,7 @@ from gr_ros2.link.v1.neighbours import Neighbour, Neighbours
 from gr_ros2.link.v1.order import Ready
 from gr_ros2.link.v1.outcomes import Outcomes
 from gr_ros2.link.v1.sent_on import REPAIRED_S, SentOn, ToPass
+from gr_ros2.link.v1.sent_topics import LONG_CARRIED, RELAYED
 from gr_ros2.link.v1.sequences import Sequences
 from gr_ros2.relay.gain import TOLD, Gains, Stream
 from gr_ros2.relay.in_order import Kept, Name
@@ -76,6 +78,7 @@ class Relaying:
     :param repairs: whether lost packets are repaired
     :param most: bytes of all that is kept of messages of other robots
     :param make_inbox: see :class:`FarRobots`
+    :param custody: makes what keeps messages for single robots
     :ivar gains: who lacks what
     :ivar routes: over whom robots are reached
     :ivar memory: shared by all that is kept: far tables, the two kinds of what is sent on, what is carried here and on
@@ -91,25 +94,24 @@ class Relaying:
         outcomes: Outcomes,
         make_inbox: Callable[[int, int, int], Inbox],
         *,
+        custody: Callable[..., Custody],
         packet_len: int,
         repairs: bool,
         most: int,
     ) -> None:
         self.src_id, self._robots, self._packet_len = src_id, robots, packet_len
-        self._neighbours, self._dropped = neighbours, outcomes.stats.dropped
+        self._neighbours, self._outcomes, self._dropped = neighbours, outcomes, outcomes.stats.dropped
         self.gains, self.routes = Gains(src_id, robots), Routes(robots)
         self.memory = Memory(most, kinds=5)
         self.far = FarRobots(robots, neighbours, outcomes, self.routes, make_inbox, share=self.memory.share())
         self.sent_on = SentOn(self.gains, self._dropped, self.memory, repairs=repairs)
-        self.custody: Custody
         self._telling = deque[Stream | None]()
         """What is told next: a reliable topic for all, or None for the newest message of the next of the others."""
         self._swept = 0.0
         self._tables: dict[int, tuple[int, bytes, float]] = {}
-        """OtherRobots that are heard: boot number, table, and when it was last worth sending on."""
+        """Robots that are heard: boot number, table, and when it was last worth sending on."""
         self._carried_here = Sequences[Ready](self.memory.share())
-        self.found: Callable[[int, float], None] = lambda _, __: None
-        """Called with a robot that is reached over others for the first time."""
+        self.custody = custody(gains=self.gains, routes=self.routes, share=self.memory.share(), dropped=self._dropped)
 
     # ---- what arrives
 
@@ -131,9 +133,10 @@ class Relaying:
         if now > self._swept + TABLE_S:
             self._sweep(now)
 
-    def reached(self, neighbour: Neighbour, number: int) -> None:
-        """A robot itself has reached this number: whoever has said more was wrong."""
-        if self.far.overruled(neighbour, number):
+    def reached(self, neighbour: Neighbour, number: int, began: float) -> None:
+        """A robot itself has reached this number, in a packet that began to arrive at a time, s: whoever has said more
+        was wrong."""
+        if self.far.overruled(neighbour, number, began):
             topics = neighbour.inbox.announced.topics
             self.sent_on.drop_above(neighbour.src_id, neighbour.boot & 0xFFFF, number, topics)
 
@@ -359,7 +362,7 @@ class Relaying:
             self.sent_on.drop_of(origin)
             self.sent_on.drop_other_starts(origin, message.start)
             self._robots.of(origin).met_over = now
-            self.found(origin, now)
+            self._outcomes.facts.append(Reached(origin))
         if lost := self.far.hold(origin, via, len(message.payload)):
             self._dropped["max_sources"] += lost
         return True
@@ -367,8 +370,11 @@ class Relaying:
     # ---- what leaves
 
     def left(self, message: Message, now: float) -> None:
-        """A message that was offered leaves whole in the packet that is composed."""
-        self.sent_on.left(message, now, self.custody.repaired_for)
+        """A message leaves whole in the packet that is composed: one that was offered, or any other."""
+        if message.topic_id in RELAYED:
+            self.sent_on.left(message, now, self.custody.repaired_for)
+        elif message.topic_id in (CARRIED_TOPIC, LONG_CARRIED):
+            self.custody.left(message, now)
 
     def tells(self, now: float) -> list[Newest]:
         """What this robot has of others' topics, in turn: of reliable topics for all, what has not come directly."""

@@ -68,7 +68,7 @@ class Reporter:
     :ivar loss: recent share of lost packets
     :ivar confirms: whether something has arrived that the sender repairs until it is confirmed
     :ivar snr: SNR of its packets
-    :ivar tells_snr: whether reports give the SNR, as an adaptive rate needs
+    :param tells_snr: whether reports give the SNR, as an adaptive rate needs
     """
 
     def __init__(
@@ -77,12 +77,14 @@ class Reporter:
         decoder: RepairDecoder,
         order: Order,
         settings: Settings,
+        *,
+        tells_snr: bool = True,
     ) -> None:
         self.unreported = 0
         self.loss = 0.0
         self.confirms = False
         self.snr = SnrFilter()
-        self.tells_snr = True
+        self.tells_snr = tells_snr
         self._sender = sender
         self._decoder, self._order = decoder, order
         self._settings = settings
@@ -199,10 +201,12 @@ class SharedReporter(Reporter):
         sender: tuple[int, int],
         decoder: RepairDecoder,
         order: Order,
-        reassembly: Reassembly,
         settings: Settings,
+        reassembly: Reassembly,
+        *,
+        tells_snr: bool = True,
     ) -> None:
-        super().__init__(sender, decoder, order, settings)
+        super().__init__(sender, decoder, order, settings, tells_snr=tells_snr)
         self._reassembly = reassembly
 
     @property

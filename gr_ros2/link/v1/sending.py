@@ -23,6 +23,7 @@ from gr_ros2.link.v1.facts import (
     PeerMet,
     ProofWanted,
     Questioned,
+    Reached,
     Reported,
     Taken,
 )
@@ -89,7 +90,6 @@ class SendingSide:
         self.pings = Pings(turn_s=settings.turn_s)
         self._audiences: Audiences | None = None
         if rate is not None and settings.dst_id == BROADCAST and not settings.shares and relaying is None:
-            packing = messages.packing
             self._audiences = Audiences(
                 rate,
                 window.peers,
@@ -97,9 +97,8 @@ class SendingSide:
                 messages.sent,
                 reads=neighbours.reads_left_out,
                 room=writer.room,
-                short=packing.short,
+                short=messages.packing.short,
             )
-            packing.audiences = self._audiences
         self.repairs = RepairSlots(settings, pace, window, writer=writer, hold=hold, audiences=self._audiences)
         self.reports = ReportSlots(settings, neighbours.all.values(), writer)
         self.urgent = False
@@ -167,9 +166,13 @@ class SendingSide:
         parts = self._audiences is not None and self._parts()
         if parts:  # who waits for what was not sent to all is told
             room -= LEFT_OUT_LEN + LENGTH_LEN
-        filling = self._messages.packing.fill(number, room - reports.reserved, now, spare=spare)
+        audiences = self._audiences
+        filling = self._messages.packing.fill(number, room - reports.reserved, now, spare=spare, audiences=audiences)
         if filling is None:
             return None
+        if self._relaying is not None:
+            for message in filling.left:
+                self._relaying.left(message, now)
         self.hellos.yielded()
         self._slowness.waited(filling.since, now)
         if due or now >= reports.requests.check_at:
@@ -178,7 +181,7 @@ class SendingSide:
         lifetimes = () if spare else filling.lifetimes
         if parts and filling.robots is None and any(lifetime.in_order for lifetime in lifetimes):
             filling.parts.append(self._window.packets.left_out(now))
-        robots, audiences = filling.robots, self._audiences
+        robots = filling.robots
         skipped = 0 if audiences is None else audiences.skipped(robots)
         sent = self._writer.source(
             filling.parts, lifetimes, filling.qos, filling.sent, slot, robots=robots, skipped=skipped
@@ -239,15 +242,20 @@ class SendingSide:
             case PeerLeft(robot, ended):
                 self._left(robot, now, ended=ended)
             case Asked(robot, topic_ids):
-                for topic_id in topic_ids:
-                    if self._messages.kept.asked(topic_id, now, self._interval, robot=robot):
-                        self._messages.asks[topic_id] += 1
-                    else:
-                        self._neighbours.dropped["asked_too_often"] += 1
+                self._asked(robot, topic_ids, now)
             case Questioned(robot, entry):
                 self.pings.receive(robot, self.settings.src_id, entry, now)
+            case Reached(robot):
+                self._messages.found(robot, now)
             case ProofWanted():
                 self.hellos.answer(now)
+
+    def _asked(self, robot: int, topic_ids: tuple[int, ...], now: float) -> None:
+        for topic_id in topic_ids:
+            if self._messages.kept.asked(topic_id, now, self._interval, robot=robot):
+                self._messages.asks[topic_id] += 1
+            else:
+                self._neighbours.dropped["asked_too_often"] += 1
 
     def _come(self, robot: int) -> None:
         """A robot reports: if it has just come, it has missed what has left of the messages under way."""

@@ -29,8 +29,9 @@ def named(last: int = LAST, **options: Any) -> Registry:
 
 
 def custody_of(one: Robot) -> Custody:
-    assert one.end.messages.custody is not None
-    return one.end.messages.custody
+    relaying = one.end._receiving.relaying
+    assert relaying is not None
+    return relaying.custody
 
 
 def line_of(*robots: Robot, loss: float = 0.1) -> Line:

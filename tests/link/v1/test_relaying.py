@@ -39,7 +39,7 @@ def robot(src_id: int, mode: SealMode = "none", topics: Registry = ODOM, **setti
 
 
 class Line:
-    """OtherRobots in a row of which each hears the next on both sides; packets that overlap destroy each other."""
+    """Robots in a row of which each hears the next on both sides; packets that overlap destroy each other."""
 
     def __init__(self, *robots: Robot, loss: float = 0.0) -> None:
         self.robots = list(robots)

@@ -30,7 +30,7 @@ def reporter() -> tuple[SharedReporter, RepairDecoder, Reassembly]:
     order = Order(decoder, 1, 1.0, sure=10_000, fits=lambda _: False, room=ROOM)
     order.told = True
     access: Any = SimpleNamespace(turn_s=0.0)
-    return SharedReporter((1, 1), decoder, order, reassembly, Settings(2, access=access)), decoder, reassembly
+    return SharedReporter((1, 1), decoder, order, Settings(2, access=access), reassembly), decoder, reassembly
 
 
 def test_packets_that_nobody_repairs_are_not_reported() -> None:
