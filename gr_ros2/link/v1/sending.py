@@ -214,6 +214,7 @@ class SendingSide:
         leaving = self._messages.packing.next_timeout(now)
         if leaving > now:
             leaving = min(leaving, self.hellos.due, self.pings.due, self._repeat_at, self.reports.next(now))
+            leaving = min(leaving, self.reports.requests.again_at)
         if leaving > now:
             leaving = min(leaving, self.repairs.next(now, waiting=self._messages.packing.fills))
         return max(leaving, self._pace.slot)

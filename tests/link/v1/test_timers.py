@@ -7,6 +7,7 @@ thread in a live link.
 from __future__ import annotations
 
 import random
+from itertools import pairwise
 from math import inf
 from struct import pack, unpack
 from typing import Any
@@ -15,7 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gr_ros2.link.events import Delivered
+from gr_ros2.link.v1.requests import ASK_S
 from gr_ros2.settings.config import SendOptions
+from gr_ros2.wire.control import Ask
+from gr_ros2.wire.v1 import QOS_REPAIR, read_header
 from tests.link.v1.air import SLOT_S, Robot, registry
 from tests.link.v1.invariants import PacketsEnd
 from tests.packets import data_of
@@ -107,3 +111,22 @@ def test_a_topic_above_its_rate_is_thinned_out_and_not_delayed() -> None:
     found = ages({"odom": SendOptions(max_rate=5)}, [(n / 35, 0, 20) for n in range(350)])
     assert 48 <= len(found[0]) <= 52
     assert max(found[0]) < 1 / 35 + 3 * SLOT_S
+
+
+def test_a_request_without_an_answer_is_repeated_in_time_though_nothing_else_leaves() -> None:
+    one = Robot(1, registry(map=SendOptions(durability="transient_local")), repair="off")
+    two = Robot(2)
+    one.end.messages.submit(0, b"map", 0.0)
+    now, asked = 0.0, []
+    while now < 5.0:
+        if now < 1.0 and (data := one.slot(now)) is not None and read_header(data, 64).qos == QOS_REPAIR:
+            two.receive(data, now)  # nothing but hellos, and then nothing any more
+        two.end.pace.credit()
+        sent = two.end.next_packet(now)
+        if sent is not None and any(isinstance(entry, Ask) for entry in sent.packet.body):
+            asked.append(now)
+        departure = two.end.next_departure(credited=True)
+        assert departure is not None
+        now = max(now + 0.01, departure if now >= 1.0 else now)
+    assert len(asked) > 6
+    assert max(later - earlier for earlier, later in pairwise(asked)) < ASK_S + 0.05
