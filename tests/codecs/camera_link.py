@@ -159,11 +159,15 @@ class Air:
         for robot in self.robots:
             if not robot.on:
                 continue
-            robot.take(robot.end.handle_timeout(now), now)
+            if (due := robot.end.next_timeout()) is not None and due <= now:
+                robot.take(robot.end.handle_timeout(now), now)
             robot.coder.look(now)
             while robot.free <= now:
                 if robot.end.pace.out_of_credit:
                     robot.end.pace.credit(1, robot.free)
+                at = robot.end.next_departure()
+                if not robot.end.urgent and (at is None or at > now):
+                    break
                 if (sent := robot.end.next_packet(now)) is None:
                     break
                 robot.free = max(robot.free, now - STEP_S) + len(sent.data) * 8e-3 / robot.kbit_s

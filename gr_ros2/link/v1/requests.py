@@ -22,17 +22,25 @@ CHECK_S = 0.02
 class Requests:
     """The requests of one robot.
 
-    :ivar lacking: whether they keep messages that this one lacked when it last looked
-    :ivar crowded: whether some of the requests found no room then
-    :ivar check_at: when it looks next, s, if a packet may leave then; infinite for never
-    :ivar again_at: when a request is repeated whose answer has not come, s; infinite for never
+    :ivar crowded: whether some of the requests found no room when it last looked
+    :ivar check_at: when it looks next, s; infinite for never
     """
 
     def __init__(self, neighbours: Iterable[Neighbour], settings: Settings) -> None:
-        self.lacking = self.crowded = False
+        self.crowded = False
         self._neighbours, self._settings = neighbours, settings
         self.check_at = -inf if settings.hears else inf
-        self.again_at = inf
+        self._wanted_at = inf
+        """When messages that this robot lacks, or may lack since it was told, are asked for, s."""
+
+    def told(self) -> None:
+        """A robot may have named what this one lacks."""
+        self._wanted_at = -inf
+
+    def next(self) -> float:
+        """When a request may have to leave, s; infinite for never."""
+        lost = (each.asked.get(topic, -inf) for each in self._neighbours if each.proven for topic in each.lost_frames)
+        return max(self.check_at, min(self._wanted_at, min(lost, default=inf)))
 
     def entries(self, room: int, now: float) -> list[Ask]:
         """Requests, as many as ``room`` bytes hold."""
@@ -40,16 +48,15 @@ class Requests:
         if now < self.check_at:
             return found
         self.check_at = now + CHECK_S
-        self.lacking, self.crowded, self.again_at = False, False, inf
+        self.crowded, self._wanted_at = False, inf
         for neighbour in [neighbour for neighbour in self._neighbours if neighbour.proven]:
             hello, inbox, asked = neighbour.hello, neighbour.inbox, neighbour.asked
             marks = list(hello.marks)
             if hello.digest and hello.digest != inbox.announced.digest:
                 marks.append((TABLE_TOPIC, hello.digest))
             kept = [mark[0] for mark in marks if inbox.lacks(mark, neighbour.hello_number, now)]
-            lacking = [*kept, *neighbour.lost_frames]
-            self.lacking = self.lacking or bool(lacking)
-            wanted = bytes(topic for topic in dict.fromkeys(lacking) if now >= asked.get(topic, -inf))
+            lacking = dict.fromkeys([*kept, *neighbour.lost_frames])
+            wanted = bytes(topic for topic in lacking if now >= asked.get(topic, -inf))
             said = wanted[: max(room - ASK_LEN, 0)]
             if len(said) < len(wanted):
                 self.crowded, self.check_at = True, now
@@ -58,5 +65,5 @@ class Requests:
                 found.append(Ask(neighbour.src_id, said))
                 neighbour.lost_frames.difference_update(said)
                 asked.update(dict.fromkeys(said, now + ASK_S * self._settings.slower))
-            self.again_at = min([self.again_at, *(asked.get(topic, now) for topic in kept)])
+            self._wanted_at = min([self._wanted_at, *(asked.get(topic, now) for topic in kept)])
         return found

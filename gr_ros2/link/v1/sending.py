@@ -214,7 +214,7 @@ class SendingSide:
         leaving = self._messages.packing.next_timeout(now)
         if leaving > now:
             leaving = min(leaving, self.hellos.due, self.pings.due, self._repeat_at, self.reports.next(now))
-            leaving = min(leaving, self.reports.requests.again_at)
+            leaving = min(leaving, self.reports.requests.next())
         if leaving > now:
             leaving = min(leaving, self.repairs.next(now, waiting=self._messages.packing.fills))
         return max(leaving, self._pace.slot)
@@ -226,7 +226,9 @@ class SendingSide:
                 if trusted:
                     self._heard_at = now
                     self.repairs.look_anew()
-                self.urgent = self.urgent or urgent or self.reports.requests.lacking
+                if urgent:
+                    self.urgent = True
+                    self.reports.requests.told()
             case Reported(robot, number, report):
                 self._reported(robot, number, report, now)
             case Has(robot, topic_id, order):
