@@ -25,7 +25,7 @@ def test_patience_begins_anew_with_each_step_of_what_is_waited_for(monkeypatch: 
     monkeypatch.setattr(waiting.time, "monotonic", lambda: float(next(now)))
     monkeypatch.setattr(waiting.time, "sleep", lambda _: None)
     monkeypatch.setattr(waiting, "PATIENCE_S", 5.0)
-    steps = iter(range(40))
-    wait_for(lambda: next(steps) == 38, "forty steps", progress=lambda: next(steps))
+    looks, steps = iter(range(40)), iter(range(40))
+    wait_for(lambda: next(looks) == 38, "forty looks", progress=lambda: next(steps))
     with pytest.raises(AssertionError, match="waited 5 s for the tide, the last step of it low"):
         wait_for(lambda: False, "the tide", progress=lambda: "low")

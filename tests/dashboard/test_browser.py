@@ -118,10 +118,6 @@ class Viewer(Browser):
         features = {"features": [{"name": "prefers-color-scheme", "value": name}]}
         self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", features)
 
-    def wait(self, condition: Callable[[], Any], what: str) -> None:
-        """A look walks the whole page, whose numbers change every half second."""
-        wait_for(condition, what, longest_s=0.25)
-
 
 SNR, OFFSET, LOSS = range(3)
 ODOM = "/robot_1/odom"
@@ -180,36 +176,36 @@ def test_it_shows_what_the_result_says_sliders_act_and_it_returns_with_the_next_
     (port,) = free_ports(1, socket.SOCK_STREAM)
     with program(tmp_path / "out", port) as (process, url):
         viewer.driver.get(url)
-        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "a delivery on the page")
+        wait_for(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "a delivery on the page")
         first = viewer.topic(ODOM)
-        viewer.wait(lambda: viewer.topic(ODOM)["delivered"] > first["delivered"], "numbers that move")
-        viewer.wait(lambda: viewer.topic(ODOM).get("pdr_now", 0) > 0.9, "a good link")
+        wait_for(lambda: viewer.topic(ODOM)["delivered"] > first["delivered"], "numbers that move")
+        wait_for(lambda: viewer.topic(ODOM).get("pdr_now", 0) > 0.9, "a good link")
         assert viewer.phase().startswith("live")
         assert any(re.match(r"odom #\d+\[\d/4\]", text) for text in viewer.text(".bytes .entry"))
         points = "return Bokeh.documents[0].get_model_by_name(arguments[0]).renderers[0].data_source.length"
         for plot in ("map", "error", "latency", "pdr", "constellation", "spectrum"):
-            viewer.wait(lambda plot=plot: viewer.run(points, plot) > 0, f"something on {plot}")
+            wait_for(lambda plot=plot: viewer.run(points, plot) > 0, f"something on {plot}")
 
         # Another viewer sees what this one sets.
         mine = viewer.driver.current_window_handle
         viewer.driver.switch_to.new_window("window")
         viewer.driver.get(url)
-        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "the second viewer's numbers")
+        wait_for(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "the second viewer's numbers")
         viewer.slide(LOSS, Keys.END)
-        viewer.wait(lambda: viewer.topic(ODOM).get("pdr_now") == 0, "a PDR of 0 at a loss of 100 %")
+        wait_for(lambda: viewer.topic(ODOM).get("pdr_now") == 0, "a PDR of 0 at a loss of 100 %")
         viewer.driver.close()
         viewer.driver.switch_to.window(mine)
-        viewer.wait(lambda: viewer.slider(LOSS) == 100, "the first viewer's slider")
-        viewer.wait(lambda: viewer.topic(ODOM).get("pdr_now") == 0, "the first viewer's PDR")
+        wait_for(lambda: viewer.slider(LOSS) == 100, "the first viewer's slider")
+        wait_for(lambda: viewer.topic(ODOM).get("pdr_now") == 0, "the first viewer's PDR")
         viewer.slide(LOSS, Keys.HOME)
-        viewer.wait(lambda: viewer.topic(ODOM)["pdr_now"] > 0.5, "a link that is good again")
+        wait_for(lambda: viewer.topic(ODOM)["pdr_now"] > 0.5, "a link that is good again")
         viewer.slide(SNR, Keys.HOME)
-        viewer.wait(lambda: viewer.topic(ODOM)["pdr_now"] == 0, "a PDR of 0 in noise")
+        wait_for(lambda: viewer.topic(ODOM)["pdr_now"] == 0, "a PDR of 0 in noise")
 
         errors = [entry["message"] for entry in viewer.driver.get_log("browser") if entry["level"] == "SEVERE"]
         assert errors == []
         result = stop(process, tmp_path / "out")
-        viewer.wait(viewer.gone, "the page to notice that the program has ended")
+        wait_for(viewer.gone, "the page to notice that the program has ended")
     (topic,) = result.topics
     shown = viewer.topic(ODOM)
     assert viewer.phase() == "ended"
@@ -224,8 +220,8 @@ def test_it_shows_what_the_result_says_sliders_act_and_it_returns_with_the_next_
     assert result.interrupted is True
 
     with program(tmp_path / "two", port):
-        viewer.wait(lambda: not viewer.gone() and viewer.phase().startswith("live"), "the next run on the same page")
-        viewer.wait(lambda: 0 < viewer.numbers().get("sent", 0) < topic.sent, "its numbers")
+        wait_for(lambda: not viewer.gone() and viewer.phase().startswith("live"), "the next run on the same page")
+        wait_for(lambda: 0 < viewer.numbers().get("sent", 0) < topic.sent, "its numbers")
 
 
 @pytest.mark.slow
@@ -241,8 +237,8 @@ def test_it_shows_what_repair_does_and_can_be_used_with_a_keyboard_and_a_screen_
     )
     with program(tmp_path / "out", 0, *lossy) as (process, url):
         viewer.driver.get(url)
-        viewer.wait(lambda: viewer.numbers().get("repaired", 0) > 2, "repaired messages")
-        viewer.wait(lambda: viewer.text(".gap"), "a gap between the last packets")
+        wait_for(lambda: viewer.numbers().get("repaired", 0) > 2, "repaired messages")
+        wait_for(lambda: viewer.text(".gap"), "a gap between the last packets")
         gaps = [int(number) for text in viewer.text(".gap") for number in re.findall(r"(\d+) missing", text)]
         assert all(0 < gap < 1000 for gap in gaps), "a repair stands at the newest packet's number"
         tiles = viewer.numbers()
@@ -265,19 +261,17 @@ def test_it_shows_what_repair_does_and_can_be_used_with_a_keyboard_and_a_screen_
         assert stops == ["Pause", folds[0], "stop sending", "noise", *sliders, *folds[1:]]
         assert viewer.button("Pause").get_attribute("aria-pressed") == "false"
         viewer.button("Pause").send_keys(Keys.SPACE)
-        viewer.wait(lambda: viewer.button("Pause").get_attribute("aria-pressed") == "true", "a pressed toggle")
+        wait_for(lambda: viewer.button("Pause").get_attribute("aria-pressed") == "true", "a pressed toggle")
         viewer.button("Pause").send_keys(Keys.SPACE)
         for scheme in ("light", "dark"):
             viewer.scheme(scheme)
-            viewer.wait(lambda: viewer.run(PALE) == [], f"texts that can be read on a {scheme} page")
+            wait_for(lambda: viewer.run(PALE) == [], f"texts that can be read on a {scheme} page")
         # A screen reader says what is in an element that stays and has the role of a status.
         viewer.slide(LOSS, Keys.END)
-        viewer.wait(
-            lambda: "heard" in viewer.run("return document.querySelector('[role=status]').textContent"), "alarm"
-        )
+        wait_for(lambda: "heard" in viewer.run("return document.querySelector('[role=status]').textContent"), "alarm")
 
         result = stop(process, tmp_path / "out")
-        viewer.wait(viewer.gone, "the page to notice that the program has ended")
+        wait_for(viewer.gone, "the page to notice that the program has ended")
     (topic,) = result.topics
     assert viewer.numbers()["repaired"] == viewer.ledger(ODOM)["repaired"] == topic.ledger["repaired"] > 2
 
@@ -304,8 +298,8 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
     lossy = ("paper=null", "robots=[{}, {topics: []}]", "repair=off", "sim.odom_rate=20")
     with program(tmp_path / "out", 0, *lossy) as (process, url):
         viewer.driver.get(url)
-        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 60, "deliveries")
-        viewer.wait(lambda: viewer.phase().startswith("live"), "a state")
+        wait_for(lambda: viewer.topic(ODOM).get("delivered", 0) > 60, "deliveries")
+        wait_for(lambda: viewer.phase().startswith("live"), "a state")
         picture("up")
         assert {"1"} <= set(viewer.run(f"{FIND} return found.map(row => row.dataset.robot)", ".heard tr[data-robot]"))
         for name in ("pdr", "loss", "age", "air", "path", "channel"):
@@ -314,23 +308,23 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
         for fold in viewer.run(f"{FIND} return found", "summary"):
             fold.click()
         for name in ("snr", "constellation", "queue"):
-            viewer.wait(lambda name=name: card(name), f"what was folded: {name}")
+            wait_for(lambda name=name: card(name), f"what was folded: {name}")
         assert viewer.run(HOLES) == []
         picture("unfolded")
         viewer.driver.refresh()
-        viewer.wait(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "the page again")
+        wait_for(lambda: viewer.topic(ODOM).get("delivered", 0) > 0, "the page again")
         assert card("constellation"), "as it was left"
         axes = "return Bokeh.documents[0].get_model_by_name(arguments[0]).below[0].axis_label"
         assert viewer.run(axes, "spectrum") == "frequency [kHz]"
         for _ in range(5):
             viewer.slide(LOSS, Keys.PAGE_UP)
-        viewer.wait(alarm("arrived"), "a link that is degraded")
+        wait_for(alarm("arrived"), "a link that is degraded")
         picture("degraded")
         viewer.slide(LOSS, Keys.END)
-        viewer.wait(alarm("heard"), "a link that is down")
+        wait_for(alarm("heard"), "a link that is down")
         picture("down")
         viewer.button("Pause").click()
-        viewer.wait(lambda: "active" in viewer.button("Pause").get_attribute("class"), "pause")
+        wait_for(lambda: "active" in viewer.button("Pause").get_attribute("class"), "pause")
 
         def still() -> bool:
             """Whether no number moves while pictures are taken, for which the page has time to change many times."""
@@ -339,20 +333,20 @@ def test_trouble_is_shown_as_trouble_in_five_states(viewer: Viewer, tmp_path: Pa
                 viewer.driver.get_screenshot_as_png()
             return bool(viewer.numbers() == before)
 
-        viewer.wait(still, "numbers that stand still")
+        wait_for(still, "numbers that stand still")
         before = viewer.numbers()["sent"]
         viewer.button("Pause").click()
-        viewer.wait(lambda: viewer.numbers()["sent"] > before + 20, "numbers that move again")
+        wait_for(lambda: viewer.numbers()["sent"] > before + 20, "numbers that move again")
         viewer.scheme("dark")
         phone = {"width": 360, "height": 1600, "deviceScaleFactor": 1, "mobile": True}
         viewer.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", phone)
         wide = "return [document.documentElement.scrollWidth, innerWidth]"
-        viewer.wait(lambda: viewer.run(wide) == [360, 360], "a phone's width")
+        wait_for(lambda: viewer.run(wide) == [360, 360], "a phone's width")
         assert viewer.run("return getComputedStyle(document.body).backgroundColor") == "rgb(20, 24, 29)"
         picture("phone-dark")
         stop(process, tmp_path / "out")
         viewer.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-        viewer.wait(viewer.gone, "the page to notice that the program has ended")
+        wait_for(viewer.gone, "the page to notice that the program has ended")
         picture("ended")
     assert not viewer.text(".alarms li")
 
@@ -390,7 +384,7 @@ def test_a_live_link_shows_the_names_that_come_out_and_no_empty_card(viewer: Vie
                 publisher.publish(b"\0\1\0\0" + bytes(48))
                 return viewer.topic("/rx_robot_2/cmd_vel").get("delivered", 0) > 3
 
-            viewer.wait(shown, "the name that comes out")
+            wait_for(shown, "the name that comes out")
             hidden = viewer.run(
                 f"{FIND} return found.filter(one => one.hidden).map(one => one.dataset.card)", "[data-card]"
             )

@@ -47,9 +47,9 @@ def test_twenty_robots_in_one_cell_share_it_without_a_collision() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("robots", [2, 10])
 def test_packets_of_any_length_fill_the_same_share_of_the_slots_after_as_many_frames(robots: int) -> None:
-    usual = [in_slots(robots, AIRTIME, seed) for seed in (1, 2, 3)]
-    for airtime_s in (0.004, 0.2, 1.0):
-        found = [in_slots(robots, airtime_s, seed) for seed in (1, 2, 3)]
+    usual = [in_slots(robots, AIRTIME, seed) for seed in (1, 2)]
+    for airtime_s in (0.004, 1.0):
+        found = [in_slots(robots, airtime_s, seed) for seed in (1, 2)]
         assert mean(one.share for one in found) == pytest.approx(mean(one.share for one in usual), rel=0.05), airtime_s
         assert median(one.first for one in found) <= 25 * (robots + 1), airtime_s
 

@@ -53,10 +53,10 @@ def test_nothing_stops_in_hours_with_outages_and_restarts(monkeypatch: pytest.Mo
     monkeypatch.setattr(test_relaying, "SLOT_S", SLOT_S)
     hours, rng = Hours(*(robot(n, "encrypt", TOPICS, packet_len=220) for n in (1, 2, 3)), loss=0.1), random.Random(1)
     hours.invariant.bound = 400
-    for part in range(15):
+    for part in range(8):
         hours.out = rng.randrange(3)
         hours.talk(rng.choice([12, 60, 200]))
-        if part % 5 == 4:
+        if part % 4 == 3:
             hours.restart(hours.robots[rng.randrange(3)])
         hours.out = -1
         hours.talk(120)

@@ -28,7 +28,7 @@ EPISODES = st.lists(
 
 
 @pytest.mark.slow
-@settings(max_examples=16)
+@settings(max_examples=6)
 @given(
     mode=st.sampled_from(["none", "authenticate", "encrypt"]),
     count=st.sampled_from([2, 3]),
