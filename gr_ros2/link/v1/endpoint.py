@@ -206,7 +206,7 @@ class EndpointV1:
     @property
     def idle(self) -> bool:
         """Whether no message waits, and no packet that has left is worth repairing."""
-        mending = self.window.mode != "off" and self.window.packets.wanted(self._now)
+        mending = self.window.mode != "off" and self.window.wanted(self._now)
         return self.messages.idle and not mending
 
     @property

@@ -187,6 +187,11 @@ class Peers:
         """Whether any peer reports."""
         return bool(self.all)
 
+    @property
+    def gone(self) -> bool:
+        """Whether peers have reported, and all are out of range."""
+        return bool(self._away) and not self.all
+
     def sent(self, number: int, lifetimes: tuple[Lifetime, ...], now: float) -> None:
         """A source packet leaves, after ``SentPackets.newest``."""
         for lifetime in lifetimes:

@@ -41,7 +41,8 @@ def _never(_now: float) -> bool:
 class RepairWindow:
     """The choice of repairs of one sender.
 
-    :param repair: the setting: a mode, or auto, which is thrifty where somebody reports and idle where nobody does
+    :param repair: the setting: a mode, or auto, which is thrifty where somebody reports and idle where nobody does,
+        within bounds where somebody did
     :param room: bytes of the longest body
     :param expected_loss: share of packets lost, used until a report arrives
     :param shares: whether others send on the same channel
@@ -105,7 +106,7 @@ class RepairWindow:
             few repairs under way: what a report names as lost does not wait then
         """
         mode = self.mode
-        if mode == "off" or not self.packets.wanted(now):
+        if mode == "off" or not self.wanted(now):
             return None
         thrifty = mode == "thrifty"
         if self._shared is not None and self.peers and (again := self._urgent_of_all(now, idle=True)) is not None:
@@ -120,6 +121,12 @@ class RepairWindow:
         if not thrifty and (lost := self.peers.lost(now)) is not None:
             return self._alone(lost, now)
         return self._combination(window, now)
+
+    def wanted(self, now: float) -> bool:
+        """Whether anything is to be repaired in idle slots. While all peers are out of range, no more than who hears
+        and is not heard needs."""
+        bounded = self.peers.gone and self._repair == AUTO
+        return not (bounded and not self._unreported.spares) and self.packets.wanted(now)
 
     def urgent(self, now: float) -> Repair | None:
         """What goes before new packets, because later messages wait for it: a packet that a report names as lost, or,

@@ -131,7 +131,7 @@ class RepairSlots:
         if waiting or (self._audiences is not None and self._audiences.due(now) is not None):
             return max(self._waits_until, now)
         mode = self._window.mode
-        if mode == "off" or not self._window.packets.wanted(now):
+        if mode == "off" or not self._window.wanted(now):
             return inf
         return max(self._waits_until, now if mode == "idle" else self._next_look(now))
 

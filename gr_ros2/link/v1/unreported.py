@@ -18,6 +18,13 @@ from gr_ros2.wire.v1 import MAX_WINDOW
 MOST_LOSS = 0.5
 """Loss up to which repairs are sent without reports in proportion to it."""
 
+TOGETHER = 6
+"""While all peers are out of range, each new packet allows as many repairs as are enough for this many packets, divided
+by their number: 2.0. Without a bound, an outage of 30 s beside odometry at 35 Hz took 887 kB of repairs instead of 395.
+Who hears and is not heard, at 10 and 20 % loss, gets as many messages of a topic without reliable publishers as without
+a bound, 98.7 and 97.3 % (98.7 and 98.1 %), with 20 here 98.1 and 95.7 %; messages in order are younger, since repairs
+of what it has do not go before those of what it lacks: 12 ms instead of .95 s at 35 Hz."""
+
 MEETING_S = 5.0
 """s after the start of a robot in which it does not fall silent, where packets are taken only after a proof. Without
 it, a message that was said once at the start came never, if the hello of the other robot came after its repairs: on a
@@ -39,15 +46,23 @@ class Unreported:
         """When packets may be over, s; inf until the first one leaves."""
         self._owed = 0.0
         """Number of repairs of long messages that are due."""
+        self._allows = self._enough(TOGETHER) / TOGETHER
+        self._spare = 0.0
+        """Number of repairs that may leave while all peers are out of range."""
         self._awaited = -1
         """Up to this number, they go before new packets: other messages wait for what was lost."""
 
     def sent(self, number: int, lifetimes: tuple[Lifetime, ...]) -> None:
         """A source packet left, and nobody reports."""
-        ordered = [lifetime for lifetime in lifetimes if lifetime.in_order]
-        if any(lifetime.long for lifetime in ordered):
+        long = awaited = False
+        for lifetime in lifetimes:
+            if lifetime.in_order:
+                long |= lifetime.long
+                awaited |= lifetime.awaited or not lifetime.long
+        if long:
             self._owed += self._enough(MAX_WINDOW) / MAX_WINDOW
-        if any(lifetime.awaited or not lifetime.long for lifetime in ordered):
+        self._spare += self._allows
+        if awaited:
             self._awaited = number + MAX_WINDOW
 
     def due(self, newest: int) -> bool:
@@ -61,6 +76,12 @@ class Unreported:
     def repaired(self) -> None:
         """A combination leaves."""
         self._owed = max(self._owed - 1, 0.0)
+        self._spare = max(self._spare - 1, 0.0)
+
+    @property
+    def spares(self) -> bool:
+        """Whether a repair may leave while all peers are out of range."""
+        return self._spare >= 1
 
     def cover(self, packets: Sequence[Sent], now: float) -> None:
         """These packets were combined, and nobody reports: those that were combined often enough are not needed."""

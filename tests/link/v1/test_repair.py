@@ -14,6 +14,7 @@ from gr_ros2.link.v1.decoder import RepairDecoder, window_numbers
 from gr_ros2.link.v1.gf256 import combine
 from gr_ros2.link.v1.lifetime import Lifetime
 from gr_ros2.link.v1.repair import RepairMode, RepairWindow
+from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.wire.control import LeftOut
 from gr_ros2.wire.v1 import MAX_WINDOW, REPAIR_IDS
 
@@ -28,7 +29,7 @@ def decoder(span: int = 4096) -> RepairDecoder:
     return RepairDecoder(ROOM, lambda _: True, span)
 
 
-def window(mode: RepairMode = "idle", count: int = 0, **settings: float) -> RepairWindow:
+def window(mode: RepairMode | Auto = "idle", count: int = 0, **settings: float) -> RepairWindow:
     made = RepairWindow(mode, ROOM, **settings)
     for number in range(1, count + 1):
         made.sent(number, body(number), (Lifetime(),), number / 100)
@@ -239,6 +240,31 @@ def test_two_receivers_are_served_by_combinations() -> None:
     assert sender.next(0.3) is not None
     sender.peers.forget(9)
     assert sender.next(0.4) is None
+
+
+def spent(sender: RepairWindow, count: int) -> list[Repair]:
+    """The repairs in idle air without end, after each of so many packets with messages in order."""
+    repairs = []
+    for number in range(sender.packets.newest + 1, sender.packets.newest + 1 + count):
+        sender.sent(number, body(number), (Lifetime(in_order=True),), float(number))
+        while (repair := sender.next(float(number))) is not None:
+            repairs.append(repair)
+    return repairs
+
+
+def test_repairs_are_bounded_while_all_receivers_are_out_of_range() -> None:
+    count = 60
+    alone = spent(window(AUTO, expected_loss=0.2), count)
+    sender = window(AUTO, expected_loss=0.2)
+    sender.peers.meet(9, 0.0)
+    sender.peers.leave(9)
+    repairs = spent(sender, count)
+    assert count < len(repairs) <= 2.1 * count < 3 * count < len(alone)
+    # Each packet is in several of them: who hears and is not heard misses none.
+    found = [sum(number in window_numbers(one.number, one.mask) for one in repairs) for number in range(1, count + 1)]
+    assert min(found[:-5]) > 3
+    sender.peers.meet(9, count + 1.0)
+    assert sender.mode == "thrifty"
 
 
 def test_a_report_of_what_was_never_sent_confirms_nothing() -> None:
