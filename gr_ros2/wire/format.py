@@ -160,6 +160,8 @@ def varint(value: int) -> bytes:
     """Seven bits per byte, the lowest first; the top bit says that more bytes follow."""
     if value < 128:
         return bytes((value,))
+    if value < 1 << 14:
+        return bytes((value & 127 | 128, value >> 7))
     parts = bytearray()
     while value > 127:
         parts.append(value & 127 | 128)

@@ -52,17 +52,6 @@ class _Limits:
     withheld_s: float | None
     deadline_s: float
 
-    def fresh_s(self, most_s: float, *, over: bool) -> float:
-        """s for which they may have been withheld. The age of one that came over others also has what it waited at its
-        origin, which its deadline allows.
-
-        :param most_s: ``DeliveryRules``'
-        :param over: whether they came over others
-        """
-        if self.withheld_s is not None:
-            return self.withheld_s
-        return max(most_s, self.deadline_s) if over and self.deadline_s < inf else most_s
-
     @classmethod
     def of(cls, topic: AnnouncedTopic, settings: Settings) -> _Limits:
         told = options_of(topic.name, settings.max_ages, settings.max_age_s)
@@ -209,7 +198,7 @@ class DeliveryRules:
         if topic.dst_id != BROADCAST and self._own not in (topic.dst_id, NOBODY):
             return Fate.NOT_FOR_US
         limits = self._limits_of(topic)
-        withheld_s = limits.fresh_s(self.withheld_s, over=ready.over is not None)
+        withheld_s = self._withheld_s(limits, over=ready.over is not None)
         if withheld_s < inf:
             oldest = self.sealed(ready) if ready.over is None else min(ready.sealed, ready.made)
             if now - oldest > withheld_s:
@@ -245,12 +234,23 @@ class DeliveryRules:
     def limit_s(self, topic: AnnouncedTopic) -> float:
         """Age in s at which a message of a topic that came over others is of no more use."""
         limits = self._limits_of(topic)
-        return min(limits.fresh_s(self.withheld_s, over=True), limits.deadline_s)
+        return min(self._withheld_s(limits, over=True), limits.deadline_s)
 
     def deadline_s(self, topic: AnnouncedTopic) -> float:
         """s for which a message of a topic may be under way, as this robot or else the one that sends it says; infinite
         for any time."""
         return self._limits_of(topic).deadline_s
+
+    def _withheld_s(self, limits: _Limits, *, over: bool) -> float:
+        """s for which messages may have been withheld. The age of one that came over others also has what it waited at
+        its origin, which its deadline allows.
+
+        :param over: whether they came over others
+        """
+        if limits.withheld_s is not None:
+            return limits.withheld_s
+        most_s = self.withheld_s
+        return max(most_s, limits.deadline_s) if over and limits.deadline_s < inf else most_s
 
     def _limits_of(self, topic: AnnouncedTopic) -> _Limits:
         limits = self._limits.get(topic.topic_id)

@@ -49,4 +49,4 @@ class Message(Outgoing):
     def back(self, number: int) -> int:
         """How many packets before this one it began; 0 if it begins there."""
         back = number - self.begin
-        return back if self.begin and (self.started or back <= MAX_BACK // 2) else 0
+        return back if self.begin and (self.index or back <= MAX_BACK // 2) else 0

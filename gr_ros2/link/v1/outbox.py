@@ -114,7 +114,7 @@ class Outbox:
             boot=boot,
             room=room,
             shares=settings.shares,
-            slow=lambda: settings.shares and settings.slower > 1,
+            slow=lambda: settings.slower > 1,
         )
         self.packing.turns.join(TABLE_TOPIC)
         if settings.relay:

@@ -78,7 +78,7 @@ class Packing:
     :param left: called with a message that has left whole, before its lifetime may end with the next one
     :param shares: whether others send on the same channel: a turn comes seldom then, and long messages take the room
         that others leave in every packet
-    :param slow: tells whether turns come so seldom that messages do not wait for rows of other topics
+    :param slow: tells whether they come so seldom that messages do not wait for rows of other topics
     :ivar turns: whose turn it is
     """
 
@@ -117,7 +117,7 @@ class Packing:
         :return: None if nothing may be sent
         """
         self._open = {}
-        if self._slow():
+        if self._shares and self._slow():
             self._arrange_rows()
         for topic_id, topic in self._topics.items():
             if topic.queue and (ready := topic.queue.open(now)):
@@ -138,7 +138,7 @@ class Packing:
             told = ages
             if age := self._age(message, now):
                 told = ages.ljust(len(picks), b"\0") + bytes((age,))
-            free = room - used - _size(told)
+            free = room - used - (_size(told) if told else 0)
             taken, size = fit(free, remaining, back, message.offset)
             if taken < 0 or not (taken == remaining or _may_cut(message, taken, used, room)):
                 continue
@@ -160,11 +160,13 @@ class Packing:
 
     def _age(self, message: Message, now: float) -> int:
         """The code of the age that is told of a message which may begin in this packet; 0 where it is not told."""
-        if message.started:
+        if message.index:
             return 0
-        waited_s, until = now - message.made, message.submitted + message.lifespan_s
-        limit_s = min(self._topics[message.topic_id].limit_s, until - message.made)
-        return age_code(waited_s) if waited_s > max(limit_s / TOLD, AGE_STEP_S) else 0
+        waited_s = now - (made := message.made)
+        if waited_s <= AGE_STEP_S:
+            return 0
+        limit_s = min(self._topics[message.topic_id].limit_s, message.submitted + message.lifespan_s - made)
+        return age_code(waited_s) if waited_s > limit_s / TOLD else 0
 
     def next_timeout(self, now: float) -> float:
         """When ``fill`` may have something, s; inf if nothing waits. What ``fills`` does not count."""
@@ -184,7 +186,7 @@ class Packing:
     @property
     def awaits_row(self) -> bool:
         """Whether the next packet brings a row of the table that messages wait for, where turns are rare."""
-        if not self._slow() or (table := self._topics.get(TABLE_TOPIC)) is None:
+        if not (self._shares and self._slow()) or (table := self._topics.get(TABLE_TOPIC)) is None:
             return False
         return any(row.started or not self._later(row) for row in table.queue)
 
@@ -332,7 +334,7 @@ class Packing:
 
 def _size(ages: bytes) -> int:
     """Bytes that ages take behind the last message, which then needs its length."""
-    return WAITED_LEN + len(ages) + 1 if ages else 0
+    return WAITED_LEN + len(ages) + 1
 
 
 def _may_cut(message: Message, taken: int, used: int, room: int) -> bool:

@@ -75,18 +75,20 @@ class Checksum:
 
     def close(self, clear: bytes, body: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
         data = clear + body
-        return data + crc(data, self._of(number >> 16))
+        if number >> 16 != self._turns:
+            self._turn(number >> 16)
+        return data + crc(data, self._session)
 
     def open(self, clear: bytes, rest: bytes, number: int, repair_id: int, *, plain: bool = False) -> bytes:  # noqa: ARG002
         body = rest[:-CRC_LEN]
-        if crc(clear + body, self._of(number >> 16)) != rest[-CRC_LEN:]:
+        if number >> 16 != self._turns:
+            self._turn(number >> 16)
+        if crc(clear + body, self._session) != rest[-CRC_LEN:]:
             raise CrcError("CRC-32 does not match: damaged, or of another start of the sender")
         return body
 
-    def _of(self, turns: int) -> int:
-        if turns != self._turns:
-            self._turns, self._session = turns, session_crc(self._boot, turns)
-        return self._session
+    def _turn(self, turns: int) -> None:
+        self._turns, self._session = turns, session_crc(self._boot, turns)
 
 
 class Seal:

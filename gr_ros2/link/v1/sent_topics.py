@@ -72,6 +72,8 @@ class SentTopic:
     :ivar kept: whether its newest messages are kept for robots that lack them; commands never are
     :ivar in_order: whether its messages are delivered in order, each after all earlier ones
     :ivar fresh: whether its old messages are of no use
+    :ivar is_stream: whether its messages are useless when newer ones have come, should the computer be too slow for
+        all. Whoever sets ``queue`` to fifo wants every message
     :ivar limit_s: s after which its messages are of no use, as far as this is known here; infinite for never
     """
 
@@ -94,6 +96,7 @@ class SentTopic:
     kept: bool = field(init=False)
     in_order: bool = field(init=False)
     fresh: bool = field(init=False)
+    is_stream: bool = field(init=False)
     limit_s: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -109,14 +112,8 @@ class SentTopic:
         reliable = self.publishers.reliable if options.reliability == AUTO else options.reliability == "reliable"
         self.in_order = self.coded or (reliable and (self.queue.policy != "latest" or self.shared))
         self.fresh = self.queue.deadline_s > 0 or self.topic.type_name == CALLS_TYPE
+        self.is_stream = self.topic.is_topic and not (self.kept or options.max_rate or options.queue == "fifo")
         self.limit_s = min(self.queue.deadline_s or inf, MAX_AGE_S if self.fresh else inf)
-
-    @property
-    def is_stream(self) -> bool:
-        """Whether its messages are useless when newer ones have come, should the computer be too slow for all. Whoever
-        sets ``queue`` to fifo wants every message."""
-        options = self.topic.options
-        return self.topic.is_topic and not self.kept and not options.max_rate and options.queue != "fifo"
 
     @property
     def has_turns(self) -> bool:
