@@ -255,7 +255,7 @@ def _compressed(message: bytes) -> _Picture:
     data = bytes(image.data)
     codec = {b"\xff\xd8": "mjpeg", b"\x89P": "png"}.get(data[:2])
     if codec is None or "compressedDepth" in image.format:
-        raise OtherKindError(f"image: format {image.format!r} is not JPEG or PNG")
+        raise OtherKindError(f"image: {len(data)} bytes of format {image.format!r} are not JPEG or PNG")
     picture = video.still(codec, data, _MOST_SEEN)
     if "16" in picture.format.name or "48" in picture.format.name or "64" in picture.format.name:
         raise UnfitError(f"image: format {image.format!r} with 16 bits for each colour ({picture.format.name})")

@@ -39,9 +39,12 @@ _FILLED = 11 * _KILOBIT
 """Bytes of a budget below which whole kilobits are too coarse."""
 _LARGER, _LATELY = 1.25, 0.125
 """Times the mean budget that the buffer of a small frame is at least, and the weight of the newest in the mean."""
-_MOST_ASKED, _LESS = 1.28, 0.27
+_MOST_ASKED, _LESS = 1.22, 0.22
 """Times a small budget is asked for in a much larger buffer, and by how much less in one that it fills: a frame comes
 out shorter in a larger one."""
+_SMALL, _LONGER = 40_000, "fast"
+"""Pixels of a picture up to which x264 searches longer: frames of 60 to 360 bytes are .6 dB better for .6 ms. At
+640 × 480 it would be .1 dB, for 13 ms."""
 _X264 = {
     "preset": "veryfast",
     "tune": "zerolatency",
@@ -80,7 +83,7 @@ class H264Encoder:
         made.time_base, made.framerate, made.thread_count = Fraction(1, _FPS), Fraction(_FPS), 1
         made.flags |= _GLOBAL_HEADER
         made.bit_rate = _TOP
-        made.options = dict(_X264)
+        made.options = _X264 | ({"preset": _LONGER} if width * height <= _SMALL else {})
         self._context, self._count = made, 0
         self._mean = 0.0
         self._key = b""
