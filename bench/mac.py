@@ -34,8 +34,9 @@ LENGTHS_S = (0.004, 0.02, 0.1, 0.2, 0.4, 1.0)
 SEEDS = (1, 2, 3)
 MANY_SEEDS = range(1, 13)
 """Where chance decides when groups of robots find common slots."""
-SOUND_S, APART_S, GIVEN_UP_S = 0.53, 3.0, 150.0
-"""s that a packet of preset ``sound`` takes; within which the robots are switched on; after which they are given up."""
+SOUND_S, SOUND_LEN, APART_S, GIVEN_UP_S = 0.766, 135, 3.0, 150.0
+"""s that a packet of preset ``sound`` takes, and its bytes; s within which the robots are switched on; after which they
+are given up."""
 FIRST_SEEDS = range(48)
 Graph = list[set[int]]
 
@@ -236,7 +237,7 @@ def first_messages(robots: int, mode: SealMode, seed: int) -> First:
     """Whole endpoints that are switched on within ``APART_S``, on a channel of packets as of preset ``sound``."""
     rng = random.Random(seed)
     on = sorted(rng.uniform(0, APART_S) for _ in range(robots))
-    sound = Sound(SOUND_S, *(at - on[0] for at in rng.sample(on, robots)), mode=mode, seed=seed)
+    sound = Sound(SOUND_S, *(at - on[0] for at in rng.sample(on, robots)), mode=mode, seed=seed, packet_len=SOUND_LEN)
     heard: dict[tuple[int, int], float] = {}
 
     def all_heard() -> bool:
@@ -252,7 +253,7 @@ def first_messages(robots: int, mode: SealMode, seed: int) -> First:
 
 
 def first() -> list[Row]:
-    """The first messages where a packet takes half a second and is composed .4 s ahead: medians over many seeds."""
+    """The first messages where a packet takes .77 s and is composed .4 s ahead: medians over many seeds."""
     rows, modes = [], {"none": "", "encrypt": " with a key"}
     with ProcessPoolExecutor() as pool:
         for robots in (2, 3):

@@ -127,10 +127,11 @@ class Reader:
         """Learn from a packet, whatever its position among the others, how its sender's packets are read."""
         try:
             header, repair, start, end = self._clear(data)
-            if repair is None or not repair.clear:
+            if not (repair.clear if repair is not None else not header.sealed):
                 return
-            hello = self._hello(header, data[start:end])
-            trailers, _ = self._check_hello(header, hello, data, start, repair.repair_id)
+            hello = self._hello(header, data[start:end], first=repair is not None)
+            repair_id = NOT_A_REPAIR if repair is None else repair.repair_id
+            trailers, _ = self._check_hello(header, hello, data, start, repair_id)
         except WireError:
             return
         starts = self._starts.setdefault(header.src_id, [])
@@ -175,11 +176,13 @@ class Reader:
     def _room(self, header: Header) -> int:
         return header.room(self._packet_len)
 
-    def _hello(self, header: Header, body: bytes) -> Hello:
+    def _hello(self, header: Header, body: bytes, *, first: bool = True) -> Hello:
+        """The hello in a body: its first entry, or any."""
         entries = read_body(body, self._room(header))
-        if not entries or not isinstance(entries[0], Hello):
-            raise EntryKindError("a packet in the clear that does not begin with a hello")
-        return entries[0]
+        for entry in entries[:1] if first else entries:
+            if isinstance(entry, Hello):
+                return entry
+        raise EntryKindError("a packet in the clear that does not begin with a hello")
 
     def _check_hello(
         self, header: Header, hello: Hello, data: bytes, start: int, repair_id: int

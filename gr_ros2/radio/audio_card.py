@@ -58,8 +58,10 @@ _PASS_S = 0.15
 """s before a block is made in which a burst must come: its way through GNU Radio's buffers, and two blocks."""
 _SETTLED = 20
 """Blocks after which a server has settled on how far ahead it asks for them."""
-_OPEN_S = 2.0
-"""s in which a card must ask for so many blocks."""
+_OPEN_S = 10.0
+"""s in which a card must ask for so many blocks: with a load of seven per core, some take longer than two."""
+_FAR_S = 2.0
+"""s that the time of a block at the converter is away from now at most; what is more is wrong."""
 _MOST_BLOCKS = 1000
 """Blocks that may wait for the flowgraph, 10 s."""
 _WAIT_S = 0.05
@@ -167,7 +169,7 @@ def _close(stream: Any) -> None:
 def _from_now(told: float, now: float, otherwise: float) -> float:
     """s from the call to when a block is at the converter; some systems tell no times, and others wrong ones."""
     away = told - now
-    return away if now > 0 and told > 0 and abs(away) < _OPEN_S else otherwise
+    return away if now > 0 and told > 0 and abs(away) < _FAR_S else otherwise
 
 
 class Speaker(KeepsThreadState, gr.sync_block):  # type: ignore[misc]

@@ -782,6 +782,38 @@ local function meet(buffer, packet, at)
     known[#known + 1] = { boot = boot, newest = number, encrypts = buffer(at + 12, 1):bitfield(6, 1) == 1 }
 end
 
+-- Where the hello of a body begins, behind its name and size; nil where there is none. It is the first entry of a control
+-- packet; in a packet of messages it may follow them.
+local function find_hello(buffer, at, limit, messages)
+    while at + 2 <= limit and buffer(at, 1):uint() > 0 do
+        local name, second = buffer(at, 1):uint(), buffer(at + 1, 1):uint()
+        if name > CARRIED_TOPIC + 1 then
+            if CONTROLS[name] == "hello" and second >= HELLO_LEN and at + 2 + second <= limit then
+                return at + 2
+            end
+            at = at + 2 + second
+        else
+            local long, kind = second % 32 < 16, math.floor(second / 64)
+            if at + 3 > limit or (not long and second % 16 == 0) then
+                return nil
+            end
+            local size = long and second % 16 * 256 + buffer(at + 2, 1):uint() or second % 16
+            at = at + (long and 3 or 2)
+            for _ = 1, kind >= 2 and 2 or 0 do
+                while at < limit and buffer(at, 1):uint() > 127 do
+                    at = at + 1
+                end
+                at = at + 1
+            end
+            at = at + size
+        end
+        if not messages then
+            return nil
+        end
+    end
+    return nil
+end
+
 -- Which start of its sender a packet belongs to, found when it is read for the first time: by its CRC, or the newest.
 local function look_up(buffer, packet, limit)
     local known = starts[packet.src] or {}
@@ -865,9 +897,13 @@ local function dissect_v1(buffer, pinfo, tree, apart)
         clear = window == 0 and clear
     end
     if first_time then
-        local hello = clear and at + 2 + HELLO_LEN <= limit and CONTROLS[buffer(at, 1):uint()] == "hello"
-        if hello then
-            meet(buffer, packet, at + 2)
+        local messages = not repair and not sealed
+        local hello = at and (clear or messages) and find_hello(buffer, at, limit, messages)
+        -- That of another start has no effect in a packet of messages.
+        local own = hello and (clear or buffer(limit, 4):uint() == expected_crc32(
+            buffer(hello, 8):bytes():tohex(), buffer(hello + 8, 4):uint(), buffer(0, limit)))
+        if own then
+            meet(buffer, packet, hello)
         end
         look_up(buffer, packet, limit)
     end

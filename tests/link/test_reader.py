@@ -9,6 +9,7 @@ from gr_ros2.core.errors import WireError
 from gr_ros2.link.reader import Dissection, Reader
 from gr_ros2.link.v1.sealing import SealMode
 from gr_ros2.wire.control import Hello, Report
+from gr_ros2.wire.v1 import Header, PacketV1, Part, encode
 from tests.link.v1.air import KEY, Air, Robot, registry
 
 MODES: list[SealMode] = ["none", "authenticate", "encrypt"]
@@ -118,3 +119,17 @@ def test_forged_hellos_do_not_pile_up() -> None:
         reader.learn(data)
     assert sum(reader.read(data).check == "CRC ok" for data in packets) == len(packets)
     assert len(reader._starts[1]) <= 256
+
+
+def test_a_hello_behind_a_message_tells_how_the_packets_of_its_start_are_read() -> None:
+    """Where turns are rare, a robot without a key sends no other."""
+    hello = Hello(7 << 32, 0, 1, 0)
+    packets = [
+        encode(PacketV1(Header(0, False, 1, number), (Part(0, b"odom"), *also)), 64, hello.boot)
+        for number, also in ((1, ()), (2, (hello,)))
+    ]
+    _, looks = read(packets)
+    assert [look.check for look in looks] == ["CRC ok"] * 2
+    damaged = bytearray(packets[1])
+    damaged[10] ^= 1
+    assert read([bytes(damaged), packets[0]])[1][1].check.startswith("CRC not checked")

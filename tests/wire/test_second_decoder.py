@@ -172,10 +172,18 @@ def test_a_hello_that_is_not_first_in_the_clear_and_a_message_in_a_control_packe
     cases = {case["name"]: bytes.fromhex(case["hex"]) for case in VECTORS["packets"]}
     two.receive(cases["a message in a control packet, which has no effect there"], 1.1)
     assert (known.boot, known.hello, len(two.delivered())) == before
-    two.receive(cases["a hello in a source packet, which has no effect there"], 1.1)
+    two.receive(cases["a hello of another start in a source packet, which has no effect there"], 1.1)
     assert two.end.neighbours.all.get(1) is known and 6 in known.inbox.decoder
     assert (known.boot, known.hello) == before[:2]
     assert two.end.received.rejected.total() == 0
+
+
+def test_a_hello_of_its_own_start_behind_a_message_is_how_a_robot_is_met() -> None:
+    two = Robot(2)
+    (case,) = [case for case in VECTORS["packets"] if "by which the robot is met" in case["name"]]
+    two.receive(bytes.fromhex(case["hex"]), 1.0)
+    assert two.end.neighbours.all[1].boot == case["boot"]
+    assert case["number"] in two.end.neighbours.all[1].inbox.decoder
 
 
 def test_coefficients() -> None:

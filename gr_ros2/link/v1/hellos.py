@@ -171,13 +171,18 @@ class Hellos:
         return any(not neighbour.silent for neighbour in self._neighbours.all.values())
 
     @property
+    def met_all(self) -> bool:
+        """Whether robots are heard, and all of them have heard this one and prove it."""
+        heard = [neighbour for neighbour in self._neighbours.all.values() if not neighbour.silent]
+        return bool(heard) and all(neighbour.knows and neighbour.proven for neighbour in heard)
+
+    @property
     def _rests(self) -> bool:
         """Whether messages go before hellos on a slow channel: always where all that are heard have heard this robot,
         and prove it."""
-        heard = [neighbour for neighbour in self._neighbours.all.values() if not neighbour.silent]
-        met = all(neighbour.knows and neighbour.proven for neighbour in heard)
         access = self._settings.access
-        return bool(heard) and (met or (self._yields > 0 and access is not None and access.named))
+        named = access is not None and access.named
+        return self.met_all or (self._hears_others and self._yields > 0 and named)
 
     @property
     def _period(self) -> float:

@@ -1,7 +1,7 @@
 """The robots that are heard: the current start of each, how its packets are opened, and which packets are refused.
 
 A robot's packets can be opened once a hello has told its boot number. Packets that arrive shortly before the hello are
-kept until then.
+kept until then. Where packets are not sealed, a packet of messages may bring the hello itself.
 
 *Replays.* Where packets are sealed and two robots hear each other, a packet of messages is used only if it was sealed
 after this robot started, which the other robot proves (``proofs``). Packets that arrive before the first proof are kept
@@ -237,6 +237,8 @@ class Neighbours:
             start += repair.size
         neighbour = self.all.get(header.src_id)
         if neighbour is None:
+            if repair is None and self._greets(data, header):
+                return self._hello(data, header, None, now)
             self._keep(header.src_id, data, now)
             self.dropped["early"] += 1
             return None
@@ -245,6 +247,8 @@ class Neighbours:
         try:
             body = neighbour.trailer.open(data[:start], data[start:], number, repair_id)
         except (CrcError, TagError):
+            if repair is None and self._greets(data, header):
+                return self._hello(data, header, None, now)
             self._keep(header.src_id, data, now)
             raise
         control = repair is not None and not repair.mask
@@ -374,33 +378,48 @@ class Neighbours:
             counts, exact = self._counts_on_store(neighbour.hello), neighbour.inbox.newest + 1
             self.floors.settle(neighbour.floor, exact, neighbour.heard, now, counts=counts)
 
+    def _greets(self, data: bytes, header: Header) -> bool:
+        """Whether a packet of messages that is not sealed has a hello of the start that sent it."""
+        if header.sealed:
+            return False
+        try:
+            hello, _, clear, rest = self._read_hello(data, header, None)
+            self._trailer(header.src_id, hello, clear, rest, (hello.turns << 16 | header.number, NOT_A_REPAIR))
+        except WireError:
+            return False
+        return True
+
     def _read_hello(
-        self, data: bytes, header: Header, repair: RepairHeader
+        self, data: bytes, header: Header, repair: RepairHeader | None
     ) -> tuple[Hello, list[EntryV1], bytes, bytes]:
         """A hello, all entries of its packet, and the packet before and after its body begins."""
-        start = header.size + repair.size
-        room = header.room(self._settings.packet_len)
-        entries = read_body(data[start : len(data) - self._keys.trailer_len], room)
-        if not entries or not isinstance(entries[0], Hello):
-            raise EntryKindError("a packet in the clear that does not begin with a hello")
-        return entries[0], entries, data[:start], data[start:]
+        start = header.size + (0 if repair is None else repair.size)
+        entries = read_body(data[start : len(data) - self._trailer_len], header.room(self._settings.packet_len))
+        for entry in entries if repair is None else entries[:1]:
+            if isinstance(entry, Hello):
+                return entry, entries, data[:start], data[start:]
+        raise EntryKindError("a packet in the clear that does not begin with a hello")
 
-    def _hello(self, data: bytes, header: Header, repair: RepairHeader, now: float) -> Opened:
-        """Open a packet with a hello, which itself says how the packet is opened."""
+    def _hello(self, data: bytes, header: Header, repair: RepairHeader | None, now: float) -> Opened:
+        """Open a packet with a hello, which itself says how the packet is opened.
+
+        :param repair: None for a packet of messages
+        """
         src_id, sealed = header.src_id, self._keys.sealed
         hello, entries, clear, rest = self._read_hello(data, header, repair)
-        number = hello.turns << 16 | header.number
+        number, repair_id = hello.turns << 16 | header.number, NOT_A_REPAIR
+        after, body = number, rest[: len(rest) - self._trailer_len]
+        if repair is not None:
+            repair_id, after, body = repair.repair_id, number + 1, b""
         neighbour = self.all.get(src_id)
         if neighbour is not None and neighbour.boot == hello.boot:
-            neighbour.trailer.open(clear, rest, number, repair.repair_id, plain=True)
+            neighbour.trailer.open(clear, rest, number, repair_id, plain=True)
             jumps = not sealed and abs(number - neighbour.inbox.newest) > _HALF
             if not (jumps and neighbour.silent):
-                if jumps or not neighbour.new(number, repair.repair_id):
+                if jumps or not neighbour.new(number, repair_id):
                     raise ReplayedError(f"a hello of robot {src_id} at packet {number} was here before, or cannot be")
-                if number >= neighbour.hello_number:
-                    neighbour.hello, neighbour.hello_number = hello, number
-                    neighbour.proves = self._proves(hello)
-                return self._opened(Opened(neighbour, header, number, repair, b"", entries), now)
+                self.greeted(neighbour, hello, number)
+                return self._opened(Opened(neighbour, header, number, repair, body, entries), now)
         boot, floor = self.floors.of(src_id)
         robot = self._robots.of(src_id)
         before = robot.met
@@ -411,19 +430,19 @@ class Neighbours:
         if refused:
             if number >= self._ended.get((src_id, hello.boot), _MOST):
                 # No recording of what was heard: the robot of that start goes on, or what it sent then comes only now.
-                self._trailer(src_id, hello, clear, rest, (number, repair.repair_id))
+                self._trailer(src_id, hello, clear, rest, (number, repair_id))
                 self.sent_by_another_start(src_id, hello.boot, now, now)
             newest = boot if neighbour is None else neighbour.boot
             raise ReplayedError(f"start {hello.boot:016x} of robot {src_id}, after start {newest:016x} was heard")
-        trailer = self._trailer(src_id, hello, clear, rest, (number, repair.repair_id))
+        trailer = self._trailer(src_id, hello, clear, rest, (number, repair_id))
         again, stores = boot == hello.boot, self._counts_on_store(hello)
         if again and stores and number < floor:
             raise ReplayedError(f"a hello of robot {src_id} from before packet {floor}, up to which it was heard")
         if neighbour is None:
             neighbour = self._place_for(src_id)
-        first = 1 if number <= START else number + 1
+        first = 1 if number <= START and repair is not None else after
         if again:
-            first = max(first, floor if stores else number + 1)
+            first = max(first, floor if stores else after)
         if neighbour is not None:
             self._ended[neighbour.src_id, neighbour.boot] = neighbour.inbox.newest + 1
             if len(self._ended) > _STARTS:
@@ -447,11 +466,17 @@ class Neighbours:
             proves,
         )
         robot.met = now
-        met.new(number, repair.repair_id)
+        met.new(number, repair_id)
         self.all[src_id] = met
         self.floors.store(met.floor, max(first, number + 1) if stores else 0, now)
-        opened = Opened(met, header, number, repair, b"", entries, appeared=True, replaced=neighbour)
+        opened = Opened(met, header, number, repair, body, entries, appeared=True, replaced=neighbour)
         return self._opened(opened, now)
+
+    def greeted(self, neighbour: Neighbour, hello: Hello, number: int) -> None:
+        """Note a hello of the present start of a robot, at a packet number."""
+        if number >= neighbour.hello_number:
+            neighbour.hello, neighbour.hello_number = hello, number
+            neighbour.proves = self._proves(hello)
 
     def _trailer(self, src_id: int, hello: Hello, clear: bytes, rest: bytes, place: tuple[int, int]) -> Trailer:
         encrypt = hello.capabilities & ENCRYPTS != 0

@@ -263,6 +263,8 @@ class ReceivingSide:
         )
         self._outcomes.events.append(received)
         if repair is None:
+            if self._access is not None and not header.sealed:
+                self._joined(neighbour, number, entries)
             inbox.source(number, opened.body, entries, header.qos, now, began=began)
         elif mask:
             inbox.repair(
@@ -300,6 +302,13 @@ class ReceivingSide:
             elif isinstance(entry, (Ping, About)):
                 self._outcomes.facts.append(Questioned(neighbour.src_id, entry))
         inbox.heard(number, now, began, over=repair.oldest)
+
+    def _joined(self, neighbour: Neighbour, number: int, entries: Sequence[EntryV1]) -> None:
+        """Take the hello, if there is one, in a packet of messages."""
+        for entry in entries:
+            if isinstance(entry, Hello) and entry.boot == neighbour.boot:
+                self.neighbours.greeted(neighbour, entry, number)
+                self._greeted(neighbour)
 
     def _appear(self, opened: Opened, now: float) -> None:
         """Something of a robot comes for the first time, or again: it is answered, so that it can prove that it hears

@@ -7,6 +7,7 @@ entries about other robots' packets (``report_slots``); a repair.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
 
 from gr_ros2.link.events import SentPacket
@@ -40,7 +41,17 @@ from gr_ros2.link.v1.reports import Reporter
 from gr_ros2.link.v1.slowness import Slowness
 from gr_ros2.link.v1.writer import PacketWriter, SendSlot
 from gr_ros2.relay.gain import TOLD
-from gr_ros2.wire.control import LEFT_OUT_LEN, NEWEST_LEN, Heard, Hello, Newest, Report, length_of
+from gr_ros2.wire.control import (
+    LEFT_OUT_LEN,
+    NEWEST_LEN,
+    Control,
+    Heard,
+    Hello,
+    Newest,
+    Report,
+    length_of,
+    write_control,
+)
 from gr_ros2.wire.v1 import BROADCAST, TABLE_TOPIC
 
 MOST_REPEATS = 32
@@ -125,6 +136,8 @@ class SendingSide:
             idle = packing.next_timeout(now) > now
             if hellos.urgent(now, idle=idle, latency=packing.urgent, heard=bool(self._window.peers)):
                 return self._hello(slot)
+        elif self._joins and not hellos.met_all and packing.next_timeout(now) <= now:
+            return self._hello(slot)  # whoever hears this packet first needs no other
         if now >= self.pings.due:
             snrs_db = {n.src_id: n.inbox.reports.snr.snr_db for n in self._neighbours.all.values()}
             return self._writer.control(self.pings.entries(self._writer.room, snrs_db, now), "hello", slot)
@@ -155,9 +168,15 @@ class SendingSide:
         wait = not self._messages.packing.fills or self.repairs.held(slot.now, repairs=False)
         return None if wait else self._fill([], slot, spare=True)
 
-    def _fill(self, due: list[Reporter], slot: SendSlot, *, spare: bool = False) -> SentPacket | None:
-        """A packet with messages."""
+    def _fill(
+        self, due: list[Reporter], slot: SendSlot, *, spare: bool = False, hello: Sequence[Control] = ()
+    ) -> SentPacket | None:
+        """A packet with messages.
+
+        :param hello: goes along
+        """
         now, reports, room = slot.now, self.reports, self._writer.room
+        room -= sum(len(write_control(entry)) for entry in hello) + LENGTH_LEN * bool(hello)
         told: list[Newest] = []
         if self._relaying is not None:
             told = self._relaying.tells(now)
@@ -177,7 +196,7 @@ class SendingSide:
         self._slowness.waited(filling.since, now)
         if due or now >= reports.requests.check_at:
             reports.add(filling.parts, room - filling.used, due, now)
-        filling.parts += told
+        filling.parts += [*told, *hello]
         lifetimes = () if spare else filling.lifetimes
         if parts and filling.robots is None and any(lifetime.in_order for lifetime in lifetimes):
             filling.parts.append(self._window.packets.left_out(now))
@@ -357,6 +376,12 @@ class SendingSide:
         if not self._window.peers:
             self._messages.kept.announce(now)
 
+    @property
+    def _joins(self) -> bool:
+        """Whether hellos go along with messages: turns are rare, and no message in the clear would betray anything."""
+        slow = self.settings.shares and self.settings.slower > 1
+        return slow and not self._writer.sealed and self._rate is None
+
     def _hello(self, slot: SendSlot) -> SentPacket:
         now, window, kept, newest = slot.now, self._window, self._messages.kept, self._window.packets.newest
         again = newest == self._hello_number and not self.hellos.starting
@@ -367,11 +392,14 @@ class SendingSide:
         self._hello_number = newest
         self.hellos.begin()
         starting = self.hellos.starting
-        often = starting or (now >= self._table_at and not self.hellos.lone)
-        if often and not window.peers and kept.digest:  # no report says whether it has arrived
+        unmet = self._joins and not self.hellos.met_all
+        often = starting or unmet or (now >= self._table_at and not self.hellos.lone)
+        if often and (unmet or not window.peers) and kept.digest:  # no report says whether it has arrived
             self._table_at = now + kept.table_packets * self._pace.interval / TABLE_SHARE
             kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
+        if self._joins and (joined := self._fill([], slot, hello=entries)) is not None:
+            return joined
         sent = self._writer.control(entries, "hello", slot, clear=isinstance(entries[0], Hello))
         proving = [entry.src_id for entry in entries if isinstance(entry, Heard)]
         starts = frozenset((src_id, self._neighbours.all[src_id].boot) for src_id in proving)

@@ -7,12 +7,14 @@ from collections.abc import Callable
 from itertools import pairwise
 from math import inf
 from statistics import median
+from typing import Any
 
 import pytest
 
 from gr_ros2.link.airtime import LEAD_S, AirtimeClock
 from gr_ros2.link.v1.sealing import Keys, SealMode
 from gr_ros2.mac import Slots
+from gr_ros2.settings.config import SendOptions
 from gr_ros2.wire.mac_block import Block, read_block, write_block
 from gr_ros2.wire.v1 import (
     QOS_REPAIR,
@@ -164,7 +166,7 @@ class Sound:
     :param on: when each robot is switched on, s
     """
 
-    def __init__(self, airtime_s: float, *on: float, mode: SealMode, seed: int = 0) -> None:
+    def __init__(self, airtime_s: float, *on: float, mode: SealMode, seed: int = 0, packet_len: int = 64) -> None:
         self.robots, self.now, self.late, self.sent = list[Robot](), 0.0, 0, 0
         self._airtime_s, self._on = airtime_s, on
         self._gates = [AirtimeClock[bytes](airtime_s, ahead=AHEAD_S) for _ in on]
@@ -174,7 +176,7 @@ class Sound:
         for src_id in range(1, len(on) + 1):
             rng = random.Random(100 * seed + src_id)
             access = Slots(src_id, airtime_s + 0.05, rng, period_s=0.0, lead_s=LEAD_S + AHEAD_S)
-            self.robots.append(Robot(src_id, registry(), mode=mode, access=access))
+            self.robots.append(Robot(src_id, registry(), mode=mode, access=access, packet_len=packet_len))
 
     def run(self, seconds: float, *, speak: bool = True, until: Callable[[], bool] = lambda: False) -> None:
         """So long, or until something is so; every robot has a new message each second."""
@@ -278,6 +280,56 @@ def test_a_row_goes_before_its_messages_and_rows_of_silent_topics_take_what_is_l
     silent = [place for place, entry in enumerate(entries) if entry.topic_id == TABLE_TOPIC and entry.payload[1] == 2]
     assert len(two.delivered()) == 8
     assert messages[-1] < silent[0]
+
+
+def rare(src_id: int, **settings: Any) -> Robot:
+    """A robot of a channel whose packets take half a second, with a reliable topic."""
+    access = Slots(src_id, 0.6, random.Random(src_id), period_s=0.0)
+    topics = registry(odom=SendOptions(reliability="reliable"))
+    return Robot(src_id, topics, access=access, **{"packet_len": 135, **settings})
+
+
+def sent_by(one: Robot, count: int) -> list[bytes]:
+    """Its next packets, with a new message for each."""
+    now, packets = 0.0, list[bytes]()
+    one.end.handle_timeout(now)
+    while len(packets) < count:
+        one.end.messages.submit(0, b"message %d" % len(packets), now)
+        while (data := one.slot(now)) is None:
+            now = max(now, one.end.next_departure(credited=True) or now)
+        packets.append(data)
+    return packets
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_where_turns_are_rare_the_first_packet_that_is_heard_brings_its_message(lost: int) -> None:
+    """It tells who its sender is, its topic, and a message; what was sent to nobody is not waited for."""
+    one, two = rare(1), rare(2)
+    packets = sent_by(one, lost + 1)
+    two.receive(packets[-1], 10.0, 9.5)
+    assert two.delivered(1) == [b"message %d" % lost]
+    two.receive(packets[-1], 11.0, 10.5)
+    assert two.delivered(1) == [b"message %d" % lost], "a recording delivers nothing again"
+
+
+def test_a_robot_that_starts_again_is_met_by_a_message_too() -> None:
+    one, two = rare(1), rare(2)
+    two.receive(sent_by(one, 1)[0], 10.0, 9.5)
+    one.access = Slots(1, 0.6, random.Random(7), period_s=0.0)
+    one.start()
+    again = sent_by(one, 1)[0]
+    two.receive(again, 60.0, 59.5)
+    assert two.delivered(1) == [b"message 0"] * 2
+    damaged = bytearray(again)
+    damaged[30] ^= 1
+    two.receive(bytes(damaged), 61.0, 60.5)
+    assert len(two.delivered(1)) == 2
+
+
+@pytest.mark.parametrize("mode", ["authenticate", "encrypt"])
+def test_with_a_key_hellos_stay_alone(mode: SealMode) -> None:
+    one = rare(1, mode=mode, packet_len=64)
+    assert [is_repair(data) for data in sent_by(one, 2)] == [True, True]
 
 
 def team(size: int) -> tuple[list[Robot], list[Slots]]:
