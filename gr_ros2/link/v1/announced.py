@@ -34,7 +34,6 @@ class AnnouncedTopics:
     :param most: bytes of the table, and of messages that may wait for it
     :ivar topics: those that are offered, by topic id
     :ivar digest: sum of the marks of the rows that are known
-    :ivar newest: number of the packet that brought the newest row, and when, s
     """
 
     def __init__(
@@ -44,7 +43,8 @@ class AnnouncedTopics:
     ) -> None:
         self.topics: dict[int, AnnouncedTopic] = {}
         self.digest = 0
-        self.newest = (-1, -inf)
+        self._newest = (-1, -inf)
+        """Number of the packet that brought the newest row, and when, s."""
         self._rows: dict[int, AnnouncedTopic] = {}
         self._orders: dict[int, tuple[int, int]] = {}
         """The order of the newest row of each topic that the robot's own packets brought."""
@@ -58,6 +58,10 @@ class AnnouncedTopics:
     def held(self) -> int:
         """Bytes of the table and of the messages that wait for it."""
         return self._bytes + self._row_bytes
+
+    def came(self, number: int, now: float) -> None:
+        """A row has come in a packet of the robot itself."""
+        self._newest = max(number, self._newest[0]), now
 
     def topic_of(self, ready: Ready | Relayed) -> AnnouncedTopic | None:
         """The topic of a message; None if the message has to wait for a table."""
@@ -113,7 +117,7 @@ class AnnouncedTopics:
 
     def lacks(self, digest: int, number: int, since: float) -> bool:
         """Whether rows of a table, named in a hello at a packet number, are not here, and none came since then, s."""
-        newest, at = self.newest
+        newest, at = self._newest
         return digest != self.digest and newest <= number and at <= since
 
     def waiting(self) -> list[Ready]:

@@ -127,7 +127,7 @@ class ArrivingMessages:
             waited_s = 0.0 if waited is None else min(waited.age_s(place), UNKNOWN_S)
             topic = self.announced.topics.get(entry.topic_id)
             if topic is None or topic.reliable or topic.latched:
-                self._reports.confirms = True
+                self._reports.confirm()
             if entry.whole:
                 ready = Ready(entry.topic_id, (number, place), entry.payload, qos, entry.coded, repaired)
                 self._arrived(ready, repaired_s, waited_s)
@@ -175,7 +175,7 @@ class ArrivingMessages:
                 self._of_another(ready)
             return
         if ready.topic_id == TABLE_TOPIC:
-            self.announced.newest = max(ready.order[0], self.announced.newest[0]), self._now
+            self.announced.came(ready.order[0], self._now)
             self._table(ready.payload, ready.order)
         if self._relaying is not None:
             if ready.topic_id == TABLE_TOPIC:

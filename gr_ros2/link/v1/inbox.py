@@ -240,8 +240,7 @@ class Inbox:
         if len(combined) > self._room and combined.count(0, self._room) < len(combined) - self._room:
             raise PadError(f"a combination of {len(combined)} bytes, where bodies have {self._room}")
         self._began = began
-        self.reports.unreported += new
-        self.reports.confirms = True
+        self.reports.repair(new=new)
         self._advance(number, now, here=False, late=True)
         window = mask.bit_length()
         if oldest:
@@ -289,7 +288,7 @@ class Inbox:
             self.order.repaired_from(number - MAP + 1)
         self._settle()
         if self.order.held:
-            self.reports.unreported += 1  # its sender goes on to what is waited for now
+            self.reports.repair(new=True)  # its sender goes on to what is waited for now
 
     def handle_timeout(self, now: float) -> None:
         """Go on without packets that have been waited for long enough."""
@@ -352,7 +351,7 @@ class Inbox:
         :param late: it may have reached it long ago
         """
         self._now = now
-        self.order.heard = now
+        self.order.hear(now)
         newest = self.decoder.newest
         if not late:
             silence, self._heard = now - self._heard, now

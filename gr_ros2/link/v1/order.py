@@ -102,7 +102,6 @@ class Order:
     :ivar low: every packet before this number is here or given up
     :ivar wanted: every packet before this number is here, or is not repaired any more
     :ivar held: bytes of the messages that wait
-    :ivar heard: when the sender was heard last, s
     :ivar all_from: from this packet number on no message was given up for want of memory
     :ivar reached: the newest message of each topic that came out; all before it came out or are given up
     :ivar passed_on: the newest message of each topic that is kept for others
@@ -125,7 +124,8 @@ class Order:
         self.told = False
         self.low = self.wanted = self.all_from = first
         self.held = 0
-        self.heard = -inf
+        self._heard = -inf
+        """When the sender was heard last, s."""
         self.reached: dict[int, tuple[int, int]] = {}
         self.passed_on: dict[int, tuple[int, int]] = {}
         self._since: dict[int, float] = {}
@@ -148,6 +148,14 @@ class Order:
         self._waiting: dict[int, list[Ready]] = {}
         self._asked = -inf
         """When it was looked last, s."""
+
+    def hear(self, now: float) -> None:
+        """The sender was heard."""
+        self._heard = now
+
+    def reported(self) -> None:
+        """The sender gets reports, to the end of this start: it keeps what is lacked here."""
+        self.told = True
 
     def missing(self, now: float, first: int, last: int) -> None:
         """Note that these packets had not arrived when the sender went on."""
@@ -256,7 +264,7 @@ class Order:
         self.wanted = wanted
         self.low = low
         due: list[Ready] = []
-        quiet = now >= self.heard + self._quiet_s
+        quiet = now >= self._heard + self._quiet_s
         for topic_id, line in self._waiting.items():
             if line:
                 passed = self._pass(topic_id)
@@ -310,9 +318,9 @@ class Order:
         soonest = inf
         for line in self._waiting.values():
             if line and line[0].over is not None:
-                soonest = min(soonest, max(self._until(line[0]), self.heard + self._quiet_s))
-                if self._asked < self.heard + self._quiet_s:
-                    soonest = min(soonest, self.heard + self._quiet_s)
+                soonest = min(soonest, max(self._until(line[0]), self._heard + self._quiet_s))
+                if self._asked < self._heard + self._quiet_s:
+                    soonest = min(soonest, self._heard + self._quiet_s)
             if line and self._gaps and not self.told:
                 soonest = min(soonest, self._gaps[0][0] + self._hold_s)
         return None if soonest == inf else soonest

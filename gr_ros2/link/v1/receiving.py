@@ -344,8 +344,8 @@ class ReceivingSide:
 
     def _greeted(self, neighbour: Neighbour) -> None:
         """The newest hello of a robot that is heard."""
-        # Who was told once is told to the end of this start: its sender keeps what it lacks.
-        neighbour.inbox.order.told |= self._settings.hears and neighbour.hello.capabilities & REPORTED != 0
+        if self._settings.hears and neighbour.hello.capabilities & REPORTED:
+            neighbour.inbox.order.reported()
 
     def _entry(self, entry: Control) -> None:
         """Handle an entry that is not a message, from the sender of the packet that is processed."""

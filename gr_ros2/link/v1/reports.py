@@ -118,6 +118,18 @@ class Reporter:
         if not late:
             self.loss -= self.loss * _SMOOTHING
 
+    def repair(self, *, new: bool) -> None:
+        """Note a repair, or word that something is not repaired any more.
+
+        :param new: it was not here before
+        """
+        self.unreported += new
+        self.confirm()
+
+    def confirm(self) -> None:
+        """Note that something has come that its sender repairs until it is confirmed."""
+        self.confirms = True
+
     def repaired_in_vain(self) -> None:
         """Note a repair of what is here: its sender repairs on until it is told, which costs more than a report."""
         self._unspent = min(self._unspent + PER_VAIN, _MOST)

@@ -70,7 +70,7 @@ def test_what_is_known_at_once_is_taken_before_what_waited_for_it() -> None:
     """The first of the packets that are taken hands on a message of its own robot."""
     outcomes, hands = Outcomes(), _Hands()
     inbox = hands.inbox = inbox_of(outcomes, hands)
-    inbox.order.told = True
+    inbox.order.reported()
     parts = {1: v1.Part(v1.CARRIED_TOPIC, b"goal"), 2: v1.Part(ALL, b"the first"), 3: v1.Part(ALL, b"the second")}
     bodies = {number: v1.write_body([part], ROOM) for number, part in parts.items()}
     combined = combine([(number, bodies[number]) for number in (2, 1)], 5)

@@ -405,7 +405,7 @@ def test_a_message_over_others_overtakes_none_that_began_or_ends_in_a_missing_pa
     decoder.source(2, b"")
     assert order.up_to(1) == (2, ALL)
     assert order.up_to(2) == (2, 0)
-    order.heard = 0.0
+    order.hear(0.0)
 
     def come(topic_id: int, at: tuple[int, int], after: tuple[int, int]) -> list[Ready]:
         ready = Ready(topic_id, at, b"", -1, False, False, 1, 3, after=after)
@@ -423,7 +423,7 @@ def test_a_message_over_others_overtakes_none_that_began_or_ends_in_a_missing_pa
 def test_it_is_known_since_when_the_packet_that_is_repaired_first_is_missing() -> None:
     decoder = RepairDecoder(60, lambda _: True, 1000)
     order = Order(decoder, 1, 1.0, sure=10_000, fits=lambda _: True, room=60)
-    order.told = True
+    order.reported()
     for number, now, missing in ((1, 5.0, ()), (5, 6.0, (2, 4)), (8, 7.0, (6, 7))):
         if missing:
             order.missing(now, *missing)

@@ -28,7 +28,7 @@ def reporter() -> tuple[SharedReporter, RepairDecoder, Reassembly]:
     decoder = RepairDecoder(ROOM, lambda _: True, 1000)
     reassembly = Reassembly(10_000)
     order = Order(decoder, 1, 1.0, sure=10_000, fits=lambda _: False, room=ROOM)
-    order.told = True
+    order.reported()
     access: Any = SimpleNamespace(turn_s=0.0)
     return SharedReporter((1, 1), decoder, order, Settings(2, access=access), reassembly), decoder, reassembly
 
@@ -38,7 +38,7 @@ def test_packets_that_nobody_repairs_are_not_reported() -> None:
     reports.arrived(late=False)
     reports.missed(3, counts=True)
     assert reports.due(5.0) == inf
-    reports.confirms = True
+    reports.confirm()
     assert reports.due(5.0) == CONFIRM_S, "it was never reported"
     reports.make(5.0)
     assert reports.due(5.0) == inf
