@@ -34,6 +34,7 @@ from gr_ros2.core.errors import GrRos2Error
 from gr_ros2.gr.backfill import LiveBackfill
 from gr_ros2.gr.calls import LiveCalls, has_room_for_calls
 from gr_ros2.gr.factory import make_endpoint, start_of
+from gr_ros2.gr.link_parts import LinkParts
 from gr_ros2.gr.link_sending import LinkSendingBlock
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.radio_ports import RadioPorts
@@ -122,7 +123,7 @@ class _Told:
             self._observer.receiver_event(event._replace(topics=topics), now)
 
 
-class BoundEnd:
+class BoundEnd(LinkParts):
     """The endpoint of what goes over one radio alone.
 
     :param config: of the robot
@@ -136,16 +137,9 @@ class BoundEnd:
     :raises GrRos2Error: when it cannot be made
     :ivar named: whether a topic of this robot is bound to the radio
     :ivar sends: whether it sends now
-    :ivar calls: its services; None where it goes one way, or topics leave no room for calls
-    :ivar wishes: what others ask for there
-    :ivar throughput: measurements of what it carries; None where it is measured with the other radios
-    :ivar backfill: what crosses later; None where nothing does
     """
 
-    wishes: LiveWishes | None = None
-    throughput: LiveThroughput | None = None
-    calls: LiveCalls | None = None
-    backfill: LiveBackfill | None = None
+    source: LinkSendingBlock
 
     def __init__(
         self,
@@ -247,16 +241,7 @@ class BoundEnd:
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
-        for part in (
-            self.backfill,
-            self.throughput,
-            self.wishes,
-            self.calls,
-            getattr(self, "source", None),
-            getattr(self, "sink", None),
-        ):
-            if part is not None:
-                part.close()
+        super().close()
         self._start.close()
 
     def take(self, packets: Sequence[AirPacket]) -> None:
@@ -312,19 +297,11 @@ class BoundEnd:
                 self._follow()  # a radio that shares its channel has not been told of any
 
     def stats(self) -> dict[str, Any]:
-        """A snapshot of both halves."""
+        """A snapshot of all parts."""
         now = self._clock()
         with self.end.lock:
             heard = [peer.robot for peer in self.end.endpoint.peers(now) if not peer.silent]
-        return {
-            "source": self.source.stats(),
-            "sink": self.sink.stats(),
-            "heard": heard,
-            "rate": self.source.rate(),
-            "calls": {} if self.calls is None else self.calls.stats(),
-            "backfill": {} if self.backfill is None else self.backfill.stats(),
-            "wishes": {} if self.wishes is None else self.wishes.stats(),
-        }
+        return {**super().stats(), "heard": heard, "rate": self.source.rate()}
 
     def _clock_of(self, robot: int) -> ClockOffset | None:
         """What the endpoint with all radios knows of a robot's clock."""

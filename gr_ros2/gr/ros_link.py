@@ -23,11 +23,11 @@ from gr_ros2.gr.backfill import LiveBackfill
 from gr_ros2.gr.bound import BoundEnds, OwnWay, bound_to_none
 from gr_ros2.gr.calls import LiveCalls, has_room_for_calls
 from gr_ros2.gr.factory import Start, make_endpoint, start_of
+from gr_ros2.gr.link_parts import LinkParts
 from gr_ros2.gr.link_sending import LinkSendingBlock
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.radio_ports import RadioPorts
 from gr_ros2.gr.receiving import ReceivingBlock
-from gr_ros2.gr.sending import SendingBlock
 from gr_ros2.gr.throughput import LiveThroughput
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.air import Air
@@ -44,26 +44,16 @@ from gr_ros2.settings.registry import Registry, check_outputs
 from gr_ros2.settings.robot import ONE_RADIO, RobotConfig, robot_from
 
 
-class LinkBlock(gr.hier_block2):  # type: ignore[misc]
+class LinkBlock(gr.hier_block2, LinkParts):  # type: ignore[misc]
     """A block that sends and one that receives, as one. Message ports: `pdus` in and out, `credit` in, as in
     :class:`SendingBlock` and :class:`ReceivingBlock`.
 
     :param radios: over how many radios it sends and receives
     :ivar end: its endpoint; of a robot that receives its own packets, the one that receives
-    :ivar calls: the services that cross the link; None where it goes one way, or topics leave no room for calls
-    :ivar wishes: topics asked for from afar; None likewise
-    :ivar throughput: measurements of what the link carries; None likewise
-    :ivar backfill: what crosses later; None where nothing does
     :ivar bound: what goes over one radio alone; None where nothing can
     """
 
-    source: SendingBlock
-    sink: ReceivingBlock
     end: LiveEnd[Any]
-    calls: LiveCalls | None = None
-    wishes: LiveWishes | None = None
-    throughput: LiveThroughput | None = None
-    backfill: LiveBackfill | None = None
     bound: BoundEnds | None = None
 
     def __init__(self, config: RobotConfig, radios: int = 1) -> None:
@@ -84,17 +74,9 @@ class LinkBlock(gr.hier_block2):  # type: ignore[misc]
 
     def close(self) -> None:
         """Leave the ROS graph. Idempotent."""
-        for part in (
-            self.bound,
-            self.backfill,
-            self.throughput,
-            self.wishes,
-            self.calls,
-            getattr(self, "source", None),
-            getattr(self, "sink", None),
-        ):
-            if part is not None:
-                part.close()
+        if self.bound is not None:
+            self.bound.close()
+        LinkParts.close(self)
 
 
 class RosLink(LinkBlock):

@@ -480,13 +480,7 @@ class RobotLink(Flowgraph):
         if self.bond is not None:
             with self.end.lock:  # packets change it
                 radios = together(self.bond, self.radios, each)
-        halves = {
-            "source": self.source.stats(),
-            "sink": self.sink.stats(),
-            "calls": {} if self.calls is None else self.calls.stats(),
-            "backfill": {} if self._ros.link.backfill is None else self._ros.link.backfill.stats(),
-            "wishes": {} if self._ros.link.wishes is None else self._ros.link.wishes.stats(),
-        }
+        halves = self._ros.link.stats()
         if self._ros.link.bound is not None:
             join_bound(halves, radios, [one.name for one in self.radios], self._ros.link.bound.stats())
             halves["wishes"]["wants"] = best_of(halves["wishes"].get("wants", ()))
