@@ -11,7 +11,7 @@ them before any observer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import inf
 from typing import Any, NamedTuple, Protocol
@@ -25,6 +25,7 @@ from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.stats import ReceiverStats, SenderStats
+from gr_ros2.link.v1.pings import Pings
 from gr_ros2.link.v1.receipts import Receipts
 from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
@@ -255,33 +256,6 @@ def without_table(robots: Iterable[int]) -> list[str]:
     ]
 
 
-class Questions(Protocol):
-    """Questions to other robots, which answer at once, so that round trip and loss can be told.
-
-    :ivar wall_s: clock of the wall minus ``now``, s; 0 = unknown
-    :ivar snr_db: returns the SNR of the newest packets of all robots, dB
-    :ivar asked_by: when each robot asked last what this one is, s
-    """
-
-    wall_s: float
-    snr_db: Callable[[], float | None]
-    asked_by: dict[int, float]
-
-    def introduce(self, packet_len: int, phy: int, key: int, text: str) -> None:
-        """Tell those who ask what this end is.
-
-        :param phy: number that stands for the settings of the PHY
-        :param key: number that stands for the key, 0 for none
-        """
-
-    def put(self, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
-        """Ask a robot as soon as a packet may leave; returns what has come of all questions to it so far.
-
-        :param anew: forget the earlier ones
-        :raises ConfigError: for a number that no robot has
-        """
-
-
 class AirMeter(Protocol):
     """How much of the air an end uses.
 
@@ -379,5 +353,5 @@ class OpenEndpoint(Endpoint, Protocol):
         """Which of its packets one of some robots has, or any robot where none is named, as they report from now on."""
 
     @property
-    def questions(self) -> Questions:
-        """Its questions to other robots."""
+    def pings(self) -> Pings:
+        """Its questions to other robots, and its answers."""

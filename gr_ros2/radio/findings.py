@@ -86,9 +86,9 @@ def introduce(
 
     :param wall_s: see :func:`set_wall`; 0 = unknown
     """
-    questions = live.endpoint.questions
-    questions.introduce(**told)
-    questions.snr_db, questions.wall_s = snr_db, wall_s
+    pings = live.endpoint.pings
+    pings.introduce(**told)
+    pings.snr_db, pings.wall_s = snr_db, wall_s
 
 
 def peers(live: LiveEnd[OpenEndpoint], now: float) -> list[dict[str, Any]]:
@@ -106,8 +106,8 @@ def peers(live: LiveEnd[OpenEndpoint], now: float) -> list[dict[str, Any]]:
 def set_wall(live: LiveEnd[OpenEndpoint], wall_s: float) -> None:
     """From now on this computer's clock is so many s ahead of that of the link."""
     with live.lock:
-        if (questions := getattr(live.endpoint, "questions", None)) is not None:  # the paper's robots ask nothing
-            questions.wall_s = wall_s
+        if (pings := getattr(live.endpoint, "pings", None)) is not None:  # the paper's robots ask nothing
+            pings.wall_s = wall_s
 
 
 def ping(live: LiveEnd[OpenEndpoint], robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
@@ -117,11 +117,11 @@ def ping(live: LiveEnd[OpenEndpoint], robot: int, now: float, *, anew: bool = Fa
     :raises ConfigError: for a number that no robot has
     """
     with live.lock:
-        questions = live.endpoint.questions
-        told = questions.put(robot, now, anew=anew)
+        pings = live.endpoint.pings
+        told = pings.put(robot, now, anew=anew)
         snrs = {peer.robot: peer.snr_db for peer in live.endpoint.peers(now)}
         live.rouse()
-    only = questions.snr_db() if list(snrs) == [robot] else None  # where no other robot's packet may be the newest
+    only = pings.snr_db() if list(snrs) == [robot] else None  # where no other robot's packet may be the newest
     return {**told, "robot": robot, "snr_here_db": only if snrs.get(robot) is None else snrs[robot]}
 
 

@@ -145,11 +145,11 @@ class RobotLink(Flowgraph):
         ahead = wall_ahead if self._clock is time.monotonic else None
         told = about(config, [radio.phy for radio in radios])
         asked_by: Mapping[int, float] = {}
-        if hasattr(self.end.endpoint, "questions"):  # the paper's robots ask nothing
+        if hasattr(self.end.endpoint, "pings"):  # the paper's robots ask nothing
             introduce(self.end, told, lambda: self.radio.snr_db, 0.0 if ahead is None else ahead())
             if link.bound is not None:
                 link.bound.introduce_with(partial(self._introduce, told))
-            asked_by = self.end.endpoint.questions.asked_by
+            asked_by = self.end.endpoint.pings.asked_by
         self._clocks = ClockWatch(
             config.clock,
             mine=config.publish.stamps == "mine",
@@ -187,7 +187,7 @@ class RobotLink(Flowgraph):
         """
         one = self.radios[number]
         own = about(self.config, [one.phy], one.own) if one.own.shares else told
-        introduce(bound.end, own, lambda: one.radio.snr_db, self.end.endpoint.questions.wall_s)
+        introduce(bound.end, own, lambda: one.radio.snr_db, self.end.endpoint.pings.wall_s)
 
     @property
     def _ends(self) -> list[LiveEnd[Any]]:

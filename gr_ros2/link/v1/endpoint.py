@@ -33,7 +33,6 @@ from gr_ros2.link.v1.hellos import Hellos
 from gr_ros2.link.v1.hold import Hold
 from gr_ros2.link.v1.inbox import Inbox
 from gr_ros2.link.v1.outbox import Outbox
-from gr_ros2.link.v1.pings import Pings
 from gr_ros2.link.v1.receipts import Receipts
 from gr_ros2.link.v1.receiving import ReceivingSide
 from gr_ros2.link.v1.repair import RepairWindow
@@ -226,10 +225,6 @@ class EndpointV1:
         self.settings = settings = replace(self.settings, **changes)
         self._sending.reconfigure(settings, self._now)
         self.messages.reconfigure(settings)
-
-    @property
-    def questions(self) -> Pings:
-        return self.pings
 
     def peers(self, now: float) -> list[HeardRobot]:
         relaying = self._receiving.relaying

@@ -168,13 +168,24 @@ class Pings:
         self._wall_s = wall_s
 
     def clock_of(self, robot: int, now: float) -> ClockOffset | None:
+        """What is known of another robot's clock."""
         trips = self.asked.get(robot)
         return None if trips is None else trips.clock.at(now)
 
     def introduce(self, packet_len: int, phy: int, key: int, text: str) -> None:
+        """Tell those who ask what this end is.
+
+        :param phy: number that stands for the settings of the PHY
+        :param key: number that stands for the key, 0 for none
+        """
         self.about = About(packet_len, phy, key, text.encode())
 
     def put(self, robot: int, now: float, *, anew: bool = False) -> dict[str, Any]:
+        """Ask a robot as soon as a packet may leave; returns what has come of all questions to it so far.
+
+        :param anew: forget the earlier ones
+        :raises ConfigError: for a number that no robot has
+        """
         if anew and (before := self.asked.get(robot)) is not None:  # numbers go on, so that no late answer counts
             self.asked[robot] = RoundTrips(before.asked, earlier=before.asked, about=before.about, clock=before.clock)
         return self.ask(robot, now, wants_about=True).summary(now)
