@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import inf
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from gr_ros2.core.errors import ConfigError
 from gr_ros2.link.clocks import ClockOffset
@@ -25,12 +25,15 @@ from gr_ros2.link.pace import Pace
 from gr_ros2.link.queues import PublisherQos
 from gr_ros2.link.rate import Mcs
 from gr_ros2.link.stats import ReceiverStats, SenderStats
-from gr_ros2.link.v1.pings import Pings
-from gr_ros2.link.v1.receipts import Receipts
 from gr_ros2.settings.config import QueuePolicy, SendOptions
 from gr_ros2.settings.fields import AUTO, Auto
 from gr_ros2.settings.registry import NewTopic, Registry, Topic
 from gr_ros2.wire import AnnouncedTopic
+
+if TYPE_CHECKING:
+    from gr_ros2.link.v1.pings import Pings
+    from gr_ros2.link.v1.receipts import Receipts
+    from gr_ros2.link.v1.used_air import UsedAir
 
 
 def check_live(changes: Mapping[str, Any], live: Sequence[str]) -> None:
@@ -256,27 +259,6 @@ def without_table(robots: Iterable[int]) -> list[str]:
     ]
 
 
-class AirMeter(Protocol):
-    """How much of the air an end uses.
-
-    :ivar on: whether it counts
-    """
-
-    on: bool
-
-    def free(self, now: float) -> float:
-        """bytes/s of further messages that fit beside what is sent; infinite where the air has no known rate."""
-
-    def cost(self, size: float) -> float:
-        """bytes that a message of so many bytes takes."""
-
-    def others_left(self, packets: Sequence[SentPacket], now: float) -> None:
-        """Packets of another endpoint have left over the same radio."""
-
-    def leave_out(self, topic_id: int) -> None:
-        """A topic is made to fit what others leave: what it uses does not count as used."""
-
-
 class Endpoint(PacketSide, Protocol):
     """An end, the same for every version of the wire format."""
 
@@ -346,7 +328,7 @@ class OpenEndpoint(Endpoint, Protocol):
         """The topics of a robot by topic id, as far as it has announced them."""
 
     @property
-    def used_air(self) -> AirMeter:
+    def used_air(self) -> UsedAir:
         """How much of the air it uses."""
 
     def receipts_of(self, robots: Collection[int]) -> Receipts:

@@ -82,7 +82,8 @@ class UsedAir:
         return self._sum / self._seconds(now)
 
     def free(self, now: float) -> float:
-        """bytes/s of further messages that fit beside what is sent, within what this robot may send.
+        """bytes/s of further messages that fit beside what is sent, within what this robot may send; infinite where the
+        air has no known rate.
 
         Repairs do not count, as they fill whatever is idle. Neither does an interval that was measured where the
         airtime is known: between the few packets of a link with little to send it says nothing of what would fit.
