@@ -15,6 +15,7 @@ import pytest
 
 from gr_ros2.codecs import CodedTopic
 from gr_ros2.codecs.messages import CAMERA_INFO, GRID, IMAGE, VIDEO, read
+from gr_ros2.codecs.pull import KEY_S
 from gr_ros2.codecs.received_frames import MOST_BYTES_S, MOST_DECODERS, FrameReceiver
 from gr_ros2.core.errors import BackendMissingError, CodecError, DamagedError, MissingFrameError
 from gr_ros2.link.events import Accepted, Delivered, Refused
@@ -176,18 +177,39 @@ def test_a_camera_that_starts_again_is_seen_again() -> None:
     assert len(air.robots[1].of(1)) > 15
 
 
-def test_a_receiver_that_lost_its_place_asks_for_a_key_frame() -> None:
-    air = link(loss=0.1)
-    air.run(4.0)
-    receiver = air.robots[1]
+def lose_place(receiver: Robot) -> None:
+    """Forget what was decoded."""
     receiver.receiver = FrameReceiver()
     for row in receiver.end.topics_of(1).values():
         receiver.receiver.announce((1, row.topic_id), row)
     receiver.seen.clear()
+
+
+def test_a_receiver_that_lost_its_place_asks_for_a_key_frame() -> None:
+    air = link(loss=0.1)
+    air.run(4.0)
+    receiver = air.robots[1]
+    lose_place(receiver)
     air.run(6.0)
     assert receiver.failed
     assert receiver.of(1)[0][0] < 5.0
     assert len(receiver.of(1)) > 12
+
+
+def test_one_that_lost_its_place_again_lacks_frames_until_the_next_key_frame_may_come_and_none_then() -> None:
+    air = link(kbit_s=32, receivers=2)
+    air.run(4.0)
+    other, receiver = air.robots[1:]
+    lose_place(receiver)
+    air.run(5.0)
+    asked = receiver.of(1)[0][0]
+    lose_place(receiver)
+    air.run(9.0)
+    again = receiver.of(1)[0][0]
+    assert asked + 1 < again < asked + KEY_S + 0.75
+    assert receiver.failed
+    assert all(isinstance(error, MissingFrameError) and now < again for now, error in receiver.failed)
+    assert not other.failed
 
 
 def test_one_that_cannot_follow_does_not_hold_others_back() -> None:
