@@ -7,7 +7,9 @@ gain on any promise does not earn its place. A variant runs with all seeds, or u
 wholly beyond ``SHOWN``: what is needed is known then.
 
 ``gr-ros2 ablate`` does not run over them: its variants differ in settings, which any user can repeat with ``--set``.
-These are no settings. The rules of the adaptive rate have promises of their own: :mod:`bench.rate_rules`.
+These are no settings, and no value that is passed in either: each constant stands beside the rule that it tunes, with
+what it was measured by, and 22 variants take away a whole rule, which has no number. So a variant patches modules, in
+worker processes. The rules of the adaptive rate have promises of their own: :mod:`bench.rate_rules`.
 """
 
 from __future__ import annotations

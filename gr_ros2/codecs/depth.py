@@ -71,8 +71,6 @@ _VIDEO, _BITS = 1, 2
 _RANGE = Struct("<ff")
 _CONFIG = Struct("<iff")
 """What stands before the picture in compressedDepth: its kind and the two numbers of its inverse distances."""
-_GREATEST = 254
-"""Steps of 8 bits; in video 0 is a distance, too."""
 
 
 @dataclass(frozen=True)

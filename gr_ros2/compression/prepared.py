@@ -11,7 +11,7 @@ from typing import Any
 
 from gr_ros2.compression.ans import Table
 from gr_ros2.compression.floats import DEFAULT_CLASS, KnownNumbers, class_table
-from gr_ros2.compression.layout import MATRIX, Outline
+from gr_ros2.compression.layout import Outline
 from gr_ros2.compression.static_values import Value, Words, pop_static
 
 PARTS = 15
@@ -45,7 +45,6 @@ class Prepared:
         self.forward = self.backward[::-1]
         self.bulk = plan.bulk
         self.static_indexes = [slot.index for slot in plan.static_values]
-        self.matrices = [slot.index for slot in plan.static_values if slot.kind == MATRIX]
         self.templates: dict[tuple[Value, ...], int] = {}
         self.template_values: dict[int, list[Value]] = {}
         self.blank: list[Any] = [0] * (len(plan.items) + 1)

@@ -23,8 +23,8 @@ import pmt
 
 from gr_ros2.link.events import AirPacket
 
-PDUS, CREDIT = pmt.intern("pdus"), pmt.intern("credit")
-"""The message ports of the blocks: packets, and the credits that request them."""
+PDUS = pmt.intern("pdus")
+"""The message port of the blocks for packets."""
 
 
 def port_of(name: str, radio: int) -> str:

@@ -33,7 +33,6 @@ from gr_ros2_lab.sim.sim_settings import SimSettings
 
 PHY_NAME = "ofdm"
 """The PHY with its defaults. For every contender, a frame is only as long on the air as its bytes need."""
-SIM_TOPIC = "/robot_1/odom"
 MOST_ROBOTS = 10
 _SIM_START_NS = 1_700_000_000_000_000_000
 """Start of a recording of the simulator, ns since 1970. It is constant, so the messages are always the same."""

@@ -9,7 +9,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.settings.config import build
-from gr_ros2_lab.race.race_settings import SIM_TOPIC, RaceSettings, check, conditions, read_recordings
+from gr_ros2_lab.race.race_settings import RaceSettings, check, conditions, read_recordings
 
 
 def write_bag(path: Path, topics: dict[str, list[bytes]], step_s: float = 0.1) -> str:
@@ -29,7 +29,7 @@ def text(number: int, size: int = 40) -> bytes:
 def test_the_simulated_recording_is_odometry_at_35_hz_and_the_same_each_time(tmp_path: Path) -> None:
     settings = RaceSettings(duration_s=2)
     (recording,) = read_recordings(settings, tmp_path / "a")
-    assert recording.topic == SIM_TOPIC
+    assert recording.topic == "/robot_1/odom"
     assert recording.type_name == "nav_msgs/msg/Odometry"
     assert len(recording.payloads) == 70
     assert recording.hz == pytest.approx(35, rel=1e-3)
