@@ -25,7 +25,7 @@ _STEP = 20
 
 def relay(data: bytes) -> None:
     """Take the bytes as packets heard, and choose in between."""
-    gains = Gains(1, OtherRobots())
+    gains, dropped = Gains(1, OtherRobots()), Counter[str]()
     now = 0.0
     topics, window = SentTopics(None, ()), RepairWindow("off", 200)
     topics.relay()
@@ -39,7 +39,7 @@ def relay(data: bytes) -> None:
         room=200,
         most=10_000,
         share=Memory(10_000).share(),
-        dropped=Counter(),
+        dropped=dropped,
         drop=lambda _: None,
         ended=lambda *_: None,
     )
@@ -61,22 +61,23 @@ def relay(data: bytes) -> None:
             assert gains.has(best) >= 0
             gains.sent(best, gains.has(best), now)
         assert len(gains.tells()) <= 2
-        carry(custody, data[start + 5 : start + _STEP], src_id, now)
+        carry(custody, dropped, data[start + 5 : start + _STEP], src_id, now)
 
 
-def carry(custody: Custody, data: bytes, src_id: int, now: float) -> None:
+def carry(custody: Custody, dropped: Counter[str], data: bytes, src_id: int, now: float) -> None:
     """Take the bytes as a message that a robot hands over."""
     try:
         taker, message = read_carried(data)
     except WireError:
         return
     assert write_carried(taker, message) == data
-    held = len(custody)
+    held = len(custody) + dropped["custody_full"]
     custody.routes.note(message.origin, src_id, message.hops, now)
     within(MOST_LINES, partial(custody.take, message, src_id, now, made=now))
     within(MOST_LINES, partial(custody.receipt, message.origin, Receipt(message.start, message.topic_id, 0, 0)))
     within(MOST_LINES, partial(custody.offer, now, now))
-    assert held <= len(custody) <= MOST_HELD
+    assert held <= len(custody) + dropped["custody_full"], "what is not held any more is counted"
+    assert len(custody) <= MOST_HELD
 
 
 def corpus() -> list[bytes]:
