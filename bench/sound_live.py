@@ -30,7 +30,7 @@ CABLE_S, SHARED_S = 600.0, 240.0
 """s for which messages are published."""
 CABLE_HZ, SHARED_HZ = 3.0, 0.1
 """Odometry of each robot, messages/s: with one sink for all, less than the slots carry."""
-_SETTLE_S, _DRAIN_S, _FIRST_S = 30.0, 60.0, 90.0
+_SETTLE_S, _DRAIN_S, _FIRST_S = 120.0, 60.0, 90.0
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _QOS = Qos("reliable", "volatile", 10)
 
@@ -117,7 +117,12 @@ def _run(
                 time.sleep(1.0)
                 place += 1
             run.first_s = min(run.came.values(), default=float("inf")) - begin
-            time.sleep(_SETTLE_S)
+            # Meanwhile more was said than slots carry, and what comes next would wait behind it.
+            last, until = list(run.sent)[-count:], time.monotonic() + _SETTLE_S
+            while time.monotonic() < until and not all(
+                (source, taker, data) in run.came for source, data in last for taker in numbers if taker != source
+            ):
+                time.sleep(0.1)
             run.sent.clear()
             run.came.clear()
             begin = time.monotonic()

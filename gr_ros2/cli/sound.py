@@ -28,6 +28,9 @@ _LOUD_DB, _WEAK_DB = -3.0, -50.0
 """dB of full scale at the microphone: above the first peaks are cut off, below the second a card's noise shows."""
 _DRY_S = 0.6
 """RT60 up to which OFDM with the prefix of preset `sound` passes (docs/how-to/sound.md)."""
+_AHEAD_S = 0.5
+"""s from composing a packet to its sound, and from its end to its message. Before that a message waits for half of the
+three slots of two robots: 2.4 s in all with preset `sound` (simulated)."""
 
 
 @click.group("sound")
@@ -110,5 +113,5 @@ def _expected(name: str) -> str:
     airtime = front_end.airtime_with(phy, front_end.Options(**preset.settings))
     return (
         f"--radio {name} fits: packets of {preset.packet_len} B in {airtime:.2f} s, about {1 / airtime:.1f} small "
-        f"messages/s for all robots together, {2 * airtime:.1f} s old with two robots"
+        f"messages/s for all robots together, {2.5 * airtime + _AHEAD_S:.1f} s old with two robots"
     )
