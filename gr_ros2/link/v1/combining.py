@@ -11,6 +11,7 @@ Invariant: no two repairs of the same packets have the same coefficients.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from gr_ros2.link.v1.gf256 import combine
@@ -67,7 +68,28 @@ class Combining:
             first, last = last + 1, min(last + MAX_WINDOW, packets.newest)
             if later := packets.live(first, last, now):
                 found = packets.live(later[0].number, min(later[0].number + MAX_WINDOW - 1, packets.newest), now)
-        return self.fitting(found[::-1], -1) if packets.parts else found[::-1]
+        return self.fitting(found[::-1], -1) if packets.parts else self._group(found[::-1])
+
+    def _group(self, window: list[Sent]) -> list[Sent]:
+        """A part of a window, in turn, where no mask fits beside the bodies and somebody lacks more packets between its
+        parts than it has: all in its span would have to be repaired too. A robot that came back after 6 s needed 110
+        repairs for four packets."""
+        if not window or self._named(window):
+            return window
+        records, everybody = self._packets.records, self._packets.everybody
+        groups = [window[:1]]
+        for later, record in pairwise(window):
+            between = (records.get(number) for number in range(record.number + 1, later.number))
+            lacked = sum(1 for other in between if other is not None and everybody & ~other.confirmed)
+            if lacked > len(window):
+                groups.append([])
+            groups[-1].append(record)
+        return groups[int(self._place * len(groups))]
+
+    def _named(self, window: list[Sent]) -> bool:
+        """Whether a combination can name its packets alone: they have no gaps, or a mask fits beside the bodies."""
+        size = window[0].number - window[-1].number + 1
+        return len(window) == size or max(len(record.body) for record in window) + (size + 7) // 8 <= self._room
 
     def around(self, number: int, now: float) -> list[Sent]:
         """The window around a number; only the oldest packet if all are newer."""
@@ -106,10 +128,8 @@ class Combining:
         packets = self._packets
         newest, first = window[0].number, window[-1].number
         size = newest - first + 1
-        if len(window) < size:
-            longest = max(len(record.body) for record in window)
-            if longest + (size + 7) // 8 > self._room:
-                window = [packets.records[number] for number in range(newest, first - 1, -1)]
+        if not self._named(window):
+            window = [packets.records[number] for number in range(newest, first - 1, -1)]
         mask = (1 << size) - 1
         if len(window) < size:
             mask = 0

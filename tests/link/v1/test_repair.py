@@ -191,6 +191,28 @@ def test_what_is_over_is_left_out_where_its_mask_fits() -> None:
     assert (repair.number, repair.mask) == (6, 0b111111)
 
 
+def test_who_comes_back_need_not_be_brought_what_was_over_meanwhile() -> None:
+    """Where no mask fits, a combination of all would have to bring that too."""
+    sender, alive = window(), {1, 2, 3, 99, 100}
+    sender.peers.meet(8, 0.0)
+    sender.peers.meet(9, 0.0)
+    for number in range(1, 101):
+        sender.sent(number, b"x" * ROOM, (lifetime := Lifetime(),), 0.0)
+        if number not in alive:
+            lifetime.end()
+
+    def spans() -> list[set[int]]:
+        repairs = [sender.next(1.0) for _ in range(9)]
+        return [set(window_numbers(repair.number, repair.mask)) for repair in repairs if repair is not None]
+
+    assert len(spans()) == 9
+    assert all(span in ({1, 2, 3}, {99, 100}) for span in spans())
+    assert set.union(*spans()) == alive
+    for number, record in sender.packets.records.items():
+        record.confirmed = 0 if number in alive else sender.packets.everybody
+    assert all(span == set(range(1, 101)) for span in spans()), "what all have costs nothing"
+
+
 def test_more_than_a_group_is_repaired_in_windows_that_move_over_it() -> None:
     sender = window()
     long = Lifetime()
