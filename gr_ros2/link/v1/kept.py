@@ -175,6 +175,12 @@ class KeptMessages:
         new = [row for row in rows.values() if row.named == inf and row.payload not in waiting]
         self._send_rows(new, self._table_qos, now)
 
+    def untold(self, now: float) -> None:
+        """Send all rows of the table as if none had left: somebody is heard who may have heard none, or nobody is."""
+        for row in self._rows.values():
+            row.named = inf
+        self._tell_anew(now)
+
     def _tell_anew(self, now: float) -> bool:
         """Send all rows of the table: those that wait already, then first those of topics whose messages wait; returns
         whether there are any."""

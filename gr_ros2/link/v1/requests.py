@@ -31,11 +31,13 @@ class Requests:
         self._neighbours, self._settings = neighbours, settings
         self.check_at = -inf if settings.hears else inf
         self._wanted_at = inf
-        """When messages that this robot lacks, or may lack since it was told, are asked for, s."""
+        """When messages that others keep and this robot lacks are asked for, s."""
 
-    def told(self) -> None:
+    def told(self, now: float) -> None:
         """A robot may have named what this one lacks."""
-        self._wanted_at = -inf
+        for neighbour in self._neighbours:
+            if neighbour.proven:
+                self._want(neighbour, self._kept(neighbour, now), now)
 
     def next(self) -> float:
         """When a request may have to leave, s; infinite for never."""
@@ -50,11 +52,7 @@ class Requests:
         self.check_at = now + CHECK_S
         self.crowded, self._wanted_at = False, inf
         for neighbour in [neighbour for neighbour in self._neighbours if neighbour.proven]:
-            hello, inbox, asked = neighbour.hello, neighbour.inbox, neighbour.asked
-            marks = list(hello.marks)
-            if hello.digest and hello.digest != inbox.announced.digest:
-                marks.append((TABLE_TOPIC, hello.digest))
-            kept = [mark[0] for mark in marks if inbox.lacks(mark, neighbour.hello_number, now)]
+            kept, asked = self._kept(neighbour, now), neighbour.asked
             lacking = dict.fromkeys([*kept, *neighbour.lost_frames])
             wanted = bytes(topic for topic in lacking if now >= asked.get(topic, -inf))
             said = wanted[: max(room - ASK_LEN, 0)]
@@ -65,5 +63,17 @@ class Requests:
                 found.append(Ask(neighbour.src_id, said))
                 neighbour.lost_frames.difference_update(said)
                 asked.update(dict.fromkeys(said, now + ASK_S * self._settings.slower))
-            self._wanted_at = min([self._wanted_at, *(asked.get(topic, now) for topic in kept)])
+            self._want(neighbour, kept, now)
         return found
+
+    def _want(self, neighbour: Neighbour, topics: Iterable[int], now: float) -> None:
+        for topic in topics:
+            self._wanted_at = min(self._wanted_at, neighbour.asked.get(topic, now))
+
+    def _kept(self, neighbour: Neighbour, now: float) -> list[int]:
+        """Topics of which a robot keeps a message that this one lacks."""
+        hello, inbox = neighbour.hello, neighbour.inbox
+        marks = list(hello.marks)
+        if hello.digest and hello.digest != inbox.announced.digest:
+            marks.append((TABLE_TOPIC, hello.digest))
+        return [mark[0] for mark in marks if inbox.lacks(mark, neighbour.hello_number, now)]

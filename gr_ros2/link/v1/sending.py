@@ -247,7 +247,7 @@ class SendingSide:
                     self.repairs.look_anew()
                 if urgent:
                     self.urgent = True
-                    self.reports.requests.told()
+                    self.reports.requests.told(now)
             case Reported(robot, number, report):
                 self._reported(robot, number, report, now)
             case Has(robot, topic_id, order):
@@ -396,7 +396,10 @@ class SendingSide:
         often = starting or unmet or (now >= self._table_at and not self.hellos.lone)
         if often and (unmet or not window.peers) and kept.digest:  # no report says whether it has arrived
             self._table_at = now + kept.table_packets * self._pace.interval / TABLE_SHARE
-            kept.ask(TABLE_TOPIC, now, fills=not starting)
+            if unmet:
+                kept.untold(now)
+            else:
+                kept.ask(TABLE_TOPIC, now, fills=not starting)
         entries = self.hellos.entries(self._writer.room, now)
         if self._joins and (joined := self._fill([], slot, hello=entries)) is not None:
             return joined

@@ -61,4 +61,4 @@ def test_in_slots_a_camera_takes_the_air_that_is_free_and_makes_nobody_much_olde
         assert age < 1.5 * alone[topic], topic
     (frames,) = [made for made in found.frames.values() if made["frames"]]
     assert frames["frames"] > 100
-    assert 8e-3 * frames["bytes"] / found.duration_s > 50
+    assert 8e-3 * frames["bytes"] / found.duration_s > 45

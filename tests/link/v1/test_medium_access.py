@@ -408,3 +408,15 @@ def test_recordings_of_a_robot_that_is_dead_neither_slow_others_nor_move_their_c
             assert one.access.clock.jumps == 0
             assert {peer.robot for peer in one.end.peers(148.0)} == {1, 2, 3} - {one.src_id}
     assert rates[True] > 0.9 * rates[False]
+
+
+@pytest.mark.parametrize("lost", [1, 2, 5])
+def test_a_topic_comes_out_of_the_first_packet_that_is_heard_however_many_were_lost(lost: int) -> None:
+    """Its row of the table goes along until everybody that is heard has heard this robot, before those of others."""
+    one, other = rare(1), rare(2)
+    one.topics = registry()
+    one.start()
+    packets = sent_by(one, lost + 1)
+    other.end.handle_timeout(0.0)
+    other.receive(packets[-1], 100.0)
+    assert other.delivered(1)
