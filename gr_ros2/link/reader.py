@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gr_ros2.core.errors import CrcError, EntryKindError, TagError, WireError, WrongKeyError
+from gr_ros2.core.errors import CrcError, TagError, WireError, WrongKeyError
 from gr_ros2.link.v1.endpoint_settings import MIN_PACKET_LEN
 from gr_ros2.link.v1.reassembly import Reassembly
 from gr_ros2.link.v1.sealing import NOT_A_REPAIR, Keys, Trailer
@@ -32,6 +32,7 @@ from gr_ros2.wire.v1 import (
     Header,
     Part,
     RepairHeader,
+    hello_in,
     read_body,
     read_header,
     read_repair_header,
@@ -129,7 +130,7 @@ class Reader:
             header, repair, start, end = self._clear(data)
             if not (repair.clear if repair is not None else not header.sealed):
                 return
-            hello = self._hello(header, data[start:end], first=repair is not None)
+            hello = self._hello(header, repair, data[start:end])
             repair_id = NOT_A_REPAIR if repair is None else repair.repair_id
             trailers, _ = self._check_hello(header, hello, data, start, repair_id)
         except WireError:
@@ -148,7 +149,7 @@ class Reader:
         """
         header, repair, start, end = self._clear(data)
         if repair is not None and repair.clear:
-            hello = self._hello(header, data[start:end])
+            hello = self._hello(header, repair, data[start:end])
             number, body = _number(header, hello), data[start:end]
             _, check = self._check_hello(header, hello, data, start, repair.repair_id)
             self._heard(header.src_id, hello.boot, number)
@@ -176,13 +177,8 @@ class Reader:
     def _room(self, header: Header) -> int:
         return header.room(self._packet_len)
 
-    def _hello(self, header: Header, body: bytes, *, first: bool = True) -> Hello:
-        """The hello in a body: its first entry, or any."""
-        entries = read_body(body, self._room(header))
-        for entry in entries[:1] if first else entries:
-            if isinstance(entry, Hello):
-                return entry
-        raise EntryKindError("a packet in the clear that does not begin with a hello")
+    def _hello(self, header: Header, repair: RepairHeader | None, body: bytes) -> Hello:
+        return hello_in(read_body(body, self._room(header)), control=repair is not None)
 
     def _check_hello(
         self, header: Header, hello: Hello, data: bytes, start: int, repair_id: int

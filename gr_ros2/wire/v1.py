@@ -374,6 +374,17 @@ def read_body(body: bytes, room: int) -> list[EntryV1]:
     return entries
 
 
+def hello_in(entries: Sequence[EntryV1], *, control: bool) -> Hello:
+    """The hello that may have an effect: the first entry of a control packet, or any of a packet of messages.
+
+    :raises EntryKindError: there is none
+    """
+    for entry in entries[:1] if control else entries:
+        if isinstance(entry, Hello):
+            return entry
+    raise EntryKindError("a packet in the clear that does not begin with a hello")
+
+
 def _write_part(part: Part, room: int) -> bytes:
     topic_id, payload, back, offset, last, coded = part
     size = len(payload)

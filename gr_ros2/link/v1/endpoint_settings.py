@@ -110,6 +110,11 @@ class Settings:
         return max(1.0, self.turn_s() / TURN_S) / self.airtime_share
 
     @property
+    def turns_are_rare(self) -> bool:
+        """Whether this robot's turns on a channel that others share are rare."""
+        return self.shares and self.slower > 1
+
+    @property
     def idle_is_free(self) -> bool:
         """Whether a packet in a slot that would be idle takes airtime from nobody."""
         return self.airtime_share == 1 and not (self.half_duplex or self.shares)

@@ -233,8 +233,7 @@ class Hellos:
 
     def _next(self, now: float, *, wants: bool) -> float:
         """When the next hello is due, s."""
-        slow = self._settings.shares and self._settings.slower > 1
-        while slow and self._starting and self._starting[0] <= now:
+        while self._settings.turns_are_rare and self._starting and self._starting[0] <= now:
             self._starting.popleft()  # messages went first for so long that this hello stands for several
         due = self._starting.popleft() if self._starting else now + self.early(self._pause)
         if not wants or not self._eager:

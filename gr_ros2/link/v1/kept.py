@@ -152,8 +152,7 @@ class KeptMessages:
         :param robot: which robot asks; -1 = not known
         :param anew: it has nothing of it. Otherwise rows of the table that wait may be those that it lacks
         """
-        slow = self._settings.shares and self._settings.slower > 1
-        if slow and topic_id == TABLE_TOPIC and not anew and self._topics[TABLE_TOPIC].queue:
+        if topic_id == TABLE_TOPIC and not anew and self._topics[TABLE_TOPIC].queue and self._settings.turns_are_rare:
             return True
         if not self._of(topic_id):
             return True

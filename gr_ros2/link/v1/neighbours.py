@@ -25,7 +25,6 @@ from dataclasses import dataclass, field
 
 from gr_ros2.core.errors import (
     CrcError,
-    EntryKindError,
     ReplayedError,
     SameIdError,
     SourcesError,
@@ -46,6 +45,7 @@ from gr_ros2.wire.v1 import (
     EntryV1,
     Header,
     RepairHeader,
+    hello_in,
     read_body,
     read_repair_header,
 )
@@ -395,10 +395,7 @@ class Neighbours:
         """A hello, all entries of its packet, and the packet before and after its body begins."""
         start = header.size + (0 if repair is None else repair.size)
         entries = read_body(data[start : len(data) - self._trailer_len], header.room(self._settings.packet_len))
-        for entry in entries if repair is None else entries[:1]:
-            if isinstance(entry, Hello):
-                return entry, entries, data[:start], data[start:]
-        raise EntryKindError("a packet in the clear that does not begin with a hello")
+        return hello_in(entries, control=repair is not None), entries, data[:start], data[start:]
 
     def _hello(self, data: bytes, header: Header, repair: RepairHeader | None, now: float) -> Opened:
         """Open a packet with a hello, which itself says how the packet is opened.

@@ -337,7 +337,7 @@ class ReceivingSide:
         if self.relaying is not None:
             self.relaying.far.met(neighbour, now)
         self._greeted(neighbour)
-        if self._settings.shares and self._settings.slower > 1:  # its table comes unasked
+        if self._settings.turns_are_rare:  # its table comes unasked
             neighbour.asked[TABLE_TOPIC] = now + ARRIVING_S * self._settings.slower
         if neighbour.proofs.proven is not None:
             neighbour.inbox.order.repaired_from(neighbour.proofs.proven - REACH)

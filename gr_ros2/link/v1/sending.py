@@ -321,7 +321,7 @@ class SendingSide:
             self._plan_repeat(now)
         if self.settings.hears:
             self.hellos.met(now, knows=knows)
-        if self.settings.shares and self.settings.slower > 1 and self._started:
+        if self.settings.turns_are_rare and self._started:
             # It lacks the table, and would say so some turns later.
             self._messages.kept.asked(TABLE_TOPIC, now, self._interval, anew=True)
 
@@ -379,8 +379,7 @@ class SendingSide:
     @property
     def _joins(self) -> bool:
         """Whether hellos go along with messages: turns are rare, and no message in the clear would betray anything."""
-        slow = self.settings.shares and self.settings.slower > 1
-        return slow and not self._writer.sealed and self._rate is None
+        return self.settings.turns_are_rare and not self._writer.sealed and self._rate is None
 
     def _hello(self, slot: SendSlot) -> SentPacket:
         now, window, kept, newest = slot.now, self._window, self._messages.kept, self._window.packets.newest
