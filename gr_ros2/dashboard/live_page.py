@@ -25,9 +25,11 @@ from bokeh.models import (
     CustomJS,
     DataRange1d,
     Div,
+    FixedTicker,
     HoverTool,
     InlineStyleSheet,
-    LogTicker,
+    LogAxis,
+    NumeralTickFormatter,
     Range1d,
     Slider,
     Toggle,
@@ -382,7 +384,6 @@ class LivePage:
         spectrum.varea("khz", -200, "db", source=sources["spectrum"], color=_SENT, alpha=0.15)
         spectrum.line("khz", "db", source=sources["spectrum"], color=_SENT, line_width=1.2)
         latency = _plot("latency", "name", "latency [ms]", "share", x_axis_type="log", y_range=Range1d(0, 1.03))
-        latency.xaxis.ticker = LogTicker(desired_num_ticks=4, num_minor_ticks=0)
         latency.multi_line("ms", "share", source=sources["latency"], color="colour", line_width=2)
         air = _plot("air", "", "time [s]", "busy [%]", y_range=DataRange1d(start=0, max_interval=100))
         air.varea_stack(
@@ -527,4 +528,7 @@ def _plot(name: str, hover: str, x: str, y: str, **options: Any) -> Any:
         axis.minor_tick_line_color = None
         axis.major_label_text_color = _SOFT
         axis.major_label_text_font_size = "11px"
+        if isinstance(axis, LogAxis):  # by itself it writes all of .1, .2, ... .9 over each other
+            axis.ticker = FixedTicker(ticks=[m * 10.0**e for e in range(-4, 6) for m in (1, 3)], minor_ticks=[])
+            axis.formatter = NumeralTickFormatter(format="0.[0000]")
     return plot

@@ -44,6 +44,7 @@ from gr_ros2.observe.latency import Latency, latency, latency_cdf
 from gr_ros2.observe.positions import PositionReader, position_reader
 from gr_ros2.observe.result import RunResult, TopicResult
 from gr_ros2.settings.registry import Registry, Topic
+from gr_ros2.wire import Packet
 
 HISTORY_S = 180.0
 """Length of the shown curves and paths, s."""
@@ -57,7 +58,8 @@ _ROBOTS = 64
 """Most robots heard that are remembered."""
 _ENOUGH = 3
 """Fewest messages or packets in the last seconds from which a share is taken."""
-
+_QUIET_S = 1.0
+"""s, and three times as long as between two packets, after which none comes any more: a burst is heard in less."""
 _CHANGES = 100
 """Most changes of the channel that are remembered."""
 _PATH_STEP_S = 0.1
@@ -105,6 +107,8 @@ class _SourceWindow:
         """Whether what arrives of it is seen: not at its own end of a link."""
         self.messages: Tracker[Tracked] = Tracker(UNDER_WAY)
         """Messages on their way, so that a delivery finds its submission."""
+        self.unheard = Rate()
+        """Packets that it has sent since one of it came; as bytes, how many numbers they take."""
 
 
 class DashboardState:
@@ -183,6 +187,7 @@ class DashboardState:
                 if self._airtime is not None:
                     self._spent[event.kind] += self._airtime(len(event.data), event.mcs)  # type: ignore[assignment]
                 self._packets_sent.add(event.now)
+                source.unheard.add(event.now, event.packet.numbered)
                 for entry in event.entries:
                     source.messages.left(entry)
             elif isinstance(event, Accepted):
@@ -217,7 +222,7 @@ class DashboardState:
                     self._understood.add(now)
                     if event.packet.numbered:  # others, as repairs and reports, tell only which are missing
                         self._numbered.add(now)
-                    self._missed.add(now, missing_before(event.packet, self._newest))
+                    self._missed.add(now, self._missing_before(event.packet, now))
                 if isinstance(event, Rejected):
                     self._packets[f"rejected_{event.error.kind}"] += 1
                     self._packets["rejected"] += 1
@@ -266,8 +271,7 @@ class DashboardState:
         with self._lock:
             over = self._phase in ("ended", "failed")
             here = self._understood.totals(now)[0]
-            numbered, missing = self._numbered.totals(now)[0], self._missed.totals(now)[1]
-            lost_now = missing / (numbered + missing) if numbered + missing >= _ENOUGH else None
+            lost_now = self._lost(now)
             start = now if self._start is None else self._start
             elapsed = max(now - start, 0.0)
             keys = sorted(self._topics)
@@ -354,6 +358,31 @@ class DashboardState:
                 poor.append(f"{self._names.full(key)}: {share:.0%} of the messages of the last {RATE_S:.0f} s arrived")
         if poor:
             yield "degraded", poor
+
+    def _lost(self, now: float) -> float | None:
+        """The share of the packets of the last seconds that were lost. While nothing comes, packets that were sent say
+        so; where only what comes is seen, nothing does: the last ones that came tell only of the time before them."""
+        numbered, missing = self._numbered.totals(now)[0], self._missed.totals(now)[1]
+        since = {src_id: now - last for src_id, (last, _) in self._robots.items()}
+        between_s = (RATE_S - min(since.values(), default=0.0)) / max(numbered, 1)
+        silent = {src_id: silence > max(_QUIET_S, 3 * between_s) for src_id, silence in since.items()}
+        unheard = sum(
+            source.unheard.totals(now)[1]
+            for src_id, source in self._sources.items()
+            if silent.get(src_id) and self._whole(src_id)
+        )
+        missing += unheard
+        told = unheard or not all(silent.values())
+        return missing / (numbered + missing) if told and numbered + missing >= _ENOUGH else None
+
+    def _missing_before(self, packet: Packet, now: float) -> int:
+        """Packets of the last seconds that are missing before this one, and no more: an outage may have been longer."""
+        missing = missing_before(packet, self._newest)
+        source = self._sources.get(packet.src_id)
+        if source is None or not self._whole(packet.src_id):
+            return missing
+        sent, source.unheard = source.unheard.totals(now)[1], Rate()
+        return min(missing, sent)
 
     def _whole(self, src_id: int) -> bool:
         """Whether it is seen both what a sender sends and what arrives of it."""

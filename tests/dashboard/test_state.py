@@ -431,3 +431,19 @@ def test_no_more_than_all_arrives_in_the_last_seconds() -> None:
         feed.submit(0, at(step, 0), step / 4)
     feed.fly(9.9)
     assert state.tick(12.0).topics[0].pdr_now == 1.0
+
+
+def test_packets_that_are_sent_into_an_outage_are_lost_and_not_unknown() -> None:
+    lost = False
+    state = DashboardState(REGISTRY, NAMES, 64, ledger=dict)
+    feed = Feed(state, lost=lambda _: lost, packet_len=64)
+    share = {}
+    for step in range(200):
+        lost = 80 <= step < 160
+        feed.submit(0, at(step, 0), step / 10)
+        feed.fly(step / 10)
+        share[step / 10] = state.tick(step / 10).lost_now
+    assert share[7.0] == 0.0
+    assert share[10.5] == pytest.approx(0.5, abs=0.05), "half of the last 5 s"
+    assert share[15.0] == 1.0
+    assert share[18.5] == pytest.approx(2 / 3, abs=0.1), "what was sent in the last 5 s, not in all of the outage"
