@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -22,6 +24,8 @@ from gr_ros2_lab.record.trace import Trace
 from gr_ros2_lab.run.load import make_phy
 from gr_ros2_lab.run.scenario import Scenario, load_scenario
 from gr_ros2_lab.run.simulate import EventLoop, Offered, Robot, Simulated, simulate
+
+README = Path(__file__).parents[3] / "README.md"
 
 
 class Sized:
@@ -75,6 +79,16 @@ def only(done: Simulated) -> Any:
     return topic
 
 
+def as_the_readme_says(name: str, odom: Any) -> bool:
+    """Whether the README's table has these figures: messages sent and received, and the 99th percentile of latency."""
+    row = re.search(
+        rf"^\| `gr-ros2 run {name}`.*?\| ([\d,]+) \| ([\d,]+) \| (\d+) (m?)s", README.read_text("utf-8"), re.M
+    )
+    assert row
+    sent, received, p99 = (int(cell.replace(",", "")) for cell in row.groups()[:3])
+    return (sent, received, p99) == (odom.sent, odom.delivered, round(odom.latency_s.p99 * (1000 if row[4] else 1)))
+
+
 def trace(done: Simulated) -> Trace:
     return done.recorder.trace(0.0, done.duration_s, {})
 
@@ -108,6 +122,7 @@ def test_the_same_scenario_gives_the_same_numbers() -> None:
 def test_plain_and_unpaced_is_as_bad_as_it_was() -> None:
     odom = only(run("paper-ofdm", duration=38.0))
     assert odom.pdr < 0.2
+    assert as_the_readme_says("paper-ofdm", odom)
 
 
 @pytest.mark.parametrize("codec", [None, Sized(102), Sized(*[85] * 99, 150)], ids=["real", "102", "a few larger"])
@@ -116,6 +131,7 @@ def test_every_message_of_the_paper_arrives_and_is_fresh(codec: Sized | None) ->
     assert odom.pdr >= 0.99
     assert odom.latency_s.p99 <= (0.060 if codec is None else 0.070)  # two packets a message, and hellos between
     assert odom.goodput_Bps >= 25_000
+    assert codec or as_the_readme_says("paper-ofdm-paced", odom)
 
 
 @pytest.mark.parametrize("codec", [None, Sized(102)], ids=["real", "102"])
