@@ -7,7 +7,6 @@ hits both.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,7 +14,7 @@ from statistics import median
 from typing import Any
 
 import pmt
-from gnuradio import gr
+from gnuradio import blocks, gr
 
 from bench.port import _OUT, PACKET_LEN, _Graph, _Poster, _Taker, _wait, checked_count, one_way
 from bench.rows import Row
@@ -25,10 +24,9 @@ from gr_ros2.middleware.bag_files import read_bag
 from gr_ros2.paper.sender import Sender
 from gr_ros2.paper.settings import paper_from
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.measure import deliver, modulated
 from gr_ros2.phy.threads import shorten_switch_interval
-from gr_ros2.phy.window import WINDOW
 from gr_ros2.settings.config import ChannelConfig
 from gr_ros2.settings.registry import Registry
 
@@ -44,6 +42,8 @@ _HEADERS = 16
 _COUNTS = {"lora": (1500, 20)}
 _COUNT = (4000, 200)
 """Packets for a rate, and for a latency."""
+_WINDOW = 32
+"""Packets under way."""
 
 
 def drive() -> list[Row]:
@@ -152,7 +152,7 @@ def _bare(phy: Phy, many: int, few: int) -> tuple[float, float]:
     begin = time.perf_counter()
     for number in range(few, few + many):
         # As many at once as the link lets under way; without a limit everything waits behind the modulator.
-        _wait(transmitter.packets_sent, number - WINDOW)
+        _wait(transmitter.packets_sent, number - _WINDOW)
         poster.message_port_pub(_OUT, packet)
     _wait(lambda: taker.taken, few + many)
     rate = many / (time.perf_counter() - begin)
@@ -169,16 +169,24 @@ def _ours(phy: Phy, many: int, few: int) -> tuple[float, float]:
     sends, takes = one_way(robot, base, phy.packet_len)
     source, sink = sends.source, takes.sink
     message = b"\0\1\0\0" + bytes(phy.packet_len - _HEADERS - 4)
-    with LoopbackLink(phy, source, sink, throttled=False):
+    transmitter, receiver, graph = phy.transmitter(), phy.receiver(), Flowgraph("gr_ros2_bench", phy.name)
+    untagged = blocks.copy(gr.sizeof_gr_complex)  # tags of GNU Radio's modulator would tell the receiver too much
+    untagged.set_tag_propagation_policy(gr.TPP_DONT)
+    graph.connect(transmitter, untagged, receiver)
+    graph.msg_connect(source, "pdus", transmitter, "pdus")
+    graph.msg_connect(receiver, "pdus", sink, "pdus")
+    with graph:
         phy.prefer_latency()
         single = _latency(lambda: robot.callback(message), lambda: base.counter.published, few)
         begin = time.perf_counter()
-        feeder = threading.Thread(target=lambda: [robot.callback(message) for _ in range(many)], daemon=True)
-        feeder.start()
+        for number in range(few, few + many):
+            _wait(transmitter.packets_sent, number - _WINDOW)
+            robot.callback(message)
         _wait(lambda: base.counter.published, few + many)
         rate = many / (time.perf_counter() - begin)
-        feeder.join()
         checked_count(phy.name, sink.stats()["packets"], few + many, 1)
+    for part in (transmitter, receiver):
+        part.release()
     sends.close()
     takes.close()
     return rate, single

@@ -27,8 +27,8 @@ from gr_ros2.settings.registry import Registry, Topic
 
 if TYPE_CHECKING:  # they need GNU Radio, and a run in simulated time by packets does not
     from gr_ros2.gr.sending import SendingBlock
-    from gr_ros2.phy.path import LinkCounts
     from gr_ros2.phy.tap import Samples
+    from gr_ros2.radio.radio import LinkCounts
 
 _HELD_BYTES = 1 << 25
 """Bytes of events that may wait for an observer with a thread of its own."""

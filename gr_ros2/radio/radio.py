@@ -1,7 +1,8 @@
 """PHY and front end as one GNU Radio block: packets to the air and back.
 
 Invariants: packets leave at the pace of the air, and each credit asks for one packet just before it is due. Neither
-direction waits for the other. Received samples can be impaired only if the channel is not a real one.
+direction waits for the other. Received samples can be impaired only if the channel is not a real one; a part that was
+not built in costs nothing, and its settings cannot be changed.
 """
 
 from __future__ import annotations
@@ -9,33 +10,60 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from gnuradio import gr
 
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, PhyError
 from gr_ros2.link.airtime_limit import AirtimeLimit
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.airtime import AirtimeGate
-from gr_ros2.phy.base import PacketTransceiver
+from gr_ros2.phy.base import PacketReceiver, PacketTransceiver, PacketTransmitter, SymbolSource
 from gr_ros2.phy.burst_blocks import BurstSink
-from gr_ros2.phy.channel import BurstChannel, PacketLoss
+from gr_ros2.phy.channel import BurstChannel, Channel, PacketLoss
 from gr_ros2.phy.flowgraph import HierBlock
-from gr_ros2.phy.path import SAMPLES_SHOWN, PacketPath
+from gr_ros2.phy.tap import Samples, Tap
 from gr_ros2.radio import FRONT_ENDS
 from gr_ros2.radio.front_end import FrontEnd
 from gr_ros2.radio.limits import open_limit
 from gr_ros2.radio.permission import SealedOnly, check_band, permitted
 from gr_ros2.radio.sigmf import SigmfRecorder, SigmfRecording
-from gr_ros2.settings.config import ChannelConfig, airtime_from, build
+from gr_ros2.settings.config import ChannelConfig, airtime_from, build, replaced
 from gr_ros2.settings.fields import AUTO, Auto
 
 _LEAST_WAIT_S = 0.001
 """s after which a channel that was not clear is listened to again, at least."""
+_SAMPLES_SHOWN = 1024
+"""Samples of one snapshot of the received signal."""
 
 
-class Radio(PacketPath, HierBlock):
+@dataclass(frozen=True)
+class LinkCounts:
+    """Packets at each place of a radio, since the start.
+
+    :param passed: packets that the gate let through
+    :param backlog: packets in the gate, waiting for the channel or occupying it
+    :param transmitted: packets that left the transmitter as samples
+    :param received: packets that came out of the receiver, if they are counted
+    :param losses: packets dropped on purpose after the receiver, by the channel's setting that caused it
+    """
+
+    passed: int
+    backlog: int
+    transmitted: int
+    received: int
+    losses: Mapping[str, int]
+
+    @property
+    def dropped(self) -> int:
+        """Packets dropped on purpose, whatever the setting."""
+        return sum(self.losses.values())
+
+
+class Radio(HierBlock):
     """Message ports `pdus` in, `pdus` out and `credit` out (see :class:`gr_ros2.gr.sending.SendingBlock`).
 
     :param phy: converts packets to samples and back
@@ -53,7 +81,16 @@ class Radio(PacketPath, HierBlock):
         stream, and `points`, the constellation, a message port on which burst PHYs send
     :raises ConfigError: for a channel that this PHY or front end cannot have, or a recording without samples
     :raises RadioError: when the recording cannot be written
+    :ivar channel: the current impairments
+    :ivar gate: lets packets pass at the pace of the air
     """
+
+    _transmitter: PacketTransmitter | None = None
+    _faded: Channel | BurstChannel | None = None
+    _receiver: PacketReceiver | None = None
+    _loss: PacketLoss | None = None
+    _tap: SymbolSource | None = None
+    _symbols: SymbolSource | None = None
 
     def __init__(
         self,
@@ -93,7 +130,7 @@ class Radio(PacketPath, HierBlock):
         self._simulated = (changeable or instrumented) and not front_end.has_radio
         self._recorder: SigmfRecorder | None = None
         airtime_of = front_end.airtime if phy.any_length else None
-        self._gate = self.gate = AirtimeGate(
+        self.gate = AirtimeGate(
             front_end.airtime(),
             airtime_of=airtime_of,
             ahead=front_end.ahead(),
@@ -107,9 +144,9 @@ class Radio(PacketPath, HierBlock):
         if not front_end.transmits:
             self.gate.transmit(on=False)
         front_end.follow(self.at_rest)
-        self.msg_connect(self, "pdus", self._gate, "pdus")
-        self.msg_connect(self._gate, "credit", self, "credit")
-        last: Any = self._gate
+        self.msg_connect(self, "pdus", self.gate, "pdus")
+        self.msg_connect(self.gate, "credit", self, "credit")
+        last: Any = self.gate
         if front_end.packets is not None:
             last = self._follow(last, front_end.packets)
         elif phy.has_samples:
@@ -128,6 +165,66 @@ class Radio(PacketPath, HierBlock):
             last = self._follow(last, self._loss)
         self._follow(last, self)
 
+    def counts(self) -> LinkCounts:
+        """A snapshot."""
+        passed = self.gate.passed
+        return LinkCounts(
+            passed=passed,
+            backlog=self.gate.backlog,
+            transmitted=passed if self._transmitter is None else self._transmitter.packets_sent(),
+            received=0 if self._loss is None else self._loss.received,
+            losses={} if self._loss is None else self._loss.dropped,
+        )
+
+    def gate_lateness(self) -> Lateness:
+        """Delays of the gate."""
+        return self.gate.lateness
+
+    @property
+    def changeable(self) -> bool:
+        """Whether a channel was built in that can be changed while it runs."""
+        return self._loss is not None
+
+    def samples(self) -> Samples | None:
+        """Newest samples at the receiver's antenna, after the channel; None without a tap, or if no samples arrived."""
+        return None if self._tap is None else self._tap.samples()
+
+    def symbols(self) -> Samples | None:
+        """Newest equalised payload symbols; None if there is no tap, or the PHY shows none."""
+        return None if self._symbols is None else self._symbols.samples()
+
+    @property
+    def snr_db(self) -> float | None:
+        """SNR of the newest packets received, dB over the sampled band; None before the first, or if the PHY does not
+        measure it."""
+        return None if self._receiver is None else self._receiver.snr_db
+
+    def set_snr_db(self, snr_db: float | None) -> None:
+        """Set the SNR of the received signal, dB, None = no noise; see :meth:`Channel.set_snr_db`.
+
+        :raises ConfigError: out of range
+        :raises PhyError: if no simulated channel was built in
+        """
+        self._change("snr_db", snr_db, self._faded)
+
+    def set_frequency_offset(self, frequency_offset: float) -> None:
+        """Set the carrier frequency offset of the received signal, fraction of the sample rate; likewise."""
+        self._change("frequency_offset", frequency_offset, self._faded)
+
+    def set_packet_loss(self, probability: float) -> None:
+        """Set the probability that a received packet is dropped; likewise."""
+        self._change("packet_loss", probability, self._loss)
+
+    def _change(self, setting: str, value: float | None, part: Any) -> None:
+        if part is None:
+            raise PhyError(
+                f"{setting}: front_end {self.front_end.name} was started without a simulated channel that can change "
+                f"it; set channel.{setting} before the start, where the PHY supports it"
+            )
+        channel = replaced(self.channel, **{setting: value})
+        getattr(part, f"set_{setting}")(value)
+        self.channel = channel
+
     def at_rest(self) -> int | None:
         """How many packets the front end gets as samples, of those that have passed; None while one is due."""
         passed = self.gate.at_rest()
@@ -139,26 +236,34 @@ class Radio(PacketPath, HierBlock):
         if self.channel.on_samples() or self._simulated:
             whole.channel = self._faded = BurstChannel(self.channel, self.phy)
         if instrumented:
-            self._tap, self._symbols = whole.tap_samples(SAMPLES_SHOWN), whole.tap_symbols()
-        self._follow(self._gate, whole)
+            self._tap, self._symbols = whole.tap_samples(_SAMPLES_SHOWN), whole.tap_symbols()
+        self._follow(self.gate, whole)
 
     def _connect_samples(self, record: str, instrumented: bool) -> None:
         """Connect the transmitter to the front end, and the front end to the receiver, where they exist."""
         front_end = self.front_end
         front_end.wire(self)
         if front_end.sink is not None:
-            self.connect(self._transmit(self._gate), front_end.sink)
+            self._transmitter = self.phy.transmitter()
+            self.connect(self._follow(self.gate, self._transmitter), front_end.sink)
         if front_end.source is None:
             return
+        heard = front_end.source
         # The channel also stops tags.
-        faded = (front_end.loops_back and self.phy.leaves_tags()) or bool(self.channel.on_samples()) or self._simulated
-        heard = self._receive(front_end.source, faded=faded, shown=instrumented)
-        if front_end.clock_offset is not None and self._receiver is not None:
-            self._receiver.follow_clock(front_end.clock_offset)
+        if (front_end.loops_back and self.phy.leaves_tags()) or self.channel.on_samples() or self._simulated:
+            heard = self._faded = Channel(self.channel, self.phy)
+            self.connect(front_end.source, heard)
+        receiver = self._receiver = self.phy.receiver()
+        self.connect(heard, receiver)
+        if instrumented:
+            self._tap, self._symbols = Tap(_SAMPLES_SHOWN), receiver.tap_symbols()
+            self.connect(heard, self._tap)
+        if front_end.clock_offset is not None:
+            receiver.follow_clock(front_end.clock_offset)
         if self._shows:
             self.connect(heard, self)
-            if isinstance(self._receiver, BurstSink):
-                self.msg_connect(self._receiver, "points", self, "points")
+            if isinstance(receiver, BurstSink):
+                self.msg_connect(receiver, "points", self, "points")
         if record:
             frequency = front_end.receive_frequency
             about = SigmfRecording(
@@ -166,6 +271,11 @@ class Radio(PacketPath, HierBlock):
             )
             self._recorder = SigmfRecorder(Path(record), about)
             self.connect(heard, self._recorder)
+
+    def _follow(self, packets: Any, block: Any) -> Any:
+        """Connect a block's port `pdus` to that of another block; returns the block."""
+        self.msg_connect(packets, "pdus", block, "pdus")
+        return block
 
     def close(self) -> None:
         """Release device, sockets, files and memory. The flowgraph must have stopped or never run. Idempotent."""
@@ -183,6 +293,11 @@ class Radio(PacketPath, HierBlock):
         flowgraph stops."""
         self.front_end.drain(self.gate.passed - self.refused)
 
+    @property
+    def transmits(self) -> bool:
+        """Whether packets may pass the gate."""
+        return self.gate.transmits
+
     def transmit(self, *, on: bool) -> None:
         """Switch sending off, at once for all packets that have not reached the device, or on again.
 
@@ -193,7 +308,7 @@ class Radio(PacketPath, HierBlock):
                 f"front_end {self.front_end.name}: it only receives, and has no open transmitter; start it again with "
                 "--transmit, or transmit: true"
             )
-        super().transmit(on=on)
+        self.gate.transmit(on=on)
 
     def recorded(self) -> dict[str, int]:
         """Numbers of samples. ``unrecorded``: not in the recording, for example because the disk is full. Empty if
@@ -218,10 +333,6 @@ class Radio(PacketPath, HierBlock):
     def foreign(self) -> int:
         """Number of whole frames received that are not packets of this link, as far as the PHY tells them."""
         return 0 if self._receiver is None else self._receiver.foreign
-
-    @property
-    def _medium(self) -> str:
-        return f"front_end {self.front_end.name}"
 
 
 class _Ready:

@@ -27,7 +27,8 @@ from gr_ros2.link.events import SentPacket
 from gr_ros2.middleware import Middleware, Qos, join_graph
 from gr_ros2.paper.settings import PaperConfig
 from gr_ros2.phy import PHY, Phy
-from gr_ros2.phy.loopback import LoopbackLink
+from gr_ros2.phy.channel import PacketLoss
+from gr_ros2.phy.flowgraph import Flowgraph
 from gr_ros2.phy.pdus import PDUS, packets_of, pdu_of
 from gr_ros2.phy.threads import KeepsThreadState, shorten_switch_interval
 from gr_ros2.radio.config import LinkConfig
@@ -239,18 +240,22 @@ class RaceIpLink(Closing):
                 tun = Tun(namespace, setup)
                 stack.callback(tun.close)
                 self._tuns.append(tun)
-            self._links: list[LoopbackLink] = []
+            self._losses, self._sinks = list[PacketLoss](), list[TunSink]()
             for direction, log in enumerate(self._logs):
                 phy = radio.with_frames_of(MTU)
-                source = TunSource(self._tuns[direction], radio, log)
-                sink = TunSink(self._tuns[1 - direction])
-                link = LoopbackLink(
-                    phy, source, sink, channel=radio.channel(direction), throttled=False, paced=False
-                )  # TunSource delays each frame by its airtime
-                stack.callback(link.stop)
-                link.start()
+                transmitter, receiver = phy.transmitter(), phy.receiver()
+                source = TunSource(self._tuns[direction], radio, log)  # delays each frame by its airtime
+                loss, sink = PacketLoss(radio.channel(direction)), TunSink(self._tuns[1 - direction])
+                graph = Flowgraph("gr_ros2_race_ip", f"phy {phy.name}")
+                graph.connect(transmitter, receiver)
+                for block, after in ((source, transmitter), (receiver, loss), (loss, sink)):
+                    graph.msg_connect(block, PDUS, after, PDUS)
+                for release in (transmitter.release, receiver.release, graph.stop):  # the last of them first
+                    stack.callback(release)
+                graph.start()
                 phy.prefer_latency()
-                self._links.append(link)
+                self._losses.append(loss)
+                self._sinks.append(sink)
             self._stack = stack.pop_all()
 
     def enter(self, end: int) -> None:
@@ -258,8 +263,8 @@ class RaceIpLink(Closing):
 
     def set_loss(self, probability: float) -> None:
         """Lose this share of all frames from now on, both ways."""
-        for link in self._links:
-            link.set_packet_loss(probability)
+        for loss in self._losses:
+            loss.set_packet_loss(probability)
 
     def matched(self) -> bool:
         """True: IP has no ends that must find each other."""
@@ -269,8 +274,8 @@ class RaceIpLink(Closing):
         """The traffic on the air so far."""
         drops = {
             "queue_full": sum(tun.dropped() for tun in self._tuns),
-            "on_air": sum(link.counts().dropped for link in self._links),
-            "not_taken": sum(link.sink.refused for link in self._links),
+            "on_air": sum(loss.dropped.total() for loss in self._losses),
+            "not_taken": sum(sink.refused for sink in self._sinks),
         }
         return LinkReport(*self._logs, drops)
 
@@ -288,8 +293,6 @@ class TunSource(gr.basic_block):  # type: ignore[misc]
     def __init__(self, tun: Tun, radio: RaceRadio, log: LinkLog) -> None:
         super().__init__("gr_ros2_tun_source", None, None)
         self._tun, self._log = tun, log
-        self.emitted = 0
-        """PDUs that have left."""
         self._airtimes = [radio.airtime_s(length) for length in range(MTU + 1)]
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -323,7 +326,6 @@ class TunSource(gr.basic_block):  # type: ignore[misc]
                 return
             self._log.note(free, len(packet), airtime)
             self.message_port_pub(PDUS, pdu_of(packet))
-            self.emitted += 1
 
 
 class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
@@ -332,10 +334,8 @@ class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
     def __init__(self, tun: Tun) -> None:
         super().__init__("gr_ros2_tun_sink", None, None)
         self._tun = tun
-        self.handled = 0
-        """PDUs that this block has handled."""
         self.refused = 0
-        """Handled PDUs that were not an IP packet, or that the kernel refused."""
+        """PDUs that were not an IP packet, or that the kernel refused."""
         self.message_port_register_in(PDUS)
         self.set_msg_handler(PDUS, self._write)
 
@@ -348,7 +348,6 @@ class TunSink(KeepsThreadState, gr.basic_block):  # type: ignore[misc]
                 self._tun.write(packet.data)
         except OSError:
             self.refused += 1
-        self.handled += 1
 
 
 def _registry(topics: Sequence[tuple[str, str, Qos | None]], queue: QueuePolicy | Auto) -> Registry:

@@ -21,9 +21,9 @@ from gr_ros2.core.errors import GrRos2Error, RunError
 from gr_ros2.core.watch import wait_until
 from gr_ros2.link.lateness import Lateness
 from gr_ros2.phy import Phy
-from gr_ros2.phy.path import LinkCounts
 from gr_ros2.phy.tap import Samples
 from gr_ros2.radio.front_end import FrontEnd
+from gr_ros2.radio.radio import LinkCounts
 from gr_ros2.radio.robot_link import RobotLink
 from gr_ros2.radio.zmq import ZmqFrontEnd
 from gr_ros2.settings.config import ChannelConfig, PhyConfig, replaced

@@ -17,13 +17,13 @@ from gr_ros2.middleware.memory import MemoryMiddleware
 from gr_ros2.paper import RosSource
 from gr_ros2.paper.sender import Sender
 from gr_ros2.paper.settings import paper_from
-from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.ofdm import OfdmPhy
 from gr_ros2.settings.registry import Registry
 from tests.domains import free_domains
 from tests.gr.probe import Probe
 from tests.middleware.support import STRING
 from tests.packets import data_of
+from tests.phy.loopback import Loopback
 from tests.waiting import wait_for
 
 GROWTH_BYTES = 500_000
@@ -127,7 +127,7 @@ def test_a_flowgraph_starts_while_other_threads_map_memory() -> None:
         thread.start()
     try:
         for _ in range(5):
-            with LoopbackLink(OfdmPhy(64, 1e6), Probe(), Probe()):
+            with Loopback(OfdmPhy(64, 1e6), Probe(), Probe()):
                 started += 1
     finally:
         over.set()

@@ -13,12 +13,12 @@ from gnuradio import blocks, gr
 from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.base import LENGTH_TAG
-from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import deliver, modulated, pdr, record
 from gr_ros2.phy.tap import SYMBOLS_SHOWN
 from gr_ros2.phy.theory import half_point
 from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
+from tests.phy.loopback import Loopback
 from tests.waiting import wait_for
 
 WITH_SAMPLES = [name for name in PHY if PHY.load(name).has_samples]
@@ -148,18 +148,18 @@ def test_lengths_that_are_fixed_take_no_other_packet(name: str) -> None:
 def test_a_single_packet_comes_out_by_itself(name: str, options: dict[str, Any]) -> None:
     source, sink = Probe(), Probe()
     draw = random.Random(1)
-    with LoopbackLink(make(name, options), source, sink, throttled=False) as link:
+    with Loopback(make(name, options), source, sink) as link:
         for number in range(1, 6):
             source.post(draw.randbytes(64))
             wait_for(lambda number=number: sink.handled == number, "the packet just sent")
-        assert link.counts().transmitted == 5
+        assert link.radio.counts().transmitted == 5
 
 
 @pytest.mark.parametrize("name", WITH_SAMPLES)
 def test_all_zeros_and_all_ones_pass(name: str) -> None:
     source, sink = Probe(), Probe()
     sent = [bytes(64), b"\xff" * 64] * 5
-    with LoopbackLink(make(name, {}), source, sink, throttled=False):
+    with Loopback(make(name, {}), source, sink):
         for packet in sent:
             source.post(packet)
         wait_for(lambda: sink.handled == len(sent), "every packet")
@@ -169,11 +169,11 @@ def test_all_zeros_and_all_ones_pass(name: str) -> None:
 @pytest.mark.parametrize("name", WITH_SAMPLES)
 def test_the_symbols_of_the_last_packet_can_be_seen(name: str) -> None:
     source, sink = Probe(), Probe()
-    with LoopbackLink(make(name, {}), source, sink, throttled=False, instrumented=True) as link:
-        assert link.symbols() is None
+    with Loopback(make(name, {}), source, sink, instrumented=True) as link:
+        assert link.radio.symbols() is None
         source.post(bytes(range(64)))
         wait_for(lambda: sink.handled == 1, "the packet")
-        symbols = link.symbols()
+        symbols = link.radio.symbols()
         assert symbols is not None
         assert 100 < len(symbols) <= SYMBOLS_SHOWN
         assert np.abs(np.abs(symbols) - 1).max() <= 0.35
@@ -237,14 +237,14 @@ def test_a_lora_burst_that_takes_too_much_memory_is_refused_with_a_remedy() -> N
 @pytest.mark.parametrize("name", WITH_SAMPLES)
 def test_a_pdu_that_is_no_packet_is_counted_and_not_sent(name: str) -> None:
     source, sink = Probe(), Probe()
-    link = LoopbackLink(make(name, {}), source, sink, throttled=False)
+    link = Loopback(make(name, {}), source, sink)
     with link:
         source.post(b"")
         source.post(bytes(65))
         source.post(bytes(64))
         wait_for(lambda: sink.handled == 1, "the right one")
-        assert link.counts().transmitted == 1
-        assert link._transmitter.refused == 2
+        assert link.radio.counts().transmitted == 1
+        assert link.radio._transmitter.refused == 2
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

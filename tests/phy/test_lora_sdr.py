@@ -14,7 +14,6 @@ from gnuradio import blocks, gr
 
 from gr_ros2.core.errors import BackendMissingError, ConfigError
 from gr_ros2.phy import PHY
-from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.lora import LoraPhy
 from gr_ros2.phy.lora_sdr import PER_CHIP, SdrFrame, whitening
 from gr_ros2.phy.measure import SampleRecording, deliver, record
@@ -22,6 +21,7 @@ from gr_ros2.phy.pdus import pdu_of
 from gr_ros2.phy.threads import start_flowgraph
 from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
+from tests.phy.loopback import Loopback
 from tests.waiting import wait_for
 
 try:
@@ -166,7 +166,7 @@ def test_with_the_least_gap_single_packets_come_out_at_once(options: dict[str, A
     phy = make(14, gap=24 * PER_CHIP, **options)
     source, sink, draw = Probe(), Probe(), random.Random(1)
     channel = ChannelConfig(snr_db=20, frequency_offset=0.004, epsilon=1.00001, seed=1)
-    with LoopbackLink(phy, source, sink, channel=channel, throttled=False):
+    with Loopback(phy, source, sink, channel=channel):
         for number in range(1, 11):
             source.post(draw.randbytes(14))
             wait_for(lambda number=number: sink.handled == number, "the packet just sent")
@@ -193,7 +193,7 @@ def test_every_byte_value_passes() -> None:
     phy = make(128)
     source, sink = Probe(), Probe()
     sent = [bytes(range(128)), bytes(range(128, 256)), bytes(128), b"\xff" * 128]
-    with LoopbackLink(phy, source, sink, throttled=False):
+    with Loopback(phy, source, sink):
         for packet in sent:
             source.post(packet)
         wait_for(lambda: sink.handled == len(sent), "every packet")
@@ -240,12 +240,12 @@ def test_with_the_carrier_known_clocks_may_differ(ppm: int) -> None:
 @with_the_module
 def test_a_pdu_that_is_no_packet_is_counted_and_not_sent() -> None:
     source, sink = Probe(), Probe()
-    with LoopbackLink(make(), source, sink, throttled=False) as link:
+    with Loopback(make(), source, sink) as link:
         source.post(bytes(63))
         source.post(bytes(64))
         wait_for(lambda: sink.handled == 1, "the right one")
-        assert link.counts().transmitted == 1
-        assert link._transmitter.refused == 1
+        assert link.radio.counts().transmitted == 1
+        assert link.radio._transmitter.refused == 1
 
 
 @with_the_module

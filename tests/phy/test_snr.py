@@ -10,10 +10,10 @@ import pytest
 
 from gr_ros2.phy import PHY, Phy
 from gr_ros2.phy.burst import BurstReceiver
-from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.theory import half_point
 from gr_ros2.settings.config import ChannelConfig
 from tests.gr.probe import Probe
+from tests.phy.loopback import Loopback
 from tests.phy.test_burst import NAMES, bursts, delayed, noise
 from tests.waiting import wait_for
 
@@ -126,11 +126,11 @@ def test_a_flowgraph_tells_it_where_the_phy_knows_it(name: str, options: dict[st
     phy: Phy = made(name, options)
     channel = ChannelConfig(snr_db=14.0, frequency_offset=0.001, seed=1) if phy.has_samples else ChannelConfig()
     source, sink = Probe(), Probe()
-    with LoopbackLink(phy, source, sink, channel=channel, throttled=False) as link:
-        assert link.snr_db is None
+    with Loopback(phy, source, sink, channel=channel) as link:
+        assert link.radio.snr_db is None
         for number in range(COUNT):
             source.post(bytes([number] * 64))
         wait_for(lambda: sink.handled == COUNT, "every packet")
-        assert (link.snr_db is not None) == told
+        assert (link.radio.snr_db is not None) == told
     if told:  # also when it has stopped
-        assert link.snr_db == pytest.approx(14.0, abs=TOLERANCE_DB)
+        assert link.radio.snr_db == pytest.approx(14.0, abs=TOLERANCE_DB)

@@ -20,7 +20,6 @@ from gr_ros2.paper.receiver import Receiver
 from gr_ros2.paper.sender import Sender
 from gr_ros2.paper.settings import paper_from
 from gr_ros2.phy import PHY
-from gr_ros2.phy.loopback import LoopbackLink
 from gr_ros2.phy.measure import SampleRecording, deliver, modulated, record
 from gr_ros2.phy.theory import half_point
 from gr_ros2.phy.threads import run_flowgraph
@@ -32,6 +31,7 @@ from gr_ros2_lab.sim.fleet import Fleet
 from gr_ros2_lab.sim.sim_settings import SimSettings
 from tests.gr.probe import Probe
 from tests.packets import data_of
+from tests.phy.loopback import Loopback
 from tests.waiting import wait_for
 
 try:
@@ -287,13 +287,13 @@ def test_with_the_channel_known_clocks_may_differ(ppm: int) -> None:
 def test_the_snr_told_is_that_of_the_channel(equalizer: str, snr_db: float) -> None:
     phy = make(equalizer=equalizer)
     source, sink = Probe(), Probe()
-    with LoopbackLink(phy, source, sink, channel=ChannelConfig(snr_db=snr_db, seed=1), throttled=False) as link:
-        assert link.snr_db is None
+    with Loopback(phy, source, sink, channel=ChannelConfig(snr_db=snr_db, seed=1)) as link:
+        assert link.radio.snr_db is None
         for number in range(40):
             source.post(bytes(64))
-            wait_for(lambda number=number: link.counts().transmitted > number, "the burst")
+            wait_for(lambda number=number: link.radio.counts().transmitted > number, "the burst")
         wait_for(lambda: sink.handled >= 30, "most packets")
-        assert link.snr_db == pytest.approx(snr_db, abs=1.0)
+        assert link.radio.snr_db == pytest.approx(snr_db, abs=1.0)
 
 
 @with_the_module
