@@ -1,5 +1,5 @@
 """DDS domains and ports that only one test process of a machine uses, also when several suites run at once, see
-:mod:`gr_ros2.middleware.free_domains`."""
+:mod:`gr_ros2_lab.run.domains`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import socket
 from contextlib import suppress
 from itertools import cycle, islice
 
-from gr_ros2.middleware.free_domains import FREE, ReservedDomain
+from gr_ros2_lab.run.domains import FREE, ReservedDomain
 
 _DOMAINS = FREE
 _PORTS = 250

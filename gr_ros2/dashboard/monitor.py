@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from gr_ros2.core.arrays import Floats
 from gr_ros2.core.errors import GrRos2Error
-from gr_ros2.dashboard.spectrum import Spectrum
 from gr_ros2.dashboard.state import DashboardState
 from gr_ros2.dashboard.views import Snapshot
 from gr_ros2.dashboard.windows import RATE_S
@@ -33,6 +32,40 @@ _LOOKS = 200
 """Newest looks at the received signal that say where the band is busy: 20 s."""
 _NEWEST = 200
 """Late moments that are looked at: more do not fit into the last seconds."""
+BINS = 256
+_SMOOTHING = 0.25
+"""Weight of new samples in the running average."""
+_FLOOR = 1e-12
+
+
+class Spectrum:
+    """Averaged power over frequency.
+
+    :param sample_rate: samples/s
+    """
+
+    def __init__(self, sample_rate: float) -> None:
+        self.frequencies: Floats = np.fft.fftshift(np.fft.fftfreq(BINS, 1 / sample_rate))
+        """Hz from the centre, ascending."""
+        self._window = np.hanning(BINS)
+        self._power: Floats | None = None
+
+    def add(self, samples: npt.NDArray[np.complex64]) -> None:
+        """Add consecutive samples, in blocks of ``BINS``. An incomplete block is ignored, and one with a sample that is
+        no finite number."""
+        blocks = samples[: len(samples) // BINS * BINS].reshape(-1, BINS)
+        blocks = blocks[np.isfinite(blocks).all(axis=1)]
+        if not len(blocks):
+            return
+        power = (np.abs(np.fft.fftshift(np.fft.fft(blocks * self._window), axes=1)) ** 2).mean(axis=0)
+        self._power = power if self._power is None else self._power + _SMOOTHING * (power - self._power)
+
+    def decibels(self) -> Floats | None:
+        """Power of each bin relative to the strongest one, dB; None before the first samples."""
+        if self._power is None:
+            return None
+        decibels: Floats = 10 * np.log10(np.maximum(self._power / max(self._power.max(), _FLOOR), _FLOOR))
+        return decibels
 
 
 @dataclass(frozen=True)

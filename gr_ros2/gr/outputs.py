@@ -20,7 +20,6 @@ from gr_ros2.core.names import topic_fault
 from gr_ros2.gr.early import EarlyMessages
 from gr_ros2.gr.failures import Failures
 from gr_ros2.gr.frame_ids import TF_TYPE, FramePrefix, MergedTransforms
-from gr_ros2.gr.heard_topics import HeardTopics, Key
 from gr_ros2.gr.latency import Latencies, LatencyWindow
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.loops import LOOP_GUARD
@@ -34,8 +33,53 @@ from gr_ros2.middleware import Middleware, Publisher, Qos
 from gr_ros2.middleware.type_definitions import known
 from gr_ros2.middleware.type_descriptions import Described
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Registry, Topic, announced
-from gr_ros2.settings.robot import RobotConfig
+from gr_ros2.settings.registry import Registry, Topic, announced, options_of
+from gr_ros2.settings.robot import PublishConfig, PublishOptions, RobotConfig
+
+Key = tuple[int, int]
+"""Source id and topic id."""
+
+
+class HeardTopics:
+    """The topics of all robots that are heard, by source id and topic id."""
+
+    def __init__(self, registry: Registry, publish: PublishConfig) -> None:
+        self._registry, self._publish = registry, publish
+        self._announced: dict[Key, Topic] = {}
+
+    def announce(self, key: Key, topic: Topic) -> None:
+        """A robot says what a topic id means."""
+        self._announced[key] = topic
+
+    def announced(self) -> list[tuple[int, str, Topic]]:
+        """Source id, absolute name here and meaning of each topic that is announced now."""
+        return [(key[0], self.name(key), topic) for key, topic in list(self._announced.items())]
+
+    def name_of(self, src_id: int, name: str) -> str:
+        """Absolute name under which a sender's topic comes out, by its name in a registry."""
+        named = options_of(name, self._publish.topics, PublishOptions()).as_
+        return Topic(0, name, "", publish_as=named).republished(self._publish.as_, src_id)
+
+    def name(self, key: Key) -> str:
+        """Absolute name under which a topic comes out."""
+        return self.topic(key).republished(self._publish.as_, key[0])
+
+    def topic(self, key: Key) -> Topic:
+        """The topic that a sender's topic id means, from its announcement or from the registry.
+
+        :raises ConfigError: when the topic id is in neither of them
+        """
+        topic = self._announced.get(key)
+        if topic is not None:
+            return topic
+        if key[1] < len(self._registry):
+            return self._registry[key[1]]
+        raise ConfigError(f"topic id {key[1]} of robot {key[0]} is neither announced nor in the registry")
+
+    def is_topic(self, key: Key) -> bool:
+        """Whether a sender's topic id means a topic: neither its table, nor its calls, nor something unknown."""
+        topic = self._announced.get(key)
+        return key[1] < len(self._registry) if topic is None else topic.is_topic
 
 
 @dataclass(slots=True, eq=False)

@@ -7,13 +7,45 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from gr_ros2.gr.pmts import PduMaker
+import pmt
+
 from gr_ros2.link import AirPacket, SentPacket
 from gr_ros2.link.bond import Bond
-from gr_ros2.phy.pdus import PduPort, port_of
+from gr_ros2.phy.pdus import PduPort, pdu_to_send, port_of
 from gr_ros2.settings.fields import AUTO
 from gr_ros2.settings.registry import Registry
-from gr_ros2.wire import QOS_LATENCY
+from gr_ros2.wire import QOS_LATENCY, Packet
+
+_SRC, _DST, _SEQ, _QOS, _WALL = (pmt.intern(name) for name in ("src_id", "dst_id", "seq", "qos", "t_src_wall"))
+
+
+class PduMaker:
+    """Makes PDUs from packets, and caches the metadata that repeats."""
+
+    def __init__(self) -> None:
+        self._metadata: dict[tuple[int, int, int], Any] = {}
+
+    def pdu(self, packet: Packet, on_air: AirPacket, wall: float) -> Any:
+        """One packet as a PDU.
+
+        :param packet: its meaning
+        :param on_air: its bytes, and how and when they leave
+        :param wall: s since 1970, for ``t_src_wall``
+        """
+        header = (packet.src_id, packet.dst_id, packet.qos)
+        metadata = self._metadata.get(header)
+        if metadata is None:
+            metadata = self._metadata[header] = _header_metadata(header)
+        metadata = pmt.dict_add(metadata, _SEQ, pmt.from_long(packet.seq))
+        metadata = pmt.dict_add(metadata, _WALL, pmt.from_double(wall))
+        return pdu_to_send(on_air, metadata)
+
+
+def _header_metadata(header: tuple[int, int, int]) -> Any:
+    metadata = pmt.make_dict()
+    for key, value in zip((_SRC, _DST, _QOS), header, strict=True):
+        metadata = pmt.dict_add(metadata, key, pmt.from_long(value))
+    return metadata
 
 
 class RadioPorts:

@@ -15,7 +15,7 @@ import logging
 import random
 import secrets
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from math import inf, isnan, nan
@@ -59,6 +59,51 @@ _HEAD = 64
 _LEAST = 16
 _NUMBER = 4
 _log = logging.getLogger(__name__)
+MAIN = ""
+"""Name of the way that any radio may carry."""
+_OVER = ("done", "failed")
+
+
+class ThroughputWays:
+    """The measurements of one robot over each of its ways, at the same time: no two have air in common.
+
+    What any radio may carry is one way, and each radio whose channel other robots share is another one with an endpoint
+    of its own (:mod:`gr_ros2.gr.bound`).
+
+    :param ways: those that there are now, at least one, by the names of their radios
+    """
+
+    def __init__(self, ways: Callable[[], Mapping[str, LiveThroughput]]) -> None:
+        self._ways = ways
+        self._measured: Mapping[str, LiveThroughput] = {}
+
+    def measure(self, robot: int, for_s: int) -> None:
+        """As :meth:`LiveThroughput.measure`, over all ways over which the robot is heard, or over none."""
+        ways = self._ways()
+        heard = {name: way for name, way in ways.items() if way.hears(robot)} or dict([next(iter(ways.items()))])
+        for way in heard.values():
+            way.check(robot, for_s)
+        for way in heard.values():
+            way.measure(robot, for_s)
+        self._measured = heard
+
+    def look(self) -> dict[str, Any]:
+        """As :meth:`LiveThroughput.look`, of what any radio may carry, with ``radios``: the same of each that has its
+        channel for itself, by name. The state is that of the way that takes longest; failed, if none did not."""
+        told = {name: way.look() for name, way in self._measured.items()}
+        if not told:
+            return {"state": "none"}
+        first = next(iter(told.values()))
+        ends = [each for each in told.values() if each["state"] == "done"] or [first]
+        going = [each for each in told.values() if each["state"] not in _OVER]
+        nothing = {"there": None, "back": None}
+        return {
+            **first,
+            **{way: told.get(MAIN, nothing)[way] for way in nothing},
+            "state": (going or ends)[0]["state"],
+            "words": "; ".join(dict.fromkeys(each["words"] for each in told.values() if each["words"])),
+            "radios": {name: each for name, each in told.items() if name != MAIN},
+        }
 
 
 @dataclass(slots=True)

@@ -20,13 +20,12 @@ from pydantic.dataclasses import dataclass
 
 from gr_ros2.link.events import AirPacket
 from gr_ros2.phy.base import LENGTH_TAG, BurstCarrier, PacketReceiver, PacketTransceiver, PacketTransmitter, Phy
-from gr_ros2.phy.burst import BurstModem, Frames, Samples
-from gr_ros2.phy.demodulation import Demodulation
+from gr_ros2.phy.burst import BurstModem, BurstReceiver, DemodulatedPacket, Frames, Samples
 from gr_ros2.phy.fec import CodeName
 from gr_ros2.phy.flowgraph import ReceiverBlock, TransmitterBlock
 from gr_ros2.phy.kernels import decoders, fastest, which
 from gr_ros2.phy.pdus import PDUS, PduPort
-from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, whole_and_rest
+from gr_ros2.phy.stream_times import BURST_TIME, TX_TIME, StreamTimes, whole_and_rest
 from gr_ros2.phy.taken_packets import TakesPackets
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, BurstTap, SymbolTap
 from gr_ros2.phy.threads import KeptAlive, log_warnings_only
@@ -46,6 +45,75 @@ _WAKES = pmt.intern("wakes")
 """The message after which GNU Radio calls a block that has been given packets."""
 _GAP = 32
 """Zero samples after a packet, unless a receiver needs more."""
+
+
+class Demodulation:
+    """Samples in, packets out, with their times.
+
+    :param lag: see :attr:`gr_ros2.phy.base.Phy.lag`
+    :param gap: zero samples after each burst
+    :ivar times: when the samples were on the air; whoever feeds them says so
+    """
+
+    def __init__(self, modem: BurstModem, lag: int, gap: int, sample_rate: float) -> None:
+        self._modem = modem
+        self._engine: BurstReceiver | None = None
+        self._damaged = 0
+        self._failed = False
+        self._snr_db: float | None = None
+        self._first = 0
+        """Number of the first sample that the engine was fed."""
+        self.fed = 0
+        """Number of samples that have come since the start."""
+        self._lag, self._slack = lag, gap // 2
+        self.times = StreamTimes(sample_rate)
+
+    @property
+    def damaged(self) -> int:
+        """Bursts found whose CRC-32 was wrong."""
+        return self._damaged + (self._engine.damaged if self._engine is not None else 0)
+
+    @property
+    def snr_db(self) -> float | None:
+        """SNR over the sampled band of the newest packets, dB; None before the first."""
+        engine = self._engine
+        return self._snr_db if engine is None else engine.snr_db
+
+    def points(self) -> Samples:
+        """The constellation points of the newest packet; empty before the first."""
+        engine = self._engine
+        return np.empty(0, np.complex64) if engine is None else engine.points
+
+    def start(self) -> None:
+        """Samples come, counted anew."""
+        self._engine = self._modem.receiver()
+        self._first = self.fed = 0
+
+    def stop(self) -> None:
+        """No more samples come."""
+        self._damaged, self._snr_db, self._engine = self.damaged, self.snr_db, None
+
+    def feed(self, samples: Samples) -> list[AirPacket]:
+        """The packets that the next samples complete."""
+        assert self._engine is not None
+        self.fed += len(samples)
+        try:
+            return [self._on_air(packet) for packet in self._engine.feed(samples)]
+        except Exception as error:  # noqa: BLE001 - an exception would end the thread that feeds, and all reception
+            if not self._failed:
+                self._failed = True
+                _log.exception("%s: starts again after %s", type(self._modem).__name__, error)
+            self.stop()
+            self._engine = self._modem.receiver()
+            self._first = self.fed
+            return []
+
+    def _on_air(self, packet: DemodulatedPacket) -> AirPacket:
+        modem = self._modem.rates[packet.mcs]
+        end = self._first + packet.end
+        first = end - self._lag - modem.samples_of(len(packet.data))
+        mcs = packet.mcs if len(self._modem.rates) > 1 else None
+        return AirPacket(packet.data, self.times.at(first, end, self._slack), mcs=mcs, snr_db=packet.snr_db)
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

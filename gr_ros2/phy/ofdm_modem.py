@@ -9,6 +9,7 @@ code the payload has.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from math import sqrt
 from typing import NamedTuple
 
@@ -21,7 +22,6 @@ from gr_ros2.phy.length_word import WORD_BITS, LengthWord, header_bits, mcs_mark
 from gr_ros2.phy.ofdm_channel import UNSTEADY, ChannelEstimator, ChannelState, Complexes
 from gr_ros2.phy.ofdm_layout import HEAD_SYMBOLS, OfdmLayout, constellation
 from gr_ros2.phy.soft import Points
-from gr_ros2.phy.stretch import FRACTIONS, REACH, stretched, weights
 
 _FALSE_ALARM = 1e-3
 """Share of noise samples that are examined closely."""
@@ -50,6 +50,31 @@ _CLOCKS = 50e-6
 _TINY = 1e-20
 _FILL_MARK = 0x555
 """Value added to the number field of a header for each byte that fills up the frame."""
+REACH = 12
+"""Samples on either side of which a value between two is made."""
+FRACTIONS = 512
+
+
+@cache
+def weights() -> NDArray[np.float32]:
+    """Of the samples around a place, one row for each fraction of a sample, 0 and 1 included."""
+    away = np.arange(-REACH + 1, REACH + 1) - np.arange(FRACTIONS + 1)[:, None] / FRACTIONS
+    return np.asarray(np.sinc(away) * np.cos(np.pi * away / (2 * REACH + 2)) ** 2, np.float32)
+
+
+def stretched(samples: NDArray[np.complex64], first: float, pace: float, count: int) -> NDArray[np.complex64]:
+    """``count`` samples from a place on, each ``1 + pace`` after the one before; what is not there is 0."""
+    at = first + (1 + pace) * np.arange(count)
+    whole = np.floor(at).astype(np.int64)
+    rows = weights()[np.rint((at - whole) * FRACTIONS).astype(np.int64)]
+    begin, end = int(whole[0]) - REACH + 1, int(whole[-1]) + REACH + 1
+    padded = np.zeros(end - begin, np.complex64)
+    low, high = max(begin, 0), min(end, len(samples))
+    padded[low - begin : max(high, low) - begin] = samples[low : max(high, low)]
+    out = np.zeros(count, np.complex64)
+    for tap in range(2 * REACH):
+        out += rows[:, tap] * padded[whole - begin - REACH + 1 + tap]
+    return out
 
 
 class _FramePlace(NamedTuple):

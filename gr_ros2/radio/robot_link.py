@@ -24,8 +24,7 @@ from gr_ros2.gr.bound import BoundEnd
 from gr_ros2.gr.calls import LiveCalls
 from gr_ros2.gr.live_end import LiveEnd
 from gr_ros2.gr.ros_link import LinkBlock, RosLink
-from gr_ros2.gr.throughput import LiveThroughput
-from gr_ros2.gr.throughput_ways import MAIN, ThroughputWays
+from gr_ros2.gr.throughput import MAIN, LiveThroughput, ThroughputWays
 from gr_ros2.gr.wish_ways import WishWays, best_of
 from gr_ros2.gr.wishes import LiveWishes
 from gr_ros2.link.bond import Bond

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gr_ros2.dashboard.spectrum import BINS, Spectrum
+from gr_ros2.dashboard.monitor import BINS, Spectrum
 
 
 def tone(frequency: float, rate: float, samples: int = 1024) -> np.ndarray:

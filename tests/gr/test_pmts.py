@@ -6,7 +6,7 @@ import pmt
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2.gr.pmts import PduMaker
+from gr_ros2.gr.radio_ports import PduMaker
 from gr_ros2.link.events import AirPacket
 from gr_ros2.phy.pdus import packets_of
 from gr_ros2.wire.v0 import PacketV0

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gr_ros2.core.errors import ConfigError
-from gr_ros2.gr.throughput_ways import MAIN, ThroughputWays
+from gr_ros2.gr.throughput import MAIN, ThroughputWays
 
 
 class MeasuredWay:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from gr_ros2.radio.ax25 import HEADER_LEN, Callsign, information, ui_header
+from gr_ros2.radio.kiss import HEADER_LEN, Callsign, information, ui_header
 
 
 def test_addresses_are_those_of_the_specification() -> None:

@@ -9,7 +9,7 @@ import pytest
 from gnuradio import blocks, gr
 from numpy.typing import NDArray
 
-from gr_ros2.radio.energy import EnergyCounter
+from gr_ros2.radio.burst_device import EnergyCounter
 
 
 def counted(samples: NDArray[np.complex64], blanked: Sequence[tuple[int, int]] = ()) -> int:

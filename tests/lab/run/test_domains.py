@@ -13,9 +13,8 @@ import pytest
 
 from gr_ros2.middleware import Qos
 from gr_ros2.middleware.dds import DdsMiddleware
-from gr_ros2.middleware.free_domains import ReservedDomain
 from gr_ros2_lab.record.result import read_result
-from gr_ros2_lab.run.domains import on_own_domains
+from gr_ros2_lab.run.domains import ReservedDomain, on_own_domains
 from gr_ros2_lab.run.robot_settings import RobotSettings
 from gr_ros2_lab.run.scenario import load_scenario
 from tests.domains import free_domains
