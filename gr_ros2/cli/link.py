@@ -317,7 +317,6 @@ def _live(running: RobotLink) -> LiveRun:
 
 
 def _key_frame(running: RobotLink, src_id: int, topic_id: int) -> None:
-    """Ask for a key frame of a topic of this robot, or of another one."""
     live, topic_id = running.end_of(topic_id)
     with live.lock:
         frames = live.endpoint.frames

@@ -118,7 +118,6 @@ def _lines(packet: Packet, packet_len: int, registry: Registry | None) -> Iterat
 
 
 def _looked_at(look: Dissection, data: bytes, reader: Reader, registry: Registry | None) -> Iterator[str]:
-    """The lines of a packet of version 1."""
     header, repair = look.header, look.repair
     addressed = header.dst_id != BROADCAST
     to = f"dst {header.dst_id}, hop {header.hop}" if addressed else f"dst {header.dst_id} (broadcast)"
@@ -167,7 +166,6 @@ def _name(topic_id: int, registry: Registry | None) -> str | None:
 
 
 def _of_topic(entry: Entry, name: str | None) -> str:
-    """Describe a message or a fragment."""
     topic = f"{entry.topic_id} ({name})" if name is not None else str(entry.topic_id)
     return f"topic {topic}, {entry.describe()}, payload {len(entry.payload)} bytes: {_preview(entry.payload)}"
 

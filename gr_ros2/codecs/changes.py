@@ -69,7 +69,6 @@ class ChangesEncoder(ABC, Generic[_Read]):
         return coded
 
     def _whole(self, message: bytes) -> Coded:
-        """The frame of a message by itself."""
         return frame(WHOLE, self._packer.pack(message))
 
     def confirmed(self, name: int) -> None:
@@ -97,7 +96,6 @@ class ChangesDecoder(ABC, Generic[_Read]):
         """:raises DamagedError: not a message of this codec"""
 
     def _unpacked(self, form: int, body: bytes) -> bytes:  # noqa: ARG002 - there is one
-        """The message of a frame by itself."""
         return self._packer.unpack(body, self._max_size)
 
     @property

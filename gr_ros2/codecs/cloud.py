@@ -391,7 +391,6 @@ def _points(cloud: Any, reach: float) -> tuple[Whole, Whole]:
 
 
 def _coarser(voxels: _Voxels) -> _Voxels:
-    """Voxels of twice the edge."""
     codes, begins, count = np.unique(voxels.codes >> np.uint64(3), return_index=True, return_counts=True)
     values = voxels.values
     if values.size:

@@ -183,7 +183,6 @@ def _moved(cells: Cells, width: int, height: int, dx: int, dy: int) -> Cells:
 
 
 def _xor(head: bytes, other: bytes) -> bytes:
-    """Each byte with that of the other; where the other is shorter, as it is."""
     size = min(len(head), len(other))
     both = int.from_bytes(head[:size], "little") ^ int.from_bytes(other[:size], "little")
     return both.to_bytes(size, "little") + head[size:]

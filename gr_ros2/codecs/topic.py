@@ -119,7 +119,6 @@ class CodedTopic:
         return self.codecs[number].output == self.output
 
     def encoder(self) -> TopicEncoder:
-        """For the sender."""
         return TopicEncoder(self)
 
     def decoder(self, max_size: int = MAX_SIZE) -> TopicDecoder:

@@ -461,7 +461,6 @@ class LivePage:
 
 
 def _legend_above(plot: Any) -> Any:
-    """Its legend, in one line."""
     (legend,) = plot.legend
     legend.orientation, legend.padding, legend.margin = "horizontal", 0, 0
     legend.background_fill_alpha = legend.border_line_alpha = 0

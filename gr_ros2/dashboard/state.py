@@ -176,7 +176,6 @@ class DashboardState:
     # -- feeding ------------------------------------------------------------------------------------------------
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """Take an event of the sender with this source id."""
         if not self._hears(src_id):
             return
         with self._lock:
@@ -200,7 +199,6 @@ class DashboardState:
                 self._refused(source, src_id, event)
 
     def receiver_event(self, event: ReceiverEvent, now: float) -> None:
-        """Take an event of the receiver."""
         with self._lock:
             if isinstance(event, Delivered):
                 self._delivered(event, now)

@@ -240,7 +240,6 @@ class BoundEnd(LinkParts):
         self.sink.stop()
 
     def close(self) -> None:
-        """Leave the ROS graph. Idempotent."""
         super().close()
         self._start.close()
 
@@ -310,7 +309,6 @@ class BoundEnd(LinkParts):
             return live.endpoint.clock_of(robot, self._clock())
 
     def _begin(self) -> None:
-        """Send, if there is a reason."""
         with self._lock:
             if self.sends or not self.way.sends or not self._running:
                 return

@@ -96,7 +96,6 @@ class LiveCalls:
         sink.share(self)
 
     def takes(self, event: ReceiverEvent) -> bool:
-        """Handle what an event means for services; returns whether it was a request or a reply."""
         if isinstance(event, Met):
             self._met(event)
         elif isinstance(event, Gone):
@@ -111,7 +110,6 @@ class LiveCalls:
         return False
 
     def learn(self, src_id: int, topics: Sequence[Topic]) -> None:
-        """Take over the services that a robot announces now."""
         services = {topic.topic_id: topic for topic in topics if topic.is_service}
         robot = self._robots.get(src_id)
         if robot is None:
@@ -214,7 +212,6 @@ class LiveCalls:
     # ---- calls of this process
 
     def reached(self) -> dict[str, str]:
-        """Types, by their names here, of the services of other robots that can be called."""
         return {name: topic.type_name for name, _, topic in self._reached()}
 
     def call(self, name: str, payload: bytes) -> bytes:

@@ -263,7 +263,6 @@ class ReceivingBlock(HalfBlock):
                     self._failures.note("handler_failed", "ros2_sink", error, level=logging.ERROR)
 
     def _handle_event(self, event: ReceiverEvent) -> None:
-        """Handle an event, then call the observer."""
         calls = self._calls
         if self.config.debug and isinstance(event, Received | Rejected):
             self._log.debug("rx %s", describe(event, self.registry))

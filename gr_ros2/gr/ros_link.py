@@ -61,7 +61,6 @@ class LinkBlock(gr.hier_block2, LinkParts):  # type: ignore[misc]
         self.config, self._radios = config, range(radios)
 
     def _connect(self) -> None:
-        """Connect the ports with the two blocks."""
         for pdus, credit in [(port_of("pdus", radio), port_of("credit", radio)) for radio in self._radios]:
             for port in (pdus, credit):
                 self.message_port_register_hier_in(port)
@@ -73,7 +72,6 @@ class LinkBlock(gr.hier_block2, LinkParts):  # type: ignore[misc]
                 self.msg_connect(self.source, pdus, self, pdus)
 
     def close(self) -> None:
-        """Leave the ROS graph. Idempotent."""
         if self.bound is not None:
             self.bound.close()
         LinkParts.close(self)

@@ -36,7 +36,6 @@ class WishWays:
             way.want(robot, name, rate, for_s, None if once is None else once.told)
 
     def give_up(self, robot: int, name: str) -> None:
-        """As :meth:`LiveWishes.give_up`."""
         for way in self._to(robot):
             way.give_up(robot, name)
 
@@ -55,7 +54,6 @@ class WishWays:
         }
 
     def known(self) -> dict[int, list[dict[str, Any]]]:
-        """As :meth:`LiveWishes.known`."""
         told = [way.known() for way in self._ways()]
         robots = sorted({robot for each in told for robot in each})
         return {robot: _rows(each.get(robot, []) for each in told) for robot in robots}

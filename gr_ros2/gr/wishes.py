@@ -193,7 +193,6 @@ class LiveWishes:
         return robot in self._calls.heard()
 
     def known(self) -> dict[int, list[dict[str, Any]]]:
-        """What each robot that is heard offers, as far as it was asked and has answered."""
         heard = self._calls.heard()
         with self._due:
             told = {robot: self._lists.get(robot, _List([])) for robot in heard}
@@ -308,7 +307,6 @@ class LiveWishes:
         ]
 
     def _answer(self, robot: int, boot: int, wish: WishRequest) -> WishAnswer:
-        """Take a wish, or refuse it."""
         offered = self._found.offers.get(wish.name)
         if offered is None:
             sent = self._found.sends(wish.name, robot)
@@ -370,7 +368,6 @@ class LiveWishes:
                     _log.warning("%s is asked for and not sent: %s", name, error)
 
     def _sender(self, options: SendOptions) -> LinkSendingBlock:
-        """What sends a topic with these options."""
         return self._alone(options.via) or self._source
 
     # ---- the thread
@@ -452,7 +449,6 @@ class LiveWishes:
 
 
 def _words(robot: int, name: str, state: str, left_s: float, answer: WishAnswer | None) -> str:
-    """What has become of a wish."""
     if answer is None:
         return f"robot {robot} has been asked for {name}" if state == "asked" else f"{name} of robot {robot}: given up"
     cost = _bytes(answer.cost) + (f" of {_bytes(answer.free)} that are free" if answer.free < inf else "")

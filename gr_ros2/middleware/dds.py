@@ -287,6 +287,5 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
 
 
 def _split(node: str) -> tuple[str, str]:
-    """Name and namespace of a node."""
     namespace, _, name = node.rpartition("/")
     return name, namespace or "/"

@@ -109,12 +109,10 @@ class Receiver:
         return Lost(event.src_id, event.topic_id, Fate.PUBLISH_FAILED, event.key)
 
     def knows(self, src_id: int) -> bool:
-        """Whether the state of a sender is held at present."""
         return src_id in self._sources
 
     @property
     def held_bytes(self) -> int:
-        """Memory in use for incomplete messages."""
         return self._partials.size
 
     def _admit(self, packet: PacketV0, now: float) -> _Source | None:

@@ -131,7 +131,6 @@ class Sender:
             self._repeat_at[topic_id] = now + self.robot.repeat_s
 
     def next_packet(self, now: float) -> SentPacket | None:
-        """The next packet that may go at ``now``, or None."""
         if not self.pace.may_leave(now):
             return None
         if self._repeat_at:
@@ -162,12 +161,10 @@ class Sender:
         return "fifo", 0.0
 
     def depth(self, topic_id: int) -> int:
-        """Number of messages of a topic that may wait, 0 for unbounded."""
         depth = self._depths[topic_id]
         return self.robot.queue_depth if depth == AUTO else depth
 
     def has_space(self, topic_id: int) -> bool:
-        """Whether a message of that topic could be submitted without dropping another one."""
         return self._queues[topic_id].has_space(self.depth(topic_id))
 
     @property
@@ -176,7 +173,6 @@ class Sender:
         return not any(self._queues.values())
 
     def queued(self) -> dict[int, int]:
-        """Messages that wait or are partly sent, per topic id."""
         return {topic_id: len(queue) for topic_id, queue in self._queues.items()}
 
     def reconfigure(self, **settings: Any) -> None:

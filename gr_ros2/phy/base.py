@@ -157,7 +157,6 @@ class Phy(ABC):
 
     @property
     def mcs_table(self) -> tuple[Mcs, ...]:
-        """The rates of an adaptive rate, the most robust one first; () for a fixed rate."""
         return ()
 
     @property

@@ -398,7 +398,6 @@ class BurstReceiver:
         self._snrs = (*self._snrs, *snrs)[-_LOOKED_BACK:]
 
     def _take(self) -> list[DemodulatedPacket]:
-        """The packets that are complete now."""
         packets: list[DemodulatedPacket] = []
         while True:
             if self._start is None:

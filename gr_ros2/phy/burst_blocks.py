@@ -337,14 +337,12 @@ class BurstSink(ReceiverBlock):
 
     @property
     def snr_db(self) -> float | None:
-        """SNR over the sampled band of the newest packets, dB; None before the first."""
         return self._demodulator.inside.snr_db
 
     def follow_clock(self, offset: Callable[[], float]) -> None:
         self._demodulator.inside.times.offset = offset
 
     def tap_symbols(self) -> SymbolTap:
-        """Make the received constellation points visible."""
         return SymbolTap(self._demodulator.inside.points)
 
 
@@ -413,7 +411,6 @@ class BurstTransceiver(TakesPackets, gr.basic_block):  # type: ignore[misc]
         return self._demodulation.snr_db
 
     def packets_sent(self) -> int:
-        """Packets that have left it as samples."""
         return self._sent
 
     def follow_clock(self, offset: Callable[[], float]) -> None:

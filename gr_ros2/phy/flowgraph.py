@@ -115,7 +115,6 @@ class HierBlock(_Holds, gr.hier_block2):  # type: ignore[misc]
     """
 
     def release(self) -> None:
-        """Release everything inside. The flowgraph has stopped, or never ran. Idempotent."""
         self.disconnect_messages()
         self.disconnect_all()
 

@@ -113,7 +113,6 @@ class OfdmPhy(BurstPhy):
         return OfdmModem(frames, layout, None if threshold == AUTO else threshold, mcs)
 
     def _adaptive(self, options: dict[str, Any]) -> tuple[OfdmPhy, ...]:
-        """The PHYs of the rates."""
         chosen, default = self.options, OfdmOptions()
         for name in ("payload_modulation", "fec", "detection_threshold"):
             value = getattr(chosen, name)

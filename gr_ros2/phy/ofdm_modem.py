@@ -179,7 +179,6 @@ class OfdmModem(BurstModem):
         self.headers = self._word.bits
 
     def _header(self, packet_len: int) -> Samples:
-        """The header's points."""
         bits = self._header_mask.copy()
         bits[:WORD_BITS] ^= self.headers[packet_len - self.frames.lengths[0]]
         return self._bpsk.map(bits)

@@ -50,7 +50,6 @@ def take_messages(block: Any, name: str, handler: str, radios: int = 1, *, calle
 
 
 def _method(block: Any, name: str, radio: int) -> str:
-    """The name of a block's method for one of its radios."""
     own = port_of(name, radio)
     if not hasattr(block, own):
         setattr(type(block), own, partialmethod(getattr(type(block), name), radio=radio))

@@ -332,11 +332,9 @@ class WifiReceiver(ReceiverBlock):
 
     @property
     def snr_db(self) -> float | None:
-        """SNR over the sampled band of the newest packets, dB; None before the first."""
         return self._decoder.snr_db
 
     def tap_symbols(self) -> SymbolTap:
-        """Make the received constellation points visible."""
         points = _Points()
         self.msg_connect((self._equalizer, "symbols"), (points, "symbols"))
         return SymbolTap(points.newest)

@@ -1,7 +1,9 @@
 """The `kiss` front end: a TNC or a modem that speaks KISS, by TCP (direwolf) or on a serial line.
 
 With a callsign each packet is the information of an AX.25 UI frame (version 2.2): two addresses, no digipeaters, the
-control field of a UI frame, "no layer 3". KISS does not say how long a packet was on the air, nor whether it has been sent. So phy ``modem`` states the bit rate.
+control field of a UI frame, "no layer 3".
+
+KISS does not say how long a packet was on the air, nor whether it has been sent. So phy ``modem`` states the bit rate.
 """
 
 from __future__ import annotations

@@ -231,7 +231,6 @@ class Radio(HierBlock):
         return None if passed is None else passed - self.refused
 
     def _connect_bursts(self, whole: PacketTransceiver, instrumented: bool) -> None:
-        """Connect what carries whole bursts."""
         self._transmitter = self._receiver = whole
         if self.channel.on_samples() or self._simulated:
             whole.channel = self._faded = BurstChannel(self.channel, self.phy)

@@ -223,7 +223,6 @@ class RobotLink(Flowgraph):
         return self.radios[0].phy
 
     def _connect_radio(self, number: int) -> None:
-        """Connect a radio with the blocks of ROS."""
         link, one = self._ros.link, self.radios[number]
         pdus, credit = port_of("pdus", number), port_of("credit", number)
         if one.sends:

@@ -111,7 +111,6 @@ def _inside(kind: Any) -> Any:
 
 
 def _complaint(keys: tuple[str, ...], owner: type[Any] | None, group: Sequence[Any]) -> str:
-    """The complaint about one place."""
     key, item = ".".join(keys), group[0]
     if not key:
         return str(item["msg"]).removeprefix("Value error, ")

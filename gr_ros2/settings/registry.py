@@ -329,7 +329,6 @@ def announced(told: AnnouncedTopic, options: Mapping[str, PublishOptions]) -> To
 
 
 def _with(topic: Topic, configured: SendOptions | PublishOptions) -> Topic:
-    """A topic with other options where these are set."""
     default = type(configured)()
     changed = {f.name: getattr(configured, f.name) for f in fields(configured)}
     changed = {name: value for name, value in changed.items() if value != getattr(default, name)}

@@ -64,7 +64,6 @@ class Hello(NamedTuple):
     marks: tuple[tuple[int, int], ...] = ()
 
     def describe(self) -> str:
-        """The entry in words."""
         words = [f"hello, boot {self.boot >> 32}.{self.boot & 0xFFFF_FFFF:08x}, turns {self.turns}"]
         words += ["hears and reports"] * (self.capabilities & CAN_HEAR != 0)
         words += ["encrypts"] * (self.capabilities & ENCRYPTS != 0)
@@ -100,7 +99,6 @@ class Ask(NamedTuple):
     topic_ids: bytes
 
     def describe(self) -> str:
-        """The entry in words."""
         return f"ask, of robot {self.src_id} topics {' '.join(map(str, self.topic_ids))}"
 
 
@@ -125,7 +123,6 @@ class Report(NamedTuple):
     snr_db: float | None = None
 
     def describe(self) -> str:
-        """The entry in words."""
         older = ", nothing older wanted" if self.settled else ""
         return (
             f"report, of robot {self.src_id} (boot ends in {self.boot:04x}), number {self.number}, "
@@ -148,7 +145,6 @@ class Heard(NamedTuple):
     since: int
 
     def describe(self) -> str:
-        """The entry in words."""
         return f"heard, robot {self.src_id}, its hello that ends in {self.echo.hex()}, after number {self.since}"
 
 
@@ -175,7 +171,6 @@ class Ping(NamedTuple):
     snr_db: float | None = None
 
     def describe(self) -> str:
-        """The entry in words."""
         if not self.reply:
             return f"ping, number {self.number} to robot {self.robot}" + ", asks what it is" * self.wants_about
         snr = "" if self.snr_db is None else f", SNR {self.snr_db:g} dB"
@@ -200,7 +195,6 @@ class About(NamedTuple):
     text: bytes = b""
 
     def describe(self) -> str:
-        """The entry in words."""
         text = self.text.decode("utf-8", "replace")
         return f"about, packets of {self.packet_len} bytes, phy {self.phy:08x}, key {self.key:08x}, {text!r}"
 
@@ -223,7 +217,6 @@ class Newest(NamedTuple):
     place: int | None = None
 
     def describe(self) -> str:
-        """The entry in words."""
         return (
             f"newest, of robot {self.origin} (boot ends in {self.start:02x}) topic {self.topic_id}, "
             f"from its packet {self.number}" + ("" if self.place is None else f".{self.place}, and all before it")
@@ -244,7 +237,6 @@ class Waited(NamedTuple):
         return age_of(self.ages[place]) if place < len(self.ages) else 0.0
 
     def describe(self) -> str:
-        """The entry in words."""
         told = [f"entry {place} for {age_in_words(code)}" for place, code in enumerate(self.ages) if code]
         return f"waited, {', '.join(told)}" if told else "waited, none"
 
@@ -263,7 +255,6 @@ class LeftOut(NamedTuple):
     settled: bool
 
     def describe(self) -> str:
-        """The entry in words."""
         older = ", nothing older repaired" if self.settled else ""
         return f"left out, number {self.number}, packets {self.packets:016x}{older}"
 

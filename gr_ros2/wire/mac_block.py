@@ -60,7 +60,6 @@ class Block(NamedTuple):
     weight: int = 1
 
     def describe(self) -> str:
-        """The fields in words."""
         after = ", ".join(f"+{sum(self.ahead[:n])}" for n in (1, 2) if self.ahead[n - 1]) or "not announced"
         names = ", ".join(str(name) for name in self.names if name != NOBODY)
         text = f"slot {self.slot}, next sends {after}, hears {self.heard} robots{names and f', among them {names}'}"

@@ -93,7 +93,6 @@ class Relayed(NamedTuple):
     after: tuple[int, int] | None = None
 
     def describe(self) -> str:
-        """The fields in words."""
         to = "" if self.dst_id == BROADCAST else f" to robot {self.dst_id}"
         after = "" if self.after is None else " after {}.{}".format(*self.after)
         return (

@@ -60,7 +60,6 @@ class AnnouncedTopic(NamedTuple):
         return crc32(write_table((self,)))
 
     def describe(self) -> str:
-        """The topic in words."""
         if not self.name:
             return f"topic {self.topic_id}: not offered any more"
         words = [f"topic {self.topic_id}: {self.name} {self.type_name}, {QOS_NAMES[self.qos]}"]

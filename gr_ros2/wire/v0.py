@@ -69,7 +69,6 @@ class EntryV0(NamedTuple):
         return f"#{self.entry_id}[{self.index}/{self.total}]"
 
     def describe(self) -> str:
-        """The same as ``label``, in words."""
         return f"entry_id {self.entry_id}, index {self.index} of {self.total}"
 
 

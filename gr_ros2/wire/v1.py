@@ -153,7 +153,6 @@ class Part(NamedTuple):
         return f"-{self.back}[{self.offset}..{self.offset + len(self.payload)}{']' if self.last else ')'}"
 
     def describe(self) -> str:
-        """The same as ``label``, in words."""
         if self.whole:
             return "whole"
         end = ", its last" if self.last else ""
@@ -485,7 +484,6 @@ class PacketV1(NamedTuple):
 
     @property
     def entries(self) -> tuple[Part, ...]:
-        """Messages and fragments, in their order."""
         return tuple([entry for entry in self.body if isinstance(entry, Part)])
 
 
@@ -551,7 +549,6 @@ class FormatV1:
     max_packet_len = 4095
 
     def largest_message(self, packet_len: int) -> int:  # noqa: ARG002 - the same in packets of any length
-        """Bytes of the largest message."""
         return MAX_MESSAGE
 
     def single_entry_payload(self, packet_len: int) -> int:
@@ -559,7 +556,6 @@ class FormatV1:
         return body_room(packet_len) - _ENTRY_COST
 
     def packed_len(self, payload_lens: Sequence[int]) -> int:
-        """Bytes of a packet with entries of these payload lengths, without padding."""
         return HEADER_LEN + REPAIR_HEADER_LEN + CRC_LEN + sum(payload_lens) + _ENTRY_COST * len(payload_lens)
 
     def layout(self, packet: PacketV1, packet_len: int, size: int | None = None) -> list[Span]:

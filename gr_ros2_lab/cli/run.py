@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -26,7 +28,6 @@ from gr_ros2.observe.capture import PacketCapture
 from gr_ros2.observe.observers import RunObserver
 from gr_ros2.settings.fields import AUTO
 from gr_ros2_lab.cli.params import OUT_FOLDER, SCENARIO, new_results, pictures_option
-from gr_ros2_lab.cli.terminal import path_text
 from gr_ros2_lab.record.repetitions import REPETITIONS_FILE, repetition_folder
 from gr_ros2_lab.record.result import Result
 from gr_ros2_lab.report.explain import explanation, lateness_lines
@@ -69,6 +70,38 @@ _options = [
     dashboard_option,
     pcap_option,
 ]
+WIDTH, HEIGHT = 78, 22
+_DOTS = 2 * (WIDTH - 8), 4 * (HEIGHT - 4)
+"""Dots of the area between the axes, which are as far apart both ways."""
+_MARKS = 30
+"""Marks of the received path."""
+
+
+def path_text(sent: npt.ArrayLike, received: npt.ArrayLike, title: str) -> str:
+    """Transmitted path as blue dots, received as red crosses, axes in metres and of one scale, with terminal colours.
+
+    :param sent: positions (x, y), m, shape (n, 2)
+    :param received: the same, in the order of reception
+    """
+    import plotext  # many runs draw nothing
+
+    plotext.clear_figure()
+    plotext.plot_size(WIDTH, HEIGHT)
+    plotext.theme("clear")
+    plotext.title(title)
+    paths = [np.asarray(path, dtype=float).reshape(-1, 2) for path in (sent, received)]
+    together = np.concatenate(paths)
+    if len(together):
+        middle = (together.min(0) + together.max(0)) / 2
+        dot_m = max(float((np.ptp(together, axis=0) / _DOTS).max()), 1e-3)
+        (left, low), (right, high) = middle - dot_m * np.array(_DOTS) / 2, middle + dot_m * np.array(_DOTS) / 2
+        plotext.xlim(left, right)
+        plotext.ylim(low, high)
+    fewer = paths[1][:: max(len(paths[1]) // _MARKS, 1)]
+    for path, color, marker in ((paths[0], "blue", "braille"), (fewer, "red", "x")):
+        if len(path):
+            plotext.scatter(*path.T.tolist(), color=color, marker=marker)
+    return str(plotext.build())
 
 
 def _with_options(function: Any) -> Any:

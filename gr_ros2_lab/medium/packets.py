@@ -221,7 +221,6 @@ class PacketMedium(Medium):
         return known
 
     def _on_curves(self, reach: _Reach, sent: Transmission, sinrs_db: Floats) -> Floats:
-        """PDR at these SINRs in dB."""
         pdr = np.ones(len(sinrs_db))
         for kind, channel in enumerate(reach.groups):
             places = slice(None) if len(reach.groups) == 1 else reach.kinds == kind

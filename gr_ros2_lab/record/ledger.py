@@ -128,7 +128,6 @@ class Ledger:
     # -- feeding ------------------------------------------------------------------------------------------------
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """Take an event of the sender with this source id."""
         with self._lock:
             if self._finished:
                 return

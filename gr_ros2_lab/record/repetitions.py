@@ -98,7 +98,6 @@ def write_repetitions(results: Sequence[Result], out: Path) -> Path:
 
 
 def _numbers(result: Result, wanted: TopicResult) -> dict[str, Any]:
-    """The numbers of one topic of one source, {} where this result does not have the topic."""
     same = (topic for topic in result.topics if (topic.topic, topic.src_id) == (wanted.topic, wanted.src_id))
     return next((topic_numbers(topic, ()) for topic in same), {})
 

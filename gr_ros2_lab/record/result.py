@@ -26,7 +26,7 @@ RESULT_FILE = "result.json"
 
 @dataclass(frozen=True, config=READ)
 class LatenessResult:
-    """How late the computer was in a run that follows the wall clock; see :mod:`gr_ros2_lab.record.lateness`.
+    """How late the computer was in a run that follows the wall clock; see :mod:`gr_ros2_lab.run.runner`.
 
     :param worst_s: greatest lateness, s, by part: ``threads``, ``gate``
     :param moments: number of times that a part was late by 50 ms or more

@@ -74,7 +74,6 @@ class TeamRecord:
         self._now = 0.0
 
     def sender_event(self, src_id: int, event: SenderEvent) -> None:
-        """An event of a robot's sending half."""
         if isinstance(event, SentPacket):
             with self._lock:
                 self._sent(src_id, event)
@@ -85,7 +84,6 @@ class TeamRecord:
                     self._ways[src_id].append((event.now, *point))
 
     def receiver_event(self, robot: int, event: ReceiverEvent, now: float) -> None:
-        """An event of the receiving half of a robot."""
         with self._lock:
             self._now = max(self._now, now)
             if isinstance(event, Received):

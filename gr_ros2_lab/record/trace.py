@@ -370,7 +370,6 @@ def _copied(values: array[Any], count: int) -> npt.NDArray[Any]:
 
 
 def _named(codes: Ints, names: Mapping[int, str]) -> Texts:
-    """The name of every code."""
     texts = np.array([names.get(code, "") for code in range(max(names, default=-1) + 1)], dtype=object)
     return texts[codes] if len(codes) else np.empty(0, dtype=object)
 

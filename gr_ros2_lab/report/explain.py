@@ -184,7 +184,6 @@ def _busy(kinds: Mapping[str, float], span: float, *, several: bool = False) -> 
 
 
 def _in_flight(result: Result, trace: Trace, packets: Packets) -> Iterator[str]:
-    """Where the messages in flight were at the end."""
     left: dict[tuple[int, int], int] = {}
     for src_id, serial, total in _messages_sent(packets)[0]:
         left[src_id, serial] = total

@@ -382,7 +382,6 @@ def write_summary(runs: Sequence[Run], out: Path) -> list[Path]:
 
 
 def _check(run: Run) -> None:
-    """Check that the trace and the result are of the same run."""
     counts: dict[tuple[str, int], Messages] = {(m.topic, m.src_id): m for m in run.trace.messages()}
     for topic in run.result.topics:
         messages = counts.get((topic.topic, topic.src_id))

@@ -56,7 +56,6 @@ class PassedOn(LiveMedium):
             self._thread.join()
 
     def _take(self, number: int, packets: Sequence[AirPacket]) -> None:
-        """A robot has sent packets."""
         with self._changed:
             for packet in packets:
                 self.medium.send(number, packet.data, self.now, 0.0)

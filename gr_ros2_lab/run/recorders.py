@@ -132,7 +132,6 @@ class RunRecords:
         return self._places.get(number, 0)
 
     def sent(self, src_id: int, event: SenderEvent) -> None:
-        """An event of a robot's sending half."""
         for place in self._hearing.get(src_id, range(len(self._recorders))):
             self._guards[place](self._recorders[place].sender_event, src_id, event)
         self.run_observers.sender_event(src_id, event)
@@ -140,7 +139,6 @@ class RunRecords:
             self.team.sender_event(src_id, event)
 
     def received(self, robot: RobotObserver, event: ReceiverEvent, now: float) -> None:
-        """An event of a robot's receiving half."""
         self._guards[robot.place](self._recorders[robot.place].receiver_event, event, now)
         if not robot.place:
             self.run_observers.receiver_event(event, now)

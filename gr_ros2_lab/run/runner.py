@@ -6,6 +6,7 @@ still closes its ledger and writes its result.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,22 +17,24 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
+import numpy as np
+
 from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError, RunError
 from gr_ros2.core.files import make_folder, write_whole
 from gr_ros2.core.guard import Guard, one_line
 from gr_ros2.core.watch import wait_until
+from gr_ros2.link.fates import Fate
+from gr_ros2.link.lateness import Lateness
 from gr_ros2.middleware import Middleware, Qos, join
 from gr_ros2.middleware.bag import BagMiddleware
 from gr_ros2.observe.observers import RunObserver, RunObservers
 from gr_ros2.settings.config import ChannelConfig, Traffic
-from gr_ros2_lab.record.lateness import lateness_result
 from gr_ros2_lab.record.repetitions import repetition_folder, write_repetitions
 from gr_ros2_lab.record.result import RESULT_FILE, LatenessResult, Result, write_result
 from gr_ros2_lab.record.trace import Trace, write_trace
 from gr_ros2_lab.run.domains import on_own_domains
 from gr_ros2_lab.run.load import make_phy, recording
 from gr_ros2_lab.run.outcome import DELIVERED_BAG, Outcome, Progress
-from gr_ros2_lab.run.pulse import Pulse
 from gr_ros2_lab.run.recorders import RunRecords
 from gr_ros2_lab.run.robots import surroundings
 from gr_ros2_lab.run.scenario import Scenario, changed
@@ -50,6 +53,80 @@ _MATCH_S = 20.0
 _CONTROLLERS_S = 60.0
 """s within which controllers have to be there. Somebody starts them by hand, once the run says on which graphs."""
 _POLL_S = 0.05
+AFTER_S = 1.0
+"""s. After this time, queues that became full in a late moment are empty again, and incomplete messages have been given
+up."""
+PERIOD_S = 0.02
+
+
+class Pulse:
+    """Measures how late the threads of this process are scheduled, from ``start`` to ``close``: a thread that does
+    nothing else wakes up periodically and checks the time."""
+
+    def __init__(self) -> None:
+        self.lateness = Lateness()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="gr-ros2-pulse", daemon=True)
+
+    def start(self) -> None:
+        """Begin. To be called only once."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End. Idempotent; may also be called before the start."""
+        self._over.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _beat(self) -> None:
+        while True:
+            due = time.monotonic() + PERIOD_S
+            if self._over.wait(PERIOD_S):
+                return
+            self.lateness.happened(due, time.monotonic())
+
+
+def lateness_result(parts: Mapping[str, Iterable[Lateness]], begin: float, end: float, trace: Trace) -> LatenessResult:
+    """The lateness of all parts together, and the messages that were submitted in late moments or up to ``AFTER_S``
+    after them. That proves no cause; so the share of all messages that were submitted at such times is told too.
+
+    :param parts: measurements of each part, by name; a part without measurements is left out
+    :param begin: s, when submission began; the times of the trace count from there
+    :param end: s, when the run was over
+    """
+    measured = {name: list(several) for name, several in parts.items()}
+    worst = {name: max(one.worst for one in several) for name, several in measured.items() if several}
+    found = sorted(
+        (max(due, begin) - begin, happened - begin)
+        for several in measured.values()
+        for one in several
+        for due, happened in one.moments
+        if happened > begin
+    )
+    moments: list[tuple[float, float]] = []
+    for due, happened in found:
+        if moments and due <= moments[-1][1]:
+            moments[-1] = moments[-1][0], max(happened, moments[-1][1])
+        else:
+            moments.append((due, happened))
+    sent = lost = sent_after = lost_after = 0
+    for messages in trace.messages():
+        submitted = ~np.isnan(messages.t_sent)
+        gone = submitted & ~messages.delivered & (messages.fate != Fate.IN_FLIGHT)
+        after = np.zeros(len(submitted), dtype=bool)
+        for due, happened in moments:
+            after |= (messages.t_sent >= due) & (messages.t_sent <= happened + AFTER_S)
+        sent, sent_after = sent + int(submitted.sum()), sent_after + int(after.sum())
+        lost, lost_after = lost + int(gone.sum()), lost_after + int((gone & after).sum())
+    return LatenessResult(
+        worst_s=worst,
+        moments=len(moments),
+        share=sum(happened - due for due, happened in moments) / max(end - begin, 1e-9),
+        lost=lost,
+        lost_after=lost_after,
+        sent=sent,
+        sent_after=sent_after,
+    )
 
 
 class DeliveryRecorder:

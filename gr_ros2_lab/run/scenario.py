@@ -394,7 +394,6 @@ def _contradicted(overrides: Sequence[str]) -> bool:
 
 
 def _described(scenario: Scenario, overrides: Sequence[str]) -> str:
-    """A description made of the settings."""
     phy, channel, robots = scenario.phy, scenario.channel, len(scenario.robots)
     rate = "" if phy.sample_rate == AUTO else f" at {phy.sample_rate:,.0f} samples/s"
     snr = "" if channel.snr_db is None else f", SNR {channel.snr_db:g} dB"

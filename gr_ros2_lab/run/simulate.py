@@ -150,7 +150,6 @@ def offered_by(scenario: Scenario, registry: Registry) -> list[Iterator[Offered]
 
 
 def _own(sent: Sequence[SimMessage], names: Mapping[str, int]) -> Iterator[Offered]:
-    """The messages on these topics."""
     for message in sent:
         if message.topic in names:
             yield Offered(message.t, names[message.topic], message.payload)
@@ -490,7 +489,6 @@ class Robot:
         return {topic_id: made for topic_id, made in found.items() if made is not None}
 
     def _code(self, now: float) -> None:
-        """Encode the pictures that are due."""
         if self._coder is not None:
             self._coder.look(now)
 

@@ -23,18 +23,19 @@ from typing import Any, get_args
 import numpy as np
 
 from gr_ros2.codecs.frames import coded_topic
+from gr_ros2.codecs.whole import whole_of
+from gr_ros2.compression import LinkCodec
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.core.names import first
-from gr_ros2.gr.factory import message_codec
 from gr_ros2.link import SentPacket
 from gr_ros2.link.airtime_limit import sustained
 from gr_ros2.link.events import AirKind
-from gr_ros2.link.message_codec import FRAME, MessageCodec
+from gr_ros2.link.message_codec import FRAME
 from gr_ros2.observe.result import TopicResult
 from gr_ros2.phy import PHY, configured
 from gr_ros2.settings.config import ChannelConfig, SendOptions, replaced
 from gr_ros2.settings.fields import AUTO
-from gr_ros2.settings.registry import Registry, Topic, options_of
+from gr_ros2.settings.registry import Registry, options_of
 from gr_ros2.settings.robot import RobotConfig
 from gr_ros2_lab.medium.base import Surroundings
 from gr_ros2_lab.medium.loss_table import LossCurve
@@ -502,7 +503,7 @@ class Planner:
         if not compression:
             return None
         if self._remembering is None:
-            self._remembering = _Remembering(message_codec(self.registry))
+            self._remembering = _Remembering(self.registry)
         return self._remembering
 
     def _size(self, topic_id: int, payload: bytes) -> int:
@@ -610,44 +611,26 @@ class Planner:
         )
 
 
-class _Remembering:
+class _Remembering(LinkCodec):
     """A codec with a cache: it codes each message only once, for all forecasts."""
 
-    def __init__(self, codec: MessageCodec) -> None:
-        self._codec = codec
+    def __init__(self, registry: Registry) -> None:
+        super().__init__(registry, whole=whole_of)
         self._coded: dict[tuple[int, bytes], bytes] = {}
         self._decoded: dict[tuple[int, bytes], bytes] = {}
-
-    def add(self, topic: Topic) -> None:
-        self._codec.add(topic)
-
-    def learn(self, type_name: str, definitions: Mapping[str, Any]) -> None:
-        self._codec.learn(type_name, definitions)
-
-    def announcement(self, topic_id: int) -> str:
-        return self._codec.announcement(topic_id)
-
-    def lacks(self, topic_id: int, coded: bytes) -> bool:
-        return self._codec.lacks(topic_id, coded)
-
-    def canonical(self, topic_id: int, payload: bytes) -> bytes:
-        return self._codec.canonical(topic_id, payload)
 
     def encode(self, topic_id: int, payload: bytes) -> bytes:
         coded = self._coded.get((topic_id, payload))
         if coded is None:
-            coded = self._coded[topic_id, payload] = self._codec.encode(topic_id, payload)
+            coded = self._coded[topic_id, payload] = super().encode(topic_id, payload)
         return coded
-
-    def numbered(self, coded: bytes, number: int) -> bytes:
-        return self._codec.numbered(coded, number)
 
     def decode(self, topic_id: int, coded: bytes) -> bytes:
         if coded[:1] == FRAME:  # of a chain, which no announcement has told this codec, since it is the sender's too
             return coded[1:]
         payload = self._decoded.get((topic_id, coded))
         if payload is None:
-            payload = self._decoded[topic_id, coded] = self._codec.decode(topic_id, coded)
+            payload = self._decoded[topic_id, coded] = super().decode(topic_id, coded)
         return payload
 
 
@@ -691,7 +674,6 @@ def _process(scenario: Scenario) -> Forecast:
 
 
 def _sending(scenario: Scenario, change: Callable[[RobotConfig], RobotConfig]) -> Scenario:
-    """The scenario with every robot changed that sends messages."""
     return changed(scenario, RobotConfig, lambda robot: change(robot) if robot.sends else robot)
 
 

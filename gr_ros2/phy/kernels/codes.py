@@ -80,7 +80,6 @@ class CompiledDecoders:
 
 
 def _given(values: NDArray[Any], dtype: Any, size: int) -> NDArray[Any]:
-    """The values as a kernel takes them."""
     if len(values) != size:
         raise ValueError(f"{len(values)} soft values; this decoder takes {size}")
     return np.ascontiguousarray(values, dtype)

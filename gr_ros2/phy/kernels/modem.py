@@ -281,7 +281,6 @@ class CompiledReceiver(BurstReceiver):
         return packets
 
     def _whole(self) -> list[DemodulatedPacket]:
-        """The packets of the last call."""
         stream, packets = self._stream, []
         begin, count = stream.packets, stream.whole
         snrs = self._newest_snrs[:count]

@@ -264,7 +264,6 @@ def _texts(point: Overrides, folder: Path) -> list[str]:
 
 
 def _json(value: Any) -> str:
-    """A value as JSON, which is also valid YAML."""
     return json.dumps(value, ensure_ascii=False, default=str)
 
 

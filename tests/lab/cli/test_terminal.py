@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from gr_ros2_lab.cli.terminal import HEIGHT, path_text
+from gr_ros2_lab.cli.run import HEIGHT, path_text
 
 
 def test_both_paths_are_drawn_with_title_and_axes() -> None:

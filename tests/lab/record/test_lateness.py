@@ -8,9 +8,9 @@ import pytest
 
 from gr_ros2.link.fates import Fate
 from gr_ros2.link.lateness import Lateness
-from gr_ros2_lab.record.lateness import AFTER_S, lateness_result
 from gr_ros2_lab.record.ledger import TopicLedger
 from gr_ros2_lab.record.trace import Trace, make_trace
+from gr_ros2_lab.run.runner import AFTER_S, lateness_result
 
 BEGIN, END = 100.0, 110.0
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gr_ros2_lab.record.path_error import path_error, rms_error
+from gr_ros2_lab.record.recorder import path_error, rms_error
 
 T = np.linspace(0, 10, 401)
 LINE = np.column_stack([T, 2 * T])

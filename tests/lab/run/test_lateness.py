@@ -15,7 +15,7 @@ import pytest
 from gr_ros2_lab.record.result import Result, read_result
 from gr_ros2_lab.record.trace import read_trace
 from gr_ros2_lab.report.explain import explanation
-from gr_ros2_lab.run.pulse import PERIOD_S, Pulse
+from gr_ros2_lab.run.runner import PERIOD_S, Pulse
 from tests.domains import free_domains
 from tests.waiting import wait_for
 
