@@ -306,25 +306,19 @@ def _make_qos(qos: Qos, user_data: bytes) -> int:
 
 def _read_qos(pointer: int, key: bytes) -> Qos:
     """The QoS of the endpoint with that GUID, whose first bytes are the vendor id of its DDS."""
-    kind, depth, nanoseconds = c.c_int(0), _i32(1), _i64(0)
-    _get_reliability(pointer, c.byref(kind), c.byref(nanoseconds))
-    reliable = kind.value == 1
-    kind.value = 0
-    _get_durability(pointer, c.byref(kind))
-    latched = kind.value >= 1
-    kind.value = 0
-    _get_history(pointer, c.byref(kind), c.byref(depth))
-    nanoseconds.value = 0
-    _get_lifespan(pointer, c.byref(nanoseconds))
-    lifespan_s = finite(nanoseconds.value * 1e-9)
-    nanoseconds.value = 0
-    _get_deadline(pointer, c.byref(nanoseconds))
+    reliability, durability, history, depth = c.c_int(0), c.c_int(0), c.c_int(0), _i32(1)
+    lifespan, deadline = _i64(0), _i64(0)
+    _get_reliability(pointer, c.byref(reliability), c.byref(_i64(0)))
+    _get_durability(pointer, c.byref(durability))
+    _get_history(pointer, c.byref(history), c.byref(depth))
+    _get_lifespan(pointer, c.byref(lifespan))
+    _get_deadline(pointer, c.byref(deadline))
     return Qos(
-        "reliable" if reliable else "best_effort",
-        "transient_local" if latched else "volatile",
-        (0 if kind.value == 1 else depth.value) if key.startswith(_CYCLONE) else Qos().depth,
-        lifespan_s,
-        finite(nanoseconds.value * 1e-9),
+        "reliable" if reliability.value == 1 else "best_effort",
+        "transient_local" if durability.value >= 1 else "volatile",
+        (0 if history.value == 1 else depth.value) if key.startswith(_CYCLONE) else Qos().depth,
+        finite(lifespan.value * 1e-9),
+        finite(deadline.value * 1e-9),
     )
 
 
@@ -368,10 +362,20 @@ class _Endpoint:
     _incompatible_status = ""
     _others = ""
     """The endpoints that it matches: publications or subscriptions."""
+    _matches = 0
+    """The status of its matches."""
 
-    def __init__(self, entity: Entity) -> None:
-        self.entity = entity
-        self.guid = guid(entity)
+    def __init__(self, create: Any, participant: Entity, topic: Entity, qos: Qos, user_data: bytes) -> None:
+        pointer = _make_qos(qos, user_data)
+        try:
+            self.entity: Entity = _checked(create(participant, topic, pointer, None), "create an endpoint")
+        finally:
+            _delete_qos(pointer)
+        self.guid = guid(self.entity)
+
+    def watch_matches(self) -> None:
+        """Trigger a waitset whenever endpoints of the other side come or leave."""
+        _checked(_set_status_mask(self.entity, self._matches), "set a status mask")
 
     def _get(self, status: str) -> _Status:
         value = _Status()
@@ -422,13 +426,10 @@ class RawReader(_Endpoint):
     _matched_status = "subscription_matched"
     _others = "publication"
     _incompatible_status = "requested_incompatible_qos"
+    _matches = _SUBSCRIPTION_MATCHED
 
     def __init__(self, participant: Entity, topic: Entity, qos: Qos, user_data: bytes = b"") -> None:
-        pointer = _make_qos(qos, user_data)
-        try:
-            super().__init__(_checked(_create_reader(participant, topic, pointer, None), "create a reader"))
-        finally:
-            _delete_qos(pointer)
+        super().__init__(_create_reader, participant, topic, qos, user_data)
         self.latched = qos.durability == "transient_local"
         self.brings_past = self.latched and qos.reliability == "reliable"
         _checked(_set_status_mask(self.entity, _REQUESTED_INCOMPATIBLE | _SAMPLE_LOST), "set a status mask")
@@ -436,10 +437,6 @@ class RawReader(_Endpoint):
         self._samples = (c.c_void_p * BATCH)()
         self._infos = (_SampleInfo * BATCH)()
         self._scratch = c.create_string_buffer(4096)
-
-    def watch_matches(self) -> None:
-        """Trigger a waitset whenever publishers come or leave."""
-        _checked(_set_status_mask(self.entity, _SUBSCRIPTION_MATCHED), "set a status mask")
 
     def take(self) -> list[Sample]:
         """Up to BATCH messages that wait, oldest first."""
@@ -473,21 +470,14 @@ class RawWriter(_Endpoint):
     _matched_status = "publication_matched"
     _others = "subscription"
     _incompatible_status = "offered_incompatible_qos"
+    _matches = _PUBLICATION_MATCHED
 
     def __init__(self, participant: Entity, topic: Entity, qos: Qos, user_data: bytes = b"") -> None:
-        pointer = _make_qos(qos, user_data)
-        try:
-            super().__init__(_checked(_create_writer(participant, topic, pointer, None), "create a writer"))
-        finally:
-            _delete_qos(pointer)
+        super().__init__(_create_writer, participant, topic, qos, user_data)
         _checked(_set_status_mask(self.entity, _OFFERED_INCOMPATIBLE), "set a status mask")
         sertype = c.c_void_p()
         _checked(_get_sertype(self.entity, c.byref(sertype)), "ask for a type")
         self._sertype = sertype
-
-    def watch_matches(self) -> None:
-        """Trigger a waitset whenever subscribers come or leave."""
-        _checked(_set_status_mask(self.entity, _PUBLICATION_MATCHED), "set a status mask")
 
     def write(self, payload: bytes) -> None:
         """Send one message, zero-padded to a multiple of 4 (the library would pad with uninitialised memory).
@@ -522,10 +512,8 @@ class EndpointWatch:
         for index in range(taken):
             data = c.cast(c.c_void_p(samples[index]), c.POINTER(_BuiltinEndpoint)).contents
             key = bytes(data.key)
-            if not infos[index].valid or infos[index].instance_state != _ALIVE:
-                changes.append((key, None))
-                continue
-            changes.append((key, _discovered(data)))
+            there = infos[index].valid and infos[index].instance_state == _ALIVE
+            changes.append((key, _discovered(data) if there else None))
         if taken:
             _return_loan(self.entity, samples, taken)
         return changes

@@ -28,7 +28,7 @@ from gr_ros2.middleware.cdr_dds import (
     guid,
 )
 from gr_ros2.middleware.dds_domains import POOL
-from gr_ros2.middleware.dds_endpoints import SLACK, DdsParticipant, DdsPublisher, DdsSubscription
+from gr_ros2.middleware.dds_endpoints import SLACK, DdsPublisher, DdsSubscription
 from gr_ros2.middleware.dds_events import DdsEvents
 from gr_ros2.middleware.dds_found import FoundEndpoints
 from gr_ros2.middleware.dds_services import DdsClient, DdsPairs, DdsServer, ServiceParticipant
@@ -41,7 +41,7 @@ _DISCOVERY_QOS = Qos("reliable", "transient_local", 1)
 _log = logging.getLogger(__name__)
 
 
-class DdsMiddleware(DdsParticipant, ServiceParticipant):
+class DdsMiddleware(ServiceParticipant):
     """A participant.
 
     :param domain_id: 0..232, auto takes ROS_DOMAIN_ID, default 0
@@ -69,7 +69,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         options = ros_graph.discovery_options(localhost_only)
         self._node = ros_graph.check_node(node_name, namespace)
         self._gid_bytes = ros_graph.gid_size(os.environ)
-        self._closed = False
+        self.closed = False
         self._closing = threading.Lock()
         self._lock = threading.Lock()  # for the tables below; held only briefly, never during a callback
         self._announcing = threading.Lock()
@@ -78,8 +78,8 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         self._advertised: list[DdsPublisher] = []
         self._participant = POOL.join(self.domain_id, options, ros_graph.PARTICIPANT_USER_DATA)
         try:
-            self._guid = guid(self._participant)
-            self._others = FoundEndpoints(self._guid)
+            self.own_guid = guid(self._participant)
+            self._others = FoundEndpoints(self.own_guid)
             self._events = DdsEvents(self._participant)
             self.pairs = DdsPairs(self, self._participant, self._events, self._others)
             for publishers in (True, False):
@@ -94,14 +94,6 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             raise
         self._thread = threading.Thread(target=self._run, name=f"dds-{self.domain_id}-{node_name}", daemon=True)
         self._thread.start()
-
-    @property
-    def closed(self) -> bool:
-        return self._closed
-
-    @property
-    def own_guid(self) -> bytes:
-        return self._guid
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> DdsSubscription:
         topic, type_name = ros_graph.check_topic(topic), normalize_type(type_name)
@@ -153,12 +145,12 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
 
     def close(self) -> None:
         worker = threading.current_thread() is self._thread
-        if worker and self._closed:
+        if worker and self.closed:
             return
         with self._closing:
-            if self._closed:
+            if self.closed:
                 return
-            self._closed = True
+            self.closed = True
             with self._lock:
                 subscriptions = list(self._subscriptions)
             for subscription in subscriptions:
@@ -182,7 +174,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         reader.delete()
 
     def forget(self, endpoint: DdsSubscription | DdsPublisher) -> None:
-        if self._closed:
+        if self.closed:
             return
         if isinstance(endpoint, DdsSubscription):
             with self._lock:
@@ -205,22 +197,22 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
             own_readers, own_writers = pairs.pop("", ([], []))
             nodes = [ros_graph.NodeEntities(*self._node, readers + own_readers, writers + own_writers)]
             nodes += [ros_graph.NodeEntities(*_split(name), *guids) for name, guids in sorted(pairs.items())]
-            info = ros_graph.participant_entities_info(self._guid, nodes, gid_bytes=self._gid_bytes)
+            info = ros_graph.participant_entities_info(self.own_guid, nodes, gid_bytes=self._gid_bytes)
             try:
                 self._discovery.write(info)
             except DdsError:
-                if not self._closed:
+                if not self.closed:
                     raise
 
     # The thread.
 
     def _run(self) -> None:
         deadline: float | None = None
-        while not self._closed:
+        while not self.closed:
             try:
                 steps = self._events.wait(None if deadline is None else max(0.0, deadline - time.monotonic()))
             except DdsError as error:
-                if not self._closed:
+                if not self.closed:
                     _log.error("domain %d: no message will be received any more: %s", self.domain_id, error)
                 return
             for step in steps:
@@ -238,7 +230,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
         try:
             step()
         except DdsError as error:
-            if not self._closed and not error.gone:
+            if not self.closed and not error.gone:
                 self.count("dds_failed", str(error))
 
     def _graph_changed(self, watch: EndpointWatch, *, publishers: bool) -> None:
@@ -268,7 +260,7 @@ class DdsMiddleware(DdsParticipant, ServiceParticipant):
     # Bookkeeping.
 
     def _check_open(self, what: str) -> None:
-        if self._closed:
+        if self.closed:
             raise MiddlewareError(f"{what}: the middleware is closed")
 
     def _topic(self, topic: str, type_name: str) -> Entity:

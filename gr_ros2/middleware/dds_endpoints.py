@@ -15,8 +15,9 @@ from collections.abc import Iterable
 
 from gr_ros2.core.errors import MiddlewareError
 from gr_ros2.middleware.adapt import settle
-from gr_ros2.middleware.base import MessageCallback, Middleware, Publisher, Qos, Subscription
+from gr_ros2.middleware.base import MessageCallback, Publisher, Qos, Subscription
 from gr_ros2.middleware.cdr_dds import BATCH, DdsError, Entity, RawReader, RawWriter, Sample
+from gr_ros2.middleware.services import ServiceGraph
 
 OVERLAP_S = 2.0
 """s that an outdated reader stays in parallel to its successor: Fast DDS may take a second to send to a new reader."""
@@ -33,13 +34,15 @@ _LEAST = Qos("best_effort", "volatile")
 _log = logging.getLogger(__name__)
 
 
-class DdsParticipant(Middleware):
-    """The interface of a participant for its endpoints."""
+class DdsParticipant(ServiceGraph):
+    """The interface of a participant for its endpoints.
 
-    @property
-    @abstractmethod
-    def closed(self) -> bool:
-        """Whether the participant has left its domain."""
+    :ivar closed: whether it has left its domain
+    :ivar own_guid: its GUID
+    """
+
+    closed: bool
+    own_guid: bytes
 
     @abstractmethod
     def make_reader(self, subscription: DdsSubscription, qos: Qos) -> RawReader:

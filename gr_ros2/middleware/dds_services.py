@@ -18,7 +18,6 @@ from __future__ import annotations
 import os
 import re
 import threading
-from abc import abstractmethod
 from collections.abc import Hashable
 
 from gr_ros2.core.errors import MiddlewareError
@@ -32,6 +31,7 @@ from gr_ros2.middleware.cdr_dds import (
     create_topic,
     delete,
 )
+from gr_ros2.middleware.dds_endpoints import DdsParticipant
 from gr_ros2.middleware.dds_events import DdsEvents
 from gr_ros2.middleware.dds_found import FoundEndpoints
 from gr_ros2.middleware.services import (
@@ -41,7 +41,6 @@ from gr_ros2.middleware.services import (
     RequestCallback,
     ServerCallback,
     ServiceClient,
-    ServiceGraph,
     ServiceServer,
 )
 
@@ -63,22 +62,8 @@ def without_header(data: bytes) -> tuple[bytes, bytes] | None:
     return (data[ENCAPSULATION:end], data[:ENCAPSULATION] + data[end:]) if len(data) >= end else None
 
 
-class ServiceParticipant(ServiceGraph):
-    """The interface of a participant for its servers and clients."""
-
-    @property
-    @abstractmethod
-    def closed(self) -> bool:
-        """Whether the participant has left its domain."""
-
-    @property
-    @abstractmethod
-    def own_guid(self) -> bytes:
-        """GUID of the participant."""
-
-    @abstractmethod
-    def announce(self) -> None:
-        """Announce to the graph which endpoints belong to this node."""
+class ServiceParticipant(DdsParticipant):
+    """The same for its servers and clients."""
 
     pairs: DdsPairs
     """The endpoints of its servers and clients."""

@@ -131,7 +131,8 @@ def _policy_name(event: Any) -> str:
 class RclpyMiddleware(RclpyParticipant):
     """One ROS 2 node in a context of its own, spinning in a thread of its own.
 
-    ``counters`` also has ``executor_failed``: errors of rclpy itself, for instance a message that it could not take.
+    ``counters`` also has ``executor_failed``: errors of rclpy itself, for instance a message that it could not take. A
+    topic or service whose type cannot be imported, or whose name ROS does not allow, is a ConfigError.
 
     :param domain_id: 0..232; auto takes ROS_DOMAIN_ID
     :param node_name: base name of the node
@@ -181,10 +182,6 @@ class RclpyMiddleware(RclpyParticipant):
         atexit.register(self.close)  # a daemon thread inside rcl must not outlive the interpreter
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, callback: MessageCallback) -> Subscription:
-        """Subscribe a topic, with a QoS that adapts to its publishers.
-
-        :raises ConfigError: a type that cannot be imported, a topic name ROS does not allow
-        """
         self.check_open()
         subscription = _RclpySubscription(self, topic, type_name, qos, callback)
         subscription.adapt()
@@ -192,26 +189,14 @@ class RclpyMiddleware(RclpyParticipant):
         return subscription
 
     def advertise(self, topic: str, type_name: str, qos: Qos) -> Publisher:
-        """Publish a topic.
-
-        :raises ConfigError: a type that cannot be imported, a topic name ROS does not allow
-        """
         self.check_open()
         return _RclpyPublisher(self, topic, type_name, qos)
 
     def serve(self, service: str, type_name: str, on_request: RequestCallback, node: str = "") -> RclpyServer:
-        """Offer a service.
-
-        :raises ConfigError: a type that cannot be imported, a name ROS does not allow
-        """
         self.check_open()
         return RclpyServer(self, check_topic(service), type_name, on_request, node)
 
     def client(self, service: str, type_name: str, on_reply: ReplyCallback, on_server: ServerCallback) -> RclpyClient:
-        """Call a service.
-
-        :raises ConfigError: a type that cannot be imported, a name ROS does not allow
-        """
         self.check_open()
         client = RclpyClient(self, check_topic(service), type_name, on_reply, on_server)
         self._clients.append(client)

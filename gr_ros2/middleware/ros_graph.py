@@ -22,31 +22,7 @@ from gr_ros2.core.errors import ConfigError
 from gr_ros2.core.names import check_node, check_topic
 from gr_ros2.settings.fields import AUTO, Auto
 
-__all__ = [
-    "DISCOVERY_TOPIC",
-    "DISCOVERY_TYPE",
-    "DISCOVERY_USER_DATA",
-    "MAX_DOMAIN_ID",
-    "PARTICIPANT_USER_DATA",
-    "DiscoveryOptions",
-    "DiscoveryRange",
-    "NodeEntities",
-    "announced_hash",
-    "check_node",
-    "check_topic",
-    "dds_service",
-    "dds_topic",
-    "dds_type",
-    "discovery_options",
-    "endpoint_user_data",
-    "gid_size",
-    "has_short_gids",
-    "participant_entities_info",
-    "resolve_domain_id",
-    "ros_service",
-    "ros_topic",
-    "ros_type",
-]
+__all__ = ["check_node", "check_topic"]
 
 MAX_DOMAIN_ID = 232
 """Highest domain whose UDP ports fit 16 bits (RTPS 2.2, section 9.6.1)."""

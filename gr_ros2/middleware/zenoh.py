@@ -93,6 +93,7 @@ class ZenohMiddleware(Middleware):
     :param namespace: of the node
     :raises ConfigError: a name, number or environment variable is malformed
     :raises MiddlewareError: no session can be opened
+    :ivar session: the Zenoh session
     """
 
     name = "zenoh"
@@ -105,19 +106,19 @@ class ZenohMiddleware(Middleware):
         self._has_hashes = ros_graph.gid_size() != 24
         self._declaring = threading.RLock()  # held during a declaration, so that close() comes before or after
         self._tables = threading.Lock()  # guards the attributes below
-        self._closed = False
+        self.closed = False
         self._endpoints: list[_ZenohPublisher | _ZenohSubscription] = []
         self._entities: dict[str, Entity] = {}  # of all participants, by token
         self._numbers = 0
         config = session_config()
         with _failures("no session"):
-            self._session = zenoh.open(config)
-            self._session_id = str(self._session.zid())
-            self._graph = self._session.liveliness().declare_subscriber(
+            self.session: Any = zenoh.open(config)
+            self._session_id = str(self.session.zid())
+            self._graph = self.session.liveliness().declare_subscriber(
                 tokens_of(self.domain_id), self._graph_changed, history=True
             )
             node = Entity(self._session_id, 0, "NN", self._node_name, self._namespace)
-            self._token = self._session.liveliness().declare_token(node.token(self.domain_id))
+            self._token = self.session.liveliness().declare_token(node.token(self.domain_id))
         self.thread = CallbackThread(self, node_name)
         self._patience = threading.Timer(_ROUTER_S, self.thread.call, [self._miss_router])
         self._patience.daemon = True
@@ -147,30 +148,20 @@ class ZenohMiddleware(Middleware):
 
     def close(self) -> None:
         with self._tables:
-            if self._closed:
+            if self.closed:
                 return
-            self._closed = True
+            self.closed = True
         atexit.unregister(self.close)
         self._patience.cancel()
         self.thread.close()
         with self._declaring, _failures("close"):
-            self._session.close()  # type: ignore[no-untyped-call]
+            self.session.close()
 
     # For our endpoints
 
-    @property
-    def session(self) -> Any:
-        """The Zenoh session."""
-        return self._session
-
-    @property
-    def closed(self) -> bool:
-        """Whether :meth:`close` was called."""
-        return self._closed
-
     def check_open(self, what: str) -> None:
         """:raises MiddlewareError: once closed"""
-        if self._closed:
+        if self.closed:
             raise MiddlewareError(f"{what}: the middleware is closed")
 
     def join(self, endpoint: _ZenohPublisher | _ZenohSubscription) -> Any:
@@ -180,14 +171,14 @@ class ZenohMiddleware(Middleware):
             others = list(self._entities.values())
         for other in others:
             self._compare(endpoint, other)
-        return self._session.liveliness().declare_token(endpoint.entity.token(self.domain_id))
+        return self.session.liveliness().declare_token(endpoint.entity.token(self.domain_id))
 
     def leave(self, endpoint: _ZenohPublisher | _ZenohSubscription, declared: Iterable[Any]) -> None:
         """Remove an endpoint from the graph."""
         with self._tables:
             self._endpoints.remove(endpoint)
         with self._declaring, _failures(f"close {endpoint.entity.topic}"):
-            for thing in () if self._closed else declared:
+            for thing in () if self.closed else declared:
                 thing.undeclare()
 
     def matches(self, entity: Entity) -> list[Entity]:
@@ -195,12 +186,12 @@ class ZenohMiddleware(Middleware):
         wanted = ("MS" if entity.kind == "MP" else "MP", entity.topic, entity.type_name)
         with self._tables:
             found = [e for e in self._entities.values() if (e.kind, e.topic, e.type_name) == wanted]
-            return [] if self._closed else found
+            return [] if self.closed else found
 
     # Internals
 
     def _miss_router(self) -> None:
-        if not self._session.info.routers_zid():
+        if not self.session.info.routers_zid():
             _log.warning(
                 "zenoh: no router found; start one (ros2 run rmw_zenoh_cpp rmw_zenohd), or set "
                 "ZENOH_CONFIG_OVERRIDE='connect/endpoints=[\"tcp/HOST:7447\"]'"

@@ -43,9 +43,7 @@ class AudioOptions(BurstDeviceOptions):
     """sound device that records; auto = ``device``"""
     centre_hz: Annotated[float, Field(gt=0, lt=CARD_RATE / 2, title="Middle of the band (Hz)")] = 4500.0
     """Hz, the middle of the band that sounds; at a radio in SSB, above its dial frequency"""
-    ptt: Annotated[Literal["none", "vox", "rts", "dtr", "rigctld", "cm108"], Field(title="What keys the radio")] = (
-        "none"
-    )
+    ptt: Annotated[_Ptt, Field(title="What keys the radio")] = "none"
     """what keys a transmitter: a tone (vox), a serial line's rts or dtr, rigctld, or a sound chip's pin (cm108)"""
     ptt_device: Annotated[Text | Literal[""], Field(title="Device of the key")] = ""
     """``/dev/ttyUSB0`` for rts and dtr, ``HOST:PORT`` for rigctld, ``/dev/hidraw0`` for cm108"""

@@ -7,7 +7,7 @@ The impulse response comes from an exponential sweep (Farina, AES 108, 2000), th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log10
 
 import numpy as np
@@ -93,16 +93,8 @@ def measured(played: Sound, recorded: Sound) -> SoundMeasured:
     direct = round(_DIRECT_S * CARD_RATE)
     near = float(np.sum(response[max(peak - direct, 0) : peak + direct] ** 2))
     rest = max(float(np.sum(response[peak + direct : peak + CARD_RATE] ** 2)) - floor**2 * CARD_RATE, 1e-12)
-    return SoundMeasured(
-        heard,
-        told.level_db,
-        told.noise_db,
-        told.clipped,
-        told.silent,
-        peak / CARD_RATE,
-        _echo_s(response[peak:], floor),
-        10 * log10(near / rest),
-    )
+    echo_s, direct_db = _echo_s(response[peak:], floor), 10 * log10(near / rest)
+    return replace(told, round_trip_s=peak / CARD_RATE, echo_s=echo_s, direct_db=direct_db)
 
 
 def _response(played: Sound, recorded: Sound) -> NDArray[np.float64]:
