@@ -21,7 +21,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from math import inf
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from gr_ros2.core.errors import GrRos2Error, RunError, shortened
@@ -87,9 +86,7 @@ class ControlSocket:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._path.unlink(missing_ok=True)
         self._closed = True
         # Closing alone does not wake a thread that waits for the socket.

@@ -67,9 +67,9 @@ def from_rows(rows: Pixels, width: int, kind: str) -> av.VideoFrame:
     return made
 
 
-def to_rows(picture: av.VideoFrame, row: int, plane: int = 0) -> Pixels:
-    """The bytes of a plane, shape (rows, ``row``)."""
-    source: Any = picture.planes[plane]
+def to_rows(picture: av.VideoFrame, row: int) -> Pixels:
+    """The bytes of the first plane, shape (rows, ``row``)."""
+    source: Any = picture.planes[0]
     return np.frombuffer(source, np.uint8).reshape(-1, source.line_size)[: source.height, :row]
 
 

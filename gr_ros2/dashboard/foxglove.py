@@ -63,7 +63,7 @@ class FoxgloveServer:
     name = "foxglove"
     instruments = False
 
-    def __init__(self, address: str, port: int, program: str = "gr-ros2") -> None:
+    def __init__(self, address: str, port: int) -> None:
         try:
             foxglove: Any = import_module("foxglove")
         except ModuleNotFoundError as error:
@@ -87,7 +87,7 @@ class FoxgloveServer:
         self._lock = threading.Lock()
         try:
             self._server = foxglove.start_server(
-                name=program,
+                name="gr-ros2",
                 host=address,
                 port=port,
                 context=self._context,

@@ -199,15 +199,13 @@ class LateObservers(Observers[RunObserver]):
     """An observer that passes everything on to other observers, which may be attached while the run goes on.
 
     An observer that is attached late first receives ``run_started``, and then every further event.
-
-    :param instruments: see :class:`RunObserver`; for all observers that may be attached
     """
 
     name = "audience"
+    instruments = True
 
-    def __init__(self, instruments: bool = True) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.instruments = instruments
         self._lock = threading.Lock()
         self._run: LiveRun | None = None
 

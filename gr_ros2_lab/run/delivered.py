@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 from gr_ros2.core.errors import BagError, ConfigError
@@ -90,9 +89,7 @@ class DeliveredBag:
     def __enter__(self) -> DeliveredBag:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, *error: object) -> None:
         """Finish the file. If the run failed or was interrupted, the file is removed."""
         if kind is None:
             self.close()
