@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pmt
-from gnuradio import filter, gr
+from gnuradio import gr
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
@@ -326,6 +326,8 @@ class BurstSink(ReceiverBlock):
         if phy.receiver_taps is None:
             self.connect(self, self._demodulator)
         else:
+            from gnuradio import filter  # here: 10 MB that a link whose bursts come as a whole does not need
+
             self.connect(self, filter.fir_filter_ccf(1, phy.receiver_taps), self._demodulator)
         for port in ("pdus", "points"):
             self.msg_connect((self._demodulator, port), (self, port))

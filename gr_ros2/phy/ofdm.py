@@ -7,7 +7,7 @@ frames are only as long as needed unless ``lengths`` is ``fixed``; the stock rec
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -18,9 +18,11 @@ from gr_ros2.phy.base import BurstCarrier, PacketReceiver, PacketTransceiver, Pa
 from gr_ros2.phy.burst_blocks import STOCK, BurstOptions, BurstPhy
 from gr_ros2.phy.ofdm_layout import CRC_LEN, OfdmLayout, point_power
 from gr_ros2.phy.ofdm_modem import AdaptiveOfdmModem, OfdmModem
-from gr_ros2.phy.ofdm_stock import StockFrame, StockReceiver, StockTransmitter, idle_spinning_threads
 from gr_ros2.phy.theory import coded_success, half_point, packet_success, psk_symbol_error, qam_symbol_error
 from gr_ros2.settings.fields import AUTO, Auto
+
+if TYPE_CHECKING:
+    from gr_ros2.phy.ofdm_stock import StockFrame
 
 RateName = Literal["bpsk-cc", "qpsk-cc", "8psk-cc", "16qam-cc", "64qam-cc", "16qam", "64qam"]
 RATES: dict[str, tuple[str, str, float]] = {
@@ -158,6 +160,8 @@ class OfdmPhy(BurstPhy):
         return self._rates or (self,)
 
     def _checked_stock(self) -> StockFrame:
+        from gr_ros2.phy.ofdm_stock import StockFrame  # here, as below: 14 MB that only `stock` needs
+
         chosen, symbol = self.options, self.layout.symbol_samples
         if chosen.fec != "none":
             raise ConfigError(
@@ -203,13 +207,23 @@ class OfdmPhy(BurstPhy):
 
     def prefer_latency(self) -> None:
         if self._stock is not None:
+            from gr_ros2.phy.ofdm_stock import idle_spinning_threads
+
             idle_spinning_threads()
 
     def transmitter(self) -> PacketTransmitter:
-        return super().transmitter() if self._stock is None else StockTransmitter(self._stock)
+        if self._stock is None:
+            return super().transmitter()
+        from gr_ros2.phy.ofdm_stock import StockTransmitter
+
+        return StockTransmitter(self._stock)
 
     def receiver(self) -> PacketReceiver:
-        return super().receiver() if self._stock is None else StockReceiver(self._stock)
+        if self._stock is None:
+            return super().receiver()
+        from gr_ros2.phy.ofdm_stock import StockReceiver
+
+        return StockReceiver(self._stock)
 
     def transceiver(self, carrier: BurstCarrier) -> PacketTransceiver | None:
         return super().transceiver(carrier) if self._stock is None else None

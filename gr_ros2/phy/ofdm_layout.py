@@ -1,20 +1,16 @@
 """The frame format of the `ofdm` PHY: carriers, sync words and constellations, as in GNU Radio's blocks.
 
-Invariants: with equal settings every implementation makes the same samples; numpy's global generator, which the stock
-sync words reseed, is restored.
+Invariants: with equal settings every implementation makes the same samples. ``gnuradio.digital``, which would make the
+same words and points, is not imported: it takes 14 MB of memory, which a robot's link does not need.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from math import sqrt
 
 import numpy as np
-from gnuradio import digital
-from gnuradio.digital import ofdm_txrx
 from numpy.typing import NDArray
 
 from gr_ros2.core.errors import ConfigError
@@ -22,7 +18,7 @@ from gr_ros2.phy.length_word import WORD_BITS
 
 BITS = {"bpsk": 1, "qpsk": 2, "8psk": 3, "16qam": 4, "64qam": 6}
 """Payload bits on one carrier of one symbol, by modulation."""
-_SCRAMBLER = {"mask": 0x8A, "seed": 0x7F, "len": 7}
+SCRAMBLER = {"mask": 0x8A, "seed": 0x7F, "len": 7}
 
 
 HEAD_SYMBOLS = 3
@@ -31,6 +27,8 @@ CRC_LEN = 4
 _MAX_FRAME_LEN = 4095
 """The stock header counts the bytes of its frame, CRC-32 included, in 12 bits."""
 _HEADER_SEED = 0x6F
+_SYNC_SEED = 42
+"""Of numpy's legacy generator, from which GNU Radio's ``ofdm_txrx`` draws its sync words."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ class OfdmLayout:
 
     def mask(self, length: int) -> NDArray[np.uint8]:
         """The scrambling sequence for the bytes of a payload; zeros if scrambling is off."""
-        seed = _SCRAMBLER["seed"] if self.scramble else 0
+        seed = SCRAMBLER["seed"] if self.scramble else 0
         return np.packbits(_register(seed, 8 * length), bitorder="little")
 
     def header_mask(self) -> NDArray[np.uint8]:
@@ -149,62 +147,42 @@ class OfdmLayout:
         return (tuple((1, 1, 1, -1)[place % 4] for place in range(len(self.pilots[0]))),)
 
     def sync_words(self) -> list[list[complex]]:
-        """The sync words of the stock blocks."""
-        with _numpy_state_kept():
-            arguments = (self.fft_len, self.data, self.pilots)
-            return [
-                [complex(point) for point in make(*arguments)]
-                for make in (ofdm_txrx._make_sync_word1, ofdm_txrx._make_sync_word2)
-            ]
+        """The sync words of the stock blocks: BPSK, of the first one every second carrier, at twice the power."""
+        used = {place % self.fft_len for place in (*self.data[0], *self.pilots[0])}
+        odd = {place for place in used if place % 2}
+        return [self._sync_word(odd, sqrt(2)), self._sync_word(used, 1.0)]
 
-    def header(self, packet_key: str, frame_key: str) -> Any:
-        """The stock header's format: length, number, CRC-8; one symbol of BPSK."""
-        bits = BITS[self.modulation]
-        return digital.packet_header_ofdm(
-            self.data, 1, packet_key, frame_key, "packet_num", 1, bits, scramble_header=self.scramble
-        )
-
-    def scrambler(self, key: str) -> Any:
-        """Block that scrambles or descrambles bytes, reset for each packet."""
-        seed = _SCRAMBLER["seed"] if self.scramble else 0
-        return digital.additive_scrambler_bb(
-            _SCRAMBLER["mask"], seed, _SCRAMBLER["len"], 0, bits_per_byte=8, reset_tag_key=key
-        )
+    def _sync_word(self, used: set[int], size: float) -> list[complex]:
+        draw = np.random.RandomState(_SYNC_SEED).randint
+        word = [size * (1 - 2 * draw(2)) if place in used else 0.0 for place in range(self.fft_len)]
+        return [complex(point) for point in np.fft.fftshift(word)]
 
 
-def constellation(modulation: str) -> Any:
-    """Points of mean magnitude 1. GNU Radio's own QPSK has magnitude 2, 6 dB above preamble and header.
+def constellation(modulation: str) -> NDArray[np.complex128]:
+    """Points of mean magnitude 1, in GNU Radio's order. Its own QPSK has magnitude 2, 6 dB above preamble and header.
 
     :param modulation: a name of ``BITS``
     """
+    number = np.arange(1 << BITS[modulation])
     if modulation == "bpsk":
-        return digital.constellation_bpsk()
+        return 2.0 * number - 1 + 0j
     if modulation == "8psk":
-        return digital.constellation_8psk()
+        near, far = np.sin(np.pi / 8), np.cos(np.pi / 8)
+        steep = number & 4 > 0
+        return np.where(steep, near, far) * (1 - 2 * (number & 1)) + 1j * np.where(steep, far, near) * (
+            1 - (number & 2)
+        )
     side = 1 << BITS[modulation] // 2
     gray = np.argsort(np.arange(side) ^ np.arange(side) >> 1)
     levels = 2.0 * gray - (side - 1)
-    points = (levels[:, None] + 1j * levels).reshape(-1)
-    size = float(np.abs(points).mean())
-    symmetry, width = 4, 2 / size
-    order = list(range(side * side))
-    return digital.constellation_rect(list(points / size), order, symmetry, side, side, width, width)
+    grid = (levels[:, None] + 1j * levels).reshape(-1)
+    return grid / np.abs(grid).mean()
 
 
 @lru_cache
 def point_power(modulation: str) -> float:
     """Mean squared magnitude of the points."""
-    return float(np.mean(np.abs(constellation(modulation).points()) ** 2))
-
-
-@contextmanager
-def _numpy_state_kept() -> Iterator[None]:
-    """Restore numpy's global generator, which belongs to the user; the stock sync words reseed it."""
-    state = np.random.get_state()
-    try:
-        yield
-    finally:
-        np.random.set_state(state)
+    return float(np.mean(np.abs(constellation(modulation)) ** 2))
 
 
 def _register(seed: int, count: int) -> NDArray[np.uint8]:
@@ -212,5 +190,5 @@ def _register(seed: int, count: int) -> NDArray[np.uint8]:
     state, bits = seed, np.empty(count, np.uint8)
     for place in range(count):
         bits[place] = state & 1
-        state = state >> 1 | ((state & _SCRAMBLER["mask"]).bit_count() & 1) << _SCRAMBLER["len"]
+        state = state >> 1 | ((state & SCRAMBLER["mask"]).bit_count() & 1) << SCRAMBLER["len"]
     return bits

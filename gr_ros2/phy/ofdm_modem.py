@@ -140,7 +140,7 @@ class OfdmModem(BurstModem):
     def __init__(self, frames: Frames, layout: OfdmLayout, threshold: float | None, mcs: int | None = None) -> None:
         super().__init__(frames)
         self._threshold = threshold
-        self.constellation = Points(np.array(constellation(layout.modulation).points()), "little")
+        self.constellation = Points(constellation(layout.modulation), "little")
         self._bpsk = Points(np.array([-1, 1], complex), "little")
         self._layout = layout
         self._size, self._prefix, self._symbol = layout.fft_len, layout.cp_len, layout.symbol_samples

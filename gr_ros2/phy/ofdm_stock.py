@@ -21,7 +21,7 @@ import pmt
 from gnuradio import analog, blocks, digital, fft, gr, pdu
 
 from gr_ros2.phy.flowgraph import HierBlock, ReceiverBlock, TransmitterBlock
-from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, OfdmLayout, constellation
+from gr_ros2.phy.ofdm_layout import BITS, CRC_LEN, SCRAMBLER, OfdmLayout, constellation
 from gr_ros2.phy.tap import SYMBOLS_SHOWN, Tap
 from gr_ros2.phy.threads import lift_message_limit, log_warnings_only
 
@@ -191,13 +191,13 @@ class OfdmModulator(gr.hier_block2):  # type: ignore[misc]
             source = digital.crc32_bb(False, key)
             self._chain(self, source)
         mux = blocks.tagged_stream_mux(gr.sizeof_gr_complex, key, 1)
-        header = digital.packet_headergenerator_bb(layout.header(key, "").base(), key)
-        self._chain(source, header, digital.chunks_to_symbols_bc(constellation("bpsk").points()), (mux, 0))
+        header = digital.packet_headergenerator_bb(_header(layout, key, "").base(), key)
+        self._chain(source, header, digital.chunks_to_symbols_bc(constellation("bpsk")), (mux, 0))
         self._chain(
             source,
-            layout.scrambler(key),
+            _scrambler(layout, key),
             blocks.repack_bits_bb(8, BITS[layout.modulation], key),
-            digital.chunks_to_symbols_bc(constellation(layout.modulation).points()),
+            digital.chunks_to_symbols_bc(constellation(layout.modulation)),
             (mux, 1),
         )
         words = layout.sync_words()
@@ -236,8 +236,8 @@ class OfdmDemodulator(HierBlock):
         self._chain(self, blocks.delay(gr.sizeof_gr_complex, fft_len + cp_len), (mixer, 0), (demux, 0))
         self._chain((sync, 0), analog.frequency_modulator_fc(-2.0 / fft_len), (mixer, 1))
         self._chain((sync, 1), (demux, 1))
-        bpsk = constellation("bpsk")
-        parser = digital.packet_headerparser_b(layout.header(packet_key, frame_key).formatter())
+        bpsk = _decider("bpsk")
+        parser = digital.packet_headerparser_b(_header(layout, packet_key, frame_key).formatter())
         self._chain(
             (demux, 0),
             fft.fft_vcc(fft_len, True, (), True),
@@ -248,16 +248,16 @@ class OfdmDemodulator(HierBlock):
             parser,
         )
         self.msg_connect(parser, "header_data", demux, "header_data")
-        points = constellation(layout.modulation)
+        symbols = _decider(layout.modulation)
         self._carriers = fft.fft_vcc(fft_len, True, (), True)
         self._chain(
             (demux, 1),
             self._carriers,
-            digital.ofdm_frame_equalizer_vcvc(self._equalizer(points, 1).base(), cp_len, frame_key),
+            digital.ofdm_frame_equalizer_vcvc(self._equalizer(symbols, 1).base(), cp_len, frame_key),
             digital.ofdm_serializer_vcc(fft_len, layout.data, frame_key, packet_key, 1),
-            digital.constellation_decoder_cb(points.base()),
+            digital.constellation_decoder_cb(symbols.base()),
             blocks.repack_bits_bb(BITS[layout.modulation], 8, packet_key, True),
-            layout.scrambler(packet_key),
+            _scrambler(layout, packet_key),
             *([digital.crc32_bb(True, packet_key)] if with_crc32 else []),
             self,
         )
@@ -268,18 +268,18 @@ class OfdmDemodulator(HierBlock):
         The receiver's equaliser also decides, so a second equaliser without decisions runs in parallel.
         """
         layout = self._layout
-        points = constellation(layout.modulation)
-        equalizer = self._equalizer(points, 1, enable_soft_output=True)
+        symbols = _decider(layout.modulation)
+        equalizer = self._equalizer(symbols, 1, enable_soft_output=True)
         soft = digital.ofdm_frame_equalizer_vcvc(equalizer.base(), layout.cp_len, self._frame_key)
         serializer = digital.ofdm_serializer_vcc(layout.fft_len, layout.data, self._frame_key, "", 1)
         self.connect(self._carriers, soft, serializer, sink)
         return [soft, serializer]
 
-    def _equalizer(self, points: Any, skipped: int, **more: Any) -> Any:
+    def _equalizer(self, symbols: Any, skipped: int, **more: Any) -> Any:
         layout = self._layout
         return digital.ofdm_equalizer_simpledfe(
             layout.fft_len,
-            points.base(),
+            symbols.base(),
             layout.data,
             layout.pilots,
             layout.pilot_symbols,
@@ -299,3 +299,31 @@ def note(parts: list[Any], owner: Any, points: tuple[Any, ...]) -> None:
         block = point[0] if isinstance(point, tuple) else point
         if block is not owner and all(block is not part for part in parts):
             parts.append(block)
+
+
+def _header(layout: OfdmLayout, packet_key: str, frame_key: str) -> Any:
+    """The stock header's format: length, number, CRC-8; one symbol of BPSK."""
+    bits = BITS[layout.modulation]
+    return digital.packet_header_ofdm(
+        layout.data, 1, packet_key, frame_key, "packet_num", 1, bits, scramble_header=layout.scramble
+    )
+
+
+def _scrambler(layout: OfdmLayout, key: str) -> Any:
+    """Block that scrambles or descrambles bytes, reset for each packet."""
+    seed = SCRAMBLER["seed"] if layout.scramble else 0
+    return digital.additive_scrambler_bb(
+        SCRAMBLER["mask"], seed, SCRAMBLER["len"], 0, bits_per_byte=8, reset_tag_key=key
+    )
+
+
+def _decider(modulation: str) -> Any:
+    """GNU Radio's form of :func:`constellation`, which decides by it."""
+    if modulation == "bpsk":
+        return digital.constellation_bpsk()
+    if modulation == "8psk":
+        return digital.constellation_8psk()
+    grid = constellation(modulation)
+    side = 1 << BITS[modulation] // 2
+    width = 2 * abs(grid[0].real) / (side - 1)
+    return digital.constellation_rect(list(grid), list(range(side * side)), 4, side, side, width, width)

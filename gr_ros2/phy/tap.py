@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gnuradio import blocks, gr
+from gnuradio import gr
 
 Samples = npt.NDArray[np.complex64]
 
@@ -26,6 +26,8 @@ class Tap(gr.hier_block2):  # type: ignore[misc]
     """
 
     def __init__(self, size: int) -> None:
+        from gnuradio import blocks  # here: 7 MB that a link whose bursts come as a whole does not need
+
         super().__init__("gr_ros2_tap", gr.io_signature(1, 1, gr.sizeof_gr_complex), gr.io_signature(0, 0, 0))
         self._probe = blocks.probe_signal_vc(size)
         self.connect(self, blocks.stream_to_vector(gr.sizeof_gr_complex, size), self._probe)

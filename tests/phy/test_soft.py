@@ -12,7 +12,7 @@ NAMES = tuple(BITS)
 
 
 def points_of(name: str, order: BitOrder = "little") -> Points:
-    return Points(np.array(constellation(name).points()), order)
+    return Points(constellation(name), order)
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
