@@ -26,6 +26,10 @@ from typing import Any
 from gr_ros2.core.errors import GrRos2Error, RunError, shortened
 from gr_ros2.core.watch import LOOK_S, Watch
 
+STATUS, PING, SET, OFFERS, WANT, MEASURE, LISTEN = "status", "ping", "set", "offers", "want", "measure", "listen"
+"""Questions to a link."""
+LISTEN_S = 600
+"""s for which it listens at most when it is asked to."""
 _LINE = 4096
 """Most bytes of a request."""
 _ANSWER = 1 << 20

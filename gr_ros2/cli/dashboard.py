@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import webbrowser
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from types import MappingProxyType
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 from pydantic import Field
 from pydantic.dataclasses import dataclass
-from rich.console import Console
 
 from gr_ros2.cli.control_socket import ControlSocket, receive, request, running_programs
 from gr_ros2.cli.params import Number
@@ -24,6 +22,9 @@ from gr_ros2.dashboard.addresses import ANY, exposed, in_url
 from gr_ros2.settings.config import STRICT, build
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from gr_ros2.cli.console import Lines
     from gr_ros2.dashboard.foxglove import FoxgloveServer
     from gr_ros2.dashboard.server import Dashboard
     from gr_ros2.observe.observers import LateObservers
@@ -52,7 +53,7 @@ foxglove_option = click.option(
 
 
 @contextmanager
-def foxglove_server(where: str | None, console: Console) -> Iterator[list[FoxgloveServer]]:
+def foxglove_server(where: str | None, console: Console | Lines) -> Iterator[list[FoxgloveServer]]:
     """The observer that serves a link to Foxglove.
 
     :param where: value of ``--foxglove``; None for none
@@ -89,7 +90,7 @@ class _Place:
 @contextmanager
 def audience(
     where: str | None,
-    console: Console,
+    console: Console | Lines,
     name: str,
     *,
     answers: Mapping[str, Callable[[Any], Any]] = MappingProxyType({}),
@@ -185,6 +186,8 @@ def dashboard(place: str, pid: int | None, wait: float, browser: bool) -> None:
     (url,) = found
     click.echo(url)
     if browser:
+        import webbrowser
+
         webbrowser.open(url)
 
 

@@ -6,7 +6,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,19 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import click
 from pydantic import Field
 from pydantic.dataclasses import dataclass
-from rich.console import Console
-from rich.live import Live
 
 from gr_ros2.calls.wish_frames import MOST_RATE
-from gr_ros2.cli.console import LOG_S
-from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.console import LOG_S, Lines, airtime_words, lines
+from gr_ros2.cli.control_socket import LISTEN, LISTEN_S, MEASURE, OFFERS, PING, SET, STATUS, WANT
 from gr_ros2.cli.dashboard import audience, dashboard_option, foxglove_option, foxglove_server
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import BackendName, Number, set_option
-from gr_ros2.cli.ping import check
 from gr_ros2.cli.recording import bag_option, pcap_option, recording
-from gr_ros2.cli.spectrum import LONGEST_S
-from gr_ros2.cli.status import LISTEN, MEASURE, OFFERS, PING, SET, STATUS, WANT, airtime_words, tables
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import ConfigError, RadioError
 from gr_ros2.core.guard import Guard
@@ -45,6 +40,8 @@ from gr_ros2.settings.yaml_text import yaml_text
 from gr_ros2.wire import BROADCAST
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from gr_ros2.observe.observers import LiveRun
     from gr_ros2.radio.robot_link import RobotLink
 
@@ -136,6 +133,8 @@ def link(
             values = one_line(robot, radio, registry, given, topics)
         settings = _in_one_line(values, overrides, save)
     if checks:
+        from gr_ros2.cli.ping import check
+
         return check(settings, duration, against)
     if against is not None:
         raise click.UsageError("--against needs --check")
@@ -144,7 +143,7 @@ def link(
         from gr_ros2.observe.observers import RunObservers
         from gr_ros2.radio.robot_link import RobotLink
 
-    console = make_console()
+    console = lines()
     answers: dict[str, Callable[[Any], Any]] = {}
     with ExitStack() as stack:
         clients = stack.enter_context(audience(dashboard, console, settings.name, answers=answers))
@@ -211,11 +210,11 @@ class _Measure:
 class _Listen:
     """s for which the link is silent and listens; without, what has come of it."""
 
-    for_s: Annotated[float, Field(gt=0, le=LONGEST_S, allow_inf_nan=False)] | None = None
+    for_s: Annotated[float, Field(gt=0, le=LISTEN_S, allow_inf_nan=False)] | None = None
 
 
 def _answers(running: RobotLink) -> dict[str, Callable[[Any], Any]]:
-    """What clients may ask a running link, by the names of :mod:`gr_ros2.cli.status`."""
+    """What clients may ask a running link, by the names of :mod:`gr_ros2.cli.control_socket`."""
     from gr_ros2.radio.live_settings import LiveSettings
 
     live = LiveSettings(running.source, running.sink)
@@ -344,7 +343,7 @@ def _on(one: Any) -> str:
     return f"{one.name}: {phy.name}{rate}{every}{on_air}{runs_on}"
 
 
-def _show(console: Console, running: RobotLink, duration: float | None) -> None:
+def _show(console: Console | Lines, running: RobotLink, duration: float | None) -> None:
     """Print what runs and what it waits for, with a live table, or plain lines where there is no terminal,
     until the time is over or the link has finished."""
     from gr_ros2.radio.waiting import NewFindings, Waiting
@@ -355,9 +354,8 @@ def _show(console: Console, running: RobotLink, duration: float | None) -> None:
         guarded(say, running.config.remark)
     notify("READY=1")
     end = float("inf") if duration is None else time.monotonic() + duration
-    live = console.is_terminal
     waiting = Waiting(running.source)
-    with Live("", console=console, auto_refresh=False) if live else ExitStack() as shows:
+    with _tables(console) as show:
         shown = time.monotonic()
         findings = NewFindings(running.findings.lines)
         while (now := time.monotonic()) < end and not running.finished:
@@ -371,10 +369,19 @@ def _show(console: Console, running: RobotLink, duration: float | None) -> None:
             if due:
                 shown = time.monotonic()
                 notify(f"STATUS={status_line(stats)}")
-            if isinstance(shows, Live):
-                guarded(partial(shows.update, refresh=True), tables(stats))
+            if show is not None:
+                guarded(show, stats)
             elif due:
                 guarded(say, status_line(stats))
+
+
+def _tables(console: Console | Lines) -> AbstractContextManager[Callable[[Mapping[str, Any]], None] | None]:
+    """What shows a link on a terminal; None where there is none."""
+    if isinstance(console, Lines):
+        return nullcontext()
+    from gr_ros2.cli.status import live_tables
+
+    return live_tables(console)
 
 
 def _watch(running: RobotLink) -> None:

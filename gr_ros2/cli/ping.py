@@ -15,9 +15,10 @@ from rich.live import Live
 
 from gr_ros2.cli.console import LOG_S
 from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.control_socket import PING
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import MOST_S, Number, set_option
-from gr_ros2.cli.status import PING, ask_link, find_link, json_option, pid_option
+from gr_ros2.cli.status import ask_link, find_link, json_option, pid_option
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.watch import wait_until
 from gr_ros2.radio.config import LinkConfig, load_link

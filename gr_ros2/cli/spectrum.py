@@ -16,16 +16,16 @@ from rich.table import Table
 from rich.text import Text
 
 from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.control_socket import LISTEN, LISTEN_S
 from gr_ros2.cli.params import Number, set_option
 from gr_ros2.cli.ping import opened
-from gr_ros2.cli.status import LISTEN, ask_link, find_link, json_option, pid_option
+from gr_ros2.cli.status import ask_link, find_link, json_option, pid_option
 from gr_ros2.core.backends import uninterrupted
 from gr_ros2.core.errors import RunError
 from gr_ros2.radio.config import LinkConfig, load_link
 from gr_ros2.radio.occupancy import SELDOM, busy_words
 
 _LOOK_S = 0.2
-LONGEST_S = 600
 _WIDTH = 40
 """Columns of the bar of the strongest part."""
 _LEAST_DB = 20.0
@@ -39,7 +39,7 @@ Told = Mapping[str, Any]
 @click.option(
     "--for",
     "for_s",
-    type=Number(0, LONGEST_S, min_open=True),
+    type=Number(0, LISTEN_S, min_open=True),
     default=2.0,
     show_default=True,
     help="Seconds to listen.",

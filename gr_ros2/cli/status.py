@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import click
@@ -13,14 +14,13 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
+from gr_ros2.cli.console import airtime_words
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.control_socket import request, running_programs
+from gr_ros2.cli.control_socket import SET, STATUS, request, running_programs
 from gr_ros2.core.errors import ConfigError, RunError
 from gr_ros2.link.clocks import ClockOffset
 from gr_ros2.settings.files import parse_override
 
-STATUS, PING, SET, OFFERS, WANT, MEASURE, LISTEN = "status", "ping", "set", "offers", "want", "measure", "listen"
-"""Questions to the control socket of a link."""
 NO_LINK = "no link of yours runs; start one with gr-ros2 link"
 _EVERY_S = 0.5
 
@@ -28,6 +28,13 @@ Stats = Mapping[str, Any]
 
 pid_option = click.option("--pid", type=int, help="Process of the link, where several run.")
 json_option = click.option("--json", "as_json", is_flag=True, help="One line of JSON instead of tables.")
+
+
+@contextmanager
+def live_tables(console: Console) -> Iterator[Callable[[Stats], None]]:
+    """Shows :func:`tables` in place on a terminal."""
+    with Live("", console=console, auto_refresh=False) as shows:
+        yield lambda stats: shows.update(tables(stats), refresh=True)
 
 
 def tables(stats: Stats) -> Group:
@@ -147,20 +154,6 @@ def _air(stats: Stats) -> list[str]:
         f"packets sent: {packets['out']} ({shares}), {packets['backlog']} wait; received: {stats['sink']['packets']}",
         *([limit] if limit else []),
     ]
-
-
-def airtime_words(account: Mapping[str, Any]) -> str:
-    """What a link says about how much it may send; '' where nothing limits it."""
-    words = [] if account["transmits"] else ["sending is off"]
-    if "spent_s" in account and account["allowed_s"] < account["window_s"]:
-        words.append(
-            f"sent {account['spent_s']:.3g} of {account['allowed_s']:.3g} s allowed in {account['window_s']:g} s"
-        )
-        if account["waits_s"] > 1:
-            words.append(f"the limit lets the next packet leave in {account['waits_s']:.0f} s")
-    if not account.get("stored", True):
-        words.append("its airtime account cannot be stored")
-    return ", ".join(words)
 
 
 def _troubles(stats: Stats) -> list[str]:

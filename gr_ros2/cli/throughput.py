@@ -15,8 +15,9 @@ from rich.table import Table
 
 from gr_ros2.calls.throughput_frames import LONGEST_S
 from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.control_socket import MEASURE
 from gr_ros2.cli.ending import FAILED
-from gr_ros2.cli.status import MEASURE, ask_link, find_link, json_option, pid_option
+from gr_ros2.cli.status import ask_link, find_link, json_option, pid_option
 from gr_ros2.cli.wishes import robot_argument
 from gr_ros2.core.errors import RunError
 

@@ -27,8 +27,8 @@ from rich.table import Table
 from rich.text import Text
 
 from gr_ros2.cli.console import console as make_console
-from gr_ros2.cli.control_socket import sockets
-from gr_ros2.cli.status import NO_LINK, STATUS, Stats, ask_link, in_seconds, json_option, peer_state
+from gr_ros2.cli.control_socket import STATUS, sockets
+from gr_ros2.cli.status import NO_LINK, Stats, ask_link, in_seconds, json_option, peer_state
 from gr_ros2.core.errors import RunError, shortened
 from gr_ros2.core.watch import Watch
 from gr_ros2.gr.health import LinkHealth

@@ -13,9 +13,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from gr_ros2.cli.console import console as make_console
+from gr_ros2.cli.control_socket import OFFERS, WANT
 from gr_ros2.cli.ending import FAILED
 from gr_ros2.cli.params import Number
-from gr_ros2.cli.status import OFFERS, WANT, ask_link, find_link, json_option, pid_option
+from gr_ros2.cli.status import ask_link, find_link, json_option, pid_option
 from gr_ros2.core.errors import RunError
 from gr_ros2.core.watch import wait_until
 from gr_ros2.wire import BROADCAST

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from struct import Struct
 from typing import Any
 
@@ -77,30 +77,44 @@ class Types:
     """Message definitions: those given, and those of ROS 2 Humble for all other types.
 
     :param definitions: ``.msg`` texts by ``package/msg/Type``; one that cannot be read is left out
-    :ivar definitions: those given that say something else than Humble's
     """
 
     def __init__(self, definitions: Mapping[str, str] | None = None) -> None:
+        self._given = definitions or {}
+        self._trees: dict[str, Composite | None] = {}
+
+    @cached_property
+    def _own(self) -> dict[str, Typesdict]:
+        """What the definitions given say, those that say something else than Humble's."""
         humble = _humble_types().fielddefs
-        self.definitions: dict[str, str] = {}
-        self._own: dict[str, Typesdict] = {}
-        for name, text in (definitions or {}).items():
+        own: dict[str, Typesdict] = {}
+        for name, text in self._given.items():
             try:
                 found = _parsed(text, name)
             except TypesysError:
                 continue
             if any(kind not in humble or humble[kind][1] != members for kind, (_, members) in found.items()):
-                self.definitions[name], self._own[name] = text, found
-        self._shared = {kind: fields for found in self._own.values() for kind, fields in found.items()} | humble
-        self._trees: dict[str, Composite | None] = {}
+                own[name] = found
+        return own
+
+    def _types(self, type_name: str) -> Mapping[str, Any]:
+        """The types by which one is read. Definitions given are parsed, which takes milliseconds each, only where its
+        name appears in them."""
+        humble = _humble_types().fielddefs
+        short = type_name.rpartition("/")[2]
+        if type_name not in self._given and (
+            type_name in humble or not any(short in text for text in self._given.values())
+        ):
+            return humble
+        shared = {kind: fields for found in self._own.values() for kind, fields in found.items()} | humble
+        # What a text brings along counts for its own type only.
+        return shared | self._own.get(type_name, {})
 
     def tree(self, type_name: str) -> Composite | None:
         """The tree of a type; None where it is unknown, or has a wstring or an array of no elements."""
         if type_name not in self._trees:
             try:
-                # What a text brings along counts for its own type only.
-                types = self._shared | self._own.get(type_name, {})
-                self._trees[type_name] = _composite(types, type_name, ())
+                self._trees[type_name] = _composite(self._types(type_name), type_name, ())
             except KeyError:
                 self._trees[type_name] = None
         return self._trees[type_name]

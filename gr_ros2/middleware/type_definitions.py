@@ -34,6 +34,8 @@ MADE = {
     ),
 }
 """Types that ROS does not ship and that pictures come out as, with their definitions."""
+_UNSHIPPED = {*MADE, "rosbag2_interfaces/msg/MessagesLostEvent"}
+"""Types that links publish and that rosbags does not have: to look for one loads every distribution of ROS."""
 
 
 class Definition(NamedTuple):
@@ -61,7 +63,9 @@ def known(type_name: str) -> bool:
 
 def _shipped(type_name: str) -> Typestore | None:
     """The types of the first distribution that has a type; others are loaded only if :func:`typestore` lacks it."""
-    return typestore() if type_name in typestore().fielddefs else next(iter(typestores(type_name)), None)
+    if type_name in typestore().fielddefs:
+        return typestore()
+    return None if type_name in _UNSHIPPED else next(iter(typestores(type_name)), None)
 
 
 @cache

@@ -165,18 +165,17 @@ def constellation(modulation: str) -> NDArray[np.complex128]:
     """
     number = np.arange(1 << BITS[modulation])
     if modulation == "bpsk":
-        return 2.0 * number - 1 + 0j
+        return np.array([-1, 1], np.complex128)
     if modulation == "8psk":
         near, far = np.sin(np.pi / 8), np.cos(np.pi / 8)
         steep = number & 4 > 0
-        return np.where(steep, near, far) * (1 - 2 * (number & 1)) + 1j * np.where(steep, far, near) * (
-            1 - (number & 2)
-        )
+        across, up = np.where(steep, near, far), np.where(steep, far, near)
+        return np.asarray(across * (1 - 2 * (number & 1)) + 1j * up * (1 - (number & 2)))
     side = 1 << BITS[modulation] // 2
     gray = np.argsort(np.arange(side) ^ np.arange(side) >> 1)
     levels = 2.0 * gray - (side - 1)
     grid = (levels[:, None] + 1j * levels).reshape(-1)
-    return grid / np.abs(grid).mean()
+    return np.asarray(grid / np.abs(grid).mean())
 
 
 @lru_cache

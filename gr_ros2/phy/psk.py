@@ -46,7 +46,7 @@ def root_raised_cosine(sps: int, rolloff: float) -> NDArray[np.float64]:
     quarter = np.pi / (4 * rolloff)
     at_edge = rolloff / np.sqrt(2) * ((1 + 2 / np.pi) * np.sin(quarter) + (1 - 2 / np.pi) * np.cos(quarter))
     pulse[np.isclose(np.abs(slope), 1)] = at_edge
-    return pulse / np.sqrt((pulse**2).sum())
+    return np.asarray(pulse / np.sqrt((pulse**2).sum()))
 
 
 class PskModem(LinearModem):

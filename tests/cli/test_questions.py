@@ -14,10 +14,9 @@ from typing import Any
 import pytest
 
 from gr_ros2.cli.console import console
-from gr_ros2.cli.control_socket import folder, parse, request
+from gr_ros2.cli.control_socket import PING, SET, STATUS, folder, parse, request
 from gr_ros2.cli.dashboard import audience
 from gr_ros2.cli.link import _answers
-from gr_ros2.cli.status import PING, SET, STATUS
 from gr_ros2.core.errors import RunError
 from gr_ros2.radio.live_settings import LiveSettings
 from tests.domains import free_ports
