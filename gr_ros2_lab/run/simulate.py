@@ -16,7 +16,7 @@ import heapq
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from math import inf
 from typing import Any, Protocol
 
@@ -310,6 +310,7 @@ def _robots(
 ) -> list[Robot]:
     """The robots of a run, those that send first; see :class:`Simulation` and :class:`Robot`."""
     start, air, coming = start_of_run(scenario), air_of_run(scenario, phy), iter(messages)
+    airtime = cache(phy.airtime)
     robots: list[Robot] = []
     for number, settings in enumerate(scenario.all_robots):
         events: list[SenderEvent] = []
@@ -326,7 +327,7 @@ def _robots(
             endpoint,
             events=events,
             src_id=settings.robot_id,
-            airtime=phy.airtime,
+            airtime=airtime,
             messages=iter(()) if not config.sends else next(coming),
             start_s=settings.start_s,
             busy=busy,

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from itertools import chain
 from multiprocessing import forkserver, get_context
 from statistics import fmean
@@ -128,7 +128,6 @@ class Forecast:
     :param capacity: packets/s the radio carries
     :param used: part of the airtime that is used, 0..1; of the busiest channel, where each robot has its own
     :param air_bytes_per_message: packet bytes on the air per message delivered, PAD and headers included
-    :param pad: part of the packets' bytes that is PAD
     :param allowed: part of the airtime that may be used, 0..1; loads are parts of this
     :param shared: whether all robots use one channel
     """
@@ -138,7 +137,6 @@ class Forecast:
     capacity: float
     used: float
     air_bytes_per_message: float | None
-    pad: float
     allowed: float
     shared: bool
     topics: tuple[TopicForecast, ...]
@@ -295,12 +293,14 @@ class Planner:
                 self._rows[name], self._weights[name] = topic.name, topic.options.weight
                 if robot.compression and coded_topic(topic) is not None:
                     self._framed.add(topic_id)
+        self._coded: dict[tuple[int, bytes], bytes] = {}
+        """Messages as they are on the air, by topic id and payload."""
         self._remembering: _Remembering | None = None
         self._now: Forecast | None = None
         self._begun: Generator[Forecast, None, None] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """For another process: without what was found here so far."""
+        """For another process: of what was found here so far the coded messages alone."""
         kept = {name: value for name, value in vars(self).items() if name != "_around"}
         return {**kept, "_remembering": None, "_now": None, "_begun": None}
 
@@ -503,7 +503,7 @@ class Planner:
         if not compression:
             return None
         if self._remembering is None:
-            self._remembering = _Remembering(self.registry)
+            self._remembering = _Remembering(self.registry, self._coded)
         return self._remembering
 
     def _size(self, topic_id: int, payload: bytes) -> int:
@@ -514,7 +514,7 @@ class Planner:
     def _forecast(self, scenario: Scenario) -> Forecast:
         robots = senders_of(scenario.all_robots)
         phy = configured(scenario.phy, scenario.packet_len, self.phy.sample_rate)
-        airtime = phy.airtime()
+        airtime_of = cache(phy.airtime)
         codec = self._codec(scenario.compresses)
         rule = scenario.airtime.rule
         shared = scenario.duplex == "half"
@@ -534,21 +534,20 @@ class Planner:
             for message in messages[-1]:
                 payloads[src_id, message.topic_id].append(message.payload)
         shares: Counter[tuple[int, int]] = Counter()
-        padded = sent_bytes = 0
+        sent_bytes = 0
         senders: dict[str, Counter[str]] = {}
 
         wire = scenario.wire_format
 
         def share(sent: SentPacket) -> None:
-            nonlocal padded, sent_bytes
-            own_airtime = phy.airtime(len(sent.data))
+            nonlocal sent_bytes
+            own_airtime = airtime_of(len(sent.data))
             if sent.now <= duration:  # what is sent later has all air for itself
                 senders.setdefault(str(sent.src_id), Counter())[sent.kind] += own_airtime  # type: ignore[assignment]
             sent_bytes += len(sent.data)
-            layout = wire.layout(sent.packet, scenario.packet_len, len(sent.data))
-            padded += sum(span.size for span in layout if span.kind == "pad")
             if sent.kind != "new":
                 return
+            layout = wire.layout(sent.packet, scenario.packet_len, len(sent.data))
             whole = sum(span.size for span in layout if span.entry is not None)
             for span in layout:
                 if span.entry is not None:
@@ -598,11 +597,10 @@ class Planner:
         sending = {str(robot.robot_id) for robot in robots}
         return Forecast(
             packet_len=scenario.packet_len,
-            airtime_s=airtime,
-            capacity=allowed / airtime,
+            airtime_s=phy.airtime(),
+            capacity=allowed / phy.airtime(),
             used=min((sum(spent) if shared else max(spent, default=0.0)) / duration, 1.0),
             air_bytes_per_message=sent_bytes / delivered if delivered else None,
-            pad=padded / sent_bytes if sent_bytes else 0.0,
             allowed=allowed,
             shared=shared,
             topics=tuple(topics),
@@ -612,11 +610,14 @@ class Planner:
 
 
 class _Remembering(LinkCodec):
-    """A codec with a cache: it codes each message only once, for all forecasts."""
+    """A codec with a cache: it codes each message only once, for all forecasts.
 
-    def __init__(self, registry: Registry) -> None:
+    :param coded: what has been coded already, by topic id and payload
+    """
+
+    def __init__(self, registry: Registry, coded: dict[tuple[int, bytes], bytes]) -> None:
         super().__init__(registry, whole=whole_of)
-        self._coded: dict[tuple[int, bytes], bytes] = {}
+        self._coded = coded
         self._decoded: dict[tuple[int, bytes], bytes] = {}
 
     def encode(self, topic_id: int, payload: bytes) -> bytes:

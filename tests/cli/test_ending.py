@@ -23,12 +23,12 @@ GRAPH = ("registry", "from-graph", "--wait", "60")
         (PLAN, "click.exceptions", signal.SIGTERM),
         (PLAN, "pydantic_core", signal.SIGINT),  # with the command's own modules
         (PLAN, "pmt", signal.SIGTERM),
-        (PLAN, "gnuradio.digital.digital_python", signal.SIGINT),  # with a PHY
+        (PLAN, "gr_ros2.phy.ofdm_layout", signal.SIGINT),  # with a PHY
         (GRAPH, "gr_ros2.middleware.cdr_dds", signal.SIGTERM),  # with a middleware
     ],
 )
 def test_a_signal_while_modules_are_loaded(words: tuple[str, ...], loaded: str, number: signal.Signals) -> None:
-    if loaded.startswith(("pmt", "gnuradio")):
+    if loaded.startswith(("pmt", "gr_ros2.phy")):
         pytest.importorskip("gnuradio", reason="needs GNU Radio 3.10")
     domain = ("--domain-id", str(free_domains(1)[0])) if words is GRAPH else ()
     # Python names each module on stderr when it has loaded it.
