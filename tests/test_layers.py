@@ -109,10 +109,8 @@ PAPER_BLOCKS = ("gr_ros2/paper/blocks.py", "gr_ros2/paper/factory.py", "gr_ros2/
 SPEAKS_OF_PACKETS = {"link", "gr", "record", "run", "report", "study", "observe", "dashboard", "settings"}
 """Parts that handle packets and have no bytes of their own, as coders, modems and capture files have."""
 
-_GENERATORS = {"Random", "SystemRandom", "default_rng", "Generator", "SeedSequence", "PCG64"}
+_GENERATORS = {"Random", "SystemRandom", "default_rng", "Generator", "SeedSequence", "PCG64", "RandomState"}
 """What makes a generator of one's own; anything else of ``random`` and ``numpy.random`` is the global one."""
-_STATE = {"get_state", "set_state"}
-"""Put back what GNU Radio's stock blocks do to the global generator; draw nothing."""
 
 
 @functools.cache
@@ -282,7 +280,7 @@ def test_no_module_draws_from_a_global_generator() -> None:
     def draws(module: str) -> set[str]:
         uses = [use.split(".") for use in calls_and_uses(module)]
         drawn = [use for use in uses if use[0] == "random" or use[:2] in (["np", "random"], ["numpy", "random"])]
-        names = {use[-1] for use in drawn} - {"random"} - _STATE
+        names = {use[-1] for use in drawn} - {"random"}
         from_random = {name for name in imports(module) if name.startswith(("random.", "numpy.random."))}
         return (names | {name.rsplit(".", 1)[1] for name in from_random}) - _GENERATORS
 

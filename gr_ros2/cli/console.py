@@ -29,6 +29,7 @@ class Lines:
     """Standard output that gets lines alone, as they are: of a service, without ``rich``, which is 2 MB of memory."""
 
     def print(self, line: str, *, soft_wrap: bool = True) -> None:  # noqa: ARG002 - as of rich's console
+        """Print a line as it is."""
         click.echo(line)
 
 
