@@ -23,7 +23,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from gr_ros2.core.errors import GrRos2Error, RunError, shortened
+from gr_ros2.core.errors import GrRos2Error, RunError, reason, shortened
 from gr_ros2.core.watch import LOOK_S, Watch
 
 STATUS, PING, SET, OFFERS, WANT, MEASURE, LISTEN = "status", "ping", "set", "offers", "want", "measure", "listen"
@@ -211,7 +211,7 @@ def request(pid: int, query: Mapping[str, Any]) -> Mapping[str, Any]:
     try:
         reply = _ask(sockets().get(pid, folder() / f"{pid}.sock"), query)
     except (OSError, ValueError) as error:
-        raise RunError(f"process {pid}: does not answer ({error}); has it ended?") from error
+        raise RunError(f"process {pid}: does not answer ({reason(error)}); has it ended?") from error
     if "error" in reply:
         raise RunError(f"process {pid}: {reply['error']}")
     return reply

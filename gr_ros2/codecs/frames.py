@@ -166,6 +166,8 @@ class _Sent:
 
     def words(self, now: float, age_s: float) -> str:
         """What has become of the topic lately."""
+        if not self.lives(now):
+            return f"{self.name}: no message came in the last {_SECONDS:.0f} s"
         lately = [item for item in self._lately if item[0] >= now - _SECONDS]
         whole = sum(came for _, came, _ in lately) / _SECONDS
         frames = [frame for _, _, frame in lately if frame]

@@ -41,6 +41,13 @@ def shortened(message: str) -> str:
     return message if len(message) <= _BEGIN + _END else f"{message[:_BEGIN]}...{message[-_END:]}"
 
 
+def reason(error: Exception) -> str:
+    """What the system or a library says, in one line, without the number and the file of an OSError: a message names
+    the file itself."""
+    told = error.strerror if isinstance(error, OSError) else None
+    return told or " ".join(str(error).split()) or type(error).__name__
+
+
 class GrRos2Error(Exception):
     """Root of the tree: catch this to catch everything gr-ros2 raises on purpose."""
 

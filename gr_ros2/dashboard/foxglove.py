@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from gr_ros2.codecs.messages import VIDEO
 from gr_ros2.codecs.received_frames import FrameReceiver, frames_output
-from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError
+from gr_ros2.core.errors import BackendMissingError, CodecError, ConfigError, reason
 from gr_ros2.link.events import Accepted, Announced, Delivered, ReceiverEvent, SenderEvent
 from gr_ros2.link.frames import MARK
 from gr_ros2.middleware.service_definitions import service_definition
@@ -97,7 +97,9 @@ class FoxgloveServer:
                 supported_encodings=["cdr"],
             )
         except (RuntimeError, OSError, ValueError) as error:
-            raise ConfigError(f"foxglove = {address}:{port}: cannot be served there ({error})") from error
+            raise ConfigError(
+                f"foxglove = {address}:{port}: cannot be served there ({reason(error)}); choose another address or port"
+            ) from error
         self.port = self._server.port
 
     def close(self) -> None:

@@ -26,7 +26,7 @@ from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import RequestHandler
 
 from gr_ros2.core.closing import Closing
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, reason
 from gr_ros2.dashboard.addresses import ANY, bracketed, exposed, in_url, own_addresses
 from gr_ros2.dashboard.admission import SETTINGS, Admission, BoundedServer, keep
 from gr_ros2.dashboard.live_page import LivePage
@@ -87,9 +87,9 @@ class Dashboard(Closing, RunMonitor):
             started.result()
         except (OSError, ValueError) as error:  # an invalid host name raises no OSError
             self._thread.join()
-            reason = getattr(error, "strerror", None) or " ".join(str(error).split())
             raise ConfigError(
-                f"dashboard = {self.address}:{self.port}: cannot be served there ({reason}); choose another port"
+                f"dashboard = {self.address}:{self.port}: cannot be served there ({reason(error)}); choose another "
+                "address or port"
             ) from error
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, reason
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _FILE = "config.conf"
@@ -66,7 +66,9 @@ def install(environ: Mapping[str, str] = os.environ) -> Path:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(after, encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{file}: cannot be changed ({error}); set GRC_BLOCKS_PATH={folder} instead") from error
+            raise ConfigError(
+                f"{file}: cannot be changed ({reason(error)}); set GRC_BLOCKS_PATH={folder} instead"
+            ) from error
     return files[0]
 
 
@@ -88,7 +90,7 @@ def uninstall(environ: Mapping[str, str] = os.environ) -> list[Path]:
             else:
                 file.unlink()
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{file}: cannot be changed ({error})") from error
+            raise ConfigError(f"{file}: cannot be changed ({reason(error)})") from error
         changed.append(file)
     return changed
 

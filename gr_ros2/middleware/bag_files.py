@@ -37,7 +37,7 @@ from rosbags.rosbag2.reader import zstd  # type: ignore[attr-defined]
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError
+from gr_ros2.core.errors import BagError, ConfigError, MiddlewareError, reason
 from gr_ros2.core.guard import one_line
 from gr_ros2.core.names import first
 from gr_ros2.middleware.bag_mcap import McapStorage
@@ -155,8 +155,7 @@ def explained(path: Path, doing: str) -> Iterator[None]:
     except (MiddlewareError, ConfigError):
         raise
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise BagError(f"bag {path}: cannot be {doing} ({reason})") from error
+        raise BagError(f"bag {path}: cannot be {doing} ({reason(error)})") from error
 
 
 class _QosTexts(YAML):

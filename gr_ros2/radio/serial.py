@@ -14,7 +14,7 @@ import serial
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.core.errors import RadioError
+from gr_ros2.core.errors import RadioError, reason
 from gr_ros2.phy import Phy
 from gr_ros2.radio.framing import Cobs, Framing, Slip
 from gr_ros2.radio.front_end import SharedAir
@@ -87,8 +87,8 @@ def open_stream(front_end: str, device: str, baud: int, framing: Framing) -> Str
         return opener(device, baud, framing)
     except (OSError, ValueError) as error:  # pyserial raises ValueError for a baud rate that the driver refuses
         raise RadioError(
-            f"front_end {front_end}: device = {device!r}: {error}; check that it is there, that no other program uses "
-            "it, and that you may open it"
+            f"front_end {front_end}: device = {device!r}: {reason(error)}; check that it is there, that no other "
+            "program uses it, and that you may open it"
         ) from error
 
 

@@ -23,7 +23,7 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, reason
 from gr_ros2.core.names import (
     checked_frame_form,
     checked_merged_topic,
@@ -654,7 +654,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     try:
         text = read_bounded(Path(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from error
+        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
     values = parse_yaml(text, str(path))
     if values is None:
         return {}

@@ -17,7 +17,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TypeVar, overload
 
-from gr_ros2.core.errors import ConfigError, RegistryError
+from gr_ros2.core.errors import ConfigError, RegistryError, reason
 from gr_ros2.core.names import checked_topic_form, filled, topic_fault
 from gr_ros2.settings.config import SendOptions, build
 from gr_ros2.settings.fields import AUTO, Auto
@@ -203,7 +203,7 @@ class Registry(Sequence[Topic]):
                 reader = csv.reader(file, skipinitialspace=True, strict=True)
                 rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
         except (OSError, UnicodeDecodeError) as error:
-            raise RegistryError(f"cannot be read ({error})", path) from error
+            raise RegistryError(f"cannot be read ({reason(error)})", path) from error
         except csv.Error as error:
             raise RegistryError(f"no CSV ({error})", path, reader.line_num) from error
         return cls(list(_topics(rows, path)), path)

@@ -133,8 +133,8 @@ class Scenario(Reach, Experiment, Traffic, AirConfig):
             raise ValueError("airtime.listen_before_send: no receiver of a run measures power; leave it to live links")
         if self.airtime.rule is not None and any(robot.packet_rate == 0 for robot in self.robots):
             raise ValueError("packet_rate = 0: sends whatever airtime allows; set auto, or leave airtime out")
-        self.airtime.check_seal(encrypts=bool(self.key) and self.robots[0].seal == "encrypt")
         self._check_robots()
+        self.airtime.check_seal(encrypts=bool(self.key) and self.robots[0].seal == "encrypt")
         if self.paper is not None:
             for robot in self.robots:
                 check(robot, self.paper)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gr_ros2.core.arrays import Floats
-from gr_ros2.core.errors import ConfigError
+from gr_ros2.core.errors import ConfigError, reason
 
 MOST_BYTES = 64_000_000
 """Of a file: a day of a hundred rows in a second."""
@@ -31,7 +31,7 @@ def text_of(path: Path) -> str:
             raise ConfigError(f"{path}: has more than {MOST_BYTES:,} bytes; cut it")
         return path.read_text("utf-8-sig")  # as spreadsheets write it
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from error
+        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
 
 
 def read_numbers(path: Path, wanted: Collection[str], may_lack: Collection[str] = ()) -> Mapping[str, Floats]:

@@ -86,7 +86,7 @@ def test_a_port_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
         held.listen()
         assert run(["run", "paper-direct", f"--dashboard={held.getsockname()[1]}"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "choose another port" in line
+    assert "choose another address or port" in line
 
 
 MEMORY = ("--set", "graph.middleware=memory")

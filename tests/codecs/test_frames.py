@@ -363,6 +363,9 @@ def test_what_is_said_of_a_topic() -> None:
     assert said["made"].startswith("H.264 of")
     pattern = r"camera/image: 3\.\d MB/s as it is, sent as 1[456] frames/s in \d+ kbit/s, 0\.1 s old"
     assert re.fullmatch(pattern, said["words"]), said["words"]
+    rest = air.robots[0].sender.stats(CAMERA, air.now + 60)
+    assert rest is not None
+    assert rest["words"] == "camera/image: no message came in the last 2 s"
 
 
 def test_two_cameras_share_what_is_free_by_weight() -> None:

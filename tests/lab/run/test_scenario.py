@@ -162,6 +162,7 @@ def test_override_values_are_yaml() -> None:
         ("reports={}", "reports is no setting any more: write robots"),
         ("receivers=[{}]", "receivers is no setting any more: write robots"),
         ("robots=5x", "robots = '5x': must be a list"),
+        ("robots=0", "robots: 0 of them; a scenario has two or more"),
         ("robots=[{}, 5]", "robots.1 = 5: must be keys and values"),
         ("robots=[{}, {robot: /robot_1}]", "robots: two are robot 1; give each a number of its own"),
         ("robots=[{}, {colour: 1}]", "unknown key robots.1.colour; known are "),
